@@ -1,0 +1,43 @@
+# Two commands do everything: `make demo` runs the whole pipeline, small, to a page with motions to watch;
+# `make test` passes the tests. Each makes its own environment in .venv with pinned packages first.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+RECIPE ?= humantomato-tiny
+DEMO_ARGS ?=
+
+.PHONY: demo test lint install clean help
+
+help:
+	@echo "make demo   whole pipeline on synthetic data, ends with the path of a page to watch"
+	@echo "make test   the tests"
+	@echo "make lint   ruff and mypy"
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "motionloom needs Python 3.11 or newer; name one: make PYTHON=python3.12 demo"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip -c constraints.txt
+	$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e .
+	@touch $(STAMP)
+
+demo: $(STAMP)
+	@$(BIN)/motionloom run $(RECIPE) $(DEMO_ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -P -m pytest $(PYTEST_ARGS)
+
+# mypy reads the folders as the namespace package `motionloom`, so it gets a folder of that name that links to them.
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	@mkdir -p build/types/motionloom
+	@for d in pipeline datasets models configs; do ln -sfn ../../../$$d build/types/motionloom/$$d; done
+	cd build/types && MYPYPATH=. ../../$(BIN)/mypy --config-file ../../pyproject.toml -p motionloom.datasets -p motionloom.models -p motionloom.pipeline -p motionloom.configs
+
+clean:
+	rm -rf build .pytest_cache .mypy_cache .ruff_cache

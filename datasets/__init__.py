@@ -1,0 +1,1 @@
+"""Motion, shards, readers, converters and text conditions."""

@@ -1,0 +1,1 @@
+"""Converters from raw sources to shards, one file each."""

@@ -1,0 +1,1 @@
+"""Skeletons, layouts, features and BVH: the bottom layer (numpy, torch, roma only)."""

@@ -1,0 +1,226 @@
+"""BVH files: a fast reader for any skeleton and a writer whose rest pose other tools accept.
+
+Reader: the hierarchy is parsed line by line, the motion block as one array. A joint may list any of the
+six channels in any order; its position channels replace the matching components of its OFFSET; its rotation
+channels compose in the order listed (`Zrotation Xrotation Yrotation` = Rz Rx Ry on column vectors, degrees).
+Lengths stay in the file's unit.
+
+Writer: metres in, centimetres out; the rest pose is the skeleton's T-pose with an End Site on every leaf,
+because importers of Blender, Houdini and FBX tools take bone directions and lengths from it.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.bvh_text import (
+    Floats,
+    MotionSection,
+    find_motion,
+    load_text,
+    parse_hierarchy,
+    read_values,
+)
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+
+WRITTEN_ORDER = "ZXY"
+"""Rotation channels of written files: the usual order of motion-capture tools."""
+
+CENTIMETRES = 100.0
+
+
+@dataclass(frozen=True)
+class BvhMotion:
+    """One BVH clip of N joints and T frames, lengths in the file's unit."""
+
+    name: str
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    """Parent index of every joint, -1 for the root; parents come before children."""
+    offsets: Floats
+    """OFFSET of every joint [N, 3]."""
+    channels: tuple[tuple[str, ...], ...]
+    """Channel names of every joint, in file order."""
+    values: Floats
+    """The motion block [T, total channels]: lengths and degrees."""
+    frame_time: float
+    fps: float
+    """1 / frame time, snapped to a whole number where the printed digits allow one (0.0333333 is 30)."""
+    end_sites: tuple[tuple[int, tuple[float, float, float]], ...] = ()
+    """(joint, offset) of every End Site."""
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return len(self.values)
+
+    @cached_property
+    def _starts(self) -> list[int]:
+        return [0, *np.cumsum([len(c) for c in self.channels]).tolist()]
+
+    def local_offsets(self) -> Floats:
+        """Translation of every joint against its parent [T, N, 3]: OFFSET, replaced by position channels."""
+        out = np.repeat(self.offsets[None], self.frames, axis=0)
+        for joint, names in enumerate(self.channels):
+            for at, name in enumerate(names, start=self._starts[joint]):
+                if name.endswith("position"):
+                    out[:, joint, "XYZ".index(name[0])] = self.values[:, at]
+        return out
+
+    def local_rotations(self) -> Floats:
+        """Rotation of every joint against its parent [T, N, 3, 3]; identity without rotation channels."""
+        out = np.broadcast_to(np.eye(3), (self.frames, len(self.joints), 3, 3)).copy()
+        groups: dict[str, list[int]] = {}
+        for joint, names in enumerate(self.channels):
+            order = "".join(name[0] for name in names if name.endswith("rotation"))
+            if order:
+                groups.setdefault(order, []).append(joint)
+        for order, members in groups.items():
+            columns = [
+                at
+                for joint in members
+                for at, name in enumerate(self.channels[joint], start=self._starts[joint])
+                if name.endswith("rotation")
+            ]
+            angles = self.values[:, columns].reshape(self.frames, len(members), len(order))
+            out[:, members] = roma.euler_to_rotmat(order, torch.from_numpy(angles), degrees=True).numpy()
+        return out
+
+    def positions(self) -> Floats:
+        """Joint positions by forward kinematics [T, N, 3]."""
+        # Offsets may move per frame, so `kinematics.forward_kinematics` does not fit. Products are torch's:
+        # batched 3 x 3 ones are several times faster there than numpy's.
+        local = torch.from_numpy(self.local_offsets())
+        turn = torch.from_numpy(self.local_rotations())
+        world = local.clone()
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                world[:, joint] = world[:, parent] + (turn[:, parent] @ local[:, joint, :, None])[..., 0]
+                turn[:, joint] = turn[:, parent] @ turn[:, joint]
+        return np.asarray(world.numpy(), dtype=np.float64)
+
+    def rest_positions(self) -> Floats:
+        """Joint positions of the rest pose [N, 3]: the OFFSETs with no rotation."""
+        out = self.offsets.copy()
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                out[joint] += out[parent]
+        return out
+
+
+def read_bvh(source: Path | str | bytes, *, name: str | None = None) -> BvhMotion:
+    """Read one clip from a path, or from the text or bytes of a file.
+
+    A `str` that holds a line break is taken as text, any other as a path. `name` is what errors call the clip
+    (default: the path). Raises `UserError` naming file, line and reason for anything malformed.
+    """
+    data, where = load_text(source, name)
+    section = find_motion(data, where)
+    joints = parse_hierarchy(data[: section.start], where)
+    width = sum(len(c) for c in joints.channels)
+    if width == 0:
+        raise UserError(f"{where}: no joint has a channel, so there is no motion")
+    return BvhMotion(
+        name=where,
+        joints=tuple(joints.names),
+        parents=tuple(joints.parents),
+        offsets=np.array(joints.offsets, dtype=np.float64),
+        channels=tuple(joints.channels),
+        values=read_values(data, section.body, section.frames, width, where),
+        frame_time=section.frame_time,
+        fps=section.fps,
+        end_sites=tuple((joint, (x, y, z)) for joint, (x, y, z) in joints.end_sites),
+    )
+
+
+def read_header(source: Path | str | bytes, *, name: str | None = None) -> MotionSection:
+    """Frame count and frame rate of a clip; the hierarchy and the values are not checked."""
+    data, where = load_text(source, name)
+    return find_motion(data, where)
+
+
+def write_bvh(path: Path, skeleton: Skeleton, rotations: NDArray, root: NDArray, fps: float) -> None:
+    """Write a clip as BVH: centimetres, T-pose rest, End Sites; six channels on the root, three elsewhere.
+
+    `rotations` are local rotation matrices [T, N, 3, 3] against the skeleton's rest pose, `root` the position
+    of joint 0 [T, 3] in metres. The file appears whole or not at all (temporary file, flush to disk, rename).
+    """
+    rotations, root = np.asarray(rotations, dtype=np.float64), np.asarray(root, dtype=np.float64)
+    frames = len(root)
+    if rotations.shape != (frames, len(skeleton), 3, 3) or root.shape != (frames, 3) or frames == 0:
+        raise UserError(
+            f"{path}: BVH of skeleton {skeleton.name} needs rotations [T, {len(skeleton)}, 3, 3] and root "
+            f"[T, 3] with T > 0, got {list(rotations.shape)} and {list(root.shape)}"
+        )
+    if not (np.isfinite(rotations).all() and np.isfinite(root).all()):
+        raise UserError(f"{path}: the motion holds NaN or infinite values; a BVH file cannot")
+    if not fps > 0:
+        raise UserError(f"{path}: fps = {fps} must be above 0")
+    order = _depth_first(skeleton)
+    values = np.concatenate(
+        [root * CENTIMETRES, _euler_degrees(rotations[:, order]).reshape(frames, -1)], axis=1
+    )
+    lines = [
+        "HIERARCHY",
+        *_hierarchy_lines(skeleton, 0, 0),
+        "MOTION",
+        f"Frames: {frames}",
+        f"Frame Time: {1 / fps:.9f}",
+    ]
+    row = " ".join(["%.6f"] * values.shape[1])
+    lines += [row % tuple(frame) for frame in values.tolist()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
+            file.write("\n".join(lines) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _children(skeleton: Skeleton, joint: int) -> list[int]:
+    return [child for child, parent in enumerate(skeleton.parents) if parent == joint]
+
+
+def _depth_first(skeleton: Skeleton, joint: int = 0) -> list[int]:
+    """Joint indices in the order a BVH hierarchy lists them."""
+    return [joint, *(j for child in _children(skeleton, joint) for j in _depth_first(skeleton, child))]
+
+
+def _hierarchy_lines(skeleton: Skeleton, joint: int, depth: int) -> list[str]:
+    def offset(metres: NDArray) -> str:
+        return "OFFSET " + " ".join(f"{value * CENTIMETRES:.6f}" for value in metres)
+
+    rotation = " ".join(f"{axis}rotation" for axis in WRITTEN_ORDER)
+    channels = f"3 {rotation}" if depth else f"6 Xposition Yposition Zposition {rotation}"
+    children = _children(skeleton, joint)
+    body = [offset(skeleton.offsets[joint]), f"CHANNELS {channels}"]
+    if children:
+        body += [line for child in children for line in _hierarchy_lines(skeleton, child, depth + 1)]
+    else:  # half the parent bone goes on: a leaf of no length has no direction in other tools
+        body += ["End Site", "{", "\t" + offset(skeleton.offsets[joint] / 2), "}"]
+    kind = "JOINT" if depth else "ROOT"
+    return [f"{kind} {skeleton.joints[joint]}", "{", *("\t" + line for line in body), "}"]
+
+
+def _euler_degrees(rotations: Floats) -> Floats:
+    """Euler angles [T, N, 3] in degrees, without jumps of whole turns between frames."""
+    angles = roma.rotmat_to_euler(
+        WRITTEN_ORDER, torch.from_numpy(np.ascontiguousarray(rotations)), degrees=True
+    )
+    return np.unwrap(angles.numpy(), axis=0, period=360.0)

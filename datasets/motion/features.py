@@ -1,0 +1,87 @@
+"""Joints to features and back, for both families (SPEC section 1, HumanTOMATO section 4.2).
+
+`exact` (exact.py) is invertible and keeps the number of frames; `h3d` (h3d.py) equals the published HumanML3D
+and HumanTOMATO features, has one frame less than the joints, and retargets to the layout's skeleton first.
+The layout says which family an array holds. Both work on whole sequences and any leading dimensions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.exact import decode_exact, encode_exact
+from motionloom.datasets.motion.h3d import decode_h3d, encode_h3d
+from motionloom.datasets.motion.layout import FACE_DIMS, MotionLayout
+from motionloom.datasets.schema import UserError
+
+
+def encode(
+    joints: NDArray[Any], layout: MotionLayout, face: NDArray[Any] | None = None
+) -> NDArray[np.float32]:
+    """Joints [..., T, N, 3] (metres, Y up, canonical) -> features [..., T', D], T' = T (exact) or T - 1
+    (h3d).
+
+    `face` [..., T, 50] fills the layout's face columns; without it they are 0. Joints are not moved: call
+    `canonicalize` first (h3d does its own).
+    """
+    _check_family(layout)
+    _check_input(joints, layout)
+    out = encode_h3d(joints, layout) if layout.family == "h3d" else encode_exact(joints, layout)
+    if face is not None:
+        if not layout.has("face"):
+            raise UserError(
+                f"layout {layout.name} has no face columns; use wholebody363 for clips with a face"
+            )
+        if face.shape != (*joints.shape[:-2], FACE_DIMS):
+            raise UserError(
+                f"face of shape {list(face.shape)} does not fit joints {list(joints.shape)}: "
+                f"expected {[*joints.shape[:-2], FACE_DIMS]}"
+            )
+        out[..., layout.slice("face")] = face[..., : out.shape[-2], :]
+    return out
+
+
+def decode(features: NDArray[Any], layout: MotionLayout) -> NDArray[np.float64]:
+    """Features [..., T, D] (not normalised) -> joints [..., T, N, 3] in metres, facing +Z above the origin
+    first.
+    """
+    _check_family(layout)
+    if features.ndim < 2 or features.shape[-1] != layout.dim:
+        raise UserError(
+            f"layout {layout.name} has {layout.dim} columns, but these features are {list(features.shape)}"
+        )
+    return decode_h3d(features, layout) if layout.family == "h3d" else decode_exact(features, layout)
+
+
+def face_of(features: NDArray[Any], layout: MotionLayout) -> NDArray[Any]:
+    """The expression columns [..., T, 50] of features [..., T, D]."""
+    return features[..., layout.slice("face")]
+
+
+def _check_family(layout: MotionLayout) -> None:
+    if not layout.has("root_yaw_velocity"):
+        raise UserError(
+            f"layout {layout.name} is raw parameters, not motion features; convert it to joints first"
+        )
+    if layout.family == "raw":
+        raise UserError(f"layout {layout.name} says family 'raw'; motion features are 'exact' or 'h3d'")
+    if layout.family == "exact" and layout.has("rotations_6d"):
+        raise UserError(f"layout {layout.name} holds rotations and contacts, which only the h3d family has")
+
+
+def _check_input(joints: NDArray[Any], layout: MotionLayout) -> None:
+    wanted = (layout.num_joints, 3)
+    least = 2 if layout.family == "h3d" else 1
+    if joints.ndim < 3 or joints.shape[-2:] != wanted:
+        raise UserError(
+            f"layout {layout.name} needs joints [..., T, {wanted[0]}, 3], but these are {list(joints.shape)}"
+        )
+    if joints.shape[-3] < least:
+        raise UserError(
+            f"a clip of {joints.shape[-3]} frames is too short: the {layout.family} family needs {least}"
+        )
+    if not np.isfinite(joints).all():
+        raise UserError("joints hold NaN or infinite values")

@@ -1,0 +1,128 @@
+"""Forward kinematics, and rotations from joint positions (for BVH export of generated joints).
+
+Rotations are local matrices [..., N, 3, 3] (child frame to parent frame; column vectors), offsets are rest
+offsets in metres, parents come before their children.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.rotation import axes_first, axes_last, multiply, swing
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+
+_PRIOR = 1e-8
+"""Weight of "stay with the parent" against the bones, as a share of their squared length: decides only what
+the bones leave open (a twist about a single line, bones without length).
+"""
+
+_NO_BONE = 1e-9
+"""Shorter bones have no direction."""
+
+
+def forward_kinematics(
+    rotations: NDArray[Any], root: NDArray[Any], offsets: NDArray[Any], parents: Sequence[int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Local rotations [..., N, 3, 3], root positions [..., 3] -> joints [..., N, 3], global rotations.
+
+    Leading dimensions of `rotations` and `root` broadcast. All joints of one depth of the tree are done in
+    one call.
+    """
+    count = len(parents)
+    if rotations.shape[-3:] != (count, 3, 3) or offsets.shape != (count, 3):
+        raise UserError(
+            f"{count} parents need rotations [..., {count}, 3, 3] and offsets [{count}, 3], "
+            f"not {list(rotations.shape)} and {list(offsets.shape)}"
+        )
+    lead = np.broadcast_shapes(rotations.shape[:-3], root.shape[:-1])
+    local = axes_first(np.broadcast_to(rotations, (*lead, count, 3, 3)))
+    bones = np.asarray(offsets, dtype=np.float64).T.reshape(3, 1, count, *(1,) * len(lead))
+    world = np.empty_like(local)
+    world[:, :, 0] = local[:, :, 0]
+    joints = np.empty((3, 1, count, *lead))
+    joints[:, 0, 0] = np.moveaxis(np.broadcast_to(root, (*lead, 3)), -1, 0)
+    for children in _levels(parents):
+        above = [parents[child] for child in children]
+        turned = world[:, :, above]
+        world[:, :, children] = multiply(turned, local[:, :, children])
+        joints[:, :, children] = joints[:, :, above] + multiply(turned, bones[:, :, children])
+    return np.ascontiguousarray(np.moveaxis(joints[:, 0], (0, 1), (-1, -2))), axes_last(world)
+
+
+def joints_to_rotations(joints: NDArray[Any], skeleton: Skeleton) -> NDArray[np.float64]:
+    """Local rotations [..., N, 3, 3] that pose `skeleton` like joints [..., N, 3] (any units).
+
+    A joint with one child gets the smallest rotation that points the bone the right way (no twist, which
+    positions do not show); pelvis, chest and wrists get the rotation that fits all their bones best, so the
+    root follows hips and spine; end joints follow their parent. `forward_kinematics` of the result equals the
+    joints where the bone lengths and the fixed shape of pelvis, chest and palm are the skeleton's; bones
+    without length take their parent's pose.
+    """
+    count = len(skeleton)
+    if joints.ndim < 2 or joints.shape[-2:] != (count, 3):
+        raise UserError(
+            f"skeleton {skeleton.name} needs joints [..., {count}, 3], but these are {list(joints.shape)}"
+        )
+    parents = np.asarray(skeleton.parents)
+    rest = skeleton.offsets
+    bones = np.array(np.moveaxis(joints, (-1, -2), (0, 1)), dtype=np.float64)
+    bones[:, 1:] -= bones[:, parents[1:]]
+    lengths = np.linalg.norm(bones, axis=0)
+    bones /= np.where(lengths > _NO_BONE, lengths, np.inf)
+
+    world = np.empty((3, 3, *bones.shape[1:]))
+    start = np.broadcast_to(np.eye(3).reshape(3, 3, *(1,) * (bones.ndim - 2)), (3, 3, *bones.shape[2:]))
+    for joint in range(count):
+        children = np.flatnonzero(parents == joint)
+        above = world[:, :, parents[joint]] if joint else start
+        if len(children) == 1:
+            world[:, :, joint] = _swing_bone(rest[children[0]], bones[:, children[0]], above)
+        elif len(children) > 1:
+            world[:, :, joint] = _fit(rest[children], bones[:, children], above)
+        else:
+            world[:, :, joint] = above
+    local = world.copy()
+    local[:, :, 1:] = multiply(world[:, :, parents[1:]].swapaxes(0, 1), world[:, :, 1:])
+    return axes_last(local)
+
+
+def _levels(parents: Sequence[int]) -> list[list[int]]:
+    """Joints grouped by depth below the root, the root left out."""
+    depth = [0] * len(parents)
+    for joint, parent in enumerate(parents[1:], start=1):
+        depth[joint] = depth[parent] + 1
+    return [[j for j, d in enumerate(depth) if d == level] for level in range(1, max(depth) + 1)]
+
+
+def _swing_bone(
+    rest: NDArray[np.float64], bone: NDArray[np.float64], above: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Smallest change of the parent's `above` [3, 3, ...] that turns `rest` [3] to `bone` [3, ...]."""
+    length = np.linalg.norm(rest)
+    if length <= _NO_BONE:
+        return above
+    old = multiply(above, (rest / length).reshape(3, 1, *(1,) * (bone.ndim - 1)))[:, 0]
+    return multiply(swing(old, np.where(bone.any(axis=0), bone, old)), above)
+
+
+def _fit(
+    rest: NDArray[np.float64], bones: NDArray[np.float64], above: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rotations [3, 3, ...] that fit `rest` [C, 3] to directions `bones` [3, C, ...] best.
+
+    What the bones leave free stays as in the parent's rotations `above` [3, 3, ...].
+    """
+    # Directions at the skeleton's own bone lengths: what forward kinematics can reach is what the fit weighs.
+    aims = bones * np.linalg.norm(rest, axis=-1).reshape(-1, *(1,) * (bones.ndim - 2))
+    moment = np.einsum("ic...,cj->...ij", aims, rest)
+    moment += _PRIOR * np.square(rest).sum() * np.moveaxis(above, (0, 1), (-2, -1))
+    # SVD, not the closed form: it stays exact where bones lie in one line and the prior decides the twist.
+    best = roma.special_procrustes(torch.from_numpy(moment), method="svd").numpy()
+    return np.moveaxis(best, (-2, -1), (0, 1))

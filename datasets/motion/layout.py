@@ -1,0 +1,144 @@
+"""`MotionLayout`: what the columns of a motion array mean (HumanTOMATO section 4.2, SPEC section 1).
+
+Every module that needs a width, a slice or a body part asks the layout; no other file knows column numbers.
+
+| name          | D   | columns |
+|---------------|-----|---------|
+| `body133`     | 133 | root 4, 21 joint positions, 22 joint velocities |
+| `wholebody313`| 313 | root 4, 51 positions, 52 velocities |
+| `wholebody363`| 363 | `wholebody313` + 50 FLAME expression values |
+| `h3d263`      | 263 | HumanML3D: root 4, positions 63, 6-D rotations 126, velocities 66, foot contacts 4 |
+| `tomato623`   | 623 | the same with 52 joints |
+| `smpl75`      | 75  | UDE: translation 3, axis-angle 24 x 3 |
+| `smplx322`    | 322 | Motion-X raw input |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+
+Family = Literal["exact", "h3d", "raw"]
+Part = Literal["all", "bodyhand", "body", "hand", "face"]
+
+BODY_JOINTS = 22
+FACE_DIMS = 50
+
+
+def _h3d_fields(joints: int, *, rotations: bool, face: bool) -> tuple[tuple[str, int], ...]:
+    fields = [("root_yaw_velocity", 1), ("root_xz_velocity", 2), ("root_height", 1)]
+    fields.append(("positions", 3 * (joints - 1)))
+    if rotations:
+        fields.append(("rotations_6d", 6 * (joints - 1)))
+    fields.append(("velocities", 3 * joints))
+    if rotations:
+        fields.append(("foot_contacts", 4))
+    if face:
+        fields.append(("face", FACE_DIMS))
+    return tuple(fields)
+
+
+_SMPLX322 = (
+    ("root_orient", 3),
+    ("pose_body", 63),
+    ("pose_hand", 90),
+    ("pose_jaw", 3),
+    ("face", 50),
+    ("face_shape", 100),
+    ("trans", 3),
+    ("betas", 10),
+)
+
+_KNOWN: dict[str, tuple[str, float, Family, tuple[tuple[str, int], ...]]] = {
+    "body133": ("smpl22", 20.0, "exact", _h3d_fields(22, rotations=False, face=False)),
+    "wholebody313": ("smplx52", 30.0, "exact", _h3d_fields(52, rotations=False, face=False)),
+    "wholebody363": ("smplx52", 30.0, "exact", _h3d_fields(52, rotations=False, face=True)),
+    "h3d263": ("smpl22", 20.0, "h3d", _h3d_fields(22, rotations=True, face=False)),
+    "tomato623": ("smplx52", 30.0, "h3d", _h3d_fields(52, rotations=True, face=False)),
+    "smpl75": ("smpl22", 20.0, "raw", (("trans", 3), ("pose", 72))),
+    "smplx322": ("smplx52", 30.0, "raw", _SMPLX322),
+}
+
+
+@dataclass(frozen=True)
+class MotionLayout:
+    """Names and order of the columns, the skeleton behind them, the frame rate and the feature family."""
+
+    name: str
+    skeleton_name: str
+    fps: float
+    family: Family
+    fields: tuple[tuple[str, int], ...]
+
+    @staticmethod
+    def named(name: str, *, fps: float | None = None, family: Family | None = None) -> MotionLayout:
+        """A known layout, at its usual frame rate and family unless told otherwise."""
+        if name not in _KNOWN:
+            raise UserError(f"no motion layout '{name}'; known: {', '.join(_KNOWN)}")
+        skeleton, usual_fps, usual_family, fields = _KNOWN[name]
+        layout = MotionLayout(name, skeleton, usual_fps, usual_family, fields)
+        return replace(layout, fps=fps or layout.fps, family=family or layout.family)
+
+    @cached_property
+    def skeleton(self) -> Skeleton:
+        """The skeleton the joints belong to."""
+        return Skeleton.named(self.skeleton_name)
+
+    @property
+    def num_joints(self) -> int:
+        """N."""
+        return len(self.skeleton)
+
+    @cached_property
+    def dim(self) -> int:
+        """D, the width of one frame."""
+        return sum(size for _, size in self.fields)
+
+    def has(self, field: str) -> bool:
+        """Whether the layout holds a field."""
+        return any(name == field for name, _ in self.fields)
+
+    def slice(self, field: str) -> slice:
+        """Columns of one field."""
+        start = 0
+        for name, size in self.fields:
+            if name == field:
+                return slice(start, start + size)
+            start += size
+        raise UserError(f"layout {self.name} has no field '{field}'; it has {[n for n, _ in self.fields]}")
+
+    def part(self, part: Part) -> NDArray[np.int64]:
+        """Columns of one body part, ascending.
+
+        `body` is m^B of the paper (root, body positions, body velocities: 133), `hand` is m^H (180), `bodyhand` both
+        (313), `face` the expression (50), `all` everything.
+        """
+        columns = np.arange(self.dim)
+        if part == "all":
+            return columns
+        if part == "face":
+            return columns[self.slice("face")]
+        face = columns[self.slice("face")] if self.has("face") else columns[:0]
+        if part == "bodyhand":
+            return np.setdiff1d(columns, face)
+        hand = self._hand_columns()
+        return hand if part == "hand" else np.setdiff1d(columns, np.concatenate([hand, face]))
+
+    def _hand_columns(self) -> NDArray[np.int64]:
+        columns = np.arange(self.dim)
+        out = []
+        for field, per_joint, first in (("positions", 3, 1), ("rotations_6d", 6, 1), ("velocities", 3, 0)):
+            if self.has(field):
+                out.append(columns[self.slice(field)][per_joint * (BODY_JOINTS - first) :])
+        return np.concatenate(out) if out else columns[:0]
+
+    def has_part(self, part: Part) -> bool:
+        """Whether the layout has columns for a part."""
+        return self.has("face") if part == "face" else len(self.part(part)) > 0

@@ -1,0 +1,91 @@
+"""Skeletons are data: joint names, parents and rest offsets in metres, read from `skeletons/*.json`.
+
+Joint order of `smplx52` is SMPL-X's (22 body, 15 left hand, 15 right hand); `smpl22` is its first 22. Y is up, the
+rest pose is a T-pose that faces +Z, left is +X.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib import resources
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import model_validator
+
+from motionloom.datasets.schema import Config, UserError
+
+
+class SkeletonFile(Config):
+    """The JSON form of a skeleton."""
+
+    name: str
+    note: str = ""
+    joints: list[str]
+    parents: list[int]
+    offsets: list[tuple[float, float, float]]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> SkeletonFile:
+        if not len(self.joints) == len(self.parents) == len(self.offsets):
+            raise ValueError("joints, parents and offsets must have one length")
+        if self.parents[:1] != [-1] or any(not 0 <= p < i for i, p in enumerate(self.parents) if i):
+            raise ValueError("joint 0 is the root (parent -1) and every parent comes before its child")
+        return self
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """Names, parents and rest offsets (metres, parent to child) of N joints."""
+
+    name: str
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    rest: tuple[tuple[float, float, float], ...]
+
+    @staticmethod
+    def named(name: str) -> Skeleton:
+        """A skeleton that ships with the package."""
+        return _load(name)
+
+    @cached_property
+    def offsets(self) -> NDArray[np.float64]:
+        """Rest offsets [N, 3], metres."""
+        return np.asarray(self.rest, dtype=np.float64)
+
+    @cached_property
+    def rest_joints(self) -> NDArray[np.float64]:
+        """Rest-pose joint positions [N, 3] with the root at the origin."""
+        out = np.zeros_like(self.offsets)
+        for joint, parent in enumerate(self.parents[1:], start=1):
+            out[joint] = out[parent] + self.offsets[joint]
+        return out
+
+    def index(self, joint: str) -> int:
+        """Position of a joint by name."""
+        try:
+            return self.joints.index(joint)
+        except ValueError:
+            raise UserError(f"skeleton {self.name} has no joint '{joint}'") from None
+
+    @cached_property
+    def mirror(self) -> NDArray[np.int64]:
+        """Permutation [N] that swaps left and right joints."""
+        swap = {"left": "right", "right": "left"}
+        names = ["_".join(swap.get(w, w) for w in j.split("_")) for j in self.joints]
+        return np.array([self.joints.index(n) for n in names])
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+
+@cache
+def _load(name: str) -> Skeleton:
+    folder = resources.files("motionloom.datasets.motion.skeletons")
+    path = folder / f"{name}.json"
+    if not path.is_file():
+        known = sorted(p.name.removesuffix(".json") for p in folder.iterdir() if p.name.endswith(".json"))
+        raise UserError(f"no skeleton '{name}'; known: {', '.join(known)}")
+    data = SkeletonFile.model_validate_json(path.read_text(encoding="utf-8"))
+    return Skeleton(data.name, tuple(data.joints), tuple(data.parents), tuple(data.offsets))

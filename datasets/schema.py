@@ -1,0 +1,149 @@
+"""Typed records at the project's borders: configs, captions, clip metadata, the shard manifest.
+
+Everything read from outside (YAML recipes, `meta.json`, `manifest.json`) passes through one of these models, so a
+misspelt key or a wrong type is refused in one sentence that names the file, the key and the nearest valid name.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+SCHEMA_VERSION = 1
+
+Split = Literal["train", "val", "test"]
+
+
+class UserError(Exception):
+    """A mistake the user can fix. The command line prints the sentence alone, never a traceback."""
+
+
+class Config(BaseModel):
+    """Base of every config class and record: unknown keys and wrong types are refused, values are frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+    @classmethod
+    def parse(cls, data: Any, where: str) -> Self:
+        """Validate `data`; raise `UserError` naming `where` (a file or a dotted key) and the nearest valid name."""
+        try:
+            return cls.model_validate(data)
+        except ValidationError as error:
+            raise UserError(explain(error, cls, where)) from None
+
+    @classmethod
+    def load_json(cls, path: Path) -> Self:
+        """Read one record from a JSON file."""
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise UserError(f"{path}: no such file") from None
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise UserError(f"{path}: not valid JSON ({error})") from None
+        return cls.parse(data, str(path))
+
+    def dump(self) -> dict[str, Any]:
+        """Plain JSON types, every default written out."""
+        return self.model_dump(mode="json")
+
+
+def explain(error: ValidationError, model: type[BaseModel], where: str) -> str:
+    """One line per problem, with the nearest valid key for each unknown one."""
+    lines = []
+    for item in error.errors():
+        loc = [str(part) for part in item["loc"]]
+        key = ".".join(loc) or "(top level)"
+        if item["type"] == "extra_forbidden":
+            names = field_names(model, loc[:-1])
+            near = difflib.get_close_matches(loc[-1], names, n=1, cutoff=0.5)
+            hint = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(sorted(names))}"
+            lines.append(f"{where}: unknown key '{key}'; {hint}")
+        elif item["type"] == "missing":
+            lines.append(f"{where}: key '{key}' is required")
+        else:
+            shown = repr(item.get("input"))[:60]
+            lines.append(f"{where}: key '{key}' = {shown}: {item['msg'].removeprefix('Value error, ')}")
+    return "\n".join(lines)
+
+
+def field_names(model: type[BaseModel], path: list[str]) -> list[str]:
+    """Valid keys of the (nested) model at `path`; unions and lists are not followed."""
+    current: Any = model
+    for part in path:
+        fields = getattr(current, "model_fields", {})
+        if part not in fields:
+            return list(fields)
+        annotation = fields[part].annotation
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+            return []
+        current = annotation
+    return list(getattr(current, "model_fields", {}))
+
+
+class Caption(Config):
+    """One caption of a clip. `start`/`end` are seconds; `end` None means to the end of the clip."""
+
+    text: str
+    start: float = 0.0
+    end: float | None = None
+    source: str = ""
+    tokens: list[str] | None = None
+    """`word/POS` tags where the source brings them (HumanML3D)."""
+
+
+class ClipMeta(Config):
+    """`meta.json` of one sample: where a clip comes from and what its features mean."""
+
+    id: str
+    source: str
+    split: Split
+    layout: str
+    family: Literal["exact", "h3d", "raw"]
+    fps: float
+    skeleton: str
+    frames: int
+    licence: str
+    has_hands: bool = True
+    has_face: bool = True
+    mirror_of: str | None = None
+    truth: dict[str, Any] | None = None
+    """What a synthetic clip really does (action, direction, side, count, hand, face); measured against captions."""
+
+
+class ShardInfo(Config):
+    """One tar file of the manifest."""
+
+    name: str
+    split: Split
+    samples: int
+    frames: int
+    bytes: int
+    sha256: str
+
+
+class Dropped(Config):
+    """A source clip that did not become a sample, and why."""
+
+    source: str
+    reason: str
+
+
+class Manifest(Config):
+    """`manifest.json` beside the shards; written last, so a folder without one is an unfinished conversion."""
+
+    schema_version: int = SCHEMA_VERSION
+    name: str
+    layout: str
+    family: Literal["exact", "h3d", "raw"]
+    fps: float
+    skeleton: str
+    licence: str
+    converter: str
+    converter_version: int
+    options: dict[str, Any]
+    shards: list[ShardInfo]
+    dropped: list[Dropped] = []

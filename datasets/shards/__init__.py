@@ -1,0 +1,1 @@
+"""WebDataset shards with an index: write, check, read at random."""

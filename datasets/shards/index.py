@@ -1,0 +1,214 @@
+"""Where everything is: one JSON index per shard, one `index.npz` for the whole dataset.
+
+`NAME-SPLIT-000000.index.json` (`ShardIndex`) is readable and stands beside its tar; its presence means the
+tar is whole. `index.npz` holds the same offsets as flat arrays, one set per split (`train.frames`, ...), so
+that opening a million clips reads a few large arrays and no shard. Rows follow the shards in manifest order.
+Arrays, n clips of a split and M = `len(MEMBERS)`:
+
+| array           | type          | meaning |
+|-----------------|---------------|---------|
+| `frames`        | int32 [n]     | T |
+| `data`          | int64 [n]     | byte in the tar where the motion values start (after the .npy header) |
+| `itemsize`      | uint8 [n]     | bytes per motion value: 4 or 2 |
+| `offsets`       | int64 [n, M]  | byte in the tar where each member starts |
+| `sizes`         | uint32 [n, M] | its size; 0 = the clip has no such member |
+| `id_ends`       | int64 [n]     | end of each clip's id in `id_bytes` |
+| `id_bytes`      | uint8 [sum]   | ids, UTF-8, one after the other |
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.schema import Config, Dropped, ShardInfo, Split, UserError
+from motionloom.datasets.shards.files import write_with
+from motionloom.datasets.shards.sample import MEMBERS
+from motionloom.datasets.shards.tar import TarClip, read_npy_header, scan_tar
+
+INDEX_FILE = "index.npz"
+MANIFEST_FILE = "manifest.json"
+SPLITS: tuple[Split, ...] = get_args(Split)
+
+_ARRAYS: dict[str, tuple[type[np.generic], int]] = {
+    "frames": (np.int32, 1),
+    "data": (np.int64, 1),
+    "itemsize": (np.uint8, 1),
+    "offsets": (np.int64, 2),
+    "sizes": (np.uint32, 2),
+    "id_ends": (np.int64, 1),
+    "id_bytes": (np.uint8, 1),
+}
+
+
+class ClipEntry(Config):
+    """One clip of a shard: member name -> (offset, size), and where its motion values start."""
+
+    key: str
+    id: str
+    frames: int
+    motion_data: int
+    motion_itemsize: int
+    members: dict[str, tuple[int, int]]
+
+
+class ShardIndex(Config):
+    """`NAME-SPLIT-000000.index.json`. `shard` is None when every clip was dropped (no tar then)."""
+
+    fingerprint: str
+    shard: ShardInfo | None
+    clips: list[ClipEntry]
+    dropped: list[Dropped]
+
+
+def shard_stem(name: str, split: Split, number: int) -> str:
+    """File name of a shard without its ending."""
+    return f"{name}-{split}-{number:06d}"
+
+
+def index_path(tar: Path) -> Path:
+    """The JSON index beside a tar."""
+    return tar.with_name(tar.name.removesuffix(".tar") + ".index.json")
+
+
+def clip_entries(path: Path, ids: list[str], *, clips: list[TarClip] | None = None) -> list[ClipEntry]:
+    """Index rows of a tar as it lies on the disk; `ids` are the clips' source ids, in order."""
+    clips = scan_tar(path) if clips is None else clips
+    entries = []
+    with path.open("rb") as file:
+        for clip, source in zip(clips, ids, strict=True):
+            start, size = clip.members["motion.npy"]
+            file.seek(start)
+            header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'")
+            if header.data + int(np.prod(header.shape)) * header.dtype.itemsize != size:
+                raise UserError(
+                    f"{path}: '{clip.key}.motion.npy' has the wrong size; convert the dataset again"
+                )
+            entries.append(
+                ClipEntry(
+                    key=clip.key,
+                    id=source,
+                    frames=header.shape[0],
+                    motion_data=start + header.data,
+                    motion_itemsize=header.dtype.itemsize,
+                    members=clip.members,
+                )
+            )
+    return entries
+
+
+@dataclass(frozen=True)
+class SplitIndex:
+    """The arrays of one split (module docstring)."""
+
+    frames: NDArray[np.int32]
+    data: NDArray[np.int64]
+    itemsize: NDArray[np.uint8]
+    offsets: NDArray[np.int64]
+    sizes: NDArray[np.uint32]
+    id_ends: NDArray[np.int64]
+    id_bytes: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def id(self, i: int) -> str:
+        """Source id of clip `i`."""
+        start = int(self.id_ends[i - 1]) if i else 0
+        return self.id_bytes[start : int(self.id_ends[i])].tobytes().decode()
+
+    @staticmethod
+    def build(shards: Iterable[ShardIndex]) -> SplitIndex:
+        """Concatenate the shards of one split. Only flat arrays are kept, so a million clips fit."""
+        parts: dict[str, list[NDArray]] = {name: [] for name in _ARRAYS}
+        end = 0
+        for shard in shards:
+            ids = [entry.id.encode() for entry in shard.clips]
+            ends = end + np.cumsum([len(source) for source in ids], dtype=np.int64)
+            end = int(ends[-1]) if len(ends) else end
+            places = np.array(
+                [[entry.members.get(name, (0, 0)) for name in MEMBERS] for entry in shard.clips],
+                dtype=np.int64,
+            ).reshape(len(ids), len(MEMBERS), 2)
+            columns = {
+                "frames": [entry.frames for entry in shard.clips],
+                "data": [entry.motion_data for entry in shard.clips],
+                "itemsize": [entry.motion_itemsize for entry in shard.clips],
+                "offsets": places[..., 0],
+                "sizes": places[..., 1],
+                "id_ends": ends,
+                "id_bytes": np.frombuffer(b"".join(ids), dtype=np.uint8),
+            }
+            for name, values in columns.items():
+                parts[name].append(np.asarray(values, dtype=_ARRAYS[name][0]))
+        empty = {name: (0,) if rank == 1 else (0, len(MEMBERS)) for name, (_, rank) in _ARRAYS.items()}
+        return SplitIndex(
+            **{
+                name: np.concatenate([np.zeros(empty[name], dtype=_ARRAYS[name][0]), *values])
+                for name, values in parts.items()
+            }
+        )
+
+
+def save_index(root: Path, splits: dict[Split, SplitIndex]) -> None:
+    """Write `index.npz` atomically; zip entries carry a fixed date, so equal content is equal bytes."""
+    arrays = {f"{split}.{name}": getattr(index, name) for split, index in splits.items() for name in _ARRAYS}
+    write_with(root / INDEX_FILE, lambda file: np.savez(file, allow_pickle=False, **arrays))
+
+
+def load_index(root: Path, split: Split, shards: list[ShardInfo]) -> SplitIndex:
+    """The arrays of one split, checked against the manifest's rows for it.
+
+    Every offset is checked to lie inside its shard here, once for all clips, so reading a clip needs no
+    checks.
+    """
+    path = root / INDEX_FILE
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[f"{split}.{name}"] for name in _ARRAYS}
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; convert the dataset again") from None
+    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path}: not a readable index ({error}); convert the dataset again") from None
+    index = SplitIndex(**arrays)
+    problem = _index_problem(index, shards)
+    if problem:
+        raise UserError(f"{path}: split '{split}': {problem}; convert the dataset again")
+    return index
+
+
+def _index_problem(index: SplitIndex, shards: list[ShardInfo]) -> str | None:
+    """The first way in which an index contradicts the manifest, or None."""
+    samples = np.array([shard.samples for shard in shards], dtype=np.int64)
+    count = int(samples.sum())
+    for name, (kind, rank) in _ARRAYS.items():
+        values = getattr(index, name)
+        if values.dtype != kind or values.ndim != rank or (name != "id_bytes" and len(values) != count):
+            return f"array '{name}' is {values.dtype} {list(values.shape)}, the manifest has {count} clips"
+    if index.offsets.shape[1] != len(MEMBERS) or index.sizes.shape[1] != len(MEMBERS):
+        return f"offsets are not for {len(MEMBERS)} members"
+    if count == 0:
+        return None
+    ends = index.id_ends
+    if ends[0] < 0 or (np.diff(ends) < 0).any() or ends[-1] != len(index.id_bytes):
+        return "the clip ids are damaged"
+    firsts = np.cumsum(samples) - samples
+    for shard, first in zip(shards, firsts, strict=True):
+        rows = slice(int(first), int(first) + shard.samples)
+        frames, start, end = index.frames[rows], index.offsets[rows], index.offsets[rows] + index.sizes[rows]
+        if int(frames.sum(dtype=np.int64)) != shard.frames or (frames < 1).any():
+            return f"shard {shard.name} has other frame counts than the manifest says"
+        if (start < 0).any() or (end < start).any() or (end > shard.bytes).any():
+            return f"shard {shard.name} has members outside the file"
+        if not np.isin(index.itemsize[rows], (2, 4)).all():
+            return f"shard {shard.name} holds motion that is neither float32 nor float16"
+        motion = MEMBERS.index("motion.npy")
+        if (index.data[rows] < start[:, motion]).any() or (index.data[rows] > end[:, motion]).any():
+            return f"shard {shard.name} has motion values outside their member"
+    return None

@@ -1,0 +1,170 @@
+"""One shard as one task: what it depends on, how it is made, how a finished one is recognised.
+
+A task carries everything its bytes depend on and its fingerprint hashes the same, so tasks may run in any
+order, in any process or as the elements of a cluster's job array, and a second run keeps what the first one
+finished.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import threadpoolctl
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Dropped, ShardInfo, Split, UserError
+from motionloom.datasets.shards.files import HashingFile, atomic_file, sha256_of, write_json
+from motionloom.datasets.shards.index import SPLITS, ShardIndex, clip_entries, index_path, shard_stem
+from motionloom.datasets.shards.randomness import permutation
+from motionloom.datasets.shards.sample import DropClip, MotionType, Sample, encode_sample
+
+T = TypeVar("T")
+Convert = Callable[[T], Sample | list[Sample]]
+
+
+@dataclass(frozen=True)
+class ShardTask(Generic[T]):
+    """Everything one shard depends on. `named_items` are (name for reports, item)."""
+
+    path: Path
+    split: Split
+    number: int
+    named_items: tuple[tuple[str, T], ...]
+    layout: MotionLayout
+    motion_type: MotionType
+    strict: bool
+    fingerprint: str
+
+
+def plan_shards(
+    out: Path,
+    items: Sequence[tuple[Split, T]],
+    *,
+    name: str,
+    layout: MotionLayout,
+    made_from: dict[str, Any],
+    clips_per_shard: int,
+    seed: int,
+    strict: bool,
+    describe: Callable[[T], str],
+    motion_type: MotionType,
+) -> list[ShardTask[T]]:
+    """Which items go to which shard, in which order: known before the first one is converted."""
+    tasks = []
+    for position, split in enumerate(SPLITS):
+        members = [item for item_split, item in items if item_split == split]
+        order = permutation(len(members), seed, position)
+        for number, first in enumerate(range(0, len(members), clips_per_shard)):
+            chosen = [members[i] for i in order[first : first + clips_per_shard]]
+            named = tuple((describe(item), item) for item in chosen)
+            told = [made_from, name, split, number, [label for label, _ in named]]
+            fingerprint = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+            path = out / f"{shard_stem(name, split, number)}.tar"
+            tasks.append(ShardTask(path, split, number, named, layout, motion_type, strict, fingerprint))
+    return tasks
+
+
+def write_shard(task: ShardTask[T], convert: Convert[T]) -> tuple[ShardInfo | None, list[Dropped]]:
+    """Write one shard and its index, or find it already there. None when every clip of it was dropped."""
+    finished = _finished(task)
+    if finished is not None:
+        return finished.shard, finished.dropped
+    from webdataset.writer import TarWriter  # imports torch: two seconds that kept shards do not pay
+
+    ids: list[str] = []
+    dropped: list[Dropped] = []
+    with _one_thread(), atomic_file(task.path) as file:
+        hashing = HashingFile(file)
+        with TarWriter(hashing, encoder=False, user="", group="", mtime=0) as tar:
+            for label, item in task.named_items:
+                samples = _convert_item(task, convert, label, item)
+                if isinstance(samples, Dropped):
+                    dropped.append(samples)
+                    continue
+                for source, members in samples:
+                    tar.write({"__key__": f"{task.number:06d}-{len(ids):06d}", **members})
+                    ids.append(source)
+    info = None
+    entries = clip_entries(task.path, ids)
+    if entries:
+        info = ShardInfo(
+            name=task.path.name,
+            split=task.split,
+            samples=len(entries),
+            frames=sum(entry.frames for entry in entries),
+            bytes=task.path.stat().st_size,
+            sha256=hashing.hexdigest,
+        )
+    else:
+        task.path.unlink()  # webdataset treats a shard without samples as an error
+    index = ShardIndex(fingerprint=task.fingerprint, shard=info, clips=entries, dropped=dropped)
+    write_json(index_path(task.path), index.dump())
+    return info, dropped
+
+
+def _convert_item(
+    task: ShardTask[T], convert: Convert[T], label: str, item: T
+) -> list[tuple[str, dict[str, bytes]]] | Dropped:
+    """(clip id, encoded members) of each sample of one item, or why there are none."""
+    try:
+        made = convert(item)
+        samples = made if isinstance(made, list) else [made]
+        return [
+            (
+                sample.meta.id,
+                encode_sample(sample, split=task.split, layout=task.layout, motion_type=task.motion_type),
+            )
+            for sample in samples
+        ]
+    except DropClip as drop:
+        return Dropped(source=label, reason=str(drop))
+    except MemoryError:
+        raise
+    except Exception as error:  # a converter meets whatever a bad file makes of its libraries
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            raise
+        reason = f"{type(error).__name__}: {error}" if not isinstance(error, UserError) else str(error)
+        if task.strict:
+            raise UserError(f"{label}: {reason} (strict: the run stops at the first bad item)") from error
+        return Dropped(source=label, reason=reason)
+
+
+def _finished(task: ShardTask[T]) -> ShardIndex | None:
+    """The index of a shard that an earlier run finished from the same inputs, if its tar is unchanged."""
+    path = index_path(task.path)
+    if not path.exists():
+        return None
+    try:
+        index = ShardIndex.load_json(path)
+    except UserError:
+        return None
+    if index.fingerprint != task.fingerprint or (task.strict and any(index.dropped)):
+        return None
+    if index.shard is None:
+        return index
+    if not task.path.exists() or task.path.stat().st_size != index.shard.bytes:
+        return None
+    return index if sha256_of(task.path) == index.shard.sha256 else None
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums in numerical libraries depend on their thread count; one thread makes bytes reproducible."""
+    torch = sys.modules.get("torch")
+    before = torch.get_num_threads() if torch else 0
+    with threadpoolctl.threadpool_limits(1):
+        if torch:
+            torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            if torch:
+                torch.set_num_threads(before)

@@ -1,0 +1,165 @@
+"""Locomotion from footsteps: a plan of where and when each foot lands becomes feet, root, sway and arm swing.
+
+The ball of a foot is exactly still between landing and lift-off, the heel rolls over it, and the root follows the
+middle of the two feet, so legs reach what they stand on and planted feet cannot slide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from motionloom.datasets.synth.maths import Array, ease, keys, rot_y, smooth
+from motionloom.datasets.synth.pose import BALL, STAND, Track
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step: which foot, when it swings (seconds), where its ball lands (x, z), which way it then points."""
+
+    foot: int
+    start: float
+    end: float
+    xz: tuple[float, float]
+    yaw: float
+    height: float = 0.04
+    off: float = 0.7
+    """Heel-up angle at toe-off, radians."""
+    land: float = -0.3
+    """Foot pitch at landing; negative is heel first."""
+
+
+@dataclass(frozen=True)
+class Stride:
+    """How somebody walks or runs."""
+
+    step_seconds: float
+    swing_share: float = 0.8
+    """Swing time over step time; below 1 both feet share the floor (walking), above 1 both leave it (running)."""
+    height: float = 0.04
+    off: float = 0.75
+    land: float = -0.3
+    arm_swing: float = 0.45
+    elbow: float = 0.965
+    lean: float = 0.03
+    sway: float = 0.02
+    bounce: float = 0.0
+    toe_out: float = 0.1
+    width: float = 0.0
+
+
+def stations_to_steps(
+    stations: Sequence[tuple[float, float, float]], first: int, begin: float, stride: Stride
+) -> list[Step]:
+    """Steps along stations (x, z, yaw), one foot each in turn, and a last step that closes the feet."""
+    steps = []
+    order = [*stations[1:], stations[-1]]
+    swing = stride.step_seconds * stride.swing_share
+    for k, (x, z, yaw) in enumerate(order):
+        foot = (first + k) % 2
+        ball = ball_at(x, z, yaw, foot, stride.width)
+        start = begin + k * stride.step_seconds
+        closing = k >= len(order) - 1
+        land = -0.05 if closing else stride.land
+        off = stride.off * (0.6 if k == 0 or closing else 1.0)
+        toe = stride.toe_out * (1 if foot == 0 else -1)
+        steps.append(Step(foot, start, start + swing, ball, yaw + toe, stride.height, off, land))
+    return steps
+
+
+def ball_at(x: float, z: float, yaw: float, foot: int, width: float = 0.0) -> tuple[float, float]:
+    """The ball of one foot of somebody who stands at (x, z) and faces `yaw`."""
+    side = (BALL[0] + width) * (1 if foot == 0 else -1)
+    return (
+        float(x + np.cos(yaw) * side + np.sin(yaw) * BALL[1]),
+        float(z - np.sin(yaw) * side + np.cos(yaw) * BALL[1]),
+    )
+
+
+def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: float) -> Array:
+    """Write feet, root and heading of a step plan into a track that stands; returns the leg swing [T].
+
+    The swing is the left foot's lead over the right along the heading, in units of one step length.
+    """
+    t, fps = track.t, track.fps
+    lift = np.zeros((2, len(t)))
+    for foot in (0, 1):
+        mine = [s for s in steps if s.foot == foot]
+        start_xz = ball_at(0.0, 0.0, 0.0, foot, stride.width)
+        start_yaw = toe_out if foot == 0 else -toe_out
+        xz = np.tile(start_xz, (len(t), 1))
+        yaw = np.full(len(t), start_yaw)
+        before, before_yaw = np.asarray(start_xz), start_yaw
+        times, values = [-1e3], [0.0]
+        for step in mine:
+            span = step.end - step.start
+            s = ease((t - step.start) / span)
+            xz += s[:, None] * (np.asarray(step.xz) - before)
+            yaw += s * (step.yaw - before_yaw)
+            before, before_yaw = np.asarray(step.xz), step.yaw
+            phase = np.clip((t - step.start) / span, 0.0, 1.0)
+            lift[foot] += step.height * np.sin(np.pi * phase**0.85) ** 2
+            roll = min(0.22, 0.45 * span)
+            previous = times[-1]
+            times += [max(step.start - roll, previous + 1e-3), step.start + 0.22 * span]
+            times += [step.end - 0.06 * span, step.end + min(0.1, 0.3 * span)]
+            values += [0.0, step.off, step.land, 0.0]
+        track.ball[foot, :, [0, 2]] = xz.T
+        track.foot_yaw[foot] = yaw
+        pitch = keys(t, times, values) if mine else np.zeros(len(t))
+        track.foot_pitch[foot] = pitch
+        # Toes up means that the foot stands on its heel: the ball rises, the heel stays at the floor.
+        track.ball[foot, :, 1] = lift[foot] + 0.125 * np.sin(np.maximum(-pitch, 0.0))
+    window = 0.42 * stride.step_seconds
+    toe = np.array([toe_out, -toe_out])[:, None]
+    track.yaw = smooth((track.foot_yaw - toe).mean(0), 1.6 * window, fps)
+    back = np.stack([np.sin(track.yaw), np.cos(track.yaw)], axis=-1) * BALL[1]
+    middle = track.ball[:, :, [0, 2]].mean(0) - back
+    track.root[:, [0, 2]] = smooth(middle, window, fps)
+    gap = track.ball[0] - track.ball[1]
+    ahead = gap[:, 0] * np.sin(track.yaw) + gap[:, 2] * np.cos(track.yaw)
+    share = smooth(lift[0] - lift[1], 0.5 * window, fps) / max(stride.height, 0.03)
+    aside = -stride.sway * share
+    track.root[:, 0] += aside * np.cos(track.yaw)
+    track.root[:, 2] -= aside * np.sin(track.yaw)
+    track.pelvis[:, 2] += 0.03 * share
+    track.spine[:, 2] -= 0.03 * share
+    lead = smooth(ahead, 0.25 * window, fps)
+    return np.asarray(lead / max(np.abs(lead).max(), 0.25))
+
+
+def swing_body(track: Track, lead: Array, stride: Stride, moving: Array, amount: float = 1.0) -> None:
+    """Pelvis and chest twist against each other, arms swing against the legs; `moving` [T] fades it in and out."""
+    swing = lead * amount
+    track.pelvis[:, 1] += -0.09 * swing
+    track.spine[:, 1] += 0.2 * swing
+    track.pelvis[:, 0] += stride.lean * moving * 0.4
+    track.spine[:, 0] += stride.lean * moving * 0.6
+    folded = np.clip((0.965 - stride.elbow) / 0.4, 0.0, 1.0)
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        arm = track.arms[side]
+        angle = sign * swing * stride.arm_swing + moving * (0.06 + 0.25 * folded)
+        turned = rot_y(np.zeros_like(angle))
+        cos, sin = np.cos(angle), np.sin(angle)
+        turned[:, 1, 1], turned[:, 2, 2] = cos, cos
+        turned[:, 1, 2], turned[:, 2, 1] = sin, -sin
+        arm.direction = (turned @ arm.direction[..., None])[..., 0]
+        arm.bend = (turned @ arm.bend[..., None])[..., 0]
+        fold = moving * (arm.reach - stride.elbow) + 0.03 * np.maximum(sign * swing, 0.0) * (1 - folded)
+        arm.reach = arm.reach - fold
+        # A folded forearm swings in front of the chest: shoulder-to-wrist turns forward with it.
+        arm.direction[:, 2] += 0.75 * folded * moving
+        arm.bend[:, 1] += 0.9 * folded * moving
+
+
+def stand_height(track: Track, stride: Stride, steps: Sequence[Step]) -> None:
+    """Root height: standing, the bounce of a run, and as low as the legs need."""
+    if stride.bounce > 0:
+        first, last = steps[0].start, steps[-1].end
+        phase = (track.t - first) / stride.step_seconds - (stride.swing_share - 1.0) * 0.5
+        inside = ease((track.t - first) / 0.3) * ease((last - track.t) / 0.3)
+        track.root[:, 1] += inside * stride.bounce * (np.cos(2 * np.pi * phase) - 1.0)
+    track.root[:, 1] = np.minimum(track.root[:, 1], STAND)
+    track.lower_to_reach(0.35 * stride.step_seconds)

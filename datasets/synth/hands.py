@@ -1,0 +1,75 @@
+"""Hand shapes as finger rotations: relaxed, fist, point, spread, pinch, and fingers that wave one after another.
+
+Angles are written for the left hand of the T-pose (palm down, fingers along +X): flexion turns a finger towards the
+palm, spreading turns it about Y. Finger order is SMPL-X's: index, middle, pinky, ring, thumb, three joints each.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import roma
+import torch
+
+from motionloom.datasets.synth.maths import Array, ease, rot_y, rot_z, wander
+
+# Flexion of (knuckle, middle joint, last joint) for index, middle, pinky, ring; radians.
+_FLEX: dict[str, tuple[tuple[float, float, float], ...]] = {
+    "relaxed": ((0.3, 0.4, 0.25), (0.38, 0.45, 0.3), (0.5, 0.5, 0.3), (0.45, 0.48, 0.3)),
+    "fist": ((1.35, 1.6, 1.0), (1.4, 1.65, 1.0), (1.4, 1.6, 1.0), (1.42, 1.65, 1.0)),
+    "point": ((0.02, 0.06, 0.05), (1.35, 1.6, 1.0), (1.4, 1.6, 1.0), (1.4, 1.65, 1.0)),
+    "spread": ((-0.05, 0.02, 0.0), (-0.05, 0.02, 0.0), (-0.02, 0.04, 0.0), (-0.04, 0.02, 0.0)),
+    "pinch": ((0.78, 0.75, 0.35), (0.35, 0.35, 0.2), (0.25, 0.25, 0.15), (0.3, 0.3, 0.2)),
+    "wave_fingers": ((0.5, 0.5, 0.3), (0.5, 0.5, 0.3), (0.5, 0.5, 0.3), (0.5, 0.5, 0.3)),
+}
+_FAN = np.array([-0.06, -0.02, 0.1, 0.04])
+_FAN_WIDE = np.array([-0.34, -0.08, 0.5, 0.2])
+# Rotation vectors of the three thumb joints.
+_THUMB: dict[str, tuple[tuple[float, float, float], ...]] = {
+    "relaxed": ((0.25, 0.1, -0.25), (0.0, 0.1, -0.15), (0.0, 0.1, -0.1)),
+    "fist": ((0.7, 0.75, -0.55), (0.1, 0.6, -0.35), (0.0, 0.5, -0.2)),
+    "point": ((0.7, 0.7, -0.5), (0.1, 0.55, -0.35), (0.0, 0.5, -0.2)),
+    "spread": ((0.0, -0.45, 0.1), (0.0, -0.15, 0.0), (0.0, -0.05, 0.0)),
+    "pinch": ((0.65, 0.25, -0.6), (0.1, 0.1, -0.2), (0.0, 0.1, -0.1)),
+    "wave_fingers": ((0.25, 0.0, -0.2), (0.0, 0.1, -0.1), (0.0, 0.1, -0.1)),
+}
+
+
+def shape_hand(shape: str, t: Array, rng: np.random.Generator) -> Array:
+    """Local finger rotations [T, 15, 3, 3] of one hand; a shape is taken from a relaxed hand in the first moments."""
+    flex, fan, thumb = _angles("relaxed", rng)
+    n = len(t)
+    if shape == "relaxed":
+        on = np.zeros(n)
+    elif rng.random() < 0.5:
+        on = np.ones(n)
+    else:
+        on = ease((t - rng.uniform(-0.1, 0.1)) / rng.uniform(0.25, 0.45))
+    to_flex, to_fan, to_thumb = _angles(shape, rng)
+    mix = on[:, None, None]
+    bends = flex + mix * (to_flex - flex)
+    fans = fan + on[:, None] * (to_fan - fan)
+    thumbs = thumb + mix * (to_thumb - thumb)
+    if shape == "wave_fingers":
+        rate = rng.uniform(0.9, 1.5)
+        delay = np.array([0.0, 0.7, 2.1, 1.4]) * rng.choice([-1.0, 1.0])
+        beat = np.sin(2 * np.pi * rate * t[:, None] + delay)
+        bends = bends + mix * beat[..., None] * np.array([0.48, 0.52, 0.3])
+    noise = wander(t, rng, 5, 0.02)
+    bends = bends + noise[:, :4, None]
+    rotations = np.empty((n, 15, 3, 3))
+    base = rot_y(fans) @ rot_z(-bends[..., 0])
+    for finger in range(4):
+        rotations[:, 3 * finger] = base[:, finger]
+    rest = rot_z(-bends[..., 1:])
+    for finger in range(4):
+        rotations[:, 3 * finger + 1 : 3 * finger + 3] = rest[:, finger]
+    vectors = thumbs + 0.5 * noise[:, 4, None, None]
+    rotations[:, 12:] = roma.rotvec_to_rotmat(torch.from_numpy(vectors)).numpy()
+    return rotations
+
+
+def _angles(shape: str, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Flexion [4, 3], fan [4] and thumb vectors [3, 3] of a shape, each hand a little different."""
+    flex = np.array(_FLEX[shape]) * rng.uniform(0.94, 1.06)
+    fan = (_FAN_WIDE if shape == "spread" else _FAN) * rng.uniform(0.85, 1.15)
+    return flex, fan, np.array(_THUMB[shape])

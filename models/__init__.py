@@ -1,0 +1,1 @@
+"""Networks, losses, quantizers, sampling and metrics; one small LightningModule per stage."""

@@ -1,0 +1,47 @@
+"""The few collectives the models need; each is the identity when no process group is running."""
+
+from __future__ import annotations
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+from torch.distributed.nn.functional import all_gather as all_gather_autograd
+
+
+def is_distributed() -> bool:
+    """True inside a process group of more than one rank."""
+    return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
+
+
+def world_size() -> int:
+    """Number of ranks."""
+    return dist.get_world_size() if is_distributed() else 1
+
+
+def rank() -> int:
+    """This rank."""
+    return dist.get_rank() if is_distributed() else 0
+
+
+def sum_over_ranks(x: Tensor) -> Tensor:
+    """Sum of `x` over ranks, without gradient (codebook statistics, metric counts)."""
+    if is_distributed():
+        x = x.clone()
+        dist.all_reduce(x)
+    return x
+
+
+def gather_rows(x: Tensor) -> Tensor:
+    """Rows of every rank in rank order, [W*B, ...], without gradient. Every rank must hold the same shape."""
+    if not is_distributed():
+        return x
+    parts = [torch.empty_like(x) for _ in range(world_size())]
+    dist.all_gather(parts, x.contiguous())
+    return torch.cat(parts)
+
+
+def gather_rows_with_grad(x: Tensor) -> Tensor:
+    """Like `gather_rows`, and gradients flow back to the rank that owns each row (contrastive negatives)."""
+    if not is_distributed():
+        return x
+    return torch.cat(all_gather_autograd(x.contiguous()))

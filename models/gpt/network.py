@@ -1,0 +1,179 @@
+"""`InterleavedGPT`: one causal transformer over interleaved code streams (HumanTOMATO sections 3.3-3.4, appendix B.3).
+
+The first input is the projected text prior; the input at position i + 1 is token i, and the output at position i is the
+distribution of token i. Every stream has its own embedding and its own output head.
+
+Notable choices:
+- Logits come masked by the grammar of `tokens.py`: an illegal token has probability zero in the loss and in sampling alike,
+  and cannot be sampled. Tokens after the first End are certain, so they cost nothing and teach nothing.
+- `condition_dropout` replaces the projected text by a learned null input, for classifier-free guidance [ours].
+- Positions are learned embeddings.
+
+Legend: B batch, L tokens, D width, E text width, V largest vocabulary (K + 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.models.gpt.tokens import closing_length, kind_of_slot, stream_names
+from motionloom.models.layers.transformer import KVCache, Transformer
+from motionloom.models.tokenizer.base import Stream
+
+
+class GptConfig(Config):
+    """Sizes and regularisation of a GPT; the defaults are the paper config."""
+
+    layers: int = Field(18, ge=1)
+    """T2M-GPT's 9 + 9 blocks (base and head)."""
+    dim: int = Field(1024, ge=2)
+    heads: int = Field(16, ge=1)
+    ff: int = Field(4096, ge=1)
+    dropout: float = Field(0.1, ge=0, lt=1)
+    attention_dropout: float = Field(0.1, ge=0, lt=1)
+    block_size: int = Field(150, ge=2)
+    """Text input + tokens: 149 + 1."""
+    condition_dropout: float = Field(0.1, ge=0, lt=1)
+    """Share of samples trained without text, for guidance [ours]; 0 turns guidance off."""
+    pkeep: float = Field(1.0, gt=0, le=1)
+    """Probability that an input token is kept; the others become random codes of their stream (T2M-GPT uses 0.5)."""
+
+
+class InterleavedGPT(nn.Module):
+    """Autoregressive model of token sequences whose slots belong to several codebooks.
+
+    Args:
+        config: Sizes.
+        streams: The tokenizer's streams.
+        pattern: Stream of every slot of a group, e.g. ("body", "body", "hand").
+        text_dim: Width of the text prior (256 for TMA).
+    """
+
+    slots: Tensor
+    ends: Tensor
+
+    def __init__(
+        self, config: GptConfig, streams: Sequence[Stream], pattern: Sequence[str], text_dim: int
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.pattern = tuple(pattern)
+        self.text_dim = text_dim
+        sizes = {stream.name: stream.num_codes for stream in streams}
+        missing = [name for name in stream_names(pattern) if name not in sizes]
+        if missing:
+            raise UserError(f"the token pattern {self.pattern} names {missing}; the streams are {list(sizes)}")
+        self.names = stream_names(pattern)
+        self.num_codes = {name: sizes[name] for name in self.names}
+        """Codes per stream, which is also the stream's End token."""
+        self.vocabulary = max(self.num_codes.values()) + 1
+        self.text_in = nn.Linear(text_dim, config.dim)
+        self.null_text = nn.Parameter(torch.randn(config.dim) * 0.02)
+        self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
+        self.embeddings = nn.ModuleList(nn.Embedding(k + 1, config.dim) for k in self.num_codes.values())
+        self.dropout = nn.Dropout(config.dropout)
+        self.stack = Transformer(
+            config.layers,
+            config.dim,
+            config.heads,
+            config.ff,
+            dropout=config.dropout,
+            attention_dropout=config.attention_dropout,
+        )
+        self.heads = nn.ModuleList(nn.Linear(config.dim, k + 1) for k in self.num_codes.values())
+        for layer in (*self.embeddings, *self.heads):
+            nn.init.normal_(layer.weight, std=0.02)
+        self.register_buffer("slots", torch.tensor(kind_of_slot(pattern)), persistent=False)
+        self.register_buffer("ends", torch.tensor(list(self.num_codes.values())), persistent=False)
+
+    @property
+    def max_groups(self) -> int:
+        """Longest sequence in groups, its End tokens included."""
+        return (self.config.block_size - 1 - closing_length(self.pattern)) // len(self.pattern)
+
+    def forward(
+        self,
+        tokens: Tensor,
+        kinds: Tensor,
+        text: Tensor,
+        *,
+        inputs: Tensor | None = None,
+        drop_text: Tensor | None = None,
+    ) -> Tensor:
+        """Logits of every token given the text and the tokens before it.
+
+        Args:
+            tokens: int64 [B, L], padded with -1.
+            kinds: int64 [B, L], stream of each token.
+            text: float [B, E].
+            inputs: What the network reads instead of `tokens` (corrupted tokens); legality follows `tokens`.
+            drop_text: Bool [B], samples whose text is replaced by the null input.
+
+        Returns:
+            float32 [B, L, V]; -inf where a token is illegal. At padded positions the values mean nothing.
+        """
+        size = tokens.shape[1]
+        if size > self.config.block_size:
+            raise UserError(
+                f"a sequence of {size} tokens is longer than the GPT's block_size {self.config.block_size}; "
+                "raise block_size or shorten max_frames"
+            )
+        seen = tokens if inputs is None else inputs
+        x = torch.cat([self.embed_text(text, drop_text), self.embed(seen[:, :-1], kinds[:, :-1])], dim=1)
+        return self.logits(self.hidden(x), kinds, self.legal(tokens, kinds))
+
+    def embed_text(self, text: Tensor, drop: Tensor | None = None) -> Tensor:
+        """The first input [B, 1, D] of text [B, E]; null where `drop` [B]."""
+        if text.shape[-1] != self.text_dim:
+            raise ValueError(f"the GPT was built for {self.text_dim} text features, got {text.shape[-1]}")
+        x: Tensor = self.text_in(text.to(self.text_in.weight.dtype))
+        if drop is not None:
+            x = torch.where(drop[:, None], self.null_text.to(x.dtype), x)
+        return x[:, None]
+
+    def embed(self, tokens: Tensor, kinds: Tensor) -> Tensor:
+        """Token embeddings [B, L, D]; each stream looks up its own table, padding reads as code 0."""
+        out: Tensor | None = None
+        for kind, table in enumerate(self.embeddings):
+            here = kinds == kind
+            vectors = table(torch.where(here, tokens, 0).clamp(min=0))
+            out = vectors if out is None else torch.where(here[..., None], vectors, out)
+        assert out is not None  # a pattern has at least one stream
+        return out
+
+    def hidden(self, x: Tensor, cache: KVCache | None = None) -> Tensor:
+        """Causal states [B, L, D] of inputs x [B, L, D]; with a cache, x continues what it holds."""
+        start = 0 if cache is None else cache.length
+        x = self.dropout(x + self.positions[start : start + x.shape[1]].to(x.dtype))
+        out: Tensor = self.stack(x, causal=True, cache=cache)
+        return out
+
+    def logits(self, hidden: Tensor, kinds: Tensor, legal: Tensor) -> Tensor:
+        """Hidden states [B, L, D], kinds [B, L], legal bool [B, L, V] -> float32 [B, L, V], -inf where illegal."""
+        out = torch.full((*kinds.shape, self.vocabulary), -torch.inf, device=hidden.device)
+        for kind, head in enumerate(self.heads):
+            values = head(hidden).float()
+            padded = nn.functional.pad(values, (0, self.vocabulary - values.shape[-1]), value=-torch.inf)
+            out = torch.where((kinds == kind)[..., None], padded, out)
+        return out.masked_fill(~legal, -torch.inf)
+
+    def legal(self, tokens: Tensor, kinds: Tensor) -> Tensor:
+        """Bool [B, L, V]: what the grammar allows at each position of sequences [B, L]."""
+        batch, size = tokens.shape
+        end = self.ends[kinds]
+        is_end = tokens == end
+        closing = (is_end.cumsum(1) - is_end.long()) > 0
+        first = (torch.arange(size, device=tokens.device) % len(self.pattern) == 0).expand(batch, size)
+        return self.legal_at(end, first, closing)
+
+    def legal_at(self, end: Tensor, first: Tensor, closing: Tensor) -> Tensor:
+        """Bool [..., V] for positions with End token `end`, at a group's first slot or not, behind an End or not."""
+        code = torch.arange(self.vocabulary, device=end.device)
+        codes = (code < end[..., None]) & ~closing[..., None]
+        ending = (code == end[..., None]) & (first | closing)[..., None]
+        return codes | ending

@@ -1,0 +1,157 @@
+"""Token sequences: several code streams interleaved into one, and back (HumanTOMATO section 3.3, equation 4; B.4).
+
+A *pattern* names the stream of every slot of one group of frames: ("body", "body", "hand") for H2VQ, ("level0", "level1")
+for the face RVQ, ("code",) for one codebook. A sequence is the groups one after another, closed by one End token per
+stream in order of first appearance: 49 groups of H2VQ are 98 body + 49 hand + 2 End = 149 tokens, the paper's longest.
+
+The End of a stream with K codes is its token K. The grammar that follows, used alike in training and in sampling:
+- End is legal only at the first slot of a group, and only in that slot's stream;
+- after it, every remaining token is the End of its own stream;
+- a token of a stream is never legal where the pattern names another.
+
+A token's *kind* is the index of its stream in order of first appearance. Padding is -1 in `tokens` and 0 in `kinds`.
+
+Legend: B batch, G groups, P slots of a group, L tokens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+PAD = -1
+
+
+class TokenSequence(NamedTuple):
+    """Interleaved tokens of a batch."""
+
+    tokens: Tensor
+    """int64 [B, L], `PAD` behind `length`."""
+    kinds: Tensor
+    """int64 [B, L], stream of each token; 0 behind `length`."""
+    length: Tensor
+    """int64 [B], number of tokens, End tokens included."""
+
+
+class Codes(NamedTuple):
+    """Code streams of a batch."""
+
+    codes: dict[str, Tensor]
+    """Per stream int64 [B, G * per_group]; 0 behind `groups`, so that every entry is a valid code."""
+    groups: Tensor
+    """int64 [B], number of groups."""
+
+
+def stream_names(pattern: Sequence[str]) -> tuple[str, ...]:
+    """Streams of a pattern in order of first appearance; a token's kind is an index into these."""
+    return tuple(dict.fromkeys(pattern))
+
+
+def kind_of_slot(pattern: Sequence[str]) -> list[int]:
+    """Kind of each slot of one group."""
+    names = stream_names(pattern)
+    return [names.index(name) for name in pattern]
+
+
+def closing_length(pattern: Sequence[str]) -> int:
+    """Number of End tokens that close a sequence."""
+    return len(stream_names(pattern))
+
+
+def interleave(
+    codes: Mapping[str, Tensor],
+    pattern: Sequence[str],
+    *,
+    ends: Mapping[str, int] | None = None,
+    groups: Tensor | None = None,
+) -> TokenSequence:
+    """Code streams, each [B, G * per_group], -> one sequence.
+
+    Args:
+        codes: int64 per stream of the pattern.
+        pattern: Stream of every slot of a group.
+        ends: End token per stream (its number of codes); None leaves the sequences open, for clips that were cropped.
+        groups: Valid groups per clip, [B] (default: all G). Codes behind them are ignored.
+
+    Raises:
+        ValueError: Streams disagree about the number of groups, or a code is not below its stream's End.
+    """
+    names = stream_names(pattern)
+    kinds_row = kind_of_slot(pattern)
+    first = codes[names[0]]
+    count = first.shape[1] // kinds_row.count(0)
+    slots: list[Tensor] = []
+    seen = dict.fromkeys(names, 0)
+    for name in pattern:
+        per_group = list(pattern).count(name)
+        if codes[name].shape[1] != count * per_group:
+            raise ValueError(
+                f"stream '{name}' holds {codes[name].shape[1]} codes; {count} groups of {per_group} are "
+                f"{count * per_group}"
+            )
+        slots.append(codes[name].view(-1, count, per_group)[:, :, seen[name]])
+        seen[name] += 1
+    body = torch.stack(slots, dim=2).flatten(1)
+    device, batch = body.device, body.shape[0]
+    if groups is None:
+        groups = torch.full((batch,), count, dtype=torch.int64, device=device)
+    kinds = torch.tensor(kinds_row, device=device).repeat(count).expand(batch, -1)
+    length = groups * len(pattern)
+    valid = torch.arange(body.shape[1], device=device)[None] < length[:, None]
+    if ends is None:
+        return TokenSequence(torch.where(valid, body, PAD), torch.where(valid, kinds, 0), length)
+    limit = torch.tensor([ends[name] for name in names], device=device)
+    if bool((valid & ((body < 0) | (body >= limit[kinds]))).any()):
+        raise ValueError(f"a code is outside its stream's codebook; sizes are {dict(ends)}")
+    close = torch.arange(len(names), device=device)
+    tokens = torch.cat([torch.where(valid, body, PAD), body.new_full((batch, len(names)), PAD)], dim=1)
+    kinds = torch.cat([torch.where(valid, kinds, 0), kinds.new_zeros(batch, len(names))], dim=1)
+    at = length[:, None] + close
+    tokens = tokens.scatter(1, at, limit.expand(batch, -1))
+    kinds = kinds.scatter(1, at, close.expand(batch, -1))
+    return TokenSequence(tokens, kinds, length + len(names))
+
+
+def deinterleave(
+    tokens: Tensor, pattern: Sequence[str], *, ends: Mapping[str, int] | None = None, length: Tensor | None = None
+) -> Codes:
+    """Inverse of `interleave`: tokens [B, L], open or closed, padded or not -> streams and numbers of groups.
+
+    `length` [B] bounds the tokens read; without it they end at the first `PAD`, or at the first End when `ends` is given. An
+    unfinished last group is dropped.
+    """
+    names = stream_names(pattern)
+    kinds_row = kind_of_slot(pattern)
+    size = len(pattern)
+    position = torch.arange(tokens.shape[1], device=tokens.device)[None]
+    stop = tokens == PAD
+    if length is not None:
+        stop = stop | (position >= length[:, None])
+    if ends is not None:
+        # End is legal at the first slot of a group only, so it is enough to look there.
+        stop = stop | ((position % size == 0) & (tokens == ends[names[0]]))
+    usable = (stop.cumsum(1) == 0).sum(1)
+    groups = usable // size
+    count = int(groups.max()) if len(groups) else 0
+    body = tokens[:, : count * size].view(len(tokens), count, size)
+    valid = torch.arange(count, device=tokens.device)[None, :, None] < groups[:, None, None]
+    body = torch.where(valid, body, 0)
+    slots = torch.tensor(kinds_row, device=tokens.device)
+    return Codes({name: body[:, :, slots == k].flatten(1) for k, name in enumerate(names)}, groups)
+
+
+def pad_sequences(rows: Sequence[TokenSequence]) -> TokenSequence:
+    """Batches of different L (or single clips, B = 1) -> one padded batch."""
+    size = max(row.tokens.shape[1] for row in rows)
+
+    def padded(x: Tensor, value: int) -> Tensor:
+        return torch.nn.functional.pad(x, (0, size - x.shape[1]), value=value)
+
+    return TokenSequence(
+        torch.cat([padded(row.tokens, PAD) for row in rows]),
+        torch.cat([padded(row.kinds, 0) for row in rows]),
+        torch.cat([row.length for row in rows]),
+    )

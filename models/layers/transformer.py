@@ -1,0 +1,172 @@
+"""Transformer blocks shared by TMA and the GPTs: pre-norm, GELU, scaled-dot-product attention, optional KV cache.
+
+Notable choices:
+- Attention is always `F.scaled_dot_product_attention`, so fused kernels are used wherever the device has them.
+- Masks are boolean and say what *may* be attended (True = visible), as SDPA wants them.
+- A causal stack needs no padding mask when sequences are padded on the right: real positions never see padding.
+- Dropout acts on the residual branches (`dropout`) and on the attention weights (`attention_dropout`); CPUs have no fused
+  kernel for the second, so small CPU configs set it to 0.
+
+Legend: B batch, L positions, S visible positions, D width, H heads.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+
+def length_mask(length: Tensor, size: int) -> Tensor:
+    """Bool [B, size], True at the first `length[b]` positions of row b."""
+    return torch.arange(size, device=length.device)[None, :] < length[:, None]
+
+
+def sinusoid(size: int, dim: int, device: torch.device | None = None) -> Tensor:
+    """Fixed sine/cosine position codes, float32 [size, dim]."""
+    position = torch.arange(size, device=device, dtype=torch.float32)[:, None]
+    rate = torch.exp(torch.arange(0, dim, 2, device=device, dtype=torch.float32) * (-math.log(10000.0) / dim))
+    angle = position * rate
+    return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(1)[:, :dim]
+
+
+class LayerCache:
+    """Keys and values [B, H, size, D/H] of the positions one layer has seen; allocated once, at the first append."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.length = 0
+        self.keys: Tensor | None = None
+        self.values: Tensor | None = None
+
+    def append(self, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Store [B, H, L, D/H] more positions; return everything stored so far."""
+        if self.keys is None or self.values is None:
+            shape = (keys.shape[0], keys.shape[1], self.size, keys.shape[3])
+            self.keys, self.values = keys.new_empty(shape), values.new_empty(shape)
+        end = self.length + keys.shape[2]
+        if end > self.size:
+            raise ValueError(f"the cache holds {self.size} positions, {end} were asked for")
+        self.keys[:, :, self.length : end] = keys
+        self.values[:, :, self.length : end] = values
+        self.length = end
+        return self.keys[:, :, :end], self.values[:, :, :end]
+
+
+class KVCache:
+    """One `LayerCache` a layer, for step-by-step decoding without gradient."""
+
+    def __init__(self, layers: int, size: int) -> None:
+        self.layers = [LayerCache(size) for _ in range(layers)]
+
+    @property
+    def length(self) -> int:
+        """Positions stored."""
+        return self.layers[0].length
+
+
+class SelfAttention(nn.Module):
+    """Multi-head self-attention."""
+
+    def __init__(self, dim: int, heads: int, attention_dropout: float) -> None:
+        super().__init__()
+        if dim % heads:
+            raise ValueError(f"width {dim} is not a multiple of {heads} heads")
+        self.heads = heads
+        self.attention_dropout = attention_dropout
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.out = nn.Linear(dim, dim)
+
+    def forward(
+        self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: LayerCache | None = None
+    ) -> Tensor:
+        """x [B, L, D]; mask bool, broadcastable to [B, H, L, S], or `causal`; with a cache x continues it."""
+        batch, length, dim = x.shape
+        qkv = self.qkv(x).view(batch, length, 3, self.heads, dim // self.heads).permute(2, 0, 3, 1, 4)
+        query, key, value = qkv.unbind(0)
+        if cache is not None:
+            before = cache.length
+            key, value = cache.append(key, value)
+            if causal and before and length > 1:
+                seen = torch.ones(length, before + length, dtype=torch.bool, device=x.device)
+                mask = seen.tril(diagonal=before)
+            # A single new position sees everything stored; a first block is plainly causal.
+            causal = causal and before == 0 and length > 1
+        out = F.scaled_dot_product_attention(
+            query,
+            key,
+            value,
+            attn_mask=mask,
+            is_causal=causal and mask is None,
+            dropout_p=self.attention_dropout if self.training else 0.0,
+        )
+        merged: Tensor = self.out(out.transpose(1, 2).reshape(batch, length, dim))
+        return merged
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block: attention, then a GELU feed-forward."""
+
+    def __init__(self, dim: int, heads: int, ff: int, dropout: float, attention_dropout: float) -> None:
+        super().__init__()
+        self.norm_attention = nn.LayerNorm(dim)
+        self.attention = SelfAttention(dim, heads, attention_dropout)
+        self.norm_ff = nn.LayerNorm(dim)
+        self.ff_in = nn.Linear(dim, ff)
+        self.ff_out = nn.Linear(ff, dim)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: LayerCache | None = None
+    ) -> Tensor:
+        """[B, L, D] -> [B, L, D]; arguments as `SelfAttention`."""
+        x = x + self.dropout(self.attention(self.norm_attention(x), mask, causal, cache))
+        out: Tensor = x + self.dropout(self.ff_out(F.gelu(self.ff_in(self.norm_ff(x)))))
+        return out
+
+
+class Transformer(nn.Module):
+    """A stack of blocks and a last LayerNorm.
+
+    Weights start at N(0, 2 / (5 dim)), which is GPT-2's 0.02 at width 1024 and grows with narrower stacks so that attention
+    carries signal from the first step; outputs into the residual stream are smaller by sqrt(2 layers).
+    """
+
+    def __init__(
+        self,
+        layers: int,
+        dim: int,
+        heads: int,
+        ff: int,
+        *,
+        dropout: float = 0.1,
+        attention_dropout: float | None = None,
+    ) -> None:
+        super().__init__()
+        inner = dropout if attention_dropout is None else attention_dropout
+        self.blocks = nn.ModuleList(Block(dim, heads, ff, dropout, inner) for _ in range(layers))
+        self.norm = nn.LayerNorm(dim)
+        std = math.sqrt(2 / (5 * dim))
+        for name, parameter in self.named_parameters():
+            if parameter.dim() == 2:
+                residual = name.endswith(("attention.out.weight", "ff_out.weight"))
+                nn.init.normal_(parameter, std=std / math.sqrt(2 * layers) if residual else std)
+            elif name.endswith("bias"):
+                nn.init.zeros_(parameter)
+
+    def forward(
+        self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: KVCache | None = None
+    ) -> Tensor:
+        """x [B, L, D]; mask bool [B, L] of visible positions (or [B, L, S]), or `causal`; cache for decoding."""
+        if mask is not None:
+            mask = mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
+        for index, block in enumerate(self.blocks):
+            x = block(x, mask, causal, None if cache is None else cache.layers[index])
+        out: Tensor = self.norm(x)
+        return out
+
+    def cache(self, size: int) -> KVCache:
+        """An empty cache of `size` positions for this stack."""
+        return KVCache(len(self.blocks), size)

@@ -1,0 +1,1 @@
+"""Vector quantizers (EMA codebooks, residual levels)."""

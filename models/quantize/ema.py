@@ -1,0 +1,207 @@
+"""`EmaQuantizer`: a codebook learnt by exponential moving averages and Code Reset, never by gradient.
+
+HumanTOMATO section 3.2 and B.2 (K = 512, d = 512, decay 0.99), after VQ-VAE-2 and T2M-GPT. It equals the
+public T2M-GPT quantizer on codes, outputs, penalty, gradient, perplexity and the EMA update. It differs on
+purpose where a code is reset:
+
+- A reset code takes a *random* row of the *global* batch (there: row k of the local batch for code k), the
+  same on every rank.
+- Its EMA count becomes the threshold and its EMA sum row x count (there: both stay stale, so the next update
+  pulls the code back to where it was dead).
+- The first batch initialises the codebook with random rows (there: the first K), with the same count.
+
+`reset_below` is an EMA of uses per step: K x `reset_below` must stay well below the vectors of one global
+batch, or most of the codebook is replaced at every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Self
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from motionloom.datasets.schema import Config
+from motionloom.models.distributed import is_distributed, sum_over_ranks
+from motionloom.models.quantize.draws import draw_rows
+
+
+class QuantizerConfig(Config):
+    """One codebook."""
+
+    num_codes: int = Field(512, ge=2)
+    dim: int = Field(512, ge=1)
+    decay: float = Field(0.99, gt=0, lt=1)
+    """EMA constant lambda."""
+    reset_below: float = Field(1.0, gt=0)
+    """A code whose EMA count falls below this is reset."""
+
+
+class QuantizerOutput(NamedTuple):
+    """What a quantizer returns."""
+
+    quantized: Tensor
+    """[B, L, d], straight-through: the value of the codes, the gradient of z."""
+    codes: Tensor
+    """int64 [B, L], or [B, L, levels]; meaningless where the mask is False."""
+    penalty: Tensor
+    """Commitment |z - sg(z_hat)|^2, mean over valid elements, float32 scalar; summed over residual levels."""
+    metrics: dict[str, Tensor]
+    """float32 scalars ([levels] for a residual quantizer): `penalty`; `perplexity` of this batch's codes;
+    `usage`, the share of codes this batch used; `dead`, codes whose EMA count is not above `reset_below`;
+    `resets`, codes replaced in this step.
+    Over the global batch while training, over this rank's otherwise."""
+
+
+def nearest(z: Tensor, codebook: Tensor) -> Tensor:
+    """Index of the nearest code by squared distance; z [n, d], codebook [K, d] -> int64 [n]."""
+    # |z|^2 does not change the order, so one matmul with |e|^2 as its bias is the whole distance.
+    return torch.addmm(codebook.square().sum(1), z, codebook.t(), alpha=-2).argmin(1)
+
+
+def cluster_sums(z: Tensor, codes: Tensor, num_codes: int) -> Tensor:
+    """Sum of the vectors of each code, repeatable bit for bit; z [n, d], codes [n] -> [K, d]."""
+    sums = z.new_zeros(num_codes, z.shape[1])
+    if z.is_cuda:  # index_add_ uses atomics there; accumulating index_put_ sorts, hence is deterministic
+        return sums.index_put_((codes,), z, accumulate=True)
+    return sums.index_add_(0, codes, z)
+
+
+def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean of [..., d] over the positions where mask [...] is True (0 if there are none) and over d."""
+    if mask is None:
+        return values.mean()
+    total = values.masked_fill(~mask[..., None], 0.0).sum()
+    return total / (mask.sum() * values.shape[-1]).clamp(min=1)
+
+
+class EmaQuantizer(nn.Module):
+    """Nearest code, straight-through; see the module docstring.
+
+    All state is in buffers (`codebook`, `ema_sum`, `ema_count`, `initialised`, `draws`) and is float32
+    whatever the model is cast to; the arithmetic is float32 under autocast too.
+
+    Args:
+        config: Sizes and rates.
+        salt: Number of this quantizer among those of one network (each draws its own random rows).
+    """
+
+    codebook: Tensor
+    ema_sum: Tensor
+    ema_count: Tensor
+    initialised: Tensor
+    draws: Tensor
+
+    def __init__(self, config: QuantizerConfig, *, salt: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        self.salt = salt
+        self.frozen = False
+        size = (config.num_codes, config.dim)
+        # Random, so that an untrained tokenizer decodes to something; the first training batch replaces it.
+        self.register_buffer("codebook", torch.randn(size) * config.dim**-0.5)
+        self.register_buffer("ema_sum", self.codebook * config.reset_below)
+        self.register_buffer("ema_count", torch.full((config.num_codes,), config.reset_below))
+        self.register_buffer("initialised", torch.tensor(False))
+        self.register_buffer("draws", torch.tensor(0))
+        # Mirror of `initialised`: reading the buffer at every step would wait for the device.
+        self._is_initialised = False
+
+    def freeze(self) -> None:
+        """Never update again, in training mode neither."""
+        self.frozen = True
+
+    def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
+        """Quantize z [B, L, d].
+
+        Args:
+            z: Latents of any float type; the output has the same.
+            mask: [B, L], False = padding: neither counted nor learnt from, and outside the penalty.
+            update: False keeps the codebook as it is. It also stays in eval mode and when frozen.
+        """
+        update = update and self.training and not self.frozen
+        with torch.autocast(z.device.type, enabled=False):
+            full = z.float()
+            rows = full.detach().reshape(-1, full.shape[-1])
+            flat_mask = None if mask is None else mask.reshape(-1)
+            if flat_mask is not None:
+                rows = rows.masked_fill(~flat_mask[:, None], 0.0)
+            if update and not self._is_initialised:
+                self._initialise(rows, flat_mask)
+            codes = nearest(rows, self.codebook)
+            chosen = functional.embedding(codes, self.codebook).view_as(full)
+            penalty = masked_mean((full - chosen).square(), mask)
+            used = rows.new_ones(len(rows)) if flat_mask is None else flat_mask.float()
+            counts = rows.new_zeros(self.config.num_codes).index_add_(0, codes, used)
+            resets = rows.new_zeros(())
+            if update:
+                counts, resets = self._update(rows, flat_mask, codes, counts)
+            metrics = {"penalty": penalty.detach(), **self._metrics(counts), "resets": resets}
+            straight = full + (chosen - full).detach()
+        return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
+
+    def vectors(self, codes: Tensor) -> Tensor:
+        """Code vectors, int64 [...] -> float32 [..., d]."""
+        return functional.embedding(codes, self.codebook)
+
+    @torch.no_grad()
+    def _draw(self, rows: Tensor, mask: Tensor | None) -> Tensor:
+        drawn = draw_rows(rows, mask, self.config.num_codes, salt=self.salt, step=self.draws)
+        self.draws.add_(1)
+        return drawn
+
+    @torch.no_grad()
+    def _initialise(self, rows: Tensor, mask: Tensor | None) -> None:
+        drawn = sum_over_ranks(self._draw(rows, mask))
+        self.codebook.copy_(drawn)
+        self.ema_sum.copy_(drawn * self.config.reset_below)
+        self.ema_count.fill_(self.config.reset_below)
+        self.initialised.fill_(True)
+        self._is_initialised = True
+
+    @torch.no_grad()
+    def _update(
+        self, rows: Tensor, mask: Tensor | None, codes: Tensor, counts: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """EMA step and Code Reset from the global batch; returns its counts [K] and the number of resets."""
+        sums = cluster_sums(rows, codes, self.config.num_codes)  # padded rows are zero
+        fresh = self._draw(rows, mask)
+        if is_distributed():
+            packed = sum_over_ranks(torch.cat([sums, fresh, counts[:, None]], dim=1))
+            dim = self.config.dim
+            sums, fresh, counts = packed[:, :dim], packed[:, dim:-1], packed[:, -1]
+        floor = self.config.reset_below
+        # lerp: decay * floor + (1 - decay) * floor may round below the floor and reset a code in steady use
+        self.ema_count.lerp_(counts, 1 - self.config.decay)
+        self.ema_sum.lerp_(sums, 1 - self.config.decay)
+        reset = self.ema_count < floor
+        self.ema_count.masked_fill_(reset, floor)
+        self.ema_sum.copy_(torch.where(reset[:, None], fresh * floor, self.ema_sum))
+        self.codebook.copy_(torch.where(reset[:, None], fresh, self.ema_sum / self.ema_count[:, None]))
+        return counts, reset.sum().float()
+
+    @torch.no_grad()
+    def _metrics(self, counts: Tensor) -> dict[str, Tensor]:
+        share = counts / counts.sum().clamp(min=1)
+        return {
+            "perplexity": torch.exp(-(share * torch.log(share + 1e-7)).sum()),
+            "usage": (counts > 0).float().mean(),
+            "dead": (self.ema_count <= self.config.reset_below).sum().float(),
+        }
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Follow moves between devices, refuse casts: a bfloat16 EMA would stop moving."""
+        kept = {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        for name, before in kept.items():
+            after = getattr(self, name)
+            if after.dtype != before.dtype:
+                setattr(self, name, before.to(after.device))
+        return self
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._is_initialised = bool(self.initialised)

@@ -1,0 +1,77 @@
+"""Base of the stages' LightningModules: one seeded step, one optimizer, plain scalar logs.
+
+Every random draw of a training step (dropout, latents, code resets, Gumbel noise) comes from a generator state that
+is a pure function of (seed, step, rank), so a run that was killed and resumed repeats the undisturbed run bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import lightning as L
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from motionloom.datasets.schema import Config
+
+
+class OptimConfig(Config):
+    """AdamW and its learning-rate schedule."""
+
+    lr: float = Field(1e-4, gt=0)
+    betas: tuple[float, float] = (0.9, 0.99)
+    weight_decay: float = Field(0.0, ge=0)
+    warmup_steps: int = Field(0, ge=0)
+    schedule: Literal["constant", "cosine"] = "constant"
+    grad_clip: float = Field(1.0, ge=0)
+    """Largest gradient norm; 0 turns clipping off."""
+
+
+class StageModule(L.LightningModule):
+    """A network, its losses and its optimizer. Subclasses implement `losses(batch)`."""
+
+    def __init__(self, net: nn.Module, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
+        super().__init__()
+        self.net = net
+        self.optim_config = optim
+        self.seed = seed
+        self.max_steps = max_steps
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Losses and scalar metrics of one batch; the entry "loss" is minimised, the others are only logged."""
+        raise NotImplementedError
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
+        """One step; seeds torch from (seed, step, rank) first."""
+        torch.manual_seed((self.seed * 1_000_003 + self.global_step) * 4099 + self.global_rank)
+        values = self.losses(batch)
+        self.log_dict({f"train/{k}": v.detach() for k, v in values.items()}, prog_bar=False, sync_dist=True)
+        self.log("loss", values["loss"].detach(), prog_bar=True, logger=False)
+        return values["loss"]
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        """The same losses on held-out data."""
+        values = self.losses(batch)
+        size = len(batch["length"])
+        self.log_dict({f"val/{k}": v for k, v in values.items()}, sync_dist=True, batch_size=size)
+
+    def configure_optimizers(self) -> Any:
+        """AdamW over the trainable parameters, linear warm-up, then constant or cosine."""
+        config = self.optim_config
+        params = [p for p in self.net.parameters() if p.requires_grad]
+        optimizer = torch.optim.AdamW(
+            params, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay, fused=True
+        )
+
+        def factor(step: int) -> float:
+            if step < config.warmup_steps:
+                return (step + 1) / config.warmup_steps
+            if config.schedule == "constant":
+                return 1.0
+            done = (step - config.warmup_steps) / max(1, self.max_steps - config.warmup_steps)
+            return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

@@ -1,0 +1,1 @@
+"""Text-motion alignment (HumanTOMATO section 3.5, appendix D)."""

@@ -1,0 +1,90 @@
+"""The Lightning side of TMA: sample latents, sum the weighted losses (HumanTOMATO appendix D.1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from motionloom.datasets.schema import Config
+from motionloom.models.layers.transformer import length_mask
+from motionloom.models.stage_module import OptimConfig, StageModule
+from motionloom.models.tma.losses import info_nce, kl_four, latent_loss, reconstruction_loss
+from motionloom.models.tma.network import Tma
+
+
+class TmaLossConfig(Config):
+    """Weights of the loss terms and the negative filter; the defaults are the paper's."""
+
+    reconstruction: float = Field(1.0, ge=0)
+    kl: float = Field(1e-5, ge=0)
+    latent: float = Field(1e-5, ge=0)
+    contrastive: float = Field(0.1, ge=0)
+    temperature: float = Field(0.1, gt=0)
+    threshold: float = Field(0.85, ge=-1, le=1)
+    """Captions with a higher sentence cosine are not negatives of each other."""
+
+
+class TmaModule(StageModule):
+    """Trains a `Tma` on the batches of `CaptionBatches`."""
+
+    net: Tma
+
+    def __init__(
+        self,
+        net: Tma,
+        optim: OptimConfig,
+        *,
+        seed: int,
+        max_steps: int,
+        loss: TmaLossConfig | None = None,
+    ) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.loss_config = loss or TmaLossConfig()
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Loss of one batch: "motion" [B, T, D], "length" [B], "text_tokens" [B, S, E], "text_mask", "sentence" [B, E].
+
+        Latents are sampled in training and are the means in evaluation. InfoNCE contrasts the means, as the published
+        HumanTOMATO code does (TMR contrasts samples): retrieval uses the means too.
+        """
+        net, weight = self.net, self.loss_config
+        motion, length = batch["motion"], batch["length"]
+        text = net.encode_text(batch["text_tokens"], batch["text_mask"])
+        moved = net.encode_motion(motion, length)
+        z_text, z_motion = self._latent(*text), self._latent(*moved)
+        target, frames = net.strided(motion, length)
+        mask = length_mask(frames, target.shape[1])
+        size = motion.shape[1]
+        rec_text = reconstruction_loss(net.decode(z_text, length, size), target, mask)
+        rec_motion = reconstruction_loss(net.decode(z_motion, length, size), target, mask)
+        kl = kl_four(text, moved)
+        latent = latent_loss(z_text, z_motion)
+        contrastive = info_nce(
+            text[0],
+            moved[0],
+            batch["sentence"],
+            temperature=weight.temperature,
+            threshold=weight.threshold,
+        )
+        loss = (
+            weight.reconstruction * (rec_text + rec_motion)
+            + weight.kl * kl
+            + weight.latent * latent
+            + weight.contrastive * contrastive
+        )
+        return {
+            "loss": loss,
+            "rec_text": rec_text,
+            "rec_motion": rec_motion,
+            "kl": kl,
+            "latent": latent,
+            "contrastive": contrastive,
+        }
+
+    def _latent(self, mu: Tensor, logvar: Tensor) -> Tensor:
+        if not self.training:
+            return mu
+        return mu + torch.randn_like(mu) * (0.5 * logvar).exp()

@@ -1,0 +1,123 @@
+"""TMA: text and motion in one latent space (HumanTOMATO section 3.5 and appendix D; TEMOS, TMR).
+
+Three transformers. The motion encoder and the text encoder each read their sequence behind two learned tokens whose
+outputs are the mean and the log-variance of a Gaussian latent; the motion decoder writes a motion from one latent.
+
+Notable choices:
+- The decoder puts the latent in front of the frame queries and lets them attend to it. TEMOS attends to a one-token memory by
+  cross-attention, which is the same information path with one softmax over a single key.
+- `frame_stride` n feeds and reconstructs every n-th frame. 1 is the paper; small CPU runs take 2 to 4.
+
+Legend: B batch, T frames, D motion features, S text tokens, E text width, Z latent width.
+"""
+
+from __future__ import annotations
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from motionloom.datasets.schema import Config
+from motionloom.models.layers.transformer import Transformer, length_mask, sinusoid
+
+
+class TmaConfig(Config):
+    """Sizes of TMA; the defaults are the paper config."""
+
+    latent: int = Field(256, ge=2)
+    ff: int = Field(1024, ge=1)
+    layers: int = Field(6, ge=1)
+    heads: int = Field(4, ge=1)
+    dropout: float = Field(0.1, ge=0, lt=1)
+    attention_dropout: float = Field(0.1, ge=0, lt=1)
+    frame_stride: int = Field(1, ge=1)
+    """Every n-th frame is fed and reconstructed; 1 is the paper."""
+
+
+class GaussianEncoder(nn.Module):
+    """Sequence -> mean and log-variance, through a mu token and a sigma token in front of the sequence."""
+
+    def __init__(self, config: TmaConfig, dim: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(dim, config.latent)
+        self.queries = nn.Parameter(torch.randn(2, config.latent) * config.latent**-0.5)
+        self.stack = _stack(config)
+
+    def forward(self, x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """x [B, L, dim], mask bool [B, L] (True = real) -> (mu [B, Z], logvar [B, Z])."""
+        x = self.project(x)
+        x = torch.cat([self.queries.to(x.dtype).expand(len(x), -1, -1), x], dim=1)
+        x = x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype)
+        visible = torch.cat([mask.new_ones(len(mask), 2), mask], dim=1)
+        x = self.stack(x, visible)
+        return x[:, 0].float(), x[:, 1].float()
+
+
+class MotionDecoder(nn.Module):
+    """One latent -> a motion, all frames at once."""
+
+    def __init__(self, config: TmaConfig, dim: int) -> None:
+        super().__init__()
+        self.latent = nn.Linear(config.latent, config.latent)
+        self.stack = _stack(config)
+        self.out = nn.Linear(config.latent, dim)
+
+    def forward(self, z: Tensor, mask: Tensor) -> Tensor:
+        """z [B, Z], mask bool [B, L] -> [B, L, D], zero where masked."""
+        head = self.latent(z)[:, None]
+        frames = sinusoid(mask.shape[1], head.shape[2], z.device).to(head.dtype).expand(len(z), -1, -1)
+        visible = torch.cat([mask.new_ones(len(mask), 1), mask], dim=1)
+        x = self.stack(torch.cat([head, frames], dim=1), visible)[:, 1:]
+        out: Tensor = self.out(x).float()
+        return out * mask[..., None]
+
+
+def _stack(config: TmaConfig) -> Transformer:
+    return Transformer(
+        config.layers,
+        config.latent,
+        config.heads,
+        config.ff,
+        dropout=config.dropout,
+        attention_dropout=config.attention_dropout,
+    )
+
+
+class Tma(nn.Module):
+    """Motion encoder, text encoder and motion decoder over one latent space."""
+
+    def __init__(self, config: TmaConfig, motion_dim: int, text_dim: int) -> None:
+        super().__init__()
+        self.config = config
+        self.motion_dim = motion_dim
+        self.text_dim = text_dim
+        self.motion_encoder = GaussianEncoder(config, motion_dim)
+        self.text_encoder = GaussianEncoder(config, text_dim)
+        self.motion_decoder = MotionDecoder(config, motion_dim)
+
+    def strided(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+        """Every `frame_stride`-th frame of x [B, T, D], and the lengths in such frames (rounded up)."""
+        stride = self.config.frame_stride
+        return x[:, ::stride], (length + stride - 1) // stride
+
+    def encode_motion(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+        """x [B, T, D] normalised features, length int64 [B] frames -> (mu, logvar), float32 [B, Z]."""
+        if x.shape[-1] != self.motion_dim:
+            raise ValueError(f"TMA was built for {self.motion_dim} motion features, got {x.shape[-1]}")
+        x, length = self.strided(x, length)
+        mu, logvar = self.motion_encoder(x, length_mask(length, x.shape[1]))
+        return mu, logvar
+
+    def encode_text(self, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """tokens [B, S, E] text features, mask bool [B, S] -> (mu, logvar), float32 [B, Z]."""
+        if tokens.shape[-1] != self.text_dim:
+            raise ValueError(f"TMA was built for {self.text_dim} text features, got {tokens.shape[-1]}")
+        mu, logvar = self.text_encoder(tokens, mask)
+        return mu, logvar
+
+    def decode(self, z: Tensor, length: Tensor, frames: int) -> Tensor:
+        """Z [B, Z] -> [B, ceil(frames / stride), D] at every `frame_stride`-th frame; zero past `length` frames."""
+        stride = self.config.frame_stride
+        mask = length_mask((length + stride - 1) // stride, (frames + stride - 1) // stride)
+        out: Tensor = self.motion_decoder(z, mask)
+        return out

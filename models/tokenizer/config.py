@@ -1,0 +1,76 @@
+"""Configs of the tokenizers; the defaults are the paper's sizes (HumanTOMATO B.2, SPEC sections 3 and 10)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypedDict
+
+from pydantic import Field
+
+from motionloom.datasets.motion.layout import Part
+from motionloom.datasets.schema import Config
+from motionloom.models.quantize.ema import QuantizerConfig
+
+Recon = Literal["l2", "smooth_l1"]
+
+
+class LossTerms(TypedDict):
+    """Keyword arguments of `losses.tokenizer_loss` that the config decides."""
+
+    alpha: float
+    recon: Recon
+    velocity_weight: float
+
+
+class BaseTokenizerConfig(Config):
+    """What every tokenizer has."""
+
+    width: int = Field(512, ge=1)
+    """Channels of the convolutions."""
+    depth: int = Field(3, ge=1)
+    """Residual blocks per resolution."""
+    dilation_growth: int = Field(3, ge=1)
+    code_dim: int = Field(512, ge=1)
+    num_codes: int = Field(512, ge=2)
+    decay: float = Field(0.99, gt=0, lt=1)
+    reset_below: float = Field(1.0, gt=0)
+    alpha: float = Field(0.02, ge=0)
+    """Weight of the commitment penalty."""
+    recon: Recon = "l2"
+    velocity_weight: float = Field(0.0, ge=0)
+    """Weight of the same reconstruction error between frame-to-frame differences."""
+
+    def quantizer(self) -> QuantizerConfig:
+        """Config of each codebook."""
+        return QuantizerConfig(
+            num_codes=self.num_codes, dim=self.code_dim, decay=self.decay, reset_below=self.reset_below
+        )
+
+    def loss_terms(self) -> LossTerms:
+        """Keyword arguments of `TokenizerModule` and `tokenizer_loss`."""
+        return {"alpha": self.alpha, "recon": self.recon, "velocity_weight": self.velocity_weight}
+
+
+class H2VQConfig(BaseTokenizerConfig):
+    """Holistic Hierarchical VQ: a hand codebook at 4x, a body codebook at 2x."""
+
+    kind: Literal["h2vq"] = "h2vq"
+    part: Literal["bodyhand"] = "bodyhand"
+
+
+class VqConfig(BaseTokenizerConfig):
+    """Vanilla VQ: one codebook at 4x."""
+
+    kind: Literal["vq"] = "vq"
+    part: Part = "bodyhand"
+
+
+class RvqConfig(BaseTokenizerConfig):
+    """Residual VQ: `levels` codebooks at 4x. With `part: face` it is HumanTOMATO's face tokenizer (B.4)."""
+
+    kind: Literal["rvq"] = "rvq"
+    part: Part = "bodyhand"
+    levels: int = Field(2, ge=1)
+
+
+TokenizerConfig = Annotated[H2VQConfig | VqConfig | RvqConfig, Field(discriminator="kind")]
+"""Any tokenizer, told apart by `kind`."""

@@ -1,0 +1,79 @@
+"""`H2VQ`: Holistic Hierarchical VQ-VAE (HumanTOMATO section 3.2, B.2, Algorithms 1 and 2).
+
+Hands are quantized first, at a quarter of the frame rate; the body at half of it, knowing the hand codes:
+z_hat_B = Q_B(Conv1d(Concat(Transform(z_hat_H), z_B))). The paper leaves open: Transform = nearest x2
+up-sampling and a linear projection; the fusing Conv1d has kernel 3; the decoder reads both latents at the
+body rate and doubles it once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
+from motionloom.models.quantize.ema import EmaQuantizer
+from motionloom.models.tokenizer.base import Latents, Stream, Tokenizer, stream_metrics, token_mask
+from motionloom.models.tokenizer.config import H2VQConfig
+
+
+class H2VQ(Tokenizer):
+    """Two body tokens and one hand token per four frames."""
+
+    body_columns: Tensor
+    hand_columns: Tensor
+
+    def __init__(self, config: H2VQConfig, layout: MotionLayout) -> None:
+        if not layout.has_part("hand"):
+            raise UserError(
+                f"layout {layout.name} has no hand columns; use kind 'vq' or 'rvq' with part 'body'"
+            )
+        streams = (Stream("body", config.num_codes, 2), Stream("hand", config.num_codes, 1))
+        super().__init__(config, layout, config.part, streams, ("body", "body", "hand"))
+        columns = layout.part(config.part)
+        body, hand = (np.searchsorted(columns, layout.part(part)) for part in ("body", "hand"))
+        self.register_buffer("body_columns", torch.from_numpy(body))
+        self.register_buffer("hand_columns", torch.from_numpy(hand))
+
+        width, depth, growth, d = config.width, config.depth, config.dilation_growth, config.code_dim
+        self.hand_encoder = ConvEncoder(
+            len(hand), d, width=width, halvings=2, depth=depth, dilation_growth=growth
+        )
+        self.body_encoder = ConvEncoder(
+            len(body), d, width=width, halvings=1, depth=depth, dilation_growth=growth
+        )
+        self.hand_quantizer = EmaQuantizer(config.quantizer(), salt=0)
+        self.transform = nn.Linear(d, d)
+        self.fuse = nn.Conv1d(2 * d, d, 3, padding=1)
+        self.body_quantizer = EmaQuantizer(config.quantizer(), salt=1)
+        self.decoder = ConvDecoder(
+            2 * d, self.dim, width=width, doublings=1, depth=depth, dilation_growth=growth
+        )
+
+    def codebooks(self) -> dict[str, EmaQuantizer]:
+        """The quantizer of each stream."""
+        return {"body": self.body_quantizer, "hand": self.hand_quantizer}
+
+    def _quantize(self, x: Tensor, valid: Tensor | None, *, update: bool) -> Latents:
+        z_hand = self.hand_encoder(x[..., self.hand_columns], valid)
+        hand = self.hand_quantizer(z_hand, token_mask(valid, z_hand.shape[1], 4), update=update)
+        z_body = self.body_encoder(x[..., self.body_columns], valid)
+        hint = self.transform(hand.quantized).repeat_interleave(2, dim=1)
+        mask = token_mask(valid, z_body.shape[1], 2)
+        both = torch.cat([hint, z_body], dim=-1)
+        if mask is not None:
+            both = both.masked_fill(~mask[..., None], 0.0)
+        fused = self.fuse(both.transpose(1, 2)).transpose(1, 2)
+        body = self.body_quantizer(fused, mask, update=update)
+        return Latents(
+            self._join({"body": body.quantized, "hand": hand.quantized}),
+            body.penalty + hand.penalty,
+            {"body": body.codes, "hand": hand.codes},
+            stream_metrics(body.metrics, "body") | stream_metrics(hand.metrics, "hand"),
+        )
+
+    def _join(self, vectors: dict[str, Tensor]) -> Tensor:
+        return torch.cat([vectors["body"], vectors["hand"].repeat_interleave(2, dim=1)], dim=-1)

@@ -1,0 +1,61 @@
+"""Losses of the tokenizers as functions of tensors (HumanTOMATO Eqn. 3 and 6; SPEC section 3)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from motionloom.models.quantize.ema import masked_mean
+from motionloom.models.tokenizer.config import Recon
+
+
+def reconstruction_loss(recon: Tensor, target: Tensor, length: Tensor | None, kind: Recon) -> Tensor:
+    """Mean error of [B, T, D] over the first `length` [B] frames of each clip and over D.
+
+    `kind`: "l2" squared error; "smooth_l1" Huber with threshold 1.
+    """
+    recon, target = recon.float(), target.float()
+    if kind == "l2":
+        error = functional.mse_loss(recon, target, reduction="none")
+    else:
+        error = functional.smooth_l1_loss(recon, target, reduction="none")
+    if length is None:
+        return error.mean()
+    return masked_mean(error, torch.arange(error.shape[1], device=error.device) < length[:, None])
+
+
+def velocity_loss(recon: Tensor, target: Tensor, length: Tensor | None, kind: Recon) -> Tensor:
+    """`reconstruction_loss` of frame-to-frame differences; between two valid frames only."""
+    shorter = None if length is None else length - 1
+    return reconstruction_loss(recon.float().diff(dim=1), target.float().diff(dim=1), shorter, kind)
+
+
+def tokenizer_loss(
+    recon_motion: Tensor,
+    target: Tensor,
+    penalty: Tensor,
+    length: Tensor | None,
+    *,
+    alpha: float,
+    recon: Recon,
+    velocity_weight: float,
+) -> dict[str, Tensor]:
+    """`loss` = recon + velocity_weight * velocity + alpha * penalty, and its terms `recon`, `commit` (and
+    `velocity`).
+
+    Args:
+        recon_motion: [B, T, D] from the decoder.
+        target: [B, T, D], normalised motion.
+        penalty: Commitment of the quantizers, scalar.
+        length: [B] valid frames, or None.
+        alpha: Weight of the penalty.
+        recon: Kind of error.
+        velocity_weight: Weight of the velocity term; 0 leaves it out.
+    """
+    terms = {"recon": reconstruction_loss(recon_motion, target, length, recon), "commit": penalty}
+    loss = terms["recon"] + alpha * penalty
+    if velocity_weight > 0:
+        terms["velocity"] = velocity_loss(recon_motion, target, length, recon)
+        loss = loss + velocity_weight * terms["velocity"]
+    return {"loss": loss, **terms}

@@ -1,0 +1,1 @@
+"""Command line, recipes, the stage graph, training, generation and pages."""

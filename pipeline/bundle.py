@@ -1,0 +1,257 @@
+"""Everything that turns a caption into motion: text encoder, TMA, GPT, tokenizer, statistics, and the face line.
+
+A bundle opens from a run folder or from an exported one; both hold one folder per part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor
+
+from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.shards.statistics import FeatureStats
+from motionloom.datasets.text.encoder import EncodedText, TextEncoder, load_text_encoder
+from motionloom.models.gpt import InterleavedGPT
+from motionloom.models.gpt.sampling import generate
+from motionloom.models.tokenizer import Tokenizer
+from motionloom.pipeline.artifact import Artifact
+from motionloom.pipeline.model_store import LayoutFacts
+from motionloom.pipeline.networks import LoadedTma, load_gpt, load_tokenizer
+
+PARTS = ("stats", "text", "tokenizer", "tma", "gpt", "face_tokenizer", "face_gpt")
+REQUIRED = ("stats", "tokenizer", "gpt")
+
+
+class SamplingConfig(Config):
+    """How tokens are drawn."""
+
+    temperature: float = Field(1.0, gt=0)
+    top_k: int = Field(0, ge=0)
+    """0 keeps every token."""
+    top_p: float = Field(0.95, gt=0, le=1)
+    cfg_scale: float = Field(1.0, ge=1)
+    """Classifier-free guidance; 1 is off. Needs a GPT trained with `drop_text` > 0."""
+
+
+class BundleFile(Config):
+    """`bundle.json` of an exported folder."""
+
+    layout: LayoutFacts
+    text_encoder: str
+
+
+@dataclass(frozen=True)
+class GeneratedMotion:
+    """One generated clip."""
+
+    caption: str
+    face_caption: str
+    features: NDArray[np.float32]
+    """Body-hand features [T, D]."""
+    joints: NDArray[np.float64]
+    """Positions [T, N, 3] in metres."""
+    face: NDArray[np.float32] | None
+    """Expression [T, 50], or None without a face line."""
+    layout: MotionLayout
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """The parts, loaded once."""
+
+    layout: MotionLayout
+    stats: FeatureStats
+    text_encoder_name: str
+    tokenizer: Tokenizer
+    gpt: InterleavedGPT
+    prior: str
+    tma: LoadedTma | None
+    face: tuple[Tokenizer, InterleavedGPT, str] | None
+
+    @staticmethod
+    def open(folder: Path) -> Bundle:
+        """Open a run folder or an exported folder."""
+        if (folder / "bundle.json").is_file():
+            facts = BundleFile.load_json(folder / "bundle.json")
+            return Bundle.from_parts({p: folder / p for p in PARTS if (folder / p).is_dir()}, facts.text_encoder)
+        return Bundle.from_run(folder)
+
+    @staticmethod
+    def from_run(run: Path) -> Bundle:
+        """Open the finished stages of a run."""
+        parts = part_folders(run)
+        if "text" not in parts:
+            raise UserError(f"{run}: no finished text stage; run the recipe to the end first")
+        return Bundle.from_parts(parts, text_encoder_of(parts["text"]))
+
+    @staticmethod
+    def from_parts(parts: dict[str, Path], text_encoder: str) -> Bundle:
+        """Open one folder per part."""
+        for role in REQUIRED:
+            if role not in parts:
+                raise UserError(f"no finished '{role}' stage here; run the recipe to the end first")
+        tokenizer = load_tokenizer(parts["tokenizer"])
+        gpt, prior = load_gpt(parts["gpt"], tokenizer)
+        face = None
+        if "face_gpt" in parts and "face_tokenizer" in parts:
+            face_tokenizer = load_tokenizer(parts["face_tokenizer"])
+            face = (face_tokenizer, *load_gpt(parts["face_gpt"], face_tokenizer))
+        return Bundle(
+            layout=tokenizer.layout,
+            stats=FeatureStats.load(parts["stats"] / "stats.safetensors"),
+            text_encoder_name=text_encoder,
+            tokenizer=tokenizer,
+            gpt=gpt,
+            prior=prior,
+            tma=LoadedTma.load(parts["tma"]) if "tma" in parts else None,
+            face=face,
+        )
+
+    @cached_property
+    def text_encoder(self) -> TextEncoder:
+        """Loaded on first use; it is the slow part of starting."""
+        return load_text_encoder(self.text_encoder_name)
+
+    @property
+    def max_seconds(self) -> float:
+        """Longest motion the GPT's block holds."""
+        return self.max_groups * self.tokenizer.group_frames / self.layout.fps
+
+    @property
+    def max_groups(self) -> int:
+        """Longest motion in groups of four frames."""
+        return self.gpt.pattern.groups_within(self.gpt.config.block_size - 1)
+
+    def generate(
+        self,
+        captions: Sequence[str],
+        *,
+        face_captions: Sequence[str] | None = None,
+        seconds: float | None = None,
+        seed: int = 0,
+        sampling: SamplingConfig | None = None,
+        batch: int = 64,
+    ) -> list[GeneratedMotion]:
+        """Motions for captions, in order; the same seed and caption give the same motion."""
+        faces = list(face_captions) if face_captions is not None else list(captions)
+        if len(faces) != len(captions):
+            raise UserError(f"{len(captions)} captions but {len(faces)} face captions")
+        sampling = sampling or SamplingConfig()
+        out: list[GeneratedMotion] = []
+        for start in range(0, len(captions), batch):
+            part = slice(start, start + batch)
+            out += self._batch(list(captions[part]), faces[part], seconds, seed + start, sampling)
+        return out
+
+    def _batch(
+        self, captions: list[str], faces: list[str], seconds: float | None, seed: int, sampling: SamplingConfig
+    ) -> list[GeneratedMotion]:
+        groups = self._groups(seconds, len(captions))
+        codes, lengths = self._sample(self.gpt, self.prior, captions, groups, seed, sampling)
+        body = self._decode(self.tokenizer, codes, lengths)
+        expressions: list[NDArray[np.float32]] | list[None] = [None] * len(captions)
+        if self.face is not None:
+            tokenizer, gpt, prior = self.face
+            # The face takes the body's length, so that both share one time line.
+            face_codes, _ = self._sample(gpt, prior, faces, lengths, seed + 1_000_003, sampling)
+            expressions = self._decode(tokenizer, face_codes, lengths)
+        out = []
+        for row, caption in enumerate(captions):
+            joints = decode(body[row], self._joint_layout)
+            out.append(
+                GeneratedMotion(caption, faces[row], body[row], joints, expressions[row], self.layout)
+            )
+        return out
+
+    @cached_property
+    def _joint_layout(self) -> MotionLayout:
+        """The layout of the body-hand columns alone."""
+        if not self.layout.has("face"):
+            return self.layout
+        return MotionLayout.named("wholebody313", fps=self.layout.fps, family=self.layout.family)
+
+    def _groups(self, seconds: float | None, count: int) -> Tensor | None:
+        if seconds is None:
+            return None
+        groups = round(seconds * self.layout.fps / self.tokenizer.group_frames)
+        if not 1 <= groups <= self.max_groups:
+            raise UserError(f"{seconds:g} s is out of reach: this model makes 0.2 to {self.max_seconds:.1f} s")
+        return torch.full((count,), groups)
+
+    def _sample(
+        self, gpt: InterleavedGPT, prior: str, texts: list[str], groups: Tensor | None, seed: int, s: SamplingConfig
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        text = self.embed(texts, prior)
+        result = generate(
+            gpt,
+            text,
+            max_groups=gpt.pattern.groups_within(gpt.config.block_size - 1),
+            groups=groups,
+            temperature=s.temperature,
+            top_k=s.top_k,
+            top_p=s.top_p,
+            cfg_scale=s.cfg_scale,
+            seed=seed,
+        )
+        return result.codes, result.groups
+
+    def embed(self, texts: list[str], prior: str) -> Tensor:
+        """Text priors [n, E]."""
+        encoded: EncodedText = self.text_encoder.encode(texts)
+        if prior == "sentence":
+            return torch.as_tensor(encoded.sentence)
+        if self.tma is None:
+            raise UserError("this GPT needs the TMA text encoder, and no tma part is here")
+        return self.tma.embed_text(torch.as_tensor(encoded.tokens), torch.as_tensor(encoded.mask))
+
+    def _decode(
+        self, tokenizer: Tokenizer, codes: dict[str, Tensor], groups: Tensor
+    ) -> list[NDArray[np.float32]]:
+        """Features in their own units, one array [T, D] a sample; each is decoded alone so padding plays no part."""
+        columns = tokenizer.columns.numpy()
+        out = []
+        for row, count in enumerate(groups.tolist()):
+            single = {s.name: codes[s.name][row : row + 1, : count * s.per_group] for s in tokenizer.streams}
+            with torch.no_grad():
+                motion = tokenizer.decode(single)[0].numpy()
+            out.append((motion * self.stats.std[columns] + self.stats.mean[columns]).astype(np.float32))
+        return out
+
+
+def part_folders(run: Path) -> dict[str, Path]:
+    """Folder of each part in a run: as its `generate` stage names them, else by the part's own name."""
+    recipe = _resolved(run)
+    stages = recipe["stages"]
+    roles = {part: part for part in PARTS if part in stages}
+    for name, entry in stages.items():
+        if entry["kind"] == "generate":
+            roles.update({r: s for r, s in entry.get("inputs", {}).items() if r in PARTS})
+    found = {role: run / "stages" / stage for role, stage in roles.items()}
+    return {role: folder for role, folder in found.items() if (folder / "artifact.json").is_file()}
+
+
+def text_encoder_of(text_folder: Path) -> str:
+    """Name of the text encoder a text stage used."""
+    artifact = Artifact.find(text_folder)
+    if artifact is None:
+        raise UserError(f"{text_folder}: the text stage has not finished")
+    return str(artifact.config["encoder"])
+
+
+def _resolved(run: Path) -> dict[str, dict]:
+    path = run / "recipe.yaml"
+    if not path.is_file():
+        raise UserError(f"{run}: not a run folder (no recipe.yaml) and not an exported one (no bundle.json)")
+    data: dict[str, dict] = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return data

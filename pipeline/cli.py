@@ -1,0 +1,178 @@
+"""The command line: a thin layer on the Python API.
+
+Exit codes: 0 done; 1 the check found problems; 2 a mistake in the call, the recipe or the data (one sentence on
+standard error says which and how to fix it); 130 interrupted. Anything else is a bug and shows its traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cli_data import data_app
+from motionloom.pipeline.console import make_console, quiet_libraries
+
+app = typer.Typer(
+    name="motionloom",
+    help="Text or music to whole-body motion: data, training and generation (HumanTOMATO, UDE).",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.add_typer(data_app, name="data")
+
+RunFolder = Annotated[Path, typer.Argument(help="A run folder (runs/NAME), or a folder made by export.")]
+Sets = Annotated[
+    list[str] | None, typer.Option("--set", "-s", help="Override one value: stage.field=value. May be repeated.")
+]
+
+
+@app.command()
+def info() -> None:
+    """Versions, devices, text encoder and shipped recipes.
+
+    Example: `motionloom info`
+    """
+    from motionloom.pipeline.info import show_info
+
+    show_info(make_console())
+
+
+@app.command()
+def run(
+    recipe: Annotated[str, typer.Argument(help="A shipped recipe's name (see info) or a .yaml file.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; default runs/NAME of the recipe.")] = None,
+    sets: Sets = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan with the reason for each stage.")] = False,
+    first: Annotated[str | None, typer.Option("--from", help="Run this stage and all below it again.")] = None,
+    until: Annotated[str | None, typer.Option(help="Only this stage and what it needs.")] = None,
+    only: Annotated[str | None, typer.Option(help="Only this stage; its inputs must be finished.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Run the selected stages even if finished.")] = False,
+) -> None:
+    """Run a recipe: every stage that is not finished, in order.
+
+    Finished stages are skipped, changed ones and those below them run again. Kill it at any moment and start it
+    again: it goes on where it was.
+
+    Example: `motionloom run humantomato-tiny --dry-run`
+
+    Example: `motionloom run humantomato-tiny --set tma.optim.lr=2e-4 --until tma`
+    """
+    from motionloom.pipeline.graph import Selection
+    from motionloom.pipeline.run import run_recipe
+
+    run_recipe(
+        recipe,
+        out,
+        overrides=sets or (),
+        select=Selection(first, until, only, force),
+        dry_run=dry_run,
+        console=make_console(),
+    )
+
+
+@app.command()
+def generate(
+    run_folder: RunFolder,
+    captions: Annotated[list[str] | None, typer.Argument(help="What the person does; one motion each.")] = None,
+    face: Annotated[list[str] | None, typer.Option("--face", help="What the face does, one for each caption.")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("motions"),
+    formats: Annotated[str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html.")] = "npz,bvh,mp4,html",
+    seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same motion.")] = 0,
+    temperature: Annotated[float, typer.Option(help="Below 1: safer, above 1: more varied.")] = 1.0,
+    top_k: Annotated[int, typer.Option(help="Draw from the k likeliest tokens; 0 = all.")] = 0,
+    top_p: Annotated[float, typer.Option(help="Draw from the likeliest tokens of this total probability.")] = 0.95,
+    cfg: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
+) -> None:
+    """Motions from captions, as npz, BVH, MP4 and one page to watch.
+
+    Example: `motionloom generate runs/humantomato-tiny "a person waves with the left hand" --face "a happy face" -o out`
+    """
+    from motionloom.pipeline.run import generate_motions
+
+    generate_motions(
+        run_folder,
+        captions or [],
+        face_captions=face,
+        out=out,
+        formats=formats,
+        seconds=seconds,
+        seed=seed,
+        sampling={"temperature": temperature, "top_k": top_k, "top_p": top_p, "cfg_scale": cfg},
+        console=make_console(),
+    )
+
+
+@app.command()
+def evaluate(
+    run_folder: RunFolder,
+    clips: Annotated[int | None, typer.Option(help="At most this many test clips.")] = None,
+    repeats: Annotated[int | None, typer.Option(help="Repetitions of everything that draws at random.")] = None,
+) -> None:
+    """Figures on the test split, each beside its trivial answer.
+
+    Example: `motionloom evaluate runs/humantomato-tiny --repeats 5`
+    """
+    from motionloom.pipeline.run import evaluate_run
+
+    evaluate_run(run_folder, clips=clips, repeats=repeats, console=make_console())
+
+
+@app.command()
+def report(
+    run_folder: RunFolder,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="The page; default RUN/report.html.")] = None,
+) -> None:
+    """One self-contained page: curves, codebooks, figures and motions to watch.
+
+    Example: `motionloom report runs/humantomato-tiny`
+    """
+    from motionloom.pipeline.run import report_run
+
+    report_run(run_folder, out, console=make_console())
+
+
+@app.command()
+def export(
+    run_folder: RunFolder,
+    out: Annotated[Path, typer.Option("--out", "-o", help="New folder.")] = Path("exported"),
+) -> None:
+    """One folder with all that generate needs: weights (safetensors), configs, statistics.
+
+    Example: `motionloom export runs/humantomato-tiny -o my-model && motionloom generate my-model "a person jumps"`
+    """
+    from motionloom.pipeline.run import export_run
+
+    export_run(run_folder, out, console=make_console())
+
+
+def main() -> None:
+    """Entry point: turns a user's mistake into one sentence and exit code 2."""
+    quiet_libraries()
+    try:
+        app(standalone_mode=False)
+    except UserError as error:
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"error: {error}", style="red", markup=False)
+        sys.exit(2)
+    except typer.Exit as stop:
+        sys.exit(stop.exit_code)
+    except (typer.Abort, KeyboardInterrupt):
+        Console(stderr=True).print("interrupted; the same command goes on from here", style="yellow")
+        sys.exit(130)
+    except Exception as error:
+        if type(error).__module__.startswith(("click", "typer")) and hasattr(error, "show"):
+            error.show()
+            sys.exit(2)
+        raise
+
+
+if __name__ == "__main__":
+    main()

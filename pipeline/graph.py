@@ -1,0 +1,259 @@
+"""The stage graph: what will run and why, then running it (SPEC section 9).
+
+A stage's fingerprint covers its kind and version, its full resolved config, the seed, facts about outside files and
+the fingerprints of its inputs. A stage is finished when its folder holds an `artifact.json` with that fingerprint and
+every output it lists. Anything else runs, and whatever stands below it has another fingerprint and runs too.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.table import Table
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.artifact import Artifact, InputStage
+from motionloom.pipeline.files import digest, remove_tree, write_json, write_text
+from motionloom.pipeline.hardware import process_rank
+from motionloom.pipeline.recipe import Recipe, Stage
+from motionloom.pipeline.stage import StageContext, fingerprint_fields
+
+Action = Literal["skip", "run", "resume", "leave"]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which part of the graph to run."""
+
+    first: str | None = None
+    """Run this stage and all below it again."""
+    until: str | None = None
+    """Stop after this stage: only it and what it needs."""
+    only: str | None = None
+    """Just this stage; its inputs must be finished."""
+    force: bool = False
+    """Run the selected stages even if they are finished."""
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """One row of the plan."""
+
+    stage: Stage
+    fingerprint: str
+    action: Action
+    reason: str
+
+
+def stage_folder(run: Path, name: str) -> Path:
+    """Where a stage keeps its files."""
+    return run / "stages" / name
+
+
+def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
+    """Decide for every stage, in order, what happens to it."""
+    select = select or Selection()
+    for name in (select.first, select.until, select.only):
+        if name is not None:
+            recipe.stage(name)
+    wanted = _ancestors(recipe, select.until) if select.until else {s.name for s in recipe.stages}
+    if select.only:
+        wanted = {select.only}
+    forced = _descendants(recipe, select.first) if select.first else set()
+    if select.force:
+        forced |= wanted
+    plan: list[PlannedStage] = []
+    rows: dict[str, PlannedStage] = {}
+    for stage in recipe.stages:
+        fingerprint = _fingerprint(recipe, stage, rows)
+        action, reason = _decide(stage, fingerprint, run, rows, forced, select)
+        if stage.name not in wanted and action != "skip":
+            action, reason = "leave", "not selected"
+        rows[stage.name] = PlannedStage(stage, fingerprint, action, reason)
+        plan.append(rows[stage.name])
+    if select.only:
+        for role, name in recipe.stage(select.only).inputs.items():
+            if rows[name].action != "skip":
+                raise UserError(f"--only {select.only}: its input '{role}' ({name}) is not finished; run it first")
+    return plan
+
+
+def _fingerprint(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> str:
+    external = stage.kind.external(stage.config) if stage.kind.external else None
+    return digest(
+        {
+            "kind": stage.kind.name,
+            "version": stage.kind.version,
+            "seed": recipe.seed,
+            "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
+            "external": external,
+            "inputs": {role: rows[name].fingerprint for role, name in stage.inputs.items()},
+        }
+    )
+
+
+def _decide(
+    stage: Stage, fingerprint: str, run: Path, rows: dict[str, PlannedStage], forced: set[str], select: Selection
+) -> tuple[Action, str]:
+    folder = stage_folder(run, stage.name)
+    artifact = Artifact.find(folder)
+    if stage.name in forced:
+        return "run", "forced" if select.force else f"from {select.first}"
+    if artifact is None:
+        started = folder / "started.json"
+        if started.is_file() and json.loads(started.read_text())["fingerprint"] == fingerprint:
+            return "resume", "started earlier, not finished"
+        return "run", "never run" if not started.is_file() else "settings changed before it finished"
+    if artifact.fingerprint != fingerprint:
+        return "run", _difference(artifact, stage, rows)
+    gone = artifact.missing(folder)
+    if gone:
+        return "run", f"output {gone} is gone or has another size"
+    above = [name for name in stage.inputs.values() if rows[name].action == "run" and name in forced]
+    if above:
+        return "run", f"below {above[0]}"
+    return "skip", "finished"
+
+
+def _difference(artifact: Artifact, stage: Stage, rows: dict[str, PlannedStage]) -> str:
+    if artifact.kind != stage.kind.name or artifact.version != stage.kind.version:
+        return f"{artifact.kind} v{artifact.version} is now {stage.kind.name} v{stage.kind.version}"
+    changes = list(_changed_fields(artifact.config, stage.config.dump()))
+    if changes:
+        more = f" (+{len(changes) - 1} more)" if len(changes) > 1 else ""
+        return f"changed: {changes[0]}{more}"
+    for role, name in stage.inputs.items():
+        old = artifact.inputs.get(role)
+        if old is None or old.fingerprint != rows[name].fingerprint:
+            return f"input {name} changed"
+    return "seed or source files changed"
+
+
+def _changed_fields(old: Any, new: Any, prefix: str = "") -> Iterator[str]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            yield from _changed_fields(old.get(key), new.get(key), f"{prefix}.{key}" if prefix else key)
+    elif old != new:
+        yield f"{prefix} {old} -> {new}"
+
+
+def _ancestors(recipe: Recipe, name: str) -> set[str]:
+    out, todo = set(), [name]
+    while todo:
+        current = todo.pop()
+        out.add(current)
+        todo += list(recipe.stage(current).inputs.values())
+    return out
+
+
+def _descendants(recipe: Recipe, name: str) -> set[str]:
+    out = {name}
+    for stage in recipe.stages:
+        if out & set(stage.inputs.values()):
+            out.add(stage.name)
+    return out
+
+
+def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
+    """The plan as a table for people."""
+    table = Table(title=f"{recipe.name}: {len(plan)} stages", title_justify="left")
+    for column in ("stage", "kind", "action", "why", "from"):
+        table.add_column(column, overflow="fold")
+    colours = {"run": "yellow", "resume": "cyan", "skip": "green", "leave": "dim"}
+    for row in plan:
+        colour = colours[row.action]
+        inputs = ", ".join(dict.fromkeys(row.stage.inputs.values()))
+        table.add_row(row.stage.name, row.stage.kind.name, f"[{colour}]{row.action}[/]", row.reason, inputs)
+    return table
+
+
+def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
+    """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment."""
+    follower = process_rank() > 0
+    ran = []
+    with _lock(run, needed=not follower):
+        if not follower:
+            write_text(run / "recipe.yaml", recipe.to_yaml())
+        for number, row in enumerate(plan, start=1):
+            if row.action in {"skip", "leave"}:
+                continue
+            if follower and not row.stage.kind.trains:
+                _wait_for(run, row)
+                continue
+            console.print(f"[bold]\\[{number}/{len(plan)}] {row.stage.name}[/] ({row.stage.kind.summary})")
+            _run_stage(recipe, run, row, plan, console, follower)
+            ran.append(row.stage.name)
+    return ran
+
+
+def _run_stage(
+    recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[PlannedStage], console: Console, follower: bool
+) -> None:
+    stage, folder = row.stage, stage_folder(run, row.stage.name)
+    if not follower:
+        if row.action == "run":
+            remove_tree(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "started.json", {"fingerprint": row.fingerprint})
+    context = StageContext(
+        name=stage.name,
+        config=stage.config,
+        folder=folder,
+        inputs={role: stage_folder(run, name) for role, name in stage.inputs.items()},
+        seed=recipe.seed,
+        hardware=recipe.hardware,
+        console=console,
+    )
+    begin = time.perf_counter()
+    stage.kind.run(context)
+    if follower:
+        return
+    seconds = time.perf_counter() - begin
+    write_json(folder / "timing.json", {"seconds": round(seconds, 2)})
+    fingerprints = {p.stage.name: p.fingerprint for p in plan}
+    Artifact(
+        stage=stage.name,
+        kind=stage.kind.name,
+        version=stage.kind.version,
+        fingerprint=row.fingerprint,
+        seed=recipe.seed,
+        config=stage.config.dump(),
+        inputs={r: InputStage(stage=n, fingerprint=fingerprints[n]) for r, n in stage.inputs.items()},
+    ).finish(folder)
+    console.print(f"    finished in {seconds:.1f} s")
+
+
+def _wait_for(run: Path, row: PlannedStage) -> None:
+    """Other ranks wait until rank 0 has finished a stage that runs in one process."""
+    folder = stage_folder(run, row.stage.name)
+    while True:
+        artifact = Artifact.find(folder)
+        if artifact is not None and artifact.fingerprint == row.fingerprint:
+            return
+        time.sleep(0.5)
+
+
+@contextmanager
+def _lock(run: Path, needed: bool) -> Iterator[None]:
+    """One writer a run folder; the lock goes with the process, so a kill leaves none behind."""
+    if not needed:
+        yield
+        return
+    run.mkdir(parents=True, exist_ok=True)
+    with (run / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(f"{run}: another motionloom process is working on this run; wait for it or stop it") from None
+        file.write(str(os.getpid()))
+        file.flush()
+        yield

@@ -1,0 +1,62 @@
+"""Trained networks on disk: `model.safetensors` and `model.json` (kind, config, facts needed to build the network)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.files import atomic, write_json
+
+
+class LayoutFacts(Config):
+    """What `MotionLayout.named` needs to give the same layout again."""
+
+    name: str
+    fps: float
+    family: str
+
+    @staticmethod
+    def of(layout: MotionLayout) -> LayoutFacts:
+        """The facts of a layout."""
+        return LayoutFacts(name=layout.name, fps=layout.fps, family=layout.family)
+
+    def layout(self) -> MotionLayout:
+        """The layout again."""
+        return MotionLayout.named(self.name, fps=self.fps, family=self.family)  # type: ignore[arg-type]
+
+
+class ModelFacts(Config):
+    """`model.json`."""
+
+    kind: str
+    config: dict[str, Any]
+    layout: LayoutFacts
+    extra: dict[str, Any] = {}
+
+
+def save_model(folder: Path, net: torch.nn.Module, facts: ModelFacts) -> None:
+    """Write weights and facts; the facts last."""
+    state = {k: v.detach().contiguous().cpu() for k, v in net.state_dict().items()}
+    with atomic(folder / "model.safetensors") as temporary:
+        save_file(state, temporary)
+    write_json(folder / "model.json", facts.dump())
+
+
+def load_facts(folder: Path) -> ModelFacts:
+    """Facts of the network in a folder."""
+    return ModelFacts.load_json(folder / "model.json")
+
+
+def load_weights(folder: Path, net: torch.nn.Module) -> None:
+    """Fill `net`; a file that does not fit is refused by name."""
+    path = folder / "model.safetensors"
+    try:
+        net.load_state_dict(load_file(path))
+    except (FileNotFoundError, SafetensorError, RuntimeError) as error:
+        raise UserError(f"{path}: cannot load these weights ({str(error).splitlines()[0]})") from None

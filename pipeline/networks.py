@@ -1,0 +1,88 @@
+"""Trained networks loaded for use: frozen, in eval mode, with the facts a caller needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from pydantic import TypeAdapter
+from torch import Tensor
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.text.cache import TextCache
+from motionloom.models.gpt import GptConfig, InterleavedGPT
+from motionloom.models.tma import Tma, TmaConfig
+from motionloom.models.tokenizer import Tokenizer, TokenizerConfig, build_tokenizer
+from motionloom.pipeline.model_store import load_facts, load_weights
+
+
+def freeze(net: torch.nn.Module) -> None:
+    """Evaluation mode and no gradients."""
+    net.eval()
+    net.requires_grad_(False)
+
+
+def load_tokenizer(folder: Path) -> Tokenizer:
+    """A trained tokenizer."""
+    facts = load_facts(folder)
+    config = TypeAdapter(TokenizerConfig).validate_python(facts.config)
+    net = build_tokenizer(config, facts.layout.layout())
+    load_weights(folder, net)
+    freeze(net)
+    return net
+
+
+@dataclass(frozen=True)
+class LoadedTma:
+    """A trained alignment model and the columns it reads."""
+
+    net: Tma
+    layout: MotionLayout
+    max_frames: int
+
+    @staticmethod
+    def load(folder: Path) -> LoadedTma:
+        """Read from a tma stage."""
+        facts = load_facts(folder)
+        extra = facts.extra
+        net = Tma(TmaConfig.parse(facts.config, str(folder)), extra["motion_dim"], extra["text_dim"])
+        load_weights(folder, net)
+        freeze(net)
+        return LoadedTma(net, facts.layout.layout(), int(extra["max_frames"]))
+
+    @torch.no_grad()
+    def embed_text(self, tokens: Tensor, mask: Tensor, batch: int = 256) -> Tensor:
+        """Text latents [n, 256] (the means)."""
+        parts = [self.net.encode_text(t, m)[0] for t, m in zip(tokens.split(batch), mask.split(batch), strict=True)]
+        return torch.cat(parts)
+
+    def embed_captions(self, texts: list[str], cache: TextCache) -> Tensor:
+        """Text latents of captions in the cache."""
+        out = []
+        for start in range(0, len(texts), 256):
+            tokens, mask = cache.tokens(texts[start : start + 256])
+            out.append(self.embed_text(torch.as_tensor(tokens), torch.as_tensor(mask)))
+        return torch.cat(out)
+
+    @torch.no_grad()
+    def embed_motion(self, motion: Tensor, length: Tensor) -> Tensor:
+        """Motion latents [B, 256] of normalised body-hand features [B, T, D]."""
+        return self.net.encode_motion(motion, length)[0]
+
+
+def load_gpt(folder: Path, tokenizer: Tokenizer) -> tuple[InterleavedGPT, str]:
+    """A trained GPT and the kind of text prior it was trained on ("tma" or "sentence")."""
+    facts = load_facts(folder)
+    expected = {s.name: s.num_codes for s in tokenizer.streams}
+    if facts.extra["streams"] != expected or tuple(facts.extra["pattern"]) != tuple(tokenizer.pattern):
+        raise UserError(
+            f"{folder}: this GPT was trained on streams {facts.extra['streams']}, the tokenizer has {expected}; "
+            f"train it again on this tokenizer"
+        )
+    config = GptConfig.parse(facts.config, str(folder))
+    net = InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, facts.extra["text_dim"])
+    load_weights(folder, net)
+    freeze(net)
+    return net, str(facts.extra["prior"])

@@ -1,0 +1,217 @@
+"""Recipes: one YAML file that says which stages run, with which settings.
+
+    name: humantomato-tiny
+    seed: 7
+    stages:
+      data: {kind: synth, clips: 512}
+      stats: {kind: stats}
+      tokenizer: {kind: h2vq, net: {width: 128}, train: {steps: 600}}
+
+A stage's inputs are found by role: a stage that needs `data` takes the stage called `data` unless its `inputs:` names
+another. `extends:` starts from another recipe file beside this one. `--set stage.field=value` overrides one value.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import Field
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.hardware import Hardware
+from motionloom.pipeline.stage import StageConfig, StageKind
+from motionloom.pipeline.stages.table import STAGES
+
+
+class RecipeFile(Config):
+    """The YAML form; stage entries are checked against the config class of their kind afterwards."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    description: str = ""
+    seed: int = Field(0, ge=0)
+    hardware: Hardware = Hardware()
+    stages: dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a resolved recipe. `inputs` maps role to stage name."""
+
+    name: str
+    kind: StageKind
+    config: StageConfig
+    inputs: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A checked recipe: every default filled in, every name valid, stages in an order that can run."""
+
+    name: str
+    description: str
+    seed: int
+    hardware: Hardware
+    stages: tuple[Stage, ...]
+
+    def stage(self, name: str) -> Stage:
+        """A stage by name, or an error with the nearest one."""
+        for stage in self.stages:
+            if stage.name == name:
+                return stage
+        raise UserError(f"recipe {self.name} has no stage '{name}'{nearest(name, [s.name for s in self.stages])}")
+
+    def to_yaml(self) -> str:
+        """The resolved recipe; reading it again gives an equal recipe."""
+        stages: dict[str, Any] = {}
+        for stage in self.stages:
+            entry: dict[str, Any] = {"kind": stage.kind.name, **stage.config.dump()}
+            renamed = {role: name for role, name in stage.inputs.items() if role != name}
+            stages[stage.name] = {**entry, "inputs": renamed} if renamed else entry
+        data = {
+            "name": self.name,
+            "description": self.description,
+            "seed": self.seed,
+            "hardware": self.hardware.dump(),
+            "stages": stages,
+        }
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+
+
+def nearest(name: str, valid: Sequence[str]) -> str:
+    """"; did you mean 'x'?" or the list of valid names."""
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    return f"; did you mean '{near[0]}'?" if near else f"; valid names: {', '.join(valid)}"
+
+
+def shipped_recipes() -> dict[str, Path]:
+    """Recipes that come with the package, by name."""
+    folder = Path(str(resources.files("motionloom.configs")))
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def find_recipe(name_or_path: str) -> Path:
+    """A recipe file by path, or a shipped recipe by name."""
+    path = Path(name_or_path)
+    if path.suffix in {".yaml", ".yml"}:
+        if not path.is_file():
+            raise UserError(f"{path}: no such recipe file")
+        return path
+    shipped = shipped_recipes()
+    if name_or_path not in shipped:
+        raise UserError(f"no recipe '{name_or_path}'{nearest(name_or_path, list(shipped))} (or give a .yaml file)")
+    return shipped[name_or_path]
+
+
+def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
+    """Read, extend, override and check a recipe."""
+    path = find_recipe(str(name_or_path))
+    data = _read(path, depth=0)
+    for override in overrides:
+        _apply(data, override)
+    file = RecipeFile.parse(data, str(path))
+    return Recipe(file.name, file.description, file.seed, file.hardware, _stages(file, str(path)))
+
+
+def _read(path: Path, depth: int) -> dict[str, Any]:
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not valid YAML: {error}") from None
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: a recipe is a mapping with 'name' and 'stages'")
+    base = data.pop("extends", None)
+    if base is None:
+        return data
+    if depth > 4:
+        raise UserError(f"{path}: 'extends' goes in a circle or more than four files deep")
+    beside = path.parent / f"{base}.yaml"
+    return _merge(_read(beside if beside.is_file() else find_recipe(str(base)), depth + 1), data)
+
+
+def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in change.items():
+        old = out.get(key)
+        out[key] = _merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return out
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise UserError(f"--set {override}: write it as stage.field=value")
+    if parts[0] not in {"seed", "name", "hardware", "description", "stages"}:
+        stages = data.get("stages") or {}
+        if parts[0] not in stages:
+            raise UserError(f"--set {override}: no stage '{parts[0]}'{nearest(parts[0], list(stages))}")
+        parts = ["stages", *parts]
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise UserError(f"--set {override}: {error}") from None
+    node = data
+    for part in parts[:-1]:
+        child = node.get(part)
+        node[part] = dict(child) if isinstance(child, dict) else {}
+        node = node[part]
+    # YAML 1.1 reads 1e-4 (no dot) as text; a number is what the user meant.
+    node[parts[-1]] = _number(value)
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            return value
+    return value
+
+
+def _stages(file: RecipeFile, where: str) -> tuple[Stage, ...]:
+    out: list[Stage] = []
+    for name, entry in file.stages.items():
+        fields = dict(entry)
+        kind_name = fields.pop("kind", None)
+        renamed = fields.pop("inputs", None) or {}
+        if kind_name not in STAGES:
+            hint = nearest(str(kind_name), list(STAGES))
+            raise UserError(f"{where}: stages.{name}.kind = '{kind_name}' is no stage kind{hint}")
+        kind = STAGES[kind_name]
+        config = kind.config.parse(_numbers(fields), f"{where}: stages.{name}")
+        out.append(Stage(name, kind, config, _resolve(name, kind, renamed, [s.name for s in out], where)))
+    return tuple(out)
+
+
+def _numbers(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _numbers(v) for k, v in value.items()}
+    # Only texts that look like 1e-4: other texts (a folder called "7") stay texts.
+    if isinstance(value, str) and value[:1].isdigit() and "e" in value:
+        return _number(value)
+    return value
+
+
+def _resolve(name: str, kind: StageKind, renamed: Any, before: list[str], where: str) -> dict[str, str]:
+    roles = {role.removesuffix("?"): role.endswith("?") for role in kind.inputs}
+    if not isinstance(renamed, dict):
+        raise UserError(f"{where}: stages.{name}.inputs must map roles to stages, like {{data: other_data}}")
+    for role in renamed:
+        if role not in roles:
+            raise UserError(f"{where}: stages.{name}.inputs: unknown role '{role}'{nearest(role, list(roles))}")
+    inputs = {}
+    for role, optional in roles.items():
+        source = renamed.get(role, role)
+        if source in before:
+            inputs[role] = source
+        elif role in renamed or not optional:
+            raise UserError(
+                f"{where}: stage '{name}' needs a stage '{source}' (role '{role}') before it{nearest(source, before)}"
+            )
+    return inputs

@@ -1,0 +1,1 @@
+"""Pictures, video and the self-contained viewer."""

@@ -1,0 +1,214 @@
+/* The viewer itself: cells, one shared camera, one shared clock, controls. */
+
+const VIEWS = { "3/4": [0.62, 0.2], front: [0, 0.08], side: [Math.PI / 2, 0.08], top: [0.62, 1.35] };
+const SPEEDS = [0.1, 0.25, 0.5, 1, 1.5, 2];
+const KEYS = "Space plays · ←/→ step a frame · Home/End ends · +/− zoom · Shift+arrows turn · 1–4 views · C close-up · F follow · L loop · R reset";
+
+function element(tag, properties, ...children) {
+  const node = document.createElement(tag);
+  for (const [key, value] of Object.entries(properties || {})) {
+    if (key in node && key !== "list") node[key] = value; else node.setAttribute(key, value);
+  }
+  node.append(...children);
+  return node;
+}
+
+function readTheme(root) {
+  const style = getComputedStyle(root);
+  const value = (name) => style.getPropertyValue(`--mlv-${name}`).trim();
+  const ramp = (name) => toneRamp(value(name), value("fog"), Number(value("fog-strength")));
+  return {
+    tones: { 0: ramp("centre"), 1: ramp("left"), 2: ramp("right"), head: ramp("skin"), hair: ramp("hair")[2] },
+    grid: value("grid"), floorNear: value("floor-near"), floorFar: value("floor-far"), trail: value("trail"),
+    shadow: value("shadow"), shadowClear: value("shadow-clear"), eyeWhite: value("eye-white"), feature: value("feature"),
+    brow: value("hair"), mouth: value("mouth"), lip: value("lip"), nose: value("nose"),
+  };
+}
+
+function mountViewer(root, data, options) {
+  const page = Boolean(options && options.page);
+  const clips = data.motions.map((raw) => openClip(raw, data.figures[raw.figure], data.faceStep));
+  const duration = Math.max(...clips.map((c) => c.duration));
+  const rate = Math.max(...clips.map((c) => c.fps));
+  const last = Math.round(duration * rate);
+  const calm = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const state = { time: 0, playing: !calm, speed: 1, follow: true, loop: false, draws: 0, close: false };
+  const camera = { yaw: 0, pitch: 0, zoom: 1, panX: 0, panY: 0 };
+  let theme, stale = true, dragging = 0;
+  const refresh = () => { stale = true; };
+
+  // ---- page furniture
+  if (page) {
+    root.append(element("header", { className: "mlv-header" },
+      element("h1", { textContent: data.title }), ...(data.note ? [element("p", { textContent: data.note })] : [])));
+  }
+  const { board, cells } = buildCells(clips);
+  root.append(board);
+  const bar = buildBar(root, last, duration);
+  root.classList.toggle("mlv-single", clips.length === 1);
+  const button = (name, act) => bar[name].addEventListener("click", act);
+
+  // ---- clock
+  const localFrame = (clip) => {
+    if (clip.frames < 2) return 0;
+    const t = state.loop ? state.time % (clip.duration + 1 / clip.fps) : state.time;
+    return clamp(t * clip.fps, 0, clip.frames - 1);
+  };
+  const frame = () => clamp(Math.round(state.time * rate), 0, last);
+  const play = (on) => {
+    if (on && state.time >= duration) state.time = 0;
+    state.playing = on;
+    bar.play.textContent = on ? "❚❚" : "▶";
+    bar.play.setAttribute("aria-label", on ? "Pause" : "Play");
+    bar.play.title = on ? "Pause (space)" : "Play (space)";
+    refresh();
+  };
+  const setFrame = (k) => { state.time = clamp(k, 0, last) / rate; refresh(); };
+  const step = (by) => { play(false); setFrame(frame() + by); };
+
+  // ---- camera
+  const setView = (name) => {
+    [camera.yaw, camera.pitch] = VIEWS[name];
+    camera.zoom = 1; camera.panX = camera.panY = 0; state.close = false;
+    refresh();
+  };
+  const toggle = (name, key) => {
+    state[key] = !state[key];
+    bar[name].setAttribute("aria-pressed", String(state[key]));
+    refresh();
+  };
+  const zoom = (factor) => { camera.zoom = clamp(camera.zoom * factor, 0.25, 12); refresh(); };
+  const turn = (dx, dy) => {
+    camera.yaw -= dx * 0.008;
+    camera.pitch = clamp(camera.pitch + dy * 0.008, -0.1, 1.5);
+    refresh();
+  };
+  const pan = (dx, dy, height) => { camera.panX -= (dx / height) / camera.zoom; camera.panY += (dy / height) / camera.zoom; refresh(); };
+
+  const lensOf = (cell, width, height) => {
+    const { clip, room } = cell, local = localFrame(clip);
+    const [x, z] = state.follow || state.close ? pathAt(clip, local) : clip.frame.middle;
+    let distance = fitDistance(room.height, state.follow ? room.radius : room.radius + room.travel, width, height);
+    const target = [x, clip.floor + room.height * 0.48, z];
+    if (state.close && clip.figure.head) {
+      const nodes = nodesAt(clip, clip.figure, local);
+      headPose(nodes, clip.figure.head, clip.scale).centre.forEach((v, k) => { target[k] = v; });
+      distance = 1.35 * clip.scale;
+    }
+    distance /= camera.zoom;
+    const span = 2 * distance * Math.tan(FIELD_OF_VIEW / 2) * camera.zoom;
+    const right = [Math.cos(camera.yaw), 0, -Math.sin(camera.yaw)];
+    for (const k of [0, 2]) target[k] += right[k] * camera.panX * span;
+    target[1] += camera.panY * span;
+    return makeLens(target, camera.yaw, camera.pitch, distance, width, height);
+  };
+
+  // ---- drawing
+  const paint = (cell) => {
+    const { canvas, clip } = cell, ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const width = canvas.clientWidth, height = canvas.clientHeight;
+    if (!width || !height) return;
+    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+      canvas.width = Math.round(width * ratio);
+      canvas.height = Math.round(height * ratio);
+    }
+    const ctx = cell.ctx, local = localFrame(clip);
+    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+    ctx.clearRect(0, 0, width, height);
+    const lens = lensOf(cell, width, height), nodes = nodesAt(clip, clip.figure, local);
+    const centre = state.follow ? pathAt(clip, local) : clip.frame.middle;
+    drawGround(ctx, lens, centre, clip.floor, theme);
+    drawTrail(ctx, lens, clip, local, theme);
+    drawShadow(ctx, lens, clip, nodes, clip.figure, theme);
+    drawFigure(ctx, lens, clip, clip.figure, nodes, faceAt(clip, local, data.faceNeutral), theme);
+    const own = Math.round(local), over = !state.loop && state.time > clip.duration + 0.5 / clip.fps;
+    cell.count.textContent = `${own + 1} / ${clip.frames}${over ? " · ended" : ""}`;
+  };
+  let before = 0;
+  const tick = (now) => {
+    const passed = Math.min((now - before) / 1000, 0.1);
+    before = now;
+    if (state.playing && !dragging && duration > 0) {
+      state.time += passed * state.speed;
+      if (state.time > duration + 0.35) state.time = 0; // a short rest on the last frame before the next round
+      stale = true;
+    }
+    if (stale) {
+      stale = false;
+      for (const cell of cells) if (cell.visible) paint(cell);
+      const shown = Math.min(state.time, duration);
+      bar.scrub.value = frame();
+      bar.scrub.setAttribute("aria-valuetext", `${shown.toFixed(2)} seconds`);
+      bar.time.textContent = `${shown.toFixed(2)} / ${duration.toFixed(2)} s`;
+      state.draws += 1;
+    }
+    requestAnimationFrame(tick);
+  };
+
+  // ---- events
+  button("play", () => play(!state.playing));
+  button("back", () => step(-1));
+  button("forth", () => step(1));
+  button("follow", () => toggle("follow", "follow"));
+  button("loop", () => toggle("loop", "loop"));
+  button("close", () => toggle("close", "close"));
+  button("theme", () => {
+    const dark = getComputedStyle(root).colorScheme === "dark";
+    document.documentElement.dataset.theme = dark ? "light" : "dark";
+  });
+  bar.speed.addEventListener("change", () => { state.speed = Number(bar.speed.value); });
+  bar.scrub.addEventListener("input", () => { play(false); setFrame(Number(bar.scrub.value)); });
+  for (const name of Object.keys(VIEWS)) {
+    button(`view ${name}`, () => { setView(name); bar.close.setAttribute("aria-pressed", "false"); });
+  }
+  const actions = {
+    " ": () => play(!state.playing), ArrowLeft: () => step(-1), ArrowRight: () => step(1),
+    Home: () => setFrame(0), End: () => { play(false); setFrame(last); }, "+": () => zoom(1.15), "=": () => zoom(1.15),
+    "-": () => zoom(1 / 1.15), f: () => bar.follow.click(), l: () => bar.loop.click(), c: () => bar.close.click(),
+    r: () => bar["view 3/4"].click(), t: () => bar.theme.click(),
+  };
+  Object.keys(VIEWS).forEach((name, k) => { actions[k + 1] = () => bar[`view ${name}`].click(); });
+  const turns = { ArrowLeft: [12, 0], ArrowRight: [-12, 0], ArrowUp: [0, 12], ArrowDown: [0, -12] };
+  (page ? document : root).addEventListener("keydown", (event) => {
+    const target = event.target;
+    if (event.ctrlKey || event.metaKey || event.altKey || target.tagName === "SELECT") return;
+    if (target.tagName === "BUTTON" && event.key === " ") return;
+    const act = event.shiftKey && turns[event.key] ? () => turn(...turns[event.key]) : actions[event.key];
+    if (!act || (event.shiftKey && !turns[event.key] && event.key !== "+")) return;
+    act();
+    event.preventDefault();
+  });
+  const wheelAllowed = () => page || root.contains(document.activeElement);
+  for (const cell of cells) {
+    watchPointer(cell.canvas, { turn, pan, zoom, wheelAllowed, reset: () => bar["view 3/4"].click() });
+  }
+  bar.scrub.addEventListener("pointerdown", () => { dragging += 1; });
+  window.addEventListener("pointerup", () => { dragging = 0; });
+
+  const rethemed = () => { theme = readTheme(root); refresh(); };
+  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", rethemed);
+  new MutationObserver(rethemed).observe(document.documentElement, { attributes: true, attributeFilter: ["data-theme"] });
+  const sizes = new ResizeObserver(refresh);
+  const sight = new IntersectionObserver((entries) => {
+    for (const entry of entries) cells.find((c) => c.canvas === entry.target).visible = entry.isIntersecting;
+    refresh();
+  }, { rootMargin: "80px" });
+  for (const cell of cells) { sizes.observe(cell.canvas); sight.observe(cell.canvas); }
+
+  setView("3/4");
+  play(state.playing);
+  rethemed();
+  requestAnimationFrame(tick);
+
+  const handle = {
+    get frame() { return frame(); }, get time() { return state.time; }, get playing() { return state.playing; },
+    get draws() { return state.draws; }, get frames() { return last + 1; }, get camera() { return { ...camera }; },
+    get follow() { return state.follow; }, get loop() { return state.loop; },
+    play, setFrame, setView, zoom, turn, toggle: (name) => toggle(name, name),
+    setSpeed(value) { state.speed = value; },
+  };
+  window.__viewers = window.__viewers || [];
+  window.__viewers.push(handle);
+  window.__viewer = window.__viewers[0];
+  return handle;
+}

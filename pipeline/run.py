@@ -1,0 +1,142 @@
+"""The Python API behind the commands: run a recipe, generate, evaluate, report, export."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.bundle import Bundle, BundleFile, SamplingConfig, part_folders, text_encoder_of
+from motionloom.pipeline.files import write_json
+from motionloom.pipeline.graph import Selection, execute, make_plan, plan_table, stage_folder
+from motionloom.pipeline.model_store import LayoutFacts
+from motionloom.pipeline.outputs import Format, write_motions
+from motionloom.pipeline.recipe import Recipe, load_recipe, nearest
+from motionloom.pipeline.stage import StageContext
+
+
+def run_recipe(
+    recipe: str | Path,
+    out: Path | None = None,
+    *,
+    overrides: Sequence[str] = (),
+    select: Selection | None = None,
+    dry_run: bool = False,
+    console: Console,
+) -> Path:
+    """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed."""
+    loaded = load_recipe(recipe, overrides)
+    run = out or Path("runs") / loaded.name
+    plan = make_plan(loaded, run, select)
+    todo = [row for row in plan if row.action in {"run", "resume"}]
+    if dry_run:
+        console.print(plan_table(loaded, plan))
+        console.print(f"{len(todo)} of {len(plan)} stages would run in {run}")
+        return run
+    if not todo:
+        console.print(f"{run}: all {len(plan)} stages are finished, nothing to do")
+    else:
+        console.print(f"{loaded.name} in {run}: {len(todo)} of {len(plan)} stages to run on {loaded.hardware.describe()}")
+        execute(loaded, run, plan, console)
+    for row in plan:
+        page = stage_folder(run, row.stage.name) / "report.html"
+        if row.stage.kind.name == "report" and page.is_file():
+            console.print(f"watch it: {page.resolve()}", soft_wrap=True)
+    return run
+
+
+def generate_motions(
+    folder: Path,
+    captions: Sequence[str],
+    *,
+    face_captions: Sequence[str] | None = None,
+    out: Path,
+    formats: str = "npz,bvh,mp4,html",
+    seconds: float | None = None,
+    seed: int = 0,
+    sampling: dict[str, Any] | None = None,
+    console: Console,
+) -> list[Path]:
+    """Generate and write; returns the paths."""
+    if not captions:
+        raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
+    wanted = [f.strip() for f in formats.split(",") if f.strip()]
+    for name in wanted:
+        if name not in get_args(Format):
+            raise UserError(f"--format {name}: no such format{nearest(name, get_args(Format))}")
+    bundle = Bundle.open(folder)
+    motions = bundle.generate(
+        captions,
+        face_captions=face_captions,
+        seconds=seconds,
+        seed=seed,
+        sampling=SamplingConfig.parse(sampling or {}, "sampling"),
+    )
+    paths = write_motions(out, motions, wanted, title=folder.name, seed=seed)  # type: ignore[arg-type]
+    for path in paths:
+        console.print(str(path), soft_wrap=True)
+    return paths
+
+
+def _stage_again(folder: Path, kind: str, console: Console, changes: dict[str, Any]) -> Path:
+    """Run one evaluating stage of a finished run again, into the run folder itself."""
+    recipe = _recipe_of(folder)
+    stage = next((s for s in recipe.stages if s.kind.name == kind), None)
+    if stage is None:
+        raise UserError(f"{folder}: its recipe has no {kind} stage; add one and run it again")
+    config = stage.config.model_copy(update={k: v for k, v in changes.items() if v is not None})
+    inputs = {role: stage_folder(folder, name) for role, name in stage.inputs.items()}
+    for role, path in inputs.items():
+        if not (path / "artifact.json").is_file():
+            raise UserError(f"{folder}: stage '{path.name}' (role {role}) is not finished; run the recipe first")
+    target = folder / kind
+    target.mkdir(exist_ok=True)
+    stage.kind.run(StageContext(stage.name, config, target, inputs, recipe.seed, recipe.hardware, console))
+    return target
+
+
+def evaluate_run(folder: Path, *, clips: int | None = None, repeats: int | None = None, console: Console) -> Path:
+    """Figures of a finished run; writes RUN/evaluate/metrics.json."""
+    return _stage_again(folder, "evaluate", console, {"clips": clips, "repeats": repeats}) / "metrics.json"
+
+
+def report_run(folder: Path, out: Path | None, *, console: Console) -> Path:
+    """The page of a finished run; returns its path."""
+    page = _stage_again(folder, "report", console, {}) / "report.html"
+    if out is not None:
+        shutil.copyfile(page, out)
+        page = out
+    console.print(str(page.resolve()), soft_wrap=True)
+    return page
+
+
+def export_run(folder: Path, out: Path, *, console: Console) -> Path:
+    """Copy what generation needs into one folder."""
+    if out.exists() and any(out.iterdir()):
+        raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
+    parts = part_folders(folder)
+    bundle = Bundle.from_run(folder)
+    for role, source in parts.items():
+        if role == "text":
+            continue
+        (out / role).mkdir(parents=True, exist_ok=True)
+        for name in ("model.safetensors", "model.json", "stats.safetensors"):
+            if (source / name).is_file():
+                shutil.copyfile(source / name, out / role / name)
+    facts = BundleFile(layout=LayoutFacts.of(bundle.layout), text_encoder=text_encoder_of(parts["text"]))
+    write_json(out / "bundle.json", facts.dump())
+    size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
+    console.print(f"{out}: {size:.1f} MiB; use it: motionloom generate {out} \"a person waves\"", soft_wrap=True)
+    return out
+
+
+def _recipe_of(folder: Path) -> Recipe:
+    path = folder / "recipe.yaml"
+    if not path.is_file():
+        raise UserError(f"{folder}: not a run folder (no recipe.yaml)")
+    return replace(load_recipe(path))

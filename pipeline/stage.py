@@ -1,0 +1,69 @@
+"""What a stage is: a kind (config class, input roles, a function) and the context its function gets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from rich.console import Console
+
+from motionloom.datasets.schema import Config
+from motionloom.pipeline.hardware import Hardware
+
+RUNTIME = {"runtime": True}
+"""`Field(json_schema_extra=RUNTIME)`: the field changes how a stage runs, not what it makes; not fingerprinted."""
+
+
+class StageConfig(Config):
+    """Base of every stage's config."""
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """All that a stage's function may use. `inputs` maps each role to the folder of a finished stage."""
+
+    name: str
+    config: Any
+    folder: Path
+    inputs: Mapping[str, Path]
+    seed: int
+    hardware: Hardware
+    console: Console
+
+    def input(self, role: str) -> Path:
+        """Folder of a required input."""
+        return self.inputs[role]
+
+    def optional(self, role: str) -> Path | None:
+        """Folder of an input the recipe may leave out."""
+        return self.inputs.get(role)
+
+
+@dataclass(frozen=True)
+class StageKind:
+    """One line of the stage table. A role that ends in "?" is used when the recipe has it."""
+
+    name: str
+    summary: str
+    config: type[StageConfig]
+    run: Callable[[StageContext], None]
+    inputs: tuple[str, ...] = ()
+    version: int = 1
+    trains: bool = False
+    external: Callable[[Any], Any] | None = None
+    """Facts about files outside the run (names, sizes, checksums) that belong to the fingerprint."""
+
+
+def fingerprint_fields(config: BaseModel) -> dict[str, Any]:
+    """The config as plain data without the fields marked RUNTIME."""
+    out: dict[str, Any] = {}
+    for name, field in type(config).model_fields.items():
+        extra = field.json_schema_extra
+        if isinstance(extra, dict) and extra.get("runtime"):
+            continue
+        value = getattr(config, name)
+        out[name] = fingerprint_fields(value) if isinstance(value, BaseModel) else value
+    return out

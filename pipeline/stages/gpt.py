@@ -1,0 +1,109 @@
+"""GPT stages: Hierarchical-GPT over body and hand tokens, and the face GPT (HumanTOMATO sections 3.3-3.6)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.text.cache import TextCache
+from motionloom.models.gpt import GptConfig, GptLossConfig, InterleavedGPT
+from motionloom.models.gpt.module import GptModule
+from motionloom.models.gpt.tokens import TokenPattern
+from motionloom.models.stage_module import OptimConfig
+from motionloom.models.tokenizer import Tokenizer
+from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
+from motionloom.pipeline.networks import LoadedTma, load_tokenizer
+from motionloom.pipeline.sources import captions_of, held_out, open_split, open_text
+from motionloom.pipeline.stage import StageConfig, StageContext
+from motionloom.pipeline.token_store import TokenBatches, TokenStore
+from motionloom.pipeline.training import TrainConfig, fit
+
+Prior = Literal["tma", "sentence"]
+
+
+class GptStageConfig(StageConfig):
+    """A GPT over the tokens of one tokenizer."""
+
+    net: GptConfig = GptConfig()
+    loss: GptLossConfig = GptLossConfig()
+    optim: OptimConfig = OptimConfig()
+    train: TrainConfig = TrainConfig(steps=300_000, batch_size=256)
+    prior: Prior = "tma"
+    """First input of the GPT: the TMA text latent (section 3.5) or the plain sentence embedding."""
+    face: bool = False
+    """Train on the face captions."""
+
+
+def run_gpt(context: StageContext) -> None:
+    """Train on exported tokens."""
+    config: GptStageConfig = context.config
+    tokenizer = load_tokenizer(context.input("tokenizer"))
+    tma_folder = context.optional("tma")
+    if (config.prior == "tma" or config.loss.align_weight > 0) and tma_folder is None:
+        raise UserError(f"stage {context.name}: prior 'tma' and align_weight > 0 need a tma stage before it")
+    tma = LoadedTma.load(tma_folder) if tma_folder is not None else None
+    pattern = TokenPattern(tokenizer.streams, tokenizer.pattern)
+    text = open_text(context.input("text"))
+    text_dim = tma.net.config.latent if config.prior == "tma" and tma else text.dim
+    torch.manual_seed(context.seed)
+    net = InterleavedGPT(config.net, tokenizer.streams, tokenizer.pattern, text_dim)
+    align = tma is not None and config.loss.align_weight > 0
+    module = GptModule(
+        net,
+        config.optim,
+        seed=context.seed,
+        max_steps=config.train.steps,
+        loss=config.loss,
+        tokenizer=tokenizer if align else None,
+        tma=tma.net if align and tma else None,
+    )
+    data = context.input("data")
+
+    def batches(split: str, batch: int, rank: int, world: int, training: bool) -> TokenBatches:
+        dataset = open_split(data, split)
+        store = TokenStore.load(
+            context.input("tokens") / f"tokens-{split}.safetensors", {s.name: s.per_group for s in tokenizer.streams}
+        )
+        captions, prior, sentences = priors(dataset, text, tma if config.prior == "tma" else None, face=config.face)
+        max_groups = pattern.groups_within(config.net.block_size - 1)
+        return TokenBatches(
+            store, captions, prior, sentences, pattern, max_groups, batch, context.seed, rank, world, training
+        )
+
+    def train(batch: int, rank: int, world: int) -> Dataset[Any]:
+        return batches("train", batch, rank, world, training=True)
+
+    validation = batches(held_out(data), 64, 0, 1, training=False)
+    fit(context, module, config.train, train, validation, config.optim.grad_clip)
+    if module.global_rank == 0:
+        extra = {
+            "text_dim": text_dim,
+            "prior": config.prior,
+            "streams": {s.name: s.num_codes for s in tokenizer.streams},
+            "pattern": list(tokenizer.pattern),
+        }
+        layout = open_split(data, "train").layout
+        facts = ModelFacts(kind="gpt", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra)
+        save_model(context.folder, net, facts)
+
+
+def priors(
+    dataset: ShardDataset, text: TextCache, tma: LoadedTma | None, *, face: bool
+) -> tuple[list[list[int]], Tensor, Tensor]:
+    """Captions of each clip as rows of one table of text embeddings [n, E] and of sentence embeddings [n, S]."""
+    names: dict[str, int] = {}
+    captions = []
+    for index in range(len(dataset)):
+        found = [c.text for c in captions_of(dataset, index, face=face)]
+        if not found:
+            raise UserError(f"clip {dataset.ids[index]}: no {'face ' if face else ''}caption to train a GPT on")
+        captions.append([names.setdefault(caption, len(names)) for caption in found])
+    ordered = list(names)
+    sentences = torch.as_tensor(text.sentence(ordered))
+    return captions, tma.embed_captions(ordered, text) if tma else sentences, sentences

@@ -1,0 +1,66 @@
+"""Text-motion alignment stage (HumanTOMATO section 3.5, appendix D)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pydantic import Field
+from torch.utils.data import Dataset
+
+from motionloom.datasets.shards.batches import CaptionBatches, eval_captions
+from motionloom.models.stage_module import OptimConfig
+from motionloom.models.tma import Tma, TmaConfig, TmaLossConfig
+from motionloom.models.tma.module import TmaModule
+from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
+from motionloom.pipeline.sources import held_out, open_split, open_stats, open_text
+from motionloom.pipeline.stage import StageConfig, StageContext
+from motionloom.pipeline.training import TrainConfig, fit
+
+
+class TmaStageConfig(StageConfig):
+    """Motion and text encoders in one latent space."""
+
+    net: TmaConfig = TmaConfig()
+    loss: TmaLossConfig = TmaLossConfig()
+    optim: OptimConfig = OptimConfig()
+    train: TrainConfig = TrainConfig(steps=50_000, batch_size=256)
+    max_frames: int = Field(196, ge=8)
+    """Longer clips are cropped at random."""
+    min_frames: int = Field(16, ge=1)
+    """Shorter clips are left out."""
+
+
+def run_tma(context: StageContext) -> None:
+    """Train the alignment model on whole clips and their captions."""
+    config = context.config
+    data, stats, text = context.input("data"), open_stats(context.input("stats")), open_text(context.input("text"))
+    dataset = open_split(data, "train")
+    columns = dataset.layout.part("bodyhand")
+    torch.manual_seed(context.seed)
+    net = Tma(config.net, motion_dim=len(columns), text_dim=text.dim)
+    module = TmaModule(net, config.optim, seed=context.seed, max_steps=config.train.steps, loss=config.loss)
+
+    def train(batch: int, rank: int, world: int) -> Dataset[Any]:
+        return CaptionBatches(
+            dataset,
+            stats,
+            text,
+            batch_size=batch,
+            max_frames=config.max_frames,
+            min_frames=config.min_frames,
+            seed=context.seed,
+            rank=rank,
+            world=world,
+            columns=columns,
+        )
+
+    held = open_split(data, held_out(data))
+    validation = eval_captions(
+        held, stats, text, batch_size=32, max_frames=config.max_frames, min_frames=config.min_frames, columns=columns
+    )
+    fit(context, module, config.train, train, validation, config.optim.grad_clip)
+    if module.global_rank == 0:
+        extra = {"motion_dim": len(columns), "text_dim": text.dim, "max_frames": config.max_frames}
+        facts = ModelFacts(kind="tma", config=config.net.dump(), layout=LayoutFacts.of(dataset.layout), extra=extra)
+        save_model(context.folder, net, facts)

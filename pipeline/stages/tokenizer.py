@@ -1,0 +1,78 @@
+"""Tokenizer stages: H2VQ, vanilla VQ, RVQ; body-hand, body only or face (HumanTOMATO section 3.2, appendix B.2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pydantic import Field
+from torch.utils.data import Dataset
+
+from motionloom.datasets.shards.batches import WindowBatches, eval_windows
+from motionloom.models.stage_module import OptimConfig
+from motionloom.models.tokenizer import H2VQConfig, RvqConfig, VqConfig, build_tokenizer
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
+from motionloom.pipeline.sources import held_out, open_split, open_stats
+from motionloom.pipeline.stage import StageConfig, StageContext
+from motionloom.pipeline.training import TrainConfig, fit
+
+
+class _TokenizerStageConfig(StageConfig):
+    optim: OptimConfig = OptimConfig()
+    train: TrainConfig = TrainConfig(steps=100_000, batch_size=256)
+    window: int = Field(64, ge=4, multiple_of=4)
+    """Frames of a training window."""
+    windows_per_clip: int = Field(1, ge=1)
+    """Windows cut from one read of a clip."""
+
+
+class H2VQStageConfig(_TokenizerStageConfig):
+    """Body and hand codebooks with their hierarchy."""
+
+    net: H2VQConfig = H2VQConfig()
+
+
+class VqStageConfig(_TokenizerStageConfig):
+    """One codebook."""
+
+    net: VqConfig = VqConfig()
+
+
+class RvqStageConfig(_TokenizerStageConfig):
+    """Residual codebooks (body-only data, face)."""
+
+    net: RvqConfig = RvqConfig()
+
+
+def run_tokenizer(context: StageContext) -> None:
+    """Train a tokenizer on windows of the training split."""
+    config = context.config
+    data, stats = context.input("data"), open_stats(context.input("stats"))
+    dataset = open_split(data, "train")
+    torch.manual_seed(context.seed)
+    net = build_tokenizer(config.net, dataset.layout)
+    module = TokenizerModule(
+        net, config.optim, seed=context.seed, max_steps=config.train.steps, **config.net.loss_terms()
+    )
+    columns = net.columns.numpy()
+
+    def train(batch: int, rank: int, world: int) -> Dataset[Any]:
+        return WindowBatches(
+            dataset,
+            stats,
+            window=config.window,
+            batch_size=batch,
+            windows_per_clip=config.windows_per_clip,
+            seed=context.seed,
+            rank=rank,
+            world=world,
+            columns=columns,
+        )
+
+    held = open_split(data, held_out(data))
+    validation = eval_windows(held, stats, window=config.window, batch_size=64, columns=columns)
+    fit(context, module, config.train, train, validation, config.optim.grad_clip)
+    if module.global_rank == 0:
+        facts = ModelFacts(kind=config.net.kind, config=config.net.dump(), layout=LayoutFacts.of(dataset.layout))
+        save_model(context.folder, net, facts)

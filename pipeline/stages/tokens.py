@@ -1,0 +1,94 @@
+"""Token export: every clip of every split through the trained tokenizer, once."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.statistics import FeatureStats
+from motionloom.models.tokenizer import Tokenizer
+from motionloom.pipeline.networks import load_tokenizer
+from motionloom.pipeline.progress import bar
+from motionloom.pipeline.sources import open_split, open_stats, splits_of
+from motionloom.pipeline.stage import StageConfig, StageContext
+from motionloom.pipeline.token_store import TokenStore
+
+
+class TokensConfig(StageConfig):
+    """How clips are encoded."""
+
+    batch_frames: int = Field(16384, ge=64)
+    """Frames (padding included) in one encoder call."""
+
+
+def run_tokens(context: StageContext) -> None:
+    """Write `tokens-SPLIT.safetensors` for every split."""
+    tokenizer, stats = load_tokenizer(context.input("tokenizer")), open_stats(context.input("stats"))
+    for split in splits_of(context.input("data")):
+        dataset = open_split(context.input("data"), split)
+        with bar(context.console) as progress:
+            task = progress.add_task(f"tokens {split}", total=len(dataset), note="")
+            store = encode_split(
+                tokenizer, dataset, stats, context.config.batch_frames, lambda n: progress.update(task, advance=n)
+            )
+        store.save(context.folder / f"tokens-{split}.safetensors")
+        used = ", ".join(
+            f"{s.name} {len(store.codes[s.name].unique())}/{s.num_codes} codes" for s in tokenizer.streams
+        )
+        context.console.print(f"    {split}: {len(dataset)} clips, {int(store.starts[-1])} groups; {used}")
+
+
+def encode_split(
+    tokenizer: Tokenizer,
+    dataset: ShardDataset,
+    stats: FeatureStats,
+    batch_frames: int,
+    advance: object = None,
+) -> TokenStore:
+    """Codes of all clips in order. Clips are cut to a multiple of the group length and batched by length."""
+    unit = tokenizer.group_frames
+    groups = np.maximum(np.asarray(dataset.frames) // unit, 1)
+    starts = np.concatenate([[0], np.cumsum(groups)]).astype(np.int64)
+    per_group = {s.name: s.per_group for s in tokenizer.streams}
+    flat = {name: torch.zeros(int(starts[-1]) * n, dtype=torch.int64) for name, n in per_group.items()}
+    for items in _by_length(groups, batch_frames // unit):
+        motion, length = padded(tokenizer, dataset, stats, items)
+        with torch.no_grad():
+            codes = tokenizer.encode(motion, length)
+        for row, item in enumerate(items.tolist()):
+            for name, n in per_group.items():
+                begin, count = int(starts[item]) * n, int(groups[item]) * n
+                flat[name][begin : begin + count] = codes[name][row, :count]
+        if callable(advance):
+            advance(len(items))
+    return TokenStore(flat, starts, per_group)
+
+
+def padded(
+    tokenizer: Tokenizer, dataset: ShardDataset, stats: FeatureStats, items: NDArray[np.int64]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Normalised motion [B, T, D] zero-padded, and true lengths [B] (multiples of the group length)."""
+    unit, columns = tokenizer.group_frames, tokenizer.columns.numpy()
+    lengths = [max(int(dataset.frames[i]) // unit, 1) * unit for i in items]
+    motion = torch.zeros(len(items), max(lengths), len(columns))
+    for row, (item, length) in enumerate(zip(items.tolist(), lengths, strict=True)):
+        clip = stats.normalize(dataset.motion(item)[:length])[:, columns]
+        # A clip shorter than one group stands still for the rest of it.
+        clip = np.concatenate([clip, np.repeat(clip[-1:], length - len(clip), axis=0)])
+        motion[row, :length] = torch.from_numpy(np.ascontiguousarray(clip))
+    return motion, torch.tensor(lengths)
+
+
+def _by_length(groups: NDArray[np.int64], budget: int) -> list[NDArray[np.int64]]:
+    """Items in order of length, cut into batches of at most `budget` padded groups."""
+    order = np.argsort(-groups, kind="stable")
+    out: list[NDArray[np.int64]] = []
+    start = 0
+    while start < len(order):
+        count = max(1, budget // int(groups[order[start]]))
+        out.append(order[start : start + count])
+        start += count
+    return out

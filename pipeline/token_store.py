@@ -1,0 +1,120 @@
+"""Motion tokens on disk, and the batches the GPTs train on.
+
+One `tokens-SPLIT.safetensors` per split: for each stream the codes of all clips end to end, and where each clip
+begins, counted in groups of four frames. Written once by the `tokens` stage, never re-encoded by a GPT.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.plan import BatchPlan
+from motionloom.models.gpt.tokens import TokenPattern
+from motionloom.pipeline.files import atomic
+
+Codes = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class TokenStore:
+    """Codes of every clip of a split. `groups[i]` is the length of clip i in groups."""
+
+    codes: Codes
+    starts: NDArray[np.int64]
+    per_group: Mapping[str, int]
+
+    @property
+    def groups(self) -> NDArray[np.int64]:
+        """Length of each clip in groups."""
+        return np.diff(self.starts)
+
+    def clip(self, index: int, first: int = 0, count: int | None = None) -> Codes:
+        """Codes of (a part of) a clip: per stream int64 [count * per_group]."""
+        begin = int(self.starts[index]) + first
+        end = int(self.starts[index + 1]) if count is None else begin + count
+        return {name: flat[begin * n : end * n] for (name, flat), n in self._streams()}
+
+    def _streams(self) -> list[tuple[tuple[str, Tensor], int]]:
+        return [((name, flat), self.per_group[name]) for name, flat in self.codes.items()]
+
+    def save(self, path: Path) -> None:
+        """Write the store."""
+        tensors = {f"codes.{name}": flat.to(torch.int32) for name, flat in self.codes.items()}
+        tensors["starts"] = torch.from_numpy(self.starts)
+        with atomic(path) as temporary:
+            save_file(tensors, temporary)
+
+    @staticmethod
+    def load(path: Path, per_group: Mapping[str, int]) -> TokenStore:
+        """Read a store; its streams must be the tokenizer's."""
+        if not path.is_file():
+            raise UserError(f"{path}: no tokens; run the tokens stage for this split")
+        tensors = load_file(path)
+        codes = {k.removeprefix("codes."): v.long() for k, v in tensors.items() if k.startswith("codes.")}
+        if set(codes) != set(per_group):
+            raise UserError(f"{path}: holds streams {sorted(codes)}, the tokenizer has {sorted(per_group)}")
+        return TokenStore(codes, tensors["starts"].numpy(), per_group)
+
+
+@dataclass(frozen=True)
+class TokenBatches(Dataset[dict[str, Any]]):
+    """Batch k of token sequences and text priors; a pure function of (seed, k)."""
+
+    store: TokenStore
+    captions: list[list[int]]
+    """Rows of `prior` that caption each clip."""
+    prior: Tensor
+    """Text embeddings [n, E]."""
+    sentences: Tensor
+    """Sentence embeddings of the same captions [n, S]: which negatives of the alignment loss to leave out."""
+    pattern: TokenPattern
+    max_groups: int
+    batch_size: int
+    seed: int
+    rank: int = 0
+    world: int = 1
+    training: bool = True
+
+    def _plan(self) -> BatchPlan:
+        return BatchPlan(len(self.captions), self.batch_size, self.seed)
+
+    def __len__(self) -> int:
+        return -(-len(self.captions) // self.batch_size)
+
+    def __getitem__(self, k: int) -> dict[str, Any]:
+        if self.training:
+            plan = self._plan()
+            epoch, _ = plan.batch(k)
+            items = plan.local(k, self.rank, self.world)
+        else:
+            epoch, items = 0, np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
+        rows, sequences = [], []
+        for item in items.tolist():
+            rng = np.random.default_rng([self.seed, epoch, item])
+            choice = int(rng.integers(len(self.captions[item]))) if self.training else 0
+            rows.append(self.captions[item][choice])
+            sequences.append(self._sequence(item, rng))
+        return {
+            **self.pattern.collate(sequences),
+            "text": self.prior[rows],
+            "sentence": self.sentences[rows],
+        }
+
+    def _sequence(self, item: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Tokens and kinds [L]; a clip that is longer than the block gives a random part without its end."""
+        groups = int(self.store.groups[item])
+        if groups <= self.max_groups:
+            return self.pattern.interleave(self.store.clip(item), closed=True)
+        first = int(rng.integers(groups - self.max_groups + 1)) if self.training else 0
+        return self.pattern.interleave(self.store.clip(item, first, self.max_groups), closed=False)

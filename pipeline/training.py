@@ -1,0 +1,196 @@
+"""One training run of a stage: Lightning's Trainer, the loader, checkpoints, logs, exact resume.
+
+A Lightning "epoch" is here a *chunk* of `checkpoint_every` steps. Checkpoints are written at chunk ends only, the batch
+of step k is a pure function of (seed, k) and every step seeds its own random draws, so a resumed run repeats the
+undisturbed one bit for bit and the loader's whole state is the step number.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sized
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from pydantic import Field
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.models.stage_module import StageModule
+from motionloom.pipeline.hardware import Hardware
+from motionloom.pipeline.progress import MetricLog, StepProgress
+from motionloom.pipeline.stage import RUNTIME, StageContext
+
+
+class TrainConfig(Config):
+    """Length and arithmetic of one training run."""
+
+    steps: int = Field(1000, ge=1)
+    """Optimizer steps."""
+    batch_size: int = Field(256, ge=1)
+    """Global batch, over all processes and accumulated parts."""
+    accumulate: int = Field(1, ge=1)
+    """Parts the batch of a step is cut into."""
+    precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
+    compile: bool = False
+    checkpoint_every: int = Field(100, ge=1, json_schema_extra=RUNTIME)
+    """Steps between checkpoints; what a kill can cost."""
+    validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
+    """Steps between validations, rounded up to checkpoints; 0 turns them off."""
+
+    def local_batch(self, world: int) -> int:
+        """Items a process reads at once; the global batch must divide evenly."""
+        parts = world * self.accumulate
+        if self.batch_size % parts:
+            raise UserError(
+                f"train.batch_size {self.batch_size} does not divide by {world} processes x accumulate "
+                f"{self.accumulate}; make it a multiple of {parts}"
+            )
+        return self.batch_size // parts
+
+
+class ChunkSampler(Sampler[int]):
+    """Batch numbers of one chunk; Lightning calls `set_epoch` with the chunk's number, also after a resume."""
+
+    def __init__(self, chunk: int) -> None:
+        self.chunk = chunk
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Move to a chunk."""
+        self.epoch = epoch
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(range(self.epoch * self.chunk, (self.epoch + 1) * self.chunk))
+
+    def __len__(self) -> int:
+        return self.chunk
+
+
+BatchSource = Callable[[int, int, int], Dataset[Any]]
+"""(items per global micro-batch, rank, world) -> map-style dataset whose item k is this rank's batch of micro-step k."""
+
+
+def fit(
+    context: StageContext,
+    module: StageModule,
+    config: TrainConfig,
+    train: BatchSource,
+    validation: Dataset[Any] | None,
+    grad_clip: float,
+) -> None:
+    """Train `module` for `config.steps`, resuming from the newest good checkpoint in the stage's folder."""
+    hardware = context.hardware
+    if hardware.threads:
+        torch.set_num_threads(hardware.threads)
+    world = hardware.resolved_devices() * hardware.nodes
+    config.local_batch(world)
+    chunk = min(config.checkpoint_every, config.steps)
+    data = _Data(train, validation, config, chunk, hardware)
+    checkpoints = ModelCheckpoint(
+        dirpath=context.folder / "checkpoints",
+        filename="{step:08d}",
+        monitor="step",
+        mode="max",
+        save_top_k=2,
+        save_on_train_epoch_end=True,
+    )
+    validate = max(1, -(-config.validate_every // chunk)) if config.validate_every and validation else None
+    trainer = L.Trainer(
+        accelerator="cuda" if hardware.resolved_accelerator() == "gpu" else "cpu",
+        devices=hardware.resolved_devices(),
+        num_nodes=hardware.nodes,
+        strategy=_strategy(hardware, world),
+        precision=config.precision,
+        max_steps=config.steps,
+        accumulate_grad_batches=config.accumulate,
+        gradient_clip_val=grad_clip or None,
+        check_val_every_n_epoch=validate or 1,
+        limit_val_batches=1.0 if validate else 0,
+        num_sanity_val_steps=0,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        callbacks=[checkpoints, MetricLog(context.folder), StepProgress(context.name, config.steps, context.console)],
+    )
+    if config.compile:
+        module.compile()
+    trainer.fit(module, datamodule=data, ckpt_path=newest_checkpoint(context.folder / "checkpoints"), weights_only=True)
+
+
+class _Data(L.LightningDataModule):
+    def __init__(
+        self,
+        train: BatchSource,
+        validation: Dataset[Any] | None,
+        config: TrainConfig,
+        chunk: int,
+        hardware: Hardware,
+    ) -> None:
+        super().__init__()
+        self.train, self.validation = train, validation
+        self.config, self.chunk, self.hardware = config, chunk, hardware
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        trainer = cast(L.Trainer, self.trainer)
+        micro = self.config.batch_size // self.config.accumulate
+        dataset = self.train(micro, trainer.global_rank, trainer.world_size)
+        return _loader(dataset, ChunkSampler(self.chunk * self.config.accumulate), self.hardware)
+
+    def val_dataloader(self) -> DataLoader[Any] | list[Any]:
+        if self.validation is None:
+            return []
+        trainer = cast(L.Trainer, self.trainer)
+        total = len(cast(Sized, self.validation))
+        mine = list(range(total))[trainer.global_rank :: trainer.world_size]
+        # Every rank must take the same number of batches, or the metric all-reduce waits for ever.
+        mine = mine[: total // trainer.world_size] or list(range(total))
+        return _loader(self.validation, mine, self.hardware)
+
+
+def _loader(dataset: Dataset[Any], sampler: Any, hardware: Hardware) -> DataLoader[Any]:
+    workers = hardware.workers
+    return DataLoader(
+        dataset,
+        batch_size=None,
+        sampler=sampler,
+        num_workers=workers,
+        pin_memory=hardware.resolved_accelerator() == "gpu",
+        persistent_workers=False,
+        multiprocessing_context="spawn" if workers else None,
+    )
+
+
+def _strategy(hardware: Hardware, world: int) -> Any:
+    if hardware.strategy == "fsdp":
+        return "fsdp"
+    if world == 1:
+        return "auto"
+    return L.pytorch.strategies.DDPStrategy(
+        process_group_backend="nccl" if hardware.resolved_accelerator() == "gpu" else "gloo",
+        # Codebooks are made equal by the quantizers themselves; rank 0's copy must not overwrite them mid-step.
+        broadcast_buffers=False,
+    )
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint that loads; a torn one is passed over."""
+    for path in sorted(folder.glob("*.ckpt"), reverse=True):
+        try:
+            torch.load(path, map_location="cpu", weights_only=True)
+        except Exception:
+            continue
+        return path
+    return None
+
+
+def read_metrics(folder: Path) -> list[dict[str, float]]:
+    """Rows of a stage's `metrics.jsonl`."""
+    path = folder / "metrics.jsonl"
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines()]

@@ -1,0 +1,88 @@
+"""Converters and clips for the shard tests, in a module of their own so that spawned workers can import them."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Caption, ClipMeta, Manifest, Split
+from motionloom.datasets.shards.sample import DropClip, Sample
+from motionloom.datasets.shards.writer import write_dataset
+
+LAYOUT = MotionLayout.named("body133")
+SPLIT_OF: tuple[Split, ...] = ("train", "train", "train", "val", "test")
+
+
+def items(count: int) -> list[tuple[Split, int]]:
+    return [(SPLIT_OF[i % 5], i) for i in range(count)]
+
+
+def clip_motion(i: int) -> np.ndarray:
+    frames = 20 + i % 70
+    return np.random.default_rng(i).standard_normal((frames, LAYOUT.dim)).astype(np.float32)
+
+
+def clip(i: int, split: Split = "train") -> Sample:
+    motion = clip_motion(i)
+    meta = ClipMeta(
+        id=f"clip-ä-{i}",
+        source="made",
+        split=split,
+        layout=LAYOUT.name,
+        family=LAYOUT.family,
+        fps=LAYOUT.fps,
+        skeleton=LAYOUT.skeleton_name,
+        frames=len(motion),
+        licence="CC0",
+    )
+    texts = [Caption(text=f"person {i} walks"), Caption(text=f"person {i} turns", start=0.25, end=0.75)]
+    return Sample(
+        meta,
+        motion,
+        texts=texts,
+        face_texts=[Caption(text="happy")] if i % 2 else [],
+        audio=np.full((4, 438), i, dtype=np.float32) if i % 3 == 0 else None,
+        wav=(np.sin(np.arange(800) / 10 + i).astype(np.float32) / 2, 8000) if i % 4 == 0 else None,
+    )
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Item i -> clip i; items in `drop` are left out, those in `bad` fail, and one may kill the process once."""
+
+    drop: tuple[int, ...] = ()
+    bad: tuple[int, ...] = ()
+    kill_at: int | None = None
+    kill_parent: bool = False
+    mark: Path | None = None
+
+    def __call__(self, i: int) -> Sample:
+        if i == self.kill_at and self.mark is not None and not self.mark.exists():
+            self.mark.touch()
+            if self.kill_parent:
+                os.kill(os.getppid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGKILL)
+        if i in self.drop:
+            raise DropClip("on the ignore list")
+        if i in self.bad:
+            raise RuntimeError("unreadable")
+        return clip(i)
+
+
+def write(out: Path, count: int = 60, convert: Convert | None = None, **changes: object) -> Manifest:
+    options = {
+        "name": "made",
+        "layout": LAYOUT,
+        "licence": "CC0",
+        "converter": "test",
+        "converter_version": 1,
+        "options": {"size": count},
+        "clips_per_shard": 8,
+        "progress": False,
+    }
+    return write_dataset(out, items(count), convert or Convert(), **{**options, **changes})

@@ -1,0 +1,257 @@
+"""`EmaQuantizer`: golden T2M-GPT vectors, our reset semantics, masks, float32 state, checkpoints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from motionloom.models.quantize.draws import draw_rows
+from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, cluster_sums, nearest
+
+
+@pytest.fixture(scope="module")
+def golden(shared: Path) -> dict[str, Tensor]:
+    with np.load(shared / "golden" / "t7_quantizer_A.npz", allow_pickle=False) as file:
+        return {k: torch.from_numpy(np.atleast_1d(file[k])).squeeze() for k in file.files}
+
+
+def rows(x: Tensor) -> Tensor:
+    """[N, C, T] of the public code -> [N, T, C]."""
+    return x.permute(0, 2, 1)
+
+
+def with_state(codebook: Tensor, count: float) -> EmaQuantizer:
+    quantizer = EmaQuantizer(QuantizerConfig(num_codes=len(codebook), dim=codebook.shape[1]))
+    state = quantizer.state_dict()
+    state["codebook"], state["ema_sum"] = codebook.clone(), codebook * count
+    state["ema_count"], state["initialised"] = torch.full((len(codebook),), count), torch.tensor(True)
+    quantizer.load_state_dict(state)
+    return quantizer
+
+
+def close(a: Tensor, b: Tensor, atol: float = 1e-5) -> None:
+    torch.testing.assert_close(a.detach(), b, rtol=1e-5, atol=atol)
+
+
+def test_golden_eval_and_gradient(golden: dict[str, Tensor]) -> None:
+    quantizer = with_state(golden["codebook"], 3.0).eval()
+    z = rows(golden["x"]).clone().requires_grad_()
+    out = quantizer(z)
+    assert torch.equal(out.codes, golden["codes"])
+    close(out.quantized, rows(golden["eval_quantized"]))
+    close(out.penalty, golden["eval_commit_loss"])
+    close(out.metrics["perplexity"], golden["eval_perplexity"])
+    (0.5 * out.quantized.sum() + out.penalty).backward()
+    assert z.grad is not None
+    close(z.grad, rows(golden["grad_x"]))
+    close(quantizer.codebook, golden["codebook"], 0)
+
+
+def test_golden_training_updates(golden: dict[str, Tensor]) -> None:
+    quantizer = with_state(golden["codebook"], 3.0)
+    out = quantizer(rows(golden["x"]))
+    close(out.quantized, rows(golden["train_quantized"]))
+    close(out.penalty, golden["train_commit_loss"])
+    close(out.metrics["perplexity"], golden["train_perplexity"])
+    assert out.metrics["resets"] == 0
+    close(quantizer.codebook, golden["codebook1"])
+    close(quantizer.ema_sum, golden["code_sum1"])
+    close(quantizer.ema_count, golden["code_count1"])
+    quantizer(rows(golden["x2"]))
+    close(quantizer.codebook, golden["codebook2"])
+
+
+def test_golden_after_their_initialisation_and_outside_resets(golden: dict[str, Tensor]) -> None:
+    """From the public code's first-K initialisation on: the same, except for what a reset code becomes."""
+    quantizer = with_state(rows(golden["x"]).reshape(-1, 16)[:64], 1.0)
+    quantizer(rows(golden["x"]))
+    close(quantizer.codebook, golden["init_codebook_after"])
+    close(quantizer.ema_count, golden["init_code_count_after"])
+    # Counts sit at 0.99 + 0.01 n: a code used once must stay at exactly 1 and not be reset by rounding.
+    out = quantizer(rows(golden["x2"]))
+    reset = golden["reset_code_count_after2"] < 1
+    assert out.metrics["resets"] == reset.sum() > 0
+    close(quantizer.codebook[~reset], golden["reset_codebook_after2"][~reset])
+    close(quantizer.ema_count[~reset], golden["reset_code_count_after2"][~reset])
+    close(quantizer.ema_sum[~reset], golden["reset_code_sum_after2"][~reset])
+    assert torch.equal(quantizer.ema_count[reset], torch.ones(int(reset.sum())))
+    close(quantizer.ema_sum[reset], quantizer.codebook[reset])
+    batch = rows(golden["x2"]).reshape(-1, 16)
+    same = (quantizer.codebook[reset][:, None] == batch).all(-1)
+    assert (same.sum(1) == 1).all()  # each is one row of the batch,
+    assert same.sum(0).max() == 1  # and all of them different ones
+
+
+def test_golden_ude_terms(golden: dict[str, Tensor]) -> None:
+    out = with_state(golden["codebook"], 3.0).eval()(rows(golden["x"]))
+    close(2 * out.penalty, golden["ude_loss"])  # both of its terms have this value
+    assert torch.equal(out.codes.flatten(), golden["ude_codes"])
+    torch.testing.assert_close(out.metrics["perplexity"], golden["ude_perplexity"], rtol=1e-4, atol=0)
+
+
+def test_codes_are_the_nearest() -> None:
+    z, codebook = torch.randn(300, 7), torch.randn(20, 7)
+    assert torch.equal(nearest(z, codebook), torch.cdist(z.double(), codebook.double()).argmin(1))
+    codes = torch.randint(0, 20, (300,))
+    sums = torch.stack([z[codes == k].sum(0) for k in range(20)])
+    torch.testing.assert_close(cluster_sums(z, codes, 20), sums, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        torch.zeros(20, 7).index_put_((codes,), z, accumulate=True), sums, rtol=1e-5, atol=1e-5
+    )
+
+
+def test_straight_through_gradient_is_identity() -> None:
+    quantizer = EmaQuantizer(QuantizerConfig(num_codes=8, dim=4)).eval()
+    z = torch.randn(2, 5, 4, requires_grad=True)
+    weight = torch.randn(2, 5, 4)
+    (quantizer(z).quantized * weight).sum().backward()
+    assert z.grad is not None
+    assert torch.equal(z.grad, weight)
+
+
+def test_first_batch_initialises_with_its_own_distinct_rows() -> None:
+    quantizer = EmaQuantizer(QuantizerConfig(num_codes=16, dim=4))
+    z = torch.randn(4, 10, 4)
+    out = quantizer(z)
+    assert bool(quantizer.initialised)
+    assert out.metrics["usage"] == 1  # every code owns at least the row it was made of
+    assert out.metrics["resets"] == 0
+    other = EmaQuantizer(QuantizerConfig(num_codes=16, dim=4), salt=1)
+    other(z)
+    assert not torch.allclose(other.codebook, quantizer.codebook)
+
+
+def test_unused_codes_are_reset_to_rows_of_the_batch_until_they_are_used() -> None:
+    codebook = torch.cat([torch.zeros(1, 4), torch.full((7, 4), 100.0)])
+    quantizer = with_state(codebook, 1.0)
+    z = torch.randn(3, 20, 4)
+    out = quantizer(z)
+    assert out.metrics["resets"] == 7
+    assert (quantizer.codebook[1:, None] == z.reshape(-1, 4)).all(-1).any(1).all()
+    again = quantizer(z)
+    assert again.metrics["resets"] == 0  # each now owns at least its own row and stays
+    assert again.metrics["usage"] >= 7 / 8
+
+
+def test_draws_are_distinct_valid_and_uniform() -> None:
+    x = torch.arange(40.0)[:, None]
+    mask = torch.arange(40) % 4 != 0
+    seen = torch.zeros(40)
+    for step in range(400):
+        drawn = draw_rows(x, mask, 10, salt=0, step=torch.tensor(step))[:, 0].long()
+        assert len(drawn.unique()) == 10
+        seen[drawn] += 1
+    assert seen[~mask].sum() == 0
+    assert seen[mask].min() > 90  # expected 133, standard deviation 9.4
+    assert seen[mask].max() < 180
+    few = draw_rows(x[:3], None, 7, salt=0, step=torch.tensor(0))[:, 0].long()
+    assert few.unique().tolist() == [0, 1, 2]
+    assert few.bincount().max() == 3
+
+
+def test_masked_batch_equals_truncated_batch() -> None:
+    torch.manual_seed(0)
+    config = QuantizerConfig(num_codes=6, dim=4)
+    padded, plain = EmaQuantizer(config), EmaQuantizer(config)
+    for _ in range(4):
+        z = torch.randn(1, 12, 4)
+        filler = torch.full((1, 5, 4), float("nan"))  # must not be read at all
+        mask = torch.arange(17)[None] < 12
+        a, b = padded(torch.cat([z, filler], 1), mask), plain(z)
+        assert torch.equal(a.codes[:, :12], b.codes)
+        close(a.penalty, b.penalty)
+        for name, value in b.metrics.items():
+            close(a.metrics[name], value)
+    for name, value in plain.state_dict().items():
+        torch.testing.assert_close(padded.state_dict()[name], value)
+
+
+def test_padding_gets_no_gradient_from_the_penalty() -> None:
+    z = torch.randn(2, 6, 4, requires_grad=True)
+    mask = torch.tensor([[True] * 6, [True] * 2 + [False] * 4])
+    EmaQuantizer(QuantizerConfig(num_codes=3, dim=4)).eval()(z, mask).penalty.backward()
+    assert z.grad is not None
+    assert (z.grad[~mask] == 0).all()
+    assert (z.grad[mask] != 0).any(-1).all()
+
+
+@pytest.mark.parametrize("how", ["eval", "frozen", "update=False"])
+def test_never_updates(how: str) -> None:
+    quantizer = EmaQuantizer(QuantizerConfig(num_codes=8, dim=4))
+    quantizer(torch.randn(2, 20, 4))
+    before = {k: v.clone() for k, v in quantizer.state_dict().items()}
+    if how == "eval":
+        quantizer.eval()
+    elif how == "frozen":
+        quantizer.freeze()
+        quantizer.train()
+    for _ in range(3):
+        quantizer(torch.randn(2, 20, 4), update=how != "update=False")
+    assert all(torch.equal(v, before[k]) for k, v in quantizer.state_dict().items())
+
+
+def test_state_stays_float32_under_casts_and_autocast() -> None:
+    torch.manual_seed(0)
+    config = QuantizerConfig(num_codes=8, dim=16)
+    cast, plain = EmaQuantizer(config), EmaQuantizer(config)
+    cast.bfloat16()
+    batches = [torch.randn(2, 40, 16).bfloat16() for _ in range(3)]
+    for z in batches:
+        plain(z.float())
+        with torch.autocast("cpu", torch.bfloat16):
+            out = cast(z)
+        assert out.quantized.dtype == torch.bfloat16
+        assert out.penalty.dtype == torch.float32
+    for name, value in plain.state_dict().items():
+        assert cast.state_dict()[name].dtype == value.dtype
+        assert torch.equal(cast.state_dict()[name], value)
+    assert cast.double().codebook.dtype == torch.float32
+
+
+def test_resumed_training_equals_undisturbed_training() -> None:
+    config = QuantizerConfig(num_codes=12, dim=4)
+    batches = [torch.randn(2, 9, 4, generator=torch.Generator().manual_seed(i)) for i in range(6)]
+    whole = EmaQuantizer(config)
+    for z in batches:
+        whole(z)
+    first, second = EmaQuantizer(config), EmaQuantizer(config)
+    for z in batches[:3]:
+        first(z)
+    second.load_state_dict(first.state_dict())
+    torch.manual_seed(99)
+    for z in batches[3:]:
+        second(z)
+    assert all(torch.equal(v, second.state_dict()[k]) for k, v in whole.state_dict().items())
+    assert {"codebook", "ema_sum", "ema_count", "initialised", "draws"} == set(whole.state_dict())
+
+
+def test_agrees_with_vector_quantize_pytorch() -> None:
+    """An independent oracle, its count smoothing off: codes, outputs and three EMA updates."""
+    oracle_module = pytest.importorskip("vector_quantize_pytorch")
+    oracle = oracle_module.VectorQuantize(8, 16, decay=0.99, eps=1e-12, commitment_weight=1.0)
+    codebook = torch.randn(16, 8)
+    quantizer = with_state(codebook, 100.0)
+    inner = oracle._codebook
+    inner.embed.data.copy_(codebook[None])
+    inner.embed_avg.data.copy_(codebook[None] * 100)
+    inner.cluster_size.data.fill_(100.0)
+    for _ in range(3):
+        z = torch.randn(4, 30, 8)
+        quantized, codes, loss = oracle(z)
+        out = quantizer(z)
+        assert torch.equal(out.codes, codes)
+        close(out.quantized, quantized.detach())
+        close(out.penalty, loss.detach().squeeze())
+    close(quantizer.codebook, inner.embed[0].detach())
+
+
+def test_compiles_to_one_graph() -> None:
+    quantizer = EmaQuantizer(QuantizerConfig(num_codes=8, dim=4))
+    z = torch.randn(2, 20, 4)
+    quantizer(z)
+    explained = torch._dynamo.explain(quantizer)(z)
+    assert explained.graph_break_count == 0

@@ -1,0 +1,86 @@
+"""Recipes: reading, overriding, refusing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.recipe import load_recipe, shipped_recipes
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "recipe.yaml"
+    path.write_text(text)
+    return path
+
+
+BASE = """
+name: small
+stages:
+  data: {kind: synth, clips: 8}
+  stats: {kind: stats}
+"""
+
+
+@pytest.mark.parametrize("name", sorted(shipped_recipes()))
+def test_shipped_recipes_load_and_reload(name: str, tmp_path: Path) -> None:
+    recipe = load_recipe(name)
+    assert recipe.description
+    assert load_recipe(write(tmp_path, recipe.to_yaml())) == recipe
+
+
+def test_override_changes_one_value() -> None:
+    plain = load_recipe("humantomato-tiny")
+    changed = load_recipe("humantomato-tiny", ["tma.optim.lr=1e-3"])
+    assert changed.stage("tma").config.optim.lr == 1e-3  # type: ignore[attr-defined]
+    same = [s for s in changed.stages if s.name != "tma"]
+    assert same == [s for s in plain.stages if s.name != "tma"]
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("tma.optim.lrr=1", "did you mean 'lr'"),
+        ("tmaa.optim.lr=1", "did you mean 'tma'"),
+        ("tma.optim.lr", "stage.field=value"),
+        ("tma.optim.lr=fast", "optim.lr"),
+        ("tma.train.steps=0", "train.steps"),
+        ("hardware.device=2", "did you mean 'hardware.devices'|did you mean 'devices'"),
+        ("tma.kind=tmaa", "is no stage kind; did you mean 'tma'"),
+    ],
+)
+def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        load_recipe("humantomato-tiny", [override])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("name: x\nstages: {stats: {kind: stats}}", "needs a stage 'data'"),
+        ("name: x\nstages: {data: {kind: synth}, stats: {kind: stats, inputs: {dat: data}}}", "unknown role 'dat'"),
+        ("name: x\nstage: {}", "unknown key 'stage'; did you mean 'stages'"),
+        ("name: ../x\nstages: {}", "name"),
+        ("[1, 2]", "mapping"),
+        ("a: [", "not valid YAML"),
+        ("extends: recipe\nname: x", "circle"),
+    ],
+)
+def test_wrong_recipes_are_refused(text: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=says):
+        load_recipe(write(tmp_path, text))
+
+
+def test_unknown_recipe_names_the_nearest() -> None:
+    with pytest.raises(UserError, match="did you mean 'humantomato-tiny'"):
+        load_recipe("humantomato-tin")
+
+
+def test_extends_merges_into_the_base(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(BASE)
+    recipe = load_recipe(write(tmp_path, "extends: base\nname: child\nstages: {data: {clips: 9}}"))
+    assert recipe.name == "child"
+    assert recipe.stage("data").config.clips == 9  # type: ignore[attr-defined]
+    assert [s.name for s in recipe.stages] == ["data", "stats"]
