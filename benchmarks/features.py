@@ -1,6 +1,6 @@
-"""Frames per second of the feature encoders on one core: `OMP_NUM_THREADS=1 python -P benchmarks/features.py`.
+"""Frames per second of the feature encoders: `OMP_NUM_THREADS=1 python -P benchmarks/features.py`.
 
-Prints one line a case: layout, family, clips in the call, encode and decode in thousand frames a second (median).
+One line a case: layout, family, clips in the call, encode and decode in thousand frames a second (median).
 """
 
 from __future__ import annotations

@@ -22,9 +22,9 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.datasets.text.encoder import EncodedText, TextEncoder, load_text_encoder
-from motionloom.models.gpt import InterleavedGPT
+from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate
-from motionloom.models.tokenizer import Tokenizer
+from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.artifact import Artifact
 from motionloom.pipeline.model_store import LayoutFacts
 from motionloom.pipeline.networks import LoadedTma, load_gpt, load_tokenizer
@@ -131,7 +131,7 @@ class Bundle:
     @property
     def max_groups(self) -> int:
         """Longest motion in groups of four frames."""
-        return self.gpt.pattern.groups_within(self.gpt.config.block_size - 1)
+        return self.gpt.max_groups
 
     def generate(
         self,
@@ -196,10 +196,9 @@ class Bundle:
         result = generate(
             gpt,
             text,
-            max_groups=gpt.pattern.groups_within(gpt.config.block_size - 1),
             groups=groups,
             temperature=s.temperature,
-            top_k=s.top_k,
+            top_k=s.top_k or None,
             top_p=s.top_p,
             cfg_scale=s.cfg_scale,
             seed=seed,

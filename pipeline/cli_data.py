@@ -58,8 +58,8 @@ def bvh(
     from motionloom.pipeline.data_commands import convert_bvh_command
 
     fields = {"source": str(source), "joint_map": str(joint_map), "captions": str(captions) if captions else None}
-    fields |= {"fps": fps, "licence": licence, "limit": limit, "strict": strict}
-    convert_bvh_command(fields, out, plan=plan, workers=workers, console=make_console())
+    fields |= {"fps": fps, "licence": licence, "limit": limit}
+    convert_bvh_command(fields, out, plan=plan, strict=strict, workers=workers, console=make_console())
 
 
 @data_app.command()

@@ -33,13 +33,13 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
     console.print(f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), {manifest.fps:g} fps, {manifest.licence}")
 
 
-def convert_bvh_command(fields: dict[str, Any], out: Path, *, plan: bool, workers: int, console: Console) -> None:
+def convert_bvh_command(fields: dict[str, Any], out: Path, *, plan: bool, strict: bool, workers: int, console: Console) -> None:
     """Plan or convert."""
     config = BvhConfig.parse(fields, "data convert bvh")
     if plan:
-        console.print(plan_bvh(config).table())
+        console.print(plan_bvh(config, workers=workers, progress=console.is_terminal).table())
         return
-    say_manifest(convert_bvh(config, out, workers=workers), out, console)
+    say_manifest(convert_bvh(config, out, workers=workers, strict=strict), out, console)
 
 
 def check_command(root: Path, console: Console) -> int:

@@ -12,9 +12,11 @@ from torch import Tensor
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.cache import TextCache
-from motionloom.models.gpt import GptConfig, InterleavedGPT
-from motionloom.models.tma import Tma, TmaConfig
-from motionloom.models.tokenizer import Tokenizer, TokenizerConfig, build_tokenizer
+from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import TokenizerConfig
 from motionloom.pipeline.model_store import load_facts, load_weights
 
 
@@ -30,8 +32,7 @@ def load_tokenizer(folder: Path) -> Tokenizer:
     config = TypeAdapter(TokenizerConfig).validate_python(facts.config)
     net = build_tokenizer(config, facts.layout.layout())
     load_weights(folder, net)
-    freeze(net)
-    return net
+    return net.freeze()
 
 
 @dataclass(frozen=True)

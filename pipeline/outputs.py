@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from motionloom.datasets.motion.bvh import write_bvh
-from motionloom.datasets.motion.kinematics import fit_skeleton, joints_to_rotations
+from motionloom.datasets.motion.kinematics import joints_to_rotations
 from motionloom.pipeline.bundle import GeneratedMotion
 from motionloom.pipeline.files import atomic
 from motionloom.pipeline.render.face import face_controls
@@ -88,7 +88,7 @@ def write_npz(path: Path, motion: GeneratedMotion, seed: int) -> Path:
 
 def write_bvh_of(path: Path, motion: GeneratedMotion) -> Path:
     """Bone rotations fitted to the generated joints, on a skeleton with the motion's own bone lengths."""
-    skeleton = fit_skeleton(motion.joints, motion.layout.skeleton)
+    skeleton = motion.layout.skeleton.with_lengths_of(motion.joints)
     rotations = joints_to_rotations(motion.joints, skeleton)
     write_bvh(path, skeleton, rotations, motion.joints[:, 0], motion.layout.fps)
     return path

@@ -13,7 +13,7 @@ from motionloom.datasets.motion.features import decode, face_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.statistics import FeatureStats
-from motionloom.models.tokenizer import Tokenizer
+from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.sources import open_split
 
 

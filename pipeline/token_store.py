@@ -20,7 +20,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.plan import BatchPlan
-from motionloom.models.gpt.tokens import TokenPattern
+from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences
 from motionloom.pipeline.files import atomic
 
 Codes = dict[str, Tensor]
@@ -78,7 +78,8 @@ class TokenBatches(Dataset[dict[str, Any]]):
     """Text embeddings [n, E]."""
     sentences: Tensor
     """Sentence embeddings of the same captions [n, S]: which negatives of the alignment loss to leave out."""
-    pattern: TokenPattern
+    pattern: tuple[str, ...]
+    ends: Mapping[str, int]
     max_groups: int
     batch_size: int
     seed: int
@@ -86,35 +87,41 @@ class TokenBatches(Dataset[dict[str, Any]]):
     world: int = 1
     training: bool = True
 
-    def _plan(self) -> BatchPlan:
-        return BatchPlan(len(self.captions), self.batch_size, self.seed)
-
     def __len__(self) -> int:
         return -(-len(self.captions) // self.batch_size)
 
     def __getitem__(self, k: int) -> dict[str, Any]:
         if self.training:
-            plan = self._plan()
-            epoch, _ = plan.batch(k)
-            items = plan.local(k, self.rank, self.world)
+            plan = BatchPlan(len(self.captions), self.batch_size, self.seed)
+            epoch, items = plan.local(k, self.rank, self.world)
         else:
-            epoch, items = 0, np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
+            rows_of_all = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
+            # Equal shares: the last batch repeats its last clip where the clips do not divide over the ranks.
+            fill = np.repeat(rows_of_all[-1:], -len(rows_of_all) % self.world)
+            epoch, items = 0, np.concatenate([rows_of_all, fill])[self.rank :: self.world]
         rows, sequences = [], []
         for item in items.tolist():
             rng = np.random.default_rng([self.seed, epoch, item])
             choice = int(rng.integers(len(self.captions[item]))) if self.training else 0
             rows.append(self.captions[item][choice])
             sequences.append(self._sequence(item, rng))
+        batch = pad_sequences(sequences)
         return {
-            **self.pattern.collate(sequences),
+            "tokens": batch.tokens,
+            "kinds": batch.kinds,
+            "length": batch.length,
             "text": self.prior[rows],
             "sentence": self.sentences[rows],
         }
 
-    def _sequence(self, item: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """Tokens and kinds [L]; a clip that is longer than the block gives a random part without its end."""
+    def _sequence(self, item: int, rng: np.random.Generator) -> TokenSequence:
+        """One row; a clip that is longer than the block gives a random part without its end."""
         groups = int(self.store.groups[item])
         if groups <= self.max_groups:
-            return self.pattern.interleave(self.store.clip(item), closed=True)
+            return self._row(self.store.clip(item), closed=True)
         first = int(rng.integers(groups - self.max_groups + 1)) if self.training else 0
-        return self.pattern.interleave(self.store.clip(item, first, self.max_groups), closed=False)
+        return self._row(self.store.clip(item, first, self.max_groups), closed=False)
+
+    def _row(self, codes: Codes, *, closed: bool) -> TokenSequence:
+        batched = {name: row[None] for name, row in codes.items()}
+        return interleave(batched, self.pattern, ends=self.ends if closed else None)

@@ -73,13 +73,16 @@ class ChunkSampler(Sampler[int]):
 BatchSource = Callable[[int, int, int], Dataset[Any]]
 """(items per global micro-batch, rank, world) -> map-style dataset whose item k is this rank's batch of micro-step k."""
 
+EvalSource = Callable[[int, int], Dataset[Any]]
+"""(rank, world) -> sized dataset of this rank's validation batches; every rank gets equally many of equal size."""
+
 
 def fit(
     context: StageContext,
     module: StageModule,
     config: TrainConfig,
     train: BatchSource,
-    validation: Dataset[Any] | None,
+    validation: EvalSource | None,
     grad_clip: float,
 ) -> None:
     """Train `module` for `config.steps`, resuming from the newest good checkpoint in the stage's folder."""
@@ -126,7 +129,7 @@ class _Data(L.LightningDataModule):
     def __init__(
         self,
         train: BatchSource,
-        validation: Dataset[Any] | None,
+        validation: EvalSource | None,
         config: TrainConfig,
         chunk: int,
         hardware: Hardware,
@@ -145,11 +148,8 @@ class _Data(L.LightningDataModule):
         if self.validation is None:
             return []
         trainer = cast(L.Trainer, self.trainer)
-        total = len(cast(Sized, self.validation))
-        mine = list(range(total))[trainer.global_rank :: trainer.world_size]
-        # Every rank must take the same number of batches, or the metric all-reduce waits for ever.
-        mine = mine[: total // trainer.world_size] or list(range(total))
-        return _loader(self.validation, mine, self.hardware)
+        dataset = self.validation(trainer.global_rank, trainer.world_size)
+        return _loader(dataset, range(len(cast(Sized, dataset))), self.hardware)
 
 
 def _loader(dataset: Dataset[Any], sampler: Any, hardware: Hardware) -> DataLoader[Any]:

@@ -1,7 +1,7 @@
 """Motion files of a source folder, loose or inside tar archives, read as bytes in a fixed order.
 
-Nothing is ever extracted: a member's name is only a label, links and devices are skipped, and compressed archives
-are read once from front to back (xz cannot do otherwise), one member in memory at a time.
+Nothing is ever extracted: a member's name is only a label, links and devices are skipped, and compressed
+archives are read once from front to back (xz cannot do otherwise), one member in memory at a time.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Batch:
         return self.archive or self.files[0]
 
     def read(self, suffix: str) -> Iterator[SourceFile]:
-        """Every motion file with `suffix`, in archive order. `UserError` when the archive is damaged there."""
+        """Every file with `suffix`, in archive order. `UserError` when the archive is damaged there."""
         if self.archive is not None:
             yield from _read_archive(self.root / self.archive, self.archive, suffix)
             return
@@ -60,7 +60,7 @@ class Batch:
 
 
 def list_batches(source: Path, suffix: str) -> tuple[list[Batch], int]:
-    """Batches under `source` (a folder, one motion file or one archive) in name order, and the files ignored."""
+    """Batches under `source` (a folder, a motion file or an archive), in name order, and how many others."""
     if source.is_file():
         names, root = [source.name], source.parent
     elif source.is_dir():
@@ -95,4 +95,6 @@ def _read_archive(path: Path, label: str, suffix: str) -> Iterator[SourceFile]:
 
 
 def _too_large(size: int) -> str:
-    return f"{size} bytes, more than a motion file may have ({MAX_FILE_BYTES})" if size > MAX_FILE_BYTES else ""
+    if size <= MAX_FILE_BYTES:
+        return ""
+    return f"{size} bytes, more than a motion file may have ({MAX_FILE_BYTES})"

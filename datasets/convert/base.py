@@ -1,7 +1,7 @@
 """What every converter shares: the plan it shows first, splits, clip ids, and a pool for its own work.
 
-A converter plans before it converts: the plan lists what was found, what is missing and what will be left out and
-why, so nothing is skipped silently (`convert ... --plan` prints it and stops).
+A converter plans before it converts: the plan lists what was found, what is missing and what will be left out
+and why, so nothing is skipped silently (`convert ... --plan` prints it and stops).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import torch
 from rich.table import Table
 
 from motionloom.datasets.schema import Dropped, Split, UserError
+from motionloom.datasets.shards.index import SPLITS
 
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 TRAIN_SHARE, VAL_SHARE = 0.80, 0.05
 """80/5/15, the split of HumanML3D and Motion-X, where a source brings none."""
 
@@ -46,7 +46,9 @@ class ConversionPlan(Generic[T]):
     uncaptioned: list[str] = field(default_factory=list)
     """In the source, without captions."""
     dropped: list[Dropped] = field(default_factory=list)
-    """In the source, but left out."""
+    """In the source and readable, but left out."""
+    broken: list[Dropped] = field(default_factory=list)
+    """In the source, but cannot be read."""
     ignored: int = 0
     """Files in the source that are not motion."""
     notes: list[str] = field(default_factory=list)
@@ -63,11 +65,22 @@ class ConversionPlan(Generic[T]):
         for split in SPLITS:
             table.add_row(split, str(counts[split]), str(self.frames.get(split, 0)), "")
         table.add_row("without captions", str(len(self.uncaptioned)), "", _some(self.uncaptioned))
-        for title, drops in (("missing files", self.missing), ("left out", self.dropped)):
+        told = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
+        for title, drops in told:
             table.add_row(title, str(len(drops)), "", _some([f"{d.source}: {d.reason}" for d in drops]))
         for note in self.notes:
             table.add_row("note", "", "", note)
         return table
+
+    def left_out(self) -> list[Dropped]:
+        """Everything that will not become a sample, with reasons."""
+        return [*self.missing, *self.broken, *self.dropped]
+
+    def require_whole(self) -> None:
+        """`UserError` when anything is missing or broken (`--strict`)."""
+        bad = [*self.broken, *self.missing]
+        if bad:
+            raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")
 
 
 def _some(lines: Sequence[str], limit: int = 5) -> str:
@@ -98,7 +111,7 @@ def check_id(clip_id: str, where: str) -> str:
 
 
 def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
-    """`train.txt`, `val.txt` and `test.txt` (one id a line) -> split of every id, and notes on repeated lines.
+    """`train.txt`, `val.txt`, `test.txt` (one id a line) -> split of every id, and notes on repeated lines.
 
     An id in two splits is a leak and an error; blank lines and CRLF are fine.
     """
@@ -121,9 +134,7 @@ def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
             check_id(clip_id, where)
             known = splits.setdefault(clip_id, split)
             if known != split:
-                raise UserError(
-                    f"{where}: '{clip_id}' is also in {known}.txt; a clip in two splits leaks, remove one line"
-                )
+                raise UserError(f"{where}: '{clip_id}' is also in {known}.txt; a clip in two splits leaks")
             if clip_id in here:
                 notes.append(f"{where}: '{clip_id}' is listed twice; the first line counts")
             here.add(clip_id)

@@ -1,4 +1,4 @@
-"""`captions.jsonl`: one JSON object a line with a clip's id, captions and, where known, file, split and frame rate."""
+"""`captions.jsonl`: one JSON object a line: id, captions and, where known, file, split, frame rate."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ Arrays are joint-first inside ([3, N, ..., T]): a parent lookup is a row, and ti
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -129,7 +130,8 @@ def rotations_6d(
     Points [3, N, ..., T] and heading [..., T] -> [N - 1, 2, 3, ..., T].
     """
     parents = np.asarray(skeleton.parents[1:])
-    axes = rest_axes(skeleton).T.reshape(3, -1, *(1,) * angle.ndim)
+    directions, starts = published_chains(skeleton)
+    axes = directions.T.reshape(3, -1, *(1,) * angle.ndim)
     bones = points[:, 1:] - points[:, parents]
     length = np.sqrt(bones[0] ** 2 + bones[1] ** 2 + bones[2] ** 2)
     if not length.all():
@@ -139,24 +141,25 @@ def rotations_6d(
     world = swing(axes, bones)
 
     above = np.empty_like(world)
-    starts = np.array([any(word in name for word in _CHAIN_STARTS) for name in skeleton.joints[1:]])
     above[:, :, starts] = _about_y(-angle)[:, :, None]
     above[:, :, ~starts] = world[:, :, parents[~starts] - 1]
     local = multiply(above.swapaxes(0, 1), world[:, :2])
     return np.moveaxis(local, 2, 0).swapaxes(1, 2)
 
 
-def rest_axes(skeleton: Skeleton) -> NDArray[np.float64]:
-    """Rest directions [N - 1, 3] of the published features: every bone lies along an axis."""
-    out = np.zeros((len(skeleton) - 1, 3))
-    for row, name in zip(out, skeleton.joints[1:], strict=True):
+@cache
+def published_chains(skeleton: Skeleton) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Rest directions [N - 1, 3] of joints 1..N-1, all along axes, and which ones [N - 1] start a chain."""
+    axes = np.zeros((len(skeleton) - 1, 3))
+    for axis, name in zip(axes, skeleton.joints[1:], strict=True):
         if any(word in name for word in _SIDEWAYS):
-            row[0] = 1.0 if name.startswith("left") else -1.0
+            axis[0] = 1.0 if name.startswith("left") else -1.0
         elif any(word in name for word in _FORWARD):
-            row[2] = 1.0
+            axis[2] = 1.0
         else:
-            row[1] = 1.0 if name in _UPWARD else -1.0
-    return out
+            axis[1] = 1.0 if name in _UPWARD else -1.0
+    starts = np.array([any(word in name for word in _CHAIN_STARTS) for name in skeleton.joints[1:]])
+    return axes, starts
 
 
 def _about_y(angle: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -44,9 +44,15 @@ def swing(old: NDArray[np.float64], new: NDArray[np.float64]) -> NDArray[np.floa
     y = old[2] * new[0] - old[0] * new[2]
     z = old[0] * new[1] - old[1] * new[0]
     cosine = old[0] * new[0] + old[1] * new[1] + old[2] * new[2]
-    # R = cos I + [c]x + c c^T / (1 + cos) with c = old x new; the last factor is 0/0 for opposite vectors.
-    opposite = cosine < -1.0 + 1e-12
-    share = 1.0 / np.where(opposite, 1.0, 1.0 + cosine)
+    # R = cos I + [c]x + c c^T / (1 + cos) with c = old x new. Near opposite vectors 1 + cos loses its digits,
+    # but equals |c|^2 / (1 - cos); at opposite ones both are 0.
+    share = 1.0 / np.maximum(1.0 + cosine, 1e-16)
+    near = cosine < -0.99
+    opposite = near
+    if near.any():
+        square = x * x + y * y + z * z
+        opposite = near & (square < 1e-24)
+        share[near] = (1.0 - cosine[near]) / np.maximum(square[near], 1e-24)
     out = np.empty((3, 3, *cosine.shape))
     out[0, 0] = cosine + x * x * share
     out[1, 1] = cosine + y * y * share

@@ -76,6 +76,16 @@ class Skeleton:
         names = ["_".join(swap.get(w, w) for w in j.split("_")) for j in self.joints]
         return np.array([self.joints.index(n) for n in names])
 
+    def with_lengths_of(self, joints: NDArray[np.floating]) -> Skeleton:
+        """The same rest directions with the median bone lengths of a motion [T, N, 3] in metres."""
+        parents = np.array(self.parents[1:])
+        measured = np.median(np.linalg.norm(joints[:, 1:] - joints[:, parents], axis=-1), axis=0)
+        own = np.linalg.norm(self.offsets[1:], axis=-1)
+        scaled = self.offsets.copy()
+        scaled[1:] *= (measured / np.maximum(own, 1e-9))[:, None]
+        rest = tuple((float(x), float(y), float(z)) for x, y, z in scaled)
+        return Skeleton(self.name, self.joints, self.parents, rest)
+
     def __len__(self) -> int:
         return len(self.joints)
 

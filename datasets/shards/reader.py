@@ -71,7 +71,7 @@ class ShardDataset:
     def open(
         root: Path | str, split: str, *, expect: MotionLayout | None = None, verify: bool = False
     ) -> ShardDataset:
-        """Open one split. `expect` refuses other layouts, families and frame rates; `verify` checks sha256."""
+        """Open one split. `expect` refuses another layout, family or fps; `verify` checks sha256."""
         root = Path(root)
         known = next((name for name in SPLITS if name == split), None)
         if known is None:

@@ -23,17 +23,13 @@ _ARMS: tuple[tuple[tuple[Vec, float, Vec], tuple[Vec, float, Vec]], ...] = (
 )
 
 
-def first_beat(truth: Truth, rng: np.random.Generator) -> float:
-    """Seconds to the first beat of a dance, less than one beat."""
-    return float(rng.uniform(0.0, 1.0) * 60.0 / (truth.bpm or 120))
-
-
 def dance(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
     """Step, bounce or sway from side to side on the beat with alternating arms."""
-    offset = first_beat(truth, rng)
     beat = 60.0 / (truth.bpm or 120)
+    offset = rng.uniform(0.0, beat)
     seconds = span.pick(rng, at_least=min(4.0, span.high))
     track = Track.standing(seconds, fps, rng, width=rng.uniform(0.0, 0.05))
+    track.first_beat = offset
     beats = offset + beat * np.arange(-1, int(seconds / beat) + 3)
     amount = rng.uniform(0.8, 1.2)
     even = np.where(np.arange(len(beats)) % 2 == 0, 1.0, -1.0)

@@ -95,7 +95,7 @@ def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: fl
         times, values = [-1e3], [0.0]
         for step in mine:
             span = step.end - step.start
-            s = ease((t - step.start) / span)
+            s = _carry((t - step.start) / span)
             xz += s[:, None] * (np.asarray(step.xz) - before)
             yaw += s * (step.yaw - before_yaw)
             before, before_yaw = np.asarray(step.xz), step.yaw
@@ -128,6 +128,12 @@ def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: fl
     track.spine[:, 2] -= 0.03 * share
     lead = smooth(ahead, 0.25 * window, fps)
     return np.asarray(lead / max(np.abs(lead).max(), 0.25))
+
+
+def _carry(x: Array) -> Array:
+    """Path of a swinging foot, 0 to 1: gentler than `ease`, so that it lags less behind a fast body."""
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
 
 
 def swing_body(track: Track, lead: Array, stride: Stride, moving: Array, amount: float = 1.0) -> None:

@@ -89,18 +89,20 @@ def squat(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     _lower(track, bent, depth, back=rng.uniform(0.1, 0.15), pitch=rng.uniform(0.5, 0.7))
     track.knee_out += 0.25 * bent
     end = begin + count * period - gap * squeeze
-    out = (rng.uniform(0.0, 0.15), rng.uniform(0.05, 0.25) + 0.3, 1.0)
+    out = (rng.uniform(0.0, 0.15), rng.uniform(-0.15, 0.05), 1.0)
     for side in (0, 1):
         play(
             track,
             side,
             [
                 (begin, None, 0.0, None),
-                (begin + down * squeeze, out, 0.9, (0.0, 1.0, 0.0)),
-                (end - down * squeeze, out, 0.9, (0.0, 1.0, 0.0)),
+                (begin + down * squeeze, out, 0.95, (0.0, 1.0, 0.0)),
+                (end - down * squeeze, out, 0.95, (0.0, 1.0, 0.0)),
                 (end, None, 0.0, None),
             ],
         )
+        # Arms stay level while the chest leans.
+        track.arms[side].direction[:, 1] += 0.4 * bent
     track.lower_to_reach()
     return track
 
@@ -149,7 +151,7 @@ def kick(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     begin = rng.uniform(0.3, max(0.31, seconds - count * unit_time - 0.2))
     track = Track.standing(seconds, fps, rng, width=rng.uniform(-0.02, 0.02))
     rest = track.ball[leg, 0].copy()
-    height, far = rng.uniform(0.55, 0.95), rng.uniform(0.62, 0.75)
+    height, far = rng.uniform(0.6, 0.95), rng.uniform(0.68, 0.8)
     chamber = rest + [-0.02 * sign, 0.38, 0.06]
     end = np.array([rest[0] - 0.04 * sign, height, BALL[1] + far])
     times, places, pitches, effort = [0.0], [rest], [0.0], [0.0]
@@ -211,7 +213,7 @@ def bow(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track
     track.root[:, 2] -= 0.11 * deep * bent
     track.root[:, 1] -= 0.012 * bent
     for side in (0, 1):
-        track.arms[side].direction += bent[:, None] * np.array([-0.1, 0.0, rng.uniform(0.0, 0.15)])
+        track.arms[side].direction += bent[:, None] * np.array([-0.1, 0.0, rng.uniform(0.25, 0.45) * deep])
     track.lower_to_reach()
     return track
 

@@ -71,7 +71,7 @@ def turn(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
 def run(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
     """Run forward, each step with a flight."""
     seconds = span.pick(rng)
-    speed = rng.uniform(2.5, 3.4)
+    speed = rng.uniform(2.3, 3.1)
     step = rng.uniform(0.33, 0.37)
     stride = Stride(
         step_seconds=step,

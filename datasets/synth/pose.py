@@ -32,7 +32,7 @@ LEG_REACH = 0.988
 """Longest hip-to-ankle distance as a fraction of the straight leg."""
 _MIRROR = np.outer([-1.0, 1.0, 1.0], [-1.0, 1.0, 1.0])
 
-HANG = ((0.20, -1.0, 0.06), 0.965, (0.0, 0.0, 1.0))
+HANG = ((0.20, -1.0, 0.06), 0.975, (0.0, 0.0, 1.0))
 """Arm hanging at the side: direction shoulder to wrist, reach, bend direction."""
 
 
@@ -53,6 +53,8 @@ class Track:
 
     t: Array
     fps: float
+    first_beat: float = 0.0
+    """Seconds to the first beat of a dance's music."""
     root: Array = field(init=False)
     yaw: Array = field(init=False)
     pelvis: Array = field(init=False)
@@ -128,7 +130,8 @@ class Track:
         flat = (away[..., [0, 2]] ** 2).sum(-1)
         limit = (LEG_REACH * (THIGH + SHIN)) ** 2
         top = self.root[:, 1] + away[..., 1] + np.sqrt(np.maximum(limit - flat, 0.01))
-        over = np.minimum(top.min(0) - self.root[:, 1], 0.0)
+        # A swinging foot may lag behind; only one that stands must be reached exactly.
+        over = np.where(self.ball[..., 1] < 0.02, np.minimum(top - self.root[:, 1], 0.0), 0.0).min(0)
         self.root[:, 1] += lower_envelope(over, seconds, self.fps)
 
     def _pelvis_rotation(self) -> Array:
@@ -195,9 +198,8 @@ class Track:
         forward = np.clip(axis[:, 2], -0.3, 1.0) * np.clip(arm.reach - 0.55, 0.0, 0.45) * 0.45
         collar = rot_y(-forward) @ rot_z(lift)
         shift = collar @ OFFSETS[16] - OFFSETS[16]
-        to = axis * (np.clip(arm.reach, 0.3, 0.985) * ARM)[:, None] - shift
-        distance = np.clip(np.linalg.norm(to, axis=-1), 0.3 * ARM, 0.985 * ARM)
-        axis = unit(to)
+        distance = np.clip(arm.reach, 0.3, 0.985) * ARM
+        axis = unit(axis * distance[:, None] - shift)
         bend = arm.bend - (arm.bend * axis).sum(-1, keepdims=True) * axis
         bend = unit(bend)
         cosine = (UPPER_ARM**2 + distance**2 - FOREARM**2) / (2 * UPPER_ARM * distance)

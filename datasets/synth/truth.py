@@ -109,7 +109,9 @@ def draw(action: str, rng: np.random.Generator) -> Truth:
         style = _one(rng, ("step", "bounce", "sway"))
     if action in ("squat", "bow"):
         speed = _one(rng, ("slowly", None, "quickly"))
-        count = 1 if speed == "slowly" and action == "squat" else count
+    if action == "squat" and count is not None:
+        # As many as fit into five seconds without changing the pace.
+        count = min(count, {"slowly": 1, None: 2, "quickly": 3}[speed])
     left, right = _hands(action, side, rng)
     return Truth(
         action, direction, side, count, speed, left, right, str(rng.choice(FACES)), bpm, style

@@ -1,12 +1,15 @@
-"""`InterleavedGPT`: one causal transformer over interleaved code streams (HumanTOMATO sections 3.3-3.4, appendix B.3).
+"""`InterleavedGPT`: one causal transformer over interleaved code streams (HumanTOMATO sections 3.3-3.4,
+appendix B.3).
 
-The first input is the projected text prior; the input at position i + 1 is token i, and the output at position i is the
-distribution of token i. Every stream has its own embedding and its own output head.
+The first input is the projected text prior; the input at position i + 1 is token i, and the output at
+position i is the distribution of token i. Every stream has its own embedding and its own output head.
 
 Notable choices:
-- Logits come masked by the grammar of `tokens.py`: an illegal token has probability zero in the loss and in sampling alike,
-  and cannot be sampled. Tokens after the first End are certain, so they cost nothing and teach nothing.
-- `condition_dropout` replaces the projected text by a learned null input, for classifier-free guidance [ours].
+- Logits come masked by the grammar of `tokens.py`: an illegal token has probability zero in the loss and in
+  sampling alike, and cannot be sampled. Tokens after the first End are certain, so they cost nothing and
+  teach nothing.
+- `condition_dropout` replaces the projected text by a learned null input, for classifier-free guidance
+  [ours].
 - Positions are learned embeddings.
 
 Legend: B batch, L tokens, D width, E text width, V largest vocabulary (K + 1).
@@ -41,7 +44,9 @@ class GptConfig(Config):
     condition_dropout: float = Field(0.1, ge=0, lt=1)
     """Share of samples trained without text, for guidance [ours]; 0 turns guidance off."""
     pkeep: float = Field(1.0, gt=0, le=1)
-    """Probability that an input token is kept; the others become random codes of their stream (T2M-GPT uses 0.5)."""
+    """Probability that an input token is kept; the others become random codes of their stream (T2M-GPT uses
+    0.5).
+    """
 
 
 class InterleavedGPT(nn.Module):
@@ -67,7 +72,9 @@ class InterleavedGPT(nn.Module):
         sizes = {stream.name: stream.num_codes for stream in streams}
         missing = [name for name in stream_names(pattern) if name not in sizes]
         if missing:
-            raise UserError(f"the token pattern {self.pattern} names {missing}; the streams are {list(sizes)}")
+            raise UserError(
+                f"the token pattern {self.pattern} names {missing}; the streams are {list(sizes)}"
+            )
         self.names = stream_names(pattern)
         self.num_codes = {name: sizes[name] for name in self.names}
         """Codes per stream, which is also the stream's End token."""
@@ -154,7 +161,9 @@ class InterleavedGPT(nn.Module):
         return out
 
     def logits(self, hidden: Tensor, kinds: Tensor, legal: Tensor) -> Tensor:
-        """Hidden states [B, L, D], kinds [B, L], legal bool [B, L, V] -> float32 [B, L, V], -inf where illegal."""
+        """Hidden states [B, L, D], kinds [B, L], legal bool [B, L, V] -> float32 [B, L, V], -inf where
+        illegal.
+        """
         out = torch.full((*kinds.shape, self.vocabulary), -torch.inf, device=hidden.device)
         for kind, head in enumerate(self.heads):
             values = head(hidden).float()
@@ -172,7 +181,9 @@ class InterleavedGPT(nn.Module):
         return self.legal_at(end, first, closing)
 
     def legal_at(self, end: Tensor, first: Tensor, closing: Tensor) -> Tensor:
-        """Bool [..., V] for positions with End token `end`, at a group's first slot or not, behind an End or not."""
+        """Bool [..., V] for positions with End token `end`, at a group's first slot or not, behind an End or
+        not.
+        """
         code = torch.arange(self.vocabulary, device=end.device)
         codes = (code < end[..., None]) & ~closing[..., None]
         ending = (code == end[..., None]) & (first | closing)[..., None]

@@ -1,15 +1,19 @@
-"""Token sequences: several code streams interleaved into one, and back (HumanTOMATO section 3.3, equation 4; B.4).
+"""Token sequences: several code streams interleaved into one, and back (HumanTOMATO section 3.3, equation 4;
+B.4).
 
-A *pattern* names the stream of every slot of one group of frames: ("body", "body", "hand") for H2VQ, ("level0", "level1")
-for the face RVQ, ("code",) for one codebook. A sequence is the groups one after another, closed by one End token per
-stream in order of first appearance: 49 groups of H2VQ are 98 body + 49 hand + 2 End = 149 tokens, the paper's longest.
+A *pattern* names the stream of every slot of one group of frames: ("body", "body", "hand") for H2VQ,
+("level0", "level1") for the face RVQ, ("code",) for one codebook. A sequence is the groups one after another,
+closed by one End token per stream in order of first appearance: 49 groups of H2VQ are 98 body + 49 hand + 2
+End = 149 tokens, the paper's longest.
 
-The End of a stream with K codes is its token K. The grammar that follows, used alike in training and in sampling:
+The End of a stream with K codes is its token K. The grammar that follows, used alike in training and in
+sampling:
 - End is legal only at the first slot of a group, and only in that slot's stream;
 - after it, every remaining token is the End of its own stream;
 - a token of a stream is never legal where the pattern names another.
 
-A token's *kind* is the index of its stream in order of first appearance. Padding is -1 in `tokens` and 0 in `kinds`.
+A token's *kind* is the index of its stream in order of first appearance. Padding is -1 in `tokens` and 0 in
+`kinds`.
 
 Legend: B batch, G groups, P slots of a group, L tokens.
 """
@@ -73,7 +77,8 @@ def interleave(
     Args:
         codes: int64 per stream of the pattern.
         pattern: Stream of every slot of a group.
-        ends: End token per stream (its number of codes); None leaves the sequences open, for clips that were cropped.
+        ends: End token per stream (its number of codes); None leaves the sequences open, for clips that were
+            cropped.
         groups: Valid groups per clip, [B] (default: all G). Codes behind them are ignored.
 
     Raises:
@@ -116,12 +121,16 @@ def interleave(
 
 
 def deinterleave(
-    tokens: Tensor, pattern: Sequence[str], *, ends: Mapping[str, int] | None = None, length: Tensor | None = None
+    tokens: Tensor,
+    pattern: Sequence[str],
+    *,
+    ends: Mapping[str, int] | None = None,
+    length: Tensor | None = None,
 ) -> Codes:
     """Inverse of `interleave`: tokens [B, L], open or closed, padded or not -> streams and numbers of groups.
 
-    `length` [B] bounds the tokens read; without it they end at the first `PAD`, or at the first End when `ends` is given. An
-    unfinished last group is dropped.
+    `length` [B] bounds the tokens read; without it they end at the first `PAD`, or at the first End when
+    `ends` is given. An unfinished last group is dropped.
     """
     names = stream_names(pattern)
     kinds_row = kind_of_slot(pattern)

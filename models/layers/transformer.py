@@ -1,11 +1,14 @@
-"""Transformer blocks shared by TMA and the GPTs: pre-norm, GELU, scaled-dot-product attention, optional KV cache.
+"""Transformer blocks shared by TMA and the GPTs: pre-norm, GELU, scaled-dot-product attention, optional KV
+cache.
 
 Notable choices:
-- Attention is always `F.scaled_dot_product_attention`, so fused kernels are used wherever the device has them.
+- Attention is always `F.scaled_dot_product_attention`, so fused kernels are used wherever the device has
+  them.
 - Masks are boolean and say what *may* be attended (True = visible), as SDPA wants them.
-- A causal stack needs no padding mask when sequences are padded on the right: real positions never see padding.
-- Dropout acts on the residual branches (`dropout`) and on the attention weights (`attention_dropout`); CPUs have no fused
-  kernel for the second, so small CPU configs set it to 0.
+- A causal stack needs no padding mask when sequences are padded on the right: real positions never see
+  padding.
+- Dropout acts on the residual branches (`dropout`) and on the attention weights (`attention_dropout`); CPUs
+  have no fused kernel for the second, so small CPU configs set it to 0.
 
 Legend: B batch, L positions, S visible positions, D width, H heads.
 """
@@ -15,7 +18,7 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F  # noqa: N812
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 
@@ -33,7 +36,9 @@ def sinusoid(size: int, dim: int, device: torch.device | None = None) -> Tensor:
 
 
 class LayerCache:
-    """Keys and values [B, H, size, D/H] of the positions one layer has seen; allocated once, at the first append."""
+    """Keys and values [B, H, size, D/H] of the positions one layer has seen; allocated once, at the first
+    append.
+    """
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -130,8 +135,9 @@ class Block(nn.Module):
 class Transformer(nn.Module):
     """A stack of blocks and a last LayerNorm.
 
-    Weights start at N(0, 2 / (5 dim)), which is GPT-2's 0.02 at width 1024 and grows with narrower stacks so that attention
-    carries signal from the first step; outputs into the residual stream are smaller by sqrt(2 layers).
+    Weights start at N(0, 2 / (5 dim)), which is GPT-2's 0.02 at width 1024 and grows with narrower stacks so
+    that attention carries signal from the first step; outputs into the residual stream are smaller by sqrt(2
+    layers).
     """
 
     def __init__(
@@ -159,7 +165,7 @@ class Transformer(nn.Module):
     def forward(
         self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: KVCache | None = None
     ) -> Tensor:
-        """x [B, L, D]; mask bool [B, L] of visible positions (or [B, L, S]), or `causal`; cache for decoding."""
+        """x [B, L, D]; mask bool [B, L] of visible positions or [B, L, S], or `causal`; cache to decode."""
         if mask is not None:
             mask = mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
         for index, block in enumerate(self.blocks):

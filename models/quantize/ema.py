@@ -32,11 +32,11 @@ from motionloom.models.quantize.draws import draw_rows
 class QuantizerConfig(Config):
     """One codebook."""
 
-    num_codes: int = Field(512, ge=2)
-    dim: int = Field(512, ge=1)
-    decay: float = Field(0.99, gt=0, lt=1)
+    num_codes: int = Field(default=512, ge=2)
+    dim: int = Field(default=512, ge=1)
+    decay: float = Field(default=0.99, gt=0, lt=1)
     """EMA constant lambda."""
-    reset_below: float = Field(1.0, gt=0)
+    reset_below: float = Field(default=1.0, gt=0)
     """A code whose EMA count falls below this is reset."""
 
 
@@ -133,14 +133,15 @@ class EmaQuantizer(nn.Module):
                 self._initialise(rows, flat_mask)
             codes = nearest(rows, self.codebook)
             chosen = functional.embedding(codes, self.codebook).view_as(full)
-            penalty = masked_mean((full - chosen).square(), mask)
+            error = full - chosen
+            penalty = masked_mean(error.square(), mask)
             used = rows.new_ones(len(rows)) if flat_mask is None else flat_mask.float()
             counts = rows.new_zeros(self.config.num_codes).index_add_(0, codes, used)
             resets = rows.new_zeros(())
             if update:
                 counts, resets = self._update(rows, flat_mask, codes, counts)
             metrics = {"penalty": penalty.detach(), **self._metrics(counts), "resets": resets}
-            straight = full + (chosen - full).detach()
+            straight = full - error.detach()
         return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
 
     def vectors(self, codes: Tensor) -> Tensor:

@@ -2,23 +2,26 @@
 
 L = L_rec + 1e-5 KL + 1e-5 L_E + 0.1 L_NCE. Every function returns a scalar float32.
 
-Distributed: each function returns a value whose *mean over ranks* is the loss of the concatenated batch, so DDP's gradient
-averaging reproduces one process with the whole batch. Rows per rank must be equal; numbers of real frames need not.
+Distributed: each function returns a value whose *mean over ranks* is the loss of the concatenated batch, so
+DDP's gradient averaging reproduces one process with the whole batch. Rows per rank must be equal; numbers of
+real frames need not.
 """
 
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F  # noqa: N812
+import torch.nn.functional as F
 from torch import Tensor
 
 from motionloom.models.distributed import gather_rows, gather_rows_with_grad, sum_over_ranks, world_size
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Sum of `values` where `mask` over the mean number of unmasked elements per rank; `mask` has the shape of `values`.
+    """Sum of `values` where `mask` over the mean number of unmasked elements per rank; `mask` has the shape
+    of `values`.
 
-    Dividing by the global count over the number of ranks is what makes the mean over ranks a mean over all elements.
+    Dividing by the global count over the number of ranks is what makes the mean over ranks a mean over all
+    elements.
     """
     count = sum_over_ranks(mask.sum().float()) / world_size()
     return torch.where(mask, values, 0.0).sum() / count.clamp(min=1)
@@ -53,7 +56,8 @@ def latent_loss(text: Tensor, motion: Tensor) -> Tensor:
 def false_negatives(sentence: Tensor, threshold: float) -> Tensor:
     """Bool [N, N]: pairs whose captions say the same, cosine of sentence embeddings [N, E] above `threshold`.
 
-    Exact duplicates are included (OpenTMA keeps those whose cosine rounds to 1.0 as negatives), the diagonal never is.
+    Exact duplicates are included (OpenTMA keeps those whose cosine rounds to 1.0 as negatives), the diagonal
+    never is.
     """
     unit = F.normalize(sentence.float(), dim=-1)
     similar = unit @ unit.T > threshold
@@ -68,10 +72,12 @@ def info_nce(
     temperature: float = 0.1,
     threshold: float = 0.85,
 ) -> Tensor:
-    """Symmetric InfoNCE on cosine similarity over the global batch: text, motion [B, Z], sentence [B, E] or None.
+    """Symmetric InfoNCE on cosine similarity over the global batch: text, motion [B, Z], sentence [B, E] or
+    None.
 
-    Rows are gathered from all ranks with gradient: every rank computes the same global loss, and the gradient that reaches a
-    rank's rows, averaged by DDP, equals that of one process. Pairs of `false_negatives` leave the softmax.
+    Rows are gathered from all ranks with gradient: every rank computes the same global loss, and the gradient
+    that reaches a rank's rows, averaged by DDP, equals that of one process. Pairs of `false_negatives` leave
+    the softmax.
     """
     with torch.autocast(text.device.type, enabled=False):
         text = F.normalize(gather_rows_with_grad(text.float()), dim=-1)

@@ -45,10 +45,11 @@ class TmaModule(StageModule):
         self.loss_config = loss or TmaLossConfig()
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Loss of one batch: "motion" [B, T, D], "length" [B], "text_tokens" [B, S, E], "text_mask", "sentence" [B, E].
+        """Loss of one batch: "motion" [B, T, D], "length" [B], "text_tokens" [B, S, E], "text_mask",
+        "sentence" [B, E].
 
-        Latents are sampled in training and are the means in evaluation. InfoNCE contrasts the means, as the published
-        HumanTOMATO code does (TMR contrasts samples): retrieval uses the means too.
+        Latents are sampled in training and are the means in evaluation. InfoNCE contrasts the means, as the
+        published HumanTOMATO code does (TMR contrasts samples): retrieval uses the means too.
         """
         net, weight = self.net, self.loss_config
         motion, length = batch["motion"], batch["length"]

@@ -1,11 +1,12 @@
 """TMA: text and motion in one latent space (HumanTOMATO section 3.5 and appendix D; TEMOS, TMR).
 
-Three transformers. The motion encoder and the text encoder each read their sequence behind two learned tokens whose
-outputs are the mean and the log-variance of a Gaussian latent; the motion decoder writes a motion from one latent.
+Three transformers. The motion encoder and the text encoder each read their sequence behind two learned tokens
+whose outputs are the mean and the log-variance of a Gaussian latent; the motion decoder writes a motion from
+one latent.
 
 Notable choices:
-- The decoder puts the latent in front of the frame queries and lets them attend to it. TEMOS attends to a one-token memory by
-  cross-attention, which is the same information path with one softmax over a single key.
+- The decoder puts the latent in front of the frame queries and lets them attend to it. TEMOS attends to a
+  one-token memory by cross-attention, which is the same information path with one softmax over a single key.
 - `frame_stride` n feeds and reconstructs every n-th frame. 1 is the paper; small CPU runs take 2 to 4.
 
 Legend: B batch, T frames, D motion features, S text tokens, E text width, Z latent width.
@@ -116,7 +117,9 @@ class Tma(nn.Module):
         return mu, logvar
 
     def decode(self, z: Tensor, length: Tensor, frames: int) -> Tensor:
-        """Z [B, Z] -> [B, ceil(frames / stride), D] at every `frame_stride`-th frame; zero past `length` frames."""
+        """Z [B, Z] -> [B, ceil(frames / stride), D] at every `frame_stride`-th frame; zero past `length`
+        frames.
+        """
         stride = self.config.frame_stride
         mask = length_mask((length + stride - 1) // stride, (frames + stride - 1) // stride)
         out: Tensor = self.motion_decoder(z, mask)

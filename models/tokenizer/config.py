@@ -24,19 +24,19 @@ class LossTerms(TypedDict):
 class BaseTokenizerConfig(Config):
     """What every tokenizer has."""
 
-    width: int = Field(512, ge=1)
+    width: int = Field(default=512, ge=1)
     """Channels of the convolutions."""
-    depth: int = Field(3, ge=1)
+    depth: int = Field(default=3, ge=1)
     """Residual blocks per resolution."""
-    dilation_growth: int = Field(3, ge=1)
-    code_dim: int = Field(512, ge=1)
-    num_codes: int = Field(512, ge=2)
-    decay: float = Field(0.99, gt=0, lt=1)
-    reset_below: float = Field(1.0, gt=0)
-    alpha: float = Field(0.02, ge=0)
+    dilation_growth: int = Field(default=3, ge=1)
+    code_dim: int = Field(default=512, ge=1)
+    num_codes: int = Field(default=512, ge=2)
+    decay: float = Field(default=0.99, gt=0, lt=1)
+    reset_below: float = Field(default=1.0, gt=0)
+    alpha: float = Field(default=0.02, ge=0)
     """Weight of the commitment penalty."""
     recon: Recon = "l2"
-    velocity_weight: float = Field(0.0, ge=0)
+    velocity_weight: float = Field(default=0.0, ge=0)
     """Weight of the same reconstruction error between frame-to-frame differences."""
 
     def quantizer(self) -> QuantizerConfig:
@@ -69,7 +69,7 @@ class RvqConfig(BaseTokenizerConfig):
 
     kind: Literal["rvq"] = "rvq"
     part: Part = "bodyhand"
-    levels: int = Field(2, ge=1)
+    levels: int = Field(default=2, ge=1)
 
 
 TokenizerConfig = Annotated[H2VQConfig | VqConfig | RvqConfig, Field(discriminator="kind")]

@@ -1,8 +1,8 @@
-"""What a skeleton looks like: a list of rounded shapes hung on its joints, shared by viewer, video and pictures.
+"""What a skeleton looks like: rounded shapes hung on its joints, shared by viewer, video and pictures.
 
-* Every drawn point ("node") is a linear blend of joints, so a whole clip's nodes are one matrix product. Finger and toe
-  tips, which the skeletons lack, are extrapolations; the flanks of the trunk are blends with the shoulder line.
-* Three kinds of shape: tapered capsules (limbs), hulls of spheres (trunk, palms), and one head with a face.
+* Every drawn point ("node") is a linear blend of joints, so a whole clip's nodes are one matrix product.
+  Finger and toe tips, which the skeletons lack, are extrapolated; the trunk's flanks follow the shoulders.
+* Three kinds of shape: tapered capsules (limbs), hulls of spheres (trunk, palms, feet), and one head.
 * Skeletons that are not SMPL-X's get plain capsules from their parents alone, so any BVH can be drawn.
 """
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
 
-CENTRE, LEFT, RIGHT = 0, 1, 2
+CENTRE, LEFT, RIGHT, SKIN = 0, 1, 2, 3
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 
 Blend = tuple[tuple[int, float], ...]
@@ -26,7 +26,7 @@ Blend = tuple[tuple[int, float], ...]
 
 @dataclass(frozen=True)
 class Capsule:
-    """A tapered limb between nodes `a` and `b` with radii in metres; `fine` ones (fingers) skip costly shading."""
+    """A tapered limb between nodes `a` and `b` with radii in metres; `fine` (fingers) skips shading."""
 
     a: int
     b: int
@@ -47,7 +47,7 @@ class Hull:
 
 @dataclass(frozen=True)
 class Head:
-    """Nodes that place the head: its up axis is neck to head, its left axis right shoulder to left shoulder."""
+    """Nodes that place the head: neck to head points up, right shoulder to left shoulder points left."""
 
     neck: int
     head: int
@@ -78,10 +78,12 @@ class Figure:
         return out
 
     def scale(self, joints: NDArray[Any]) -> float:
-        """Factor on all radii for the first pose of joints [T, N, 3]; keeps children and giants in proportion."""
+        """Factor on all radii by the first pose of joints [T, N, 3]: small people get thin limbs."""
         if self.stature <= 0:
             return 1.0
-        return float(np.clip(_bone_sum(np.asarray(joints[0], np.float64), self.parents) / self.stature, 0.3, 3.0))
+        return float(
+            np.clip(_bone_sum(np.asarray(joints[0], np.float64), self.parents) / self.stature, 0.3, 3.0)
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Compact form for the viewer's script."""
@@ -94,7 +96,7 @@ class Figure:
 
 
 def figure_for(parents: Sequence[int], joints: NDArray[Any]) -> Figure:
-    """The figure of a skeleton given by `parents` [N]; `joints` [T, N, 3] serves only to size unknown skeletons."""
+    """The figure of a skeleton with `parents` [N]; `joints` [T, N, 3] only sizes unknown skeletons."""
     key = tuple(int(p) for p in parents)
     for name in ("smplx52", "smpl22"):
         if key == Skeleton.named(name).parents:
@@ -124,7 +126,7 @@ def human_figure(name: str) -> Figure:
     chest, belly = [], []
     for side, sign in (("left", 1), ("right", -1)):
         chest += [
-            (node(**{f"{side}_shoulder": 0.72, "spine3": 0.28}), 0.058),
+            (node(**{f"{side}_shoulder": 0.8, "spine3": 0.2}), 0.056),
             (node(**{f"{side}_collar": 0.6, "neck": 0.4}), 0.05),
             (across("spine2", sign * 0.17), 0.075),
         ]
@@ -135,14 +137,17 @@ def human_figure(name: str) -> Figure:
         ]
     for spheres in (belly, chest):
         hulls.append(Hull(tuple(n for n, _ in spheres), tuple(r for _, r in spheres), CENTRE))
-    limb(at("neck"), at("head"), 0.048, 0.045, CENTRE)
+    limb(at("neck"), at("head"), 0.05, 0.045, SKIN)
 
     for side, code in (("left", LEFT), ("right", RIGHT)):
         limb(at(f"{side}_hip"), at(f"{side}_knee"), 0.083, 0.055, code)
         limb(at(f"{side}_knee"), at(f"{side}_ankle"), 0.056, 0.036, code)
         toe = node(**{f"{side}_foot": 1.42, f"{side}_ankle": -0.42})
-        limb(at(f"{side}_ankle"), at(f"{side}_foot"), 0.04, 0.034, code)
-        limb(at(f"{side}_foot"), toe, 0.034, 0.024, code)
+        # Half a heel's height below the ankle along the shin, then back from the ball of the foot.
+        heel = node(**{f"{side}_ankle": 1.28, f"{side}_knee": -0.08, f"{side}_foot": -0.2})
+        hulls.append(
+            Hull((at(f"{side}_ankle"), heel, at(f"{side}_foot"), toe), (0.036, 0.036, 0.035, 0.024), code)
+        )
         limb(at(f"{side}_shoulder"), at(f"{side}_elbow"), 0.054, 0.04, code)
         limb(at(f"{side}_elbow"), at(f"{side}_wrist"), 0.041, 0.028, code)
         wrist = at(f"{side}_wrist")

@@ -18,7 +18,7 @@ function readTheme(root) {
   const value = (name) => style.getPropertyValue(`--mlv-${name}`).trim();
   const ramp = (name) => toneRamp(value(name), value("fog"), Number(value("fog-strength")));
   return {
-    tones: { 0: ramp("centre"), 1: ramp("left"), 2: ramp("right"), head: ramp("skin"), hair: ramp("hair")[2] },
+    tones: { 0: ramp("centre"), 1: ramp("left"), 2: ramp("right"), [SKIN]: ramp("skin"), hair: ramp("hair")[2] },
     grid: value("grid"), floorNear: value("floor-near"), floorFar: value("floor-far"), trail: value("trail"),
     shadow: value("shadow"), shadowClear: value("shadow-clear"), eyeWhite: value("eye-white"), feature: value("feature"),
     brow: value("hair"), mouth: value("mouth"), lip: value("lip"), nose: value("nose"),
@@ -46,6 +46,8 @@ function mountViewer(root, data, options) {
   root.append(board);
   const bar = buildBar(root, last, duration);
   root.classList.toggle("mlv-single", clips.length === 1);
+  root.classList.toggle("mlv-tall", page || board.children.length > 1 || clips.length > 4);
+  bar.theme.hidden = !page;
   const button = (name, act) => bar[name].addEventListener("click", act);
 
   // ---- clock

@@ -2,6 +2,9 @@
 
 const LAMP = [-0.55, -0.83]; // where light comes from on the screen
 const FOG_STEPS = 10;
+const TRUNK_BIAS = 0.05; // metres: a thigh or upper arm must stand out this far to be painted over the trunk
+const NECK_BIAS = 0.06; // and the neck goes under the chin
+const SKIN = 3;
 
 const parseColour = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
 const toColour = (rgb) => `rgb(${rgb.map((v) => Math.round(clamp(v, 0, 255))).join(",")})`;
@@ -13,7 +16,7 @@ function toneRamp(hex, fogHex, strength) {
   return Array.from({ length: FOG_STEPS + 1 }, (_, k) => {
     const haze = (c) => toColour(blend(c, fog, (strength * k) / FOG_STEPS));
     return {
-      light: haze(blend(colour, [255, 255, 255], 0.42)), base: haze(colour),
+      light: haze(blend(colour, [255, 255, 255], 0.36)), base: haze(colour),
       dark: haze(blend(colour, [12, 16, 34], 0.46)), edge: haze(blend(colour, [8, 10, 24], 0.62)),
     };
   });
@@ -56,22 +59,22 @@ function drawFigure(ctx, lens, clip, figure, nodes, face, theme) {
   const count = figure.blends.length, s = clip.screen;
   for (let k = 0; k < count; k++) projectTo(lens, nodes[3 * k], nodes[3 * k + 1], nodes[3 * k + 2], s, 4 * k);
   const items = [];
-  const fogOf = (depth) => clamp(Math.round(((depth - lens.distance) / 1.6 + 0.35) * FOG_STEPS), 0, FOG_STEPS);
+  const fogOf = (depth) => clamp(Math.round(((depth - lens.distance + 0.3) / 1.6) * FOG_STEPS), 0, FOG_STEPS);
 
   for (const [a, b, ra, rb, side, fine] of figure.capsules) {
     if (s[4 * a + 2] < NEAR || s[4 * b + 2] < NEAR) continue;
-    const depth = (s[4 * a + 2] + s[4 * b + 2]) / 2;
+    const depth = (s[4 * a + 2] + s[4 * b + 2]) / 2 + (side === SKIN ? NECK_BIAS : 0);
     items.push({ depth, draw: () => drawLimb(ctx, s, a, b, ra * clip.scale, rb * clip.scale, fine, theme.tones[side][fogOf(depth)]) });
   }
   for (const [side, members, radii] of figure.hulls) {
     if (members.some((m) => s[4 * m + 2] < NEAR)) continue;
-    const depth = members.reduce((sum, m) => sum + s[4 * m + 2], 0) / members.length;
-    items.push({ depth, draw: () => drawHull(ctx, s, members, radii, clip.scale, theme.tones[side][fogOf(depth)]) });
+    const depth = members.reduce((sum, m) => sum + s[4 * m + 2], 0) / members.length - (side ? 0 : TRUNK_BIAS);
+    items.push({ depth, draw: () => drawHull(ctx, s, members, radii, clip.scale, side === 0, theme.tones[side][fogOf(depth)]) });
   }
   if (figure.head && s[4 * figure.head.head + 2] > NEAR) {
     const pose = headPose(nodes, figure.head, clip.scale);
     const depth = project(lens, pose.centre)[2];
-    items.push({ depth, draw: () => drawHead(ctx, lens, pose, face, theme, theme.tones.head[fogOf(depth)]) });
+    items.push({ depth, draw: () => drawHead(ctx, lens, pose, face, theme, theme.tones[SKIN][fogOf(depth)]) });
   }
   items.sort((p, q) => q.depth - p.depth);
   for (const item of items) item.draw();
@@ -104,7 +107,7 @@ function drawLimb(ctx, s, a, b, ra, rb, fine, tones) {
   ctx.stroke();
 }
 
-function drawHull(ctx, s, members, radii, scale, tones) {
+function drawHull(ctx, s, members, radii, scale, deep, tones) {
   const circles = [];
   let x = 0, y = 0;
   members.forEach((m, k) => {
@@ -118,14 +121,14 @@ function drawHull(ctx, s, members, radii, scale, tones) {
   const shade = ctx.createRadialGradient(x + LAMP[0] * 0.45 * reach, y + LAMP[1] * 0.45 * reach, 0, x, y, 1.15 * reach);
   shade.addColorStop(0, tones.light);
   shade.addColorStop(0.45, tones.base);
-  shade.addColorStop(1, tones.dark);
+  shade.addColorStop(1, deep ? tones.dark : tones.base);
   ctx.beginPath();
   polygonPath(ctx, outline);
   ctx.fillStyle = shade;
   ctx.fill();
   ctx.lineWidth = 1;
   ctx.strokeStyle = tones.edge;
-  ctx.globalAlpha = 0.55;
+  ctx.globalAlpha = deep ? 0.55 : 0.4;
   ctx.stroke();
   ctx.globalAlpha = 1;
 }

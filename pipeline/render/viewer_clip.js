@@ -86,5 +86,5 @@ function faceAt(clip, frame, neutral) {
 /* Distance from which a figure of this height and radius fits a cell. */
 function fitDistance(height, radius, width, tall) {
   const tan = Math.tan(FIELD_OF_VIEW / 2);
-  return Math.max((height / 2) * 1.16 / tan, (radius * 1.08 * tall) / (tan * width)) + radius * 0.35;
+  return Math.max((height / 2) * 1.1 / tan, (radius * 1.08 * tall) / (tan * width)) + radius * 0.3;
 }

@@ -89,7 +89,7 @@ function drawTrail(ctx, lens, clip, frame, theme) {
     if (p[2] <= NEAR) continue;
     ctx.globalAlpha = second * clip.fps <= frame ? 0.9 : 0.3;
     ctx.beginPath();
-    ctx.ellipse(p[0], p[1], 0.025 * p[3] + 1, (0.025 * p[3] + 1) * Math.max(lens.back[1], 0.25), 0, 0, 2 * Math.PI);
+    ctx.ellipse(p[0], p[1], 0.035 * p[3] + 1, (0.035 * p[3] + 1) * Math.max(lens.back[1], 0.3), 0, 0, 2 * Math.PI);
     ctx.fill();
   }
   ctx.globalAlpha = 1;

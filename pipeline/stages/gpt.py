@@ -12,11 +12,9 @@ from torch.utils.data import Dataset
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.text.cache import TextCache
-from motionloom.models.gpt import GptConfig, GptLossConfig, InterleavedGPT
-from motionloom.models.gpt.module import GptModule
-from motionloom.models.gpt.tokens import TokenPattern
+from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.stage_module import OptimConfig
-from motionloom.models.tokenizer import Tokenizer
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
 from motionloom.pipeline.networks import LoadedTma, load_tokenizer
 from motionloom.pipeline.sources import captions_of, held_out, open_split, open_text
@@ -48,7 +46,6 @@ def run_gpt(context: StageContext) -> None:
     if (config.prior == "tma" or config.loss.align_weight > 0) and tma_folder is None:
         raise UserError(f"stage {context.name}: prior 'tma' and align_weight > 0 need a tma stage before it")
     tma = LoadedTma.load(tma_folder) if tma_folder is not None else None
-    pattern = TokenPattern(tokenizer.streams, tokenizer.pattern)
     text = open_text(context.input("text"))
     text_dim = tma.net.config.latent if config.prior == "tma" and tma else text.dim
     torch.manual_seed(context.seed)
@@ -71,15 +68,27 @@ def run_gpt(context: StageContext) -> None:
             context.input("tokens") / f"tokens-{split}.safetensors", {s.name: s.per_group for s in tokenizer.streams}
         )
         captions, prior, sentences = priors(dataset, text, tma if config.prior == "tma" else None, face=config.face)
-        max_groups = pattern.groups_within(config.net.block_size - 1)
         return TokenBatches(
-            store, captions, prior, sentences, pattern, max_groups, batch, context.seed, rank, world, training
+            store,
+            captions,
+            prior,
+            sentences,
+            net.pattern,
+            net.num_codes,
+            net.max_groups,
+            batch,
+            context.seed,
+            rank,
+            world,
+            training,
         )
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
         return batches("train", batch, rank, world, training=True)
 
-    validation = batches(held_out(data), 64, 0, 1, training=False)
+    def validation(rank: int, world: int) -> Dataset[Any]:
+        return batches(held_out(data), 32 * world, rank, world, training=False)
+
     fit(context, module, config.train, train, validation, config.optim.grad_clip)
     if module.global_rank == 0:
         extra = {

@@ -8,10 +8,10 @@ import torch
 from pydantic import Field
 from torch.utils.data import Dataset
 
-from motionloom.datasets.shards.batches import CaptionBatches, eval_captions
+from motionloom.datasets.shards.batches import CaptionBatches, EvalBatches
 from motionloom.models.stage_module import OptimConfig
-from motionloom.models.tma import Tma, TmaConfig, TmaLossConfig
-from motionloom.models.tma.module import TmaModule
+from motionloom.models.tma.module import TmaLossConfig, TmaModule
+from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
 from motionloom.pipeline.sources import held_out, open_split, open_stats, open_text
 from motionloom.pipeline.stage import StageConfig, StageContext
@@ -56,9 +56,20 @@ def run_tma(context: StageContext) -> None:
         )
 
     held = open_split(data, held_out(data))
-    validation = eval_captions(
-        held, stats, text, batch_size=32, max_frames=config.max_frames, min_frames=config.min_frames, columns=columns
-    )
+
+    def validation(rank: int, world: int) -> Dataset[Any]:
+        return EvalBatches(
+            held,
+            stats,
+            text,
+            batch_size=32 * world,
+            max_frames=config.max_frames,
+            min_frames=config.min_frames,
+            rank=rank,
+            world=world,
+            columns=columns,
+        )
+
     fit(context, module, config.train, train, validation, config.optim.grad_clip)
     if module.global_rank == 0:
         extra = {"motion_dim": len(columns), "text_dim": text.dim, "max_frames": config.max_frames}

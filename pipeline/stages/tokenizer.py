@@ -8,9 +8,10 @@ import torch
 from pydantic import Field
 from torch.utils.data import Dataset
 
-from motionloom.datasets.shards.batches import WindowBatches, eval_windows
+from motionloom.datasets.shards.batches import EvalBatches, WindowBatches
 from motionloom.models.stage_module import OptimConfig
-from motionloom.models.tokenizer import H2VQConfig, RvqConfig, VqConfig, build_tokenizer
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig, VqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
 from motionloom.pipeline.sources import held_out, open_split, open_stats
@@ -71,7 +72,12 @@ def run_tokenizer(context: StageContext) -> None:
         )
 
     held = open_split(data, held_out(data))
-    validation = eval_windows(held, stats, window=config.window, batch_size=64, columns=columns)
+
+    def validation(rank: int, world: int) -> Dataset[Any]:
+        return EvalBatches(
+            held, stats, batch_size=8 * world, max_frames=4 * config.window, rank=rank, world=world, columns=columns
+        )
+
     fit(context, module, config.train, train, validation, config.optim.grad_clip)
     if module.global_rank == 0:
         facts = ModelFacts(kind=config.net.kind, config=config.net.dump(), layout=LayoutFacts.of(dataset.layout))

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.statistics import FeatureStats
-from motionloom.models.tokenizer import Tokenizer
+from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.networks import load_tokenizer
 from motionloom.pipeline.progress import bar
 from motionloom.pipeline.sources import open_split, open_stats, splits_of

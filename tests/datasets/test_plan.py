@@ -17,7 +17,9 @@ from motionloom.datasets.shards.randomness import permutation, uniform
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 200), st.integers(1, 40), st.integers(0, 2**31), st.integers(0, 500))
-def test_an_epoch_is_a_permutation_cut_into_whole_batches(items: int, batch: int, seed: int, start: int) -> None:
+def test_an_epoch_is_a_permutation_cut_into_whole_batches(
+    items: int, batch: int, seed: int, start: int
+) -> None:
     plan = BatchPlan(items, batch, seed)
     per_epoch = plan.batches_per_epoch
     assert per_epoch == max(1, items // batch)
@@ -55,7 +57,11 @@ def test_any_order_of_questions_gives_the_same_answers() -> None:
 def test_the_order_is_fixed_for_ever() -> None:
     """A changed order would break every running experiment's resume: these numbers may never change."""
     assert permutation(10, 3, 4).tolist() == [3, 2, 6, 1, 4, 9, 5, 7, 8, 0]
-    assert uniform(1, 2, np.arange(3)).tolist() == [0.9006109088931584, 0.05081380623834486, 0.545963299984951]
+    assert uniform(1, 2, np.arange(3)).tolist() == [
+        0.9006109088931584,
+        0.05081380623834486,
+        0.545963299984951,
+    ]
 
 
 def test_uniform_is_uniform_and_depends_on_every_counter() -> None:

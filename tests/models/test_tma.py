@@ -78,7 +78,9 @@ def test_paper_config() -> None:
 
 
 def toy_batch(seed: int, size: int = 32) -> dict[str, torch.Tensor]:
-    """Frequency, amplitude and drift of a curve are named by three "words"; 4 x 2 x 4 = 32 captions, one per row."""
+    """Frequency, amplitude and drift of a curve are named by three "words"; 4 x 2 x 4 = 32 captions, one per
+    row.
+    """
     generator = torch.Generator().manual_seed(seed)
     kind = torch.arange(size)
     words = torch.stack([kind % 4, 4 + kind // 4 % 2, 6 + kind // 8], dim=1)

@@ -57,8 +57,8 @@ def main() -> None:
         grads = {name: p.grad for name, p in model.module.module.net.named_parameters() if p.grad is not None}
         save_file({"loss": mean / world, **grads}, folder / "result.safetensors")
     dist.barrier()
-    # Leave without destructors: torch 2.13's DDP reducer can own the last reference to the gloo group, whose destructor joins
-    # a thread that waits for the interpreter lock the reducer's destructor holds.
+    # Leave without destructors: torch 2.13's DDP reducer can own the last reference to the gloo group, whose
+    # destructor joins a thread that waits for the interpreter lock the reducer's destructor holds.
     os._exit(0)
 
 

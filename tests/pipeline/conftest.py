@@ -1,4 +1,4 @@
-"""A procedural 52-joint walker for the drawing tests: arms, legs, curling fingers, a curved path and a changing face."""
+"""A procedural 52-joint walker for the drawing tests: limbs, curling fingers, a curved path, a face."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from motionloom.datasets.motion.skeleton import Skeleton
 Joints = NDArray[np.float64]
 
 
-def _walk(frames: int = 60, fps: float = 20.0, turn: float = 0.5, wave: bool = False, curl: float = 1.0) -> Joints:
+def _walk(
+    frames: int = 60, fps: float = 20.0, turn: float = 0.5, wave: bool = False, curl: float = 1.0
+) -> Joints:
     skeleton = Skeleton.named("smplx52")
     t = np.arange(frames) / fps
     stride = np.sin(2 * np.pi * 0.9 * t)
@@ -27,7 +29,9 @@ def _walk(frames: int = 60, fps: float = 20.0, turn: float = 0.5, wave: bool = F
     for side, sign in (("left", 1.0), ("right", -1.0)):
         swing = sign * stride
         local[f"{side}_hip"] = about("x", -0.5 * swing)
-        local[f"{side}_knee"] = about("x", 0.25 + 0.45 * (1 + np.cos(2 * np.pi * 0.9 * t + (sign - 1) * np.pi / 2 + 0.5)) / 2)
+        local[f"{side}_knee"] = about(
+            "x", 0.25 + 0.45 * (1 + np.cos(2 * np.pi * 0.9 * t + (sign - 1) * np.pi / 2 + 0.5)) / 2
+        )
         local[f"{side}_shoulder"] = about("x", 0.5 * swing) * about("z", -sign * 1.25)
         local[f"{side}_elbow"] = about("y", -sign * (0.45 + 0.2 * swing))
         for finger in ("index", "middle", "pinky", "ring"):
@@ -65,6 +69,15 @@ def face_track() -> Callable[[int], Joints]:
     def track(frames: int) -> Joints:
         phase = np.linspace(0, 4 * np.pi, frames)
         smile, frown = np.clip(np.sin(phase), 0, 1), np.clip(-np.sin(phase), 0, 1)
-        return np.stack([smile, np.cos(phase), 1 - 0.9 * (np.sin(5 * phase) > 0.97), np.clip(np.sin(2 * phase), 0, 1), frown], -1)
+        return np.stack(
+            [
+                smile,
+                np.cos(phase),
+                1 - 0.9 * (np.sin(5 * phase) > 0.97),
+                np.clip(np.sin(2 * phase), 0, 1),
+                frown,
+            ],
+            -1,
+        )
 
     return track

@@ -1,0 +1,275 @@
+"""Batches for training: map-style datasets whose item `k` is one rank's whole share of global step `k`.
+
+Use with `DataLoader(batches, batch_size=None, sampler=range(first_step, last_step))`: a run resumes by
+starting the range elsewhere. What a batch holds depends on (seed, k) alone; the ranks' shares `[rank::world]`
+together are the global batch whatever their number. `batch_size` is always the *global* one.
+"""
+
+from __future__ import annotations
+
+from typing import TypedDict
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.shards.crops import Crops, padded_length
+from motionloom.datasets.shards.plan import BatchPlan
+from motionloom.datasets.shards.randomness import uniform
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.statistics import FeatureStats
+from motionloom.datasets.text.cache import TextCache
+
+ENDLESS = 2**62
+"""`len` of training batches: they go on for as many epochs as the sampler asks for."""
+
+# Counters that keep the draws for different purposes apart (arguments of `uniform`).
+_WINDOW, _CAPTION, _CROP = 1, 2, 3
+
+
+class MotionBatch(TypedDict):
+    """`motion` float32 [B, T, C], normalised, zero behind `length` int64 [B]."""
+
+    motion: Tensor
+    length: Tensor
+
+
+class CaptionBatch(MotionBatch):
+    """A motion batch with one caption per clip: S tokens of E values, `text_mask` true where a token is."""
+
+    index: Tensor
+    """Clip numbers in the dataset, int64 [B]."""
+    valid: Tensor
+    """bool [B]; false for the repeats that fill an evaluation batch up to the number of ranks."""
+    caption: list[str]
+    text_tokens: Tensor
+    text_mask: Tensor
+    sentence: Tensor
+    """float32 [B, E], unit length."""
+
+
+class WindowBatches(Dataset[MotionBatch]):
+    """Fixed windows for the tokenizers (HumanTOMATO appendix C, T2M-GPT's 64 frames).
+
+    `windows_per_clip` windows are cut from each clip read. A clip shorter than `window` is taken whole and
+    padded.
+    """
+
+    def __init__(
+        self,
+        dataset: ShardDataset,
+        stats: FeatureStats,
+        *,
+        window: int,
+        batch_size: int,
+        windows_per_clip: int = 1,
+        seed: int = 0,
+        rank: int = 0,
+        world: int = 1,
+        columns: NDArray[np.int64] | None = None,
+    ) -> None:
+        if windows_per_clip < 1 or batch_size % windows_per_clip:
+            raise UserError(f"batch_size {batch_size} is no multiple of windows_per_clip {windows_per_clip}")
+        if window < 1:
+            raise UserError(f"a window needs at least one frame, not {window}")
+        self.crops = Crops(dataset, stats, columns)
+        self.dataset = dataset
+        self.window = window
+        self.windows_per_clip = windows_per_clip
+        self.seed, self.rank, self.world = seed, rank, world
+        self.plan = BatchPlan(len(dataset), batch_size // windows_per_clip, seed)
+        self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
+
+    def __len__(self) -> int:
+        return ENDLESS
+
+    def __getitem__(self, k: int) -> MotionBatch:
+        epoch, clips = self.plan.local(k, self.rank, self.world)
+        per_clip = self.windows_per_clip
+        frames = self.dataset.frames[clips]
+        draws = uniform(self.seed, _WINDOW, epoch, clips[:, None], np.arange(per_clip)[None])
+        starts = (draws * (np.maximum(frames - self.window, 0) + 1)[:, None]).astype(np.int64)
+        length = np.minimum(frames, self.window)
+        motion = np.empty((len(clips) * per_clip, self.window, self.crops.width), dtype=np.float32)
+        for row, clip in enumerate(clips.tolist()):
+            source = self.dataset.motion(clip)
+            for j in range(per_clip):
+                self.crops.fill(motion[row * per_clip + j], source, int(starts[row, j]), int(length[row]))
+        return {
+            "motion": torch.from_numpy(motion),
+            "length": torch.from_numpy(np.repeat(length, per_clip)),
+        }
+
+
+class _CaptionedClips:
+    """What training and evaluation share: which clips qualify, and making a batch of them."""
+
+    def __init__(
+        self,
+        dataset: ShardDataset,
+        stats: FeatureStats,
+        text: TextCache | None,
+        *,
+        max_frames: int,
+        min_frames: int,
+        face: bool,
+        columns: NDArray[np.int64] | None,
+    ) -> None:
+        if not 1 <= min_frames <= max_frames:
+            raise UserError(f"need 1 <= min_frames ({min_frames}) <= max_frames ({max_frames})")
+        if face and columns is None:
+            columns = dataset.layout.part("face")
+        self.crops = Crops(dataset, stats, columns)
+        self.dataset, self.text, self.face = dataset, text, face
+        self.min_frames, self.max_frames = min_frames, max_frames
+        usable = dataset.frames >= min_frames
+        if text is not None:
+            usable &= dataset.has("face_texts.json" if face else "texts.json")
+        self.clips = np.flatnonzero(usable)
+        if len(self.clips) == 0:
+            kind = "face captions" if face else "captions"
+            raise UserError(
+                f"{dataset.root}: no clip of split '{dataset.split}' has {kind} and {min_frames} frames; "
+                f"lower min_frames or convert data with {kind}"
+            )
+
+    def captions(self, clip: int) -> list[tuple[str, int, int]]:
+        """(text, first frame, frame behind the last) of each caption that covers `min_frames` or more.
+
+        When none does, the one that covers most: a clip that qualifies always gives a pair.
+        """
+        frames = int(self.dataset.frames[clip])
+        found = self.dataset.face_texts(clip) if self.face else self.dataset.texts(clip)
+        spans = [(caption.text, *frame_span(caption, self.dataset.layout.fps, frames)) for caption in found]
+        long = [span for span in spans if span[2] - span[1] >= self.min_frames]
+        return long or [max(spans, key=lambda span: span[2] - span[1])]
+
+    def make(
+        self, clips: NDArray[np.int64], spans: list[tuple[str, int, int]], crop: NDArray[np.float64]
+    ) -> CaptionBatch:
+        """The batch of `clips` [B] and their spans; `crop` in [0, 1) places the crop of too long a span."""
+        begin = np.array([span[1] for span in spans], dtype=np.int64)
+        whole = np.array([span[2] for span in spans], dtype=np.int64) - begin
+        length = np.minimum(whole, self.max_frames)
+        begin += (crop * (whole - length + 1)).astype(np.int64)
+        motion = np.empty((len(clips), padded_length(length), self.crops.width), dtype=np.float32)
+        for row, clip in enumerate(clips.tolist()):
+            self.crops.fill(motion[row], self.dataset.motion(clip), int(begin[row]), int(length[row]))
+        captions = [span[0] for span in spans]
+        batch = {
+            "motion": torch.from_numpy(motion),
+            "length": torch.from_numpy(length),
+            "index": torch.from_numpy(clips.copy()),
+            "valid": torch.ones(len(clips), dtype=torch.bool),
+            "caption": captions,
+        }
+        if self.text is not None:
+            tokens, mask = self.text.tokens(captions)
+            batch["text_tokens"] = torch.from_numpy(tokens)
+            batch["text_mask"] = torch.from_numpy(mask)
+            batch["sentence"] = torch.from_numpy(self.text.sentence(captions))
+        return batch  # type: ignore[return-value]
+
+
+class CaptionBatches(Dataset[CaptionBatch]):
+    """Whole clips with one caption each, for TMA and the GPTs.
+
+    Caption and crop are drawn by (seed, epoch, clip). A caption with start and end seconds gives that stretch
+    of the clip; a stretch longer than `max_frames` is cropped at random. `face` takes face captions and,
+    unless `columns` says otherwise, the face columns.
+    """
+
+    def __init__(
+        self,
+        dataset: ShardDataset,
+        stats: FeatureStats,
+        text: TextCache,
+        *,
+        batch_size: int,
+        max_frames: int,
+        min_frames: int,
+        seed: int = 0,
+        rank: int = 0,
+        world: int = 1,
+        face: bool = False,
+        columns: NDArray[np.int64] | None = None,
+    ) -> None:
+        self.source = _CaptionedClips(
+            dataset, stats, text, max_frames=max_frames, min_frames=min_frames, face=face, columns=columns
+        )
+        self.seed, self.rank, self.world = seed, rank, world
+        self.plan = BatchPlan(len(self.source.clips), batch_size, seed)
+        self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
+
+    def __len__(self) -> int:
+        return ENDLESS
+
+    def __getitem__(self, k: int) -> CaptionBatch:
+        epoch, items = self.plan.local(k, self.rank, self.world)
+        clips = self.source.clips[items]
+        which = uniform(self.seed, _CAPTION, epoch, clips)
+        spans = []
+        for clip, draw in zip(clips.tolist(), which, strict=True):
+            choices = self.source.captions(clip)
+            spans.append(choices[int(draw * len(choices))])
+        return self.source.make(clips, spans, uniform(self.seed, _CROP, epoch, clips))
+
+
+class EvalBatches(Dataset[CaptionBatch]):
+    """Every qualifying clip of a split once, in order: first caption, first `max_frames` frames.
+
+    `text` None leaves captions out (`caption` is then empty strings, no text tensors, every long enough clip
+    qualifies). Each rank gets the same number of rows; where the clips do not divide, the last batch repeats
+    its last clip with `valid` false.
+    """
+
+    def __init__(
+        self,
+        dataset: ShardDataset,
+        stats: FeatureStats,
+        text: TextCache | None = None,
+        *,
+        batch_size: int,
+        max_frames: int,
+        min_frames: int = 1,
+        rank: int = 0,
+        world: int = 1,
+        face: bool = False,
+        columns: NDArray[np.int64] | None = None,
+    ) -> None:
+        if batch_size < 1 or batch_size % world:
+            raise UserError(f"an evaluation batch of {batch_size} clips does not divide over {world} ranks")
+        self.source = _CaptionedClips(
+            dataset, stats, text, max_frames=max_frames, min_frames=min_frames, face=face, columns=columns
+        )
+        self.batch_size, self.rank, self.world = batch_size, rank, world
+
+    def __len__(self) -> int:
+        return -(-len(self.source.clips) // self.batch_size)
+
+    def __getitem__(self, k: int) -> CaptionBatch:
+        if not 0 <= k < len(self):
+            raise IndexError(f"evaluation batch {k} of {len(self)}")
+        source = self.source
+        rows = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(source.clips)))
+        missing = -len(rows) % self.world
+        valid = np.concatenate([np.ones(len(rows), bool), np.zeros(missing, bool)])[self.rank :: self.world]
+        rows = np.concatenate([rows, np.repeat(rows[-1:], missing)])[self.rank :: self.world]
+        clips = source.clips[rows]
+        if source.text is None:
+            spans = [("", 0, int(frames)) for frames in source.dataset.frames[clips]]
+        else:
+            spans = [source.captions(clip)[0] for clip in clips.tolist()]
+        batch = source.make(clips, spans, np.zeros(len(clips)))
+        batch["valid"] = torch.from_numpy(valid)
+        return batch
+
+
+def frame_span(caption: Caption, fps: float, frames: int) -> tuple[int, int]:
+    """(first frame, frame behind the last) of a caption's stretch in a clip of `frames`; all when empty."""
+    first = min(max(round(caption.start * fps), 0), frames)
+    end = frames if caption.end is None else min(max(round(caption.end * fps), 0), frames)
+    return (first, end) if end > first else (0, frames)

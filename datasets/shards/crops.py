@@ -1,0 +1,53 @@
+"""Copying pieces of clips into one normalised, zero-padded batch array: the loader's inner loop.
+
+A window is subtracted and scaled while it is in the processor's cache, straight from the mapped tar into its
+place in the batch: no intermediate array, no tensor per sample.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.reader import ShardDataset, require_layout
+from motionloom.datasets.shards.statistics import FeatureStats
+
+
+class Crops:
+    """Reads normalised pieces of a dataset's clips, all columns or some (`columns`, ascending, [C])."""
+
+    def __init__(
+        self, dataset: ShardDataset, stats: FeatureStats, columns: NDArray[np.int64] | None = None
+    ) -> None:
+        require_layout(stats.layout, dataset.layout, "feature statistics")
+        chosen = np.arange(dataset.layout.dim) if columns is None else np.asarray(columns)
+        if len(chosen) == 0 or chosen.min() < 0 or chosen.max() >= dataset.layout.dim:
+            raise UserError(f"columns outside layout {dataset.layout.name} (or none of them)")
+        self.dataset = dataset
+        self.width = len(chosen)
+        self._mean = stats.mean[chosen]
+        self._scale = 1.0 / stats.std[chosen]
+        self._runs = _runs(chosen)
+
+    def fill(self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int) -> None:
+        """Normalised frames `start .. start + length` of `clip` into `out` [T >= length, C], then zeros."""
+        target = out[:length]
+        for source, place in self._runs:
+            np.subtract(clip[start : start + length, source], self._mean[place], out=target[:, place])
+        np.multiply(target, self._scale, out=target)
+        out[length:] = 0.0
+
+
+def _runs(columns: NDArray[np.int64]) -> list[tuple[slice, slice]]:
+    """(slice of the clip's columns, slice of the batch's columns) for each run of neighbouring columns."""
+    breaks = np.flatnonzero(np.diff(columns) != 1) + 1
+    edges = [0, *breaks.tolist(), len(columns)]
+    return [(slice(int(columns[a]), int(columns[b - 1]) + 1), slice(a, b)) for a, b in pairwise(edges)]
+
+
+def padded_length(lengths: NDArray[np.int64], multiple: int = 4) -> int:
+    """The longest length, rounded up to what the tokenizers' down-sampling divides."""
+    return -(-int(lengths.max()) // multiple) * multiple

@@ -1,0 +1,219 @@
+"""Synthetic clips from (seed, index) alone, and shards of them.
+
+`make_clip` is a pure function: a clip does not depend on how many there are, on the worker that makes it or on its
+neighbours. `synthesize` writes them through the shard writer like any other converter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from motionloom.datasets.motion.canonical import canonicalize
+from motionloom.datasets.motion.features import encode
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.schema import Caption, ClipMeta, Config, Manifest, Split
+from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.shards.writer import write_dataset
+from motionloom.datasets.synth import arms, legs, locomotion
+from motionloom.datasets.synth.dance import dance
+from motionloom.datasets.synth.face import express
+from motionloom.datasets.synth.grammar import body_captions, face_captions
+from motionloom.datasets.synth.hands import shape_hand
+from motionloom.datasets.synth.maths import Array
+from motionloom.datasets.synth.music import SAMPLE_RATE, render
+from motionloom.datasets.synth.pose import Track
+from motionloom.datasets.synth.truth import ACTIONS, Span, Truth, draw
+
+CONVERTER_VERSION = 1
+LICENCE = "CC0-1.0"
+_GOLDEN = 0.6180339887498949
+
+Animator = Callable[[Truth, Span, float, np.random.Generator], Track]
+ANIMATORS: dict[str, Animator] = {
+    "walk": locomotion.walk,
+    "turn": locomotion.turn,
+    "run": locomotion.run,
+    "jump": legs.jump,
+    "squat": legs.squat,
+    "sit": legs.sit,
+    "kick": legs.kick,
+    "punch": arms.punch,
+    "wave": arms.wave,
+    "clap": arms.clap,
+    "raise": arms.lift,
+    "reach": arms.reach,
+    "bow": legs.bow,
+    "dance": dance,
+}
+
+
+class SynthConfig(Config):
+    """What to generate."""
+
+    clips: int = Field(512, ge=1)
+    seed: int = Field(0, ge=0)
+    layout: Literal["body133", "wholebody313", "wholebody363"] = "wholebody363"
+    fps: float | None = Field(None, gt=4, le=240)
+    """None = the layout's usual frame rate (30 for whole body, 20 for body only)."""
+    actions: list[str] | None = None
+    """None = all; otherwise names of `truth.ACTIONS`."""
+    min_seconds: float = Field(2.0, ge=1.0)
+    max_seconds: float = Field(6.0, le=60.0)
+    val_fraction: float = Field(0.05, ge=0, lt=1)
+    test_fraction: float = Field(0.15, ge=0, lt=1)
+    captions: int = Field(3, ge=1, le=8)
+    """Different wordings per clip."""
+    music: bool = False
+    """Give every dance its audio."""
+    size_spread: float = Field(0.02, ge=0, le=0.15)
+    """Standard deviation of body size from clip to clip, as a fraction; 0 = all clips on the uniform skeleton."""
+    hold_out: list[dict[str, Any]] = []
+    """Combinations of truth values kept for testing, for example `[{"action": "kick", "side": "left"}]`."""
+
+    @field_validator("actions")
+    @classmethod
+    def _known(cls, actions: list[str] | None) -> list[str] | None:
+        wrong = sorted(set(actions or []) - set(ACTIONS))
+        if wrong or actions == []:
+            raise ValueError(f"no action {', '.join(wrong) or 'given'}; known: {', '.join(ACTIONS)}")
+        return actions
+
+    @field_validator("hold_out")
+    @classmethod
+    def _attributes(cls, combinations: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        known = Truth.__dataclass_fields__
+        for combination in combinations:
+            wrong = sorted(set(combination) - set(known))
+            if wrong or not combination:
+                raise ValueError(f"no truth attribute {', '.join(wrong) or 'given'}; known: {', '.join(known)}")
+        return combinations
+
+    @model_validator(mode="after")
+    def _consistent(self) -> SynthConfig:
+        if self.max_seconds < max(5.0, self.min_seconds):
+            raise ValueError("max_seconds must be at least 5 (slow bows and repeated squats need it) and at least min_seconds")
+        if self.val_fraction + self.test_fraction >= 1:
+            raise ValueError("val_fraction and test_fraction leave nothing to train on")
+        return self
+
+    @property
+    def motion_layout(self) -> MotionLayout:
+        """The layout at the frame rate of this config."""
+        return MotionLayout.named(self.layout, fps=self.fps)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One generated clip before it is encoded."""
+
+    joints: Array
+    """Canonical joint positions [T, N, 3], metres."""
+    face: Array
+    """Expression values [T, 50]."""
+    texts: list[str]
+    face_texts: list[str]
+    truth: dict[str, Any]
+    wav: tuple[NDArray[np.float32], int] | None
+    """Mono samples and their rate; only dances have it."""
+
+
+def make_clip(index: int, config: SynthConfig) -> Clip:
+    """Clip `index` of a config; a pure function of (config, index)."""
+    layout = config.motion_layout
+    truth = truth_of(index, config)
+    hands, has_face = layout.num_joints > BODY_JOINTS, layout.has("face")
+    motion, shape, words, sound = (np.random.default_rng([config.seed, index, k]) for k in range(1, 5))
+    track = ANIMATORS[truth.action](truth, Span(config.min_seconds, config.max_seconds), layout.fps, motion)
+    if hands:
+        track.fingers = np.stack([shape_hand(truth.hand(side), track.t, shape) for side in (0, 1)])
+    joints = track.solve()[:, : layout.num_joints]
+    joints = joints * np.clip(1 + config.size_spread * shape.standard_normal(), 0.8, 1.2)
+    wav = None
+    if config.music and truth.action == "dance":
+        seconds = len(joints) / layout.fps
+        wav = (render(float(truth.bpm or 120), track.first_beat, seconds, sound), SAMPLE_RATE)
+    return Clip(
+        joints=canonicalize(joints),
+        face=express(truth.face, track.t, shape),
+        texts=body_captions(truth, words, config.captions, hands),
+        face_texts=face_captions(truth, words) if has_face else [],
+        truth=truth.record(hands=hands, face=has_face),
+        wav=wav,
+    )
+
+
+def truth_of(index: int, config: SynthConfig) -> Truth:
+    """What clip `index` does. Actions come in shuffled rounds, so any number of clips is balanced."""
+    actions = config.actions or list(ACTIONS)
+    block, place = divmod(index, len(actions))
+    order = np.random.default_rng([config.seed, block, 101]).permutation(len(actions))
+    return draw(actions[int(order[place])], np.random.default_rng([config.seed, index, 0]))
+
+
+def split_of(index: int, config: SynthConfig) -> Split:
+    """Split of a clip: held-out combinations test, the rest by a low-discrepancy sequence (exact shares early)."""
+    truth = truth_of(index, config)
+    for combination in config.hold_out:
+        if all(getattr(truth, key) == value for key, value in combination.items()):
+            return "test"
+    share = (index * _GOLDEN + 0.5 + config.seed * 0.7548776662466927) % 1.0
+    if share < config.test_fraction:
+        return "test"
+    return "val" if share < config.test_fraction + config.val_fraction else "train"
+
+
+def make_sample(index: int, config: SynthConfig) -> Sample:
+    """Clip `index` encoded for the shard writer."""
+    layout = config.motion_layout
+    clip = make_clip(index, config)
+    has_face = layout.has("face")
+    motion = encode(clip.joints, layout, face=clip.face if has_face else None)
+    meta = ClipMeta(
+        id=f"synth-{config.seed}-{index:06d}",
+        source=f"synthetic seed {config.seed} clip {index}",
+        split=split_of(index, config),
+        layout=layout.name,
+        family=layout.family,
+        fps=layout.fps,
+        skeleton=layout.skeleton_name,
+        frames=len(motion),
+        licence=LICENCE,
+        has_hands=layout.num_joints > BODY_JOINTS,
+        has_face=has_face,
+        truth=clip.truth,
+    )
+    return Sample(
+        meta=meta,
+        motion=motion,
+        texts=[Caption(text=text, source="synthetic") for text in clip.texts],
+        face_texts=[Caption(text=text, source="synthetic") for text in clip.face_texts],
+        audio=None,
+        wav=clip.wav,
+    )
+
+
+def synthesize(config: SynthConfig, out: Path, workers: int = 1, progress: bool = True) -> Manifest:
+    """Write the clips of a config as shards under `out`; the same config gives the same bytes."""
+    return write_dataset(
+        out,
+        [(split_of(index, config), index) for index in range(config.clips)],
+        partial(make_sample, config=config),
+        name="synth",
+        layout=config.motion_layout,
+        licence=LICENCE,
+        converter="synth",
+        converter_version=CONVERTER_VERSION,
+        options=config.dump(),
+        workers=workers,
+        seed=config.seed,
+        strict=True,
+        progress=progress,
+    )

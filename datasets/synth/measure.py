@@ -1,0 +1,227 @@
+"""Says what a motion does from its joints alone, to prove captions true and to judge generated motion.
+
+`measure` recognises the action by a cascade of physical signs (who flies, who travels, who turns, who sinks, whose
+foot or hand leaves its place) and then reads direction, side, count and speed. `agrees` compares with a truth record,
+reading each attribute as the *claimed* action defines it, so one wrong action does not hide a right limb.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.synth import face as faces
+from motionloom.datasets.synth.measure_hands import hand_shape
+from motionloom.datasets.synth.signals import Signals, rise_time, runs, signals_of, tempo
+from motionloom.datasets.synth.truth import SIDES
+
+CIRCLE = 4.0
+"""Net turn (radians) of a walk from which it is a circle."""
+TURN = 0.6
+_ATTRIBUTES = ("direction", "side", "count", "speed", "bpm")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a motion does; attributes that its action does not have are None."""
+
+    action: str
+    direction: str | None
+    side: str | None
+    count: int | None
+    speed: str | None
+    bpm: float | None
+    left_hand: str | None
+    right_hand: str | None
+    heading_change: float
+    """Net turn in radians, positive to the left."""
+    travel: float
+    """Metres along the heading, negative backwards."""
+    pace: float
+    """Typical speed of travel, metres per second."""
+    jump_height: float
+    """Rise of the root above standing, metres."""
+    squat_depth: float
+    """Fall of the root below standing, metres."""
+
+
+def measure(joints: NDArray[Any], fps: float) -> Measured:
+    """Recognise what joints [T, 22 or 52, 3] (metres, Y up) do."""
+    signals = signals_of(joints, fps)
+    action = _action(signals)
+    found = _attributes(signals, action)
+    hands = [hand_shape(joints, side, fps) if joints.shape[1] >= 52 else None for side in (0, 1)]
+    return Measured(
+        action=action,
+        **{name: found.get(name) for name in _ATTRIBUTES},
+        left_hand=hands[0],
+        right_hand=hands[1],
+        heading_change=_turned(signals),
+        travel=float(signals.travel[-1]),
+        pace=_pace(signals),
+        jump_height=float(max(-signals.drop.min(), 0.0)),
+        squat_depth=float(max(signals.drop.max(), 0.0)),
+    )
+
+
+def agrees(
+    truth: Mapping[str, Any], joints: NDArray[Any], face: NDArray[Any] | None = None, fps: float = 30.0
+) -> dict[str, bool]:
+    """For each attribute of a truth record that applies: does the motion do it?
+
+    truth is `ClipMeta.truth`; joints [T, 22 or 52, 3]; face [T, 50] or None (the face is then not judged).
+    A tempo agrees within 5 %.
+    """
+    if "action" not in truth:
+        raise UserError("truth has no 'action'; judge only clips of the synthetic source")
+    signals = signals_of(joints, fps)
+    claimed = str(truth["action"])
+    out = {"action": _action(signals) == claimed}
+    found = _attributes(signals, claimed)
+    for name in _ATTRIBUTES:
+        wanted = truth.get(name)
+        if wanted is None and not (name == "speed" and name in found and "speed" in truth):
+            continue
+        got = found.get(name)
+        if name == "bpm":
+            out[name] = got is not None and abs(got - wanted) <= 0.05 * wanted
+        else:
+            out[name] = bool(got == wanted)
+    if joints.shape[1] >= 52:
+        for side, name in enumerate(SIDES):
+            if truth.get(f"{name}_hand") is not None:
+                out[f"{name}_hand"] = hand_shape(joints, side, fps) == truth[f"{name}_hand"]
+    if face is not None and truth.get("face") is not None:
+        out["face"] = faces.read(face) == truth["face"]
+    return out
+
+
+def _action(s: Signals) -> str:
+    flights, moved, turned = len(_flights(s)), abs(float(s.travel[-1])), abs(_turned(s))
+    if flights >= 2 and _pace(s) > 1.6:
+        return "run"
+    if flights and s.drop.min() < -0.05:
+        return "jump"
+    if moved > 0.3 and s.balls.max() < 0.4:
+        return "turn" if TURN < turned < CIRCLE else "walk"
+    if turned > TURN:
+        return "turn"
+    if s.drop.max() > 0.23:
+        low = int(np.argmax(s.drop))
+        if s.wrist_height[:, low].min() < 0.42 and s.trunk[low] > 0.6:
+            return "reach"
+        return "sit" if s.behind[low] > 0.22 else "squat"
+    if s.balls.max() > 0.4:
+        return "kick"
+    if s.peaks(s.drop, 0.018) >= 3:
+        return "dance"
+    if s.trunk.max() > 0.5:
+        return "bow"
+    return _arm_action(s)
+
+
+def _arm_action(s: Signals) -> str:
+    waves, tops = [_waves(s, side) for side in (0, 1)], s.wrists[:, :, 1].max(1)
+    if max(waves) >= 2:
+        return "wave"
+    if tops.max() > 0.6:
+        hand = int(np.argmax(tops))
+        top = int(np.argmax(s.wrists[hand, :, 1]))
+        return "raise" if s.wrists[hand, top, 2] < 0.28 else "reach"
+    if _claps(s) >= 1:
+        return "clap"
+    hand, direction = _reach(s)
+    forward = s.wrists[hand, :, 2]
+    if direction == "forward" and s.longest(forward > 0.8 * forward.max()) < 0.5:
+        return "punch"
+    return "reach"
+
+
+def _attributes(s: Signals, action: str) -> dict[str, Any]:
+    """Attributes as `action` defines them."""
+    if action == "walk":
+        backward = s.travel[-1] < 0
+        limits = (0.57, 0.98) if backward else (0.78, 1.38)
+        turned = _turned(s)
+        way = "backward" if backward else "forward"
+        if abs(turned) > CIRCLE:
+            way = "counterclockwise" if turned > 0 else "clockwise"
+        return {"direction": way, "speed": _speed(_pace(s), *limits)}
+    if action == "turn":
+        return {"direction": "left" if _turned(s) > 0 else "right"}
+    if action == "run":
+        return {"direction": "forward" if s.travel[-1] > 0 else "backward"}
+    if action == "jump":
+        return {"direction": "forward" if s.travel[-1] > 0.15 else "up", "count": len(_flights(s))}
+    if action == "squat":
+        fall = rise_time(s.drop, s.fps)
+        return {"count": s.peaks(s.drop, 0.15), "speed": _speed(1 / fall, 1 / 0.93, 1 / 0.54)}
+    if action == "bow":
+        return {"speed": _speed(1 / rise_time(s.trunk, s.fps), 1 / 1.14, 1 / 0.68)}
+    if action == "kick":
+        leg = int(np.argmax(s.balls.max(1)))
+        return {"side": SIDES[leg], "count": s.peaks(s.balls[leg], 0.4)}
+    if action == "punch":
+        hand = int(np.argmax(s.wrists[:, :, 2].max(1)))
+        return {"side": SIDES[hand], "count": s.peaks(s.wrists[hand, :, 2], 0.2, 0.7)}
+    if action == "wave":
+        return {"side": _both(np.array([_waves(s, side) >= 2 for side in (0, 1)]))}
+    if action == "raise":
+        return {"side": _both(s.wrists[:, :, 1].max(1) > 0.6)}
+    if action == "clap":
+        return {"count": _claps(s)}
+    if action == "reach":
+        hand, direction = _reach(s)
+        return {"side": SIDES[hand], "direction": direction}
+    return {"bpm": tempo(s)} if action == "dance" else {}
+
+
+def _reach(s: Signals) -> tuple[int, str]:
+    """The hand that stretches furthest from the body, and where it goes."""
+    if s.drop.max() > 0.2 and s.trunk.max() > 0.6:
+        return int(np.argmin(s.wrist_height.min(1))), "down"
+    out, up, forward = (s.wrists[:, :, k].max(1) for k in range(3))
+    hand = int(np.argmax(np.maximum(np.maximum(out, up), forward)))
+    if up[hand] > 0.5:
+        return hand, "up"
+    return hand, SIDES[hand] if out[hand] > forward[hand] else "forward"
+
+
+def _waves(s: Signals, side: int) -> int:
+    """How often a raised hand swings out to the side."""
+    raised = s.wrists[side, :, 1] > 0.12
+    if not raised.any():
+        return 0
+    start, end = max(runs(raised), key=lambda run: run[1] - run[0])
+    return s.peaks(s.wrists[side, start:end, 0], 0.1)
+
+
+def _claps(s: Signals) -> int:
+    return s.peaks(-s.apart, 0.1, -0.19)
+
+
+def _flights(s: Signals) -> list[tuple[int, int]]:
+    """Runs of frames in which both feet are off the floor."""
+    return [r for r in runs(s.balls.min(0) > 0.04) if (r[1] - r[0]) / s.fps >= 0.06]
+
+
+def _turned(s: Signals) -> float:
+    end = max(1, len(s.heading) // 12)
+    return float(s.heading[-end:].mean() - s.heading[:end].mean())
+
+
+def _pace(s: Signals) -> float:
+    return float(np.percentile(np.abs(s.speed), 75))
+
+
+def _speed(value: float, slow: float, quick: float) -> str | None:
+    return "slowly" if value < slow else "quickly" if value > quick else None
+
+
+def _both(hands: NDArray[np.bool_]) -> str | None:
+    return "both" if hands.all() else SIDES[int(np.argmax(hands))] if hands.any() else None

@@ -1,0 +1,24 @@
+"""`Frozen`: a trained network that a later stage uses and must not change."""
+
+from __future__ import annotations
+
+from typing import Generic, TypeVar
+
+import torch
+from torch import nn
+
+M = TypeVar("M", bound=nn.Module)
+
+
+class Frozen(Generic[M]):
+    """Holds a module out of reach of the module that owns this: not a child, hence not in its `state_dict`,
+    its parameters or its `.train()`. The held module is in evaluation mode and asks for no gradient;
+    gradients still flow *through* it to its inputs.
+    """
+
+    def __init__(self, module: M) -> None:
+        self._module = module.eval().requires_grad_(False)
+
+    def on(self, device: torch.device) -> M:
+        """The module on `device`, in evaluation mode whatever happened to it meanwhile."""
+        return self._module.to(device).eval()

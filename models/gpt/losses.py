@@ -1,0 +1,107 @@
+"""The GPT's loss terms: cross-entropy, input corruption and text-motion alignment (HumanTOMATO sections 3.5,
+3.6).
+
+L = L_CE + eta L_align. For L_align the predicted tokens become motion without losing the gradient:
+straight-through Gumbel-softmax over each codebook (End excluded) [ours], the frozen tokenizer's soft decoder,
+the frozen TMA motion encoder, then InfoNCE against the TMA text latents of the (global) batch.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.gpt.tokens import PAD
+from motionloom.models.tma.losses import info_nce, masked_mean
+from motionloom.models.tma.network import Tma
+from motionloom.models.tokenizer.base import Tokenizer
+
+
+def predicted(tokens: Tensor, logits: Tensor) -> Tensor:
+    """Bool [B, L]: real tokens the grammar does not already decide (padding and the Ends after the first are
+    out).
+    """
+    return (tokens != PAD) & (torch.isfinite(logits).sum(-1) > 1)
+
+
+def cross_entropy(logits: Tensor, tokens: Tensor) -> Tensor:
+    """Mean over the `predicted` tokens of all ranks; logits [B, L, V], tokens int64 [B, L] padded with -1."""
+    each = F.cross_entropy(logits.flatten(0, 1), tokens.flatten(), ignore_index=PAD, reduction="none")
+    return masked_mean(each.view_as(tokens), predicted(tokens, logits))
+
+
+def accuracy(logits: Tensor, tokens: Tensor, kinds: Tensor, kind: int) -> Tensor:
+    """Share of one stream's `predicted` tokens that are the most likely ones."""
+    hit = (logits.argmax(-1) == tokens).float()
+    return masked_mean(hit, predicted(tokens, logits) & (kinds == kind))
+
+
+def corrupt(tokens: Tensor, kinds: Tensor, ends: Tensor, pkeep: float) -> Tensor:
+    """Each code is kept with probability `pkeep`, else replaced by a uniform code of its own stream
+    (T2M-GPT).
+
+    tokens, kinds int64 [B, L], ends int64 [streams]. End tokens and padding stay.
+    """
+    end = ends[kinds]
+    replace = (torch.rand(tokens.shape, device=tokens.device) >= pkeep) & (tokens != PAD) & (tokens != end)
+    draw = (torch.rand(tokens.shape, device=tokens.device) * end).long()
+    return torch.where(replace, torch.minimum(draw, end - 1), tokens)
+
+
+def group_counts(tokens: Tensor, kinds: Tensor, ends: Tensor, group: int) -> Tensor:
+    """Whole groups of `group` tokens before the first End or padding, int64 [B]."""
+    stop = (tokens == PAD) | (tokens == ends[kinds])
+    return (stop.cumsum(1) == 0).sum(1) // group
+
+
+def soft_codes(
+    gpt: InterleavedGPT, logits: Tensor, groups: Tensor, *, temperature: float, sample: bool
+) -> dict[str, Tensor]:
+    """One-hot code weights per stream [B, G * per_group, K] of logits [B, L, V], differentiable straight
+    through.
+
+    `sample` adds Gumbel noise (a draw from the model); without it the most likely codes are taken. Rows
+    behind `groups` hold arbitrary codes.
+    """
+    batch, size = len(logits), len(gpt.pattern)
+    count = int(groups.max())
+    steps = logits[:, : count * size].view(batch, count, size, -1)
+    valid = torch.arange(count, device=logits.device)[None, :, None, None] < groups[:, None, None, None]
+    out = {}
+    for kind, name in enumerate(gpt.names):
+        here = steps[:, :, gpt.slots == kind, : gpt.num_codes[name]]
+        here = torch.where(valid, here, 0.0).flatten(1, 2)
+        if sample:
+            out[name] = F.gumbel_softmax(here, tau=temperature, hard=True)
+        else:
+            soft = (here / temperature).softmax(-1)
+            out[name] = F.one_hot(here.argmax(-1), here.shape[-1]).to(soft) + soft - soft.detach()
+    return out
+
+
+def align_loss(
+    gpt: InterleavedGPT,
+    logits: Tensor,
+    tokens: Tensor,
+    kinds: Tensor,
+    text_latent: Tensor,
+    sentence: Tensor | None,
+    *,
+    tokenizer: Tokenizer,
+    tma: Tma,
+    gumbel_temperature: float,
+    temperature: float,
+    threshold: float,
+    sample: bool,
+) -> Tensor:
+    """L_align of one batch: logits [B, L, V], text_latent [B, Z] (TMA's text mean), sentence [B, E] for the
+    filter.
+    """
+    groups = group_counts(tokens, kinds, gpt.ends, len(gpt.pattern))
+    weights = soft_codes(gpt, logits, groups, temperature=gumbel_temperature, sample=sample)
+    frames = groups * tokenizer.group_frames
+    motion = tokenizer.decode_soft(weights, frames)
+    latent, _ = tma.encode_motion(motion, frames)
+    return info_nce(text_latent, latent, sentence, temperature=temperature, threshold=threshold)

@@ -1,0 +1,124 @@
+"""The Lightning side of the GPTs: cross-entropy and the optional text-motion alignment (HumanTOMATO section
+3.6).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.models.gpt.frozen import Frozen
+from motionloom.models.gpt.losses import accuracy, align_loss, corrupt, cross_entropy
+from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.stage_module import OptimConfig, StageModule
+from motionloom.models.tma.network import Tma
+from motionloom.models.tokenizer.base import Tokenizer
+
+
+class GptLossConfig(Config):
+    """Weight and temperatures of the alignment term."""
+
+    align_weight: float = Field(0.1, ge=0)
+    """eta [ours]; 0 turns L_align off, and the tokenizer and TMA are then not needed."""
+    gumbel_temperature: float = Field(1.0, gt=0)
+    temperature: float = Field(0.1, gt=0)
+    threshold: float = Field(0.85, ge=-1, le=1)
+
+
+class GptModule(StageModule):
+    """Trains an `InterleavedGPT`; the tokenizer and TMA are only looked through, never trained or saved."""
+
+    net: InterleavedGPT
+
+    def __init__(
+        self,
+        net: InterleavedGPT,
+        optim: OptimConfig,
+        *,
+        seed: int,
+        max_steps: int,
+        loss: GptLossConfig | None = None,
+        tokenizer: Tokenizer | None = None,
+        tma: Tma | None = None,
+    ) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.loss_config = loss or GptLossConfig()
+        self.tokenizer: Frozen[Tokenizer] | None = None
+        self.tma: Frozen[Tma] | None = None
+        if not self.loss_config.align_weight:
+            return
+        if tokenizer is None or tma is None:
+            raise UserError(
+                "align_weight > 0 needs a trained tokenizer and a trained TMA; set align_weight: 0"
+            )
+        _check(net, tokenizer, tma)
+        self.tokenizer, self.tma = Frozen(tokenizer), Frozen(tma)
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Loss of one batch.
+
+        "tokens" int64 [B, L] padded with -1, "kinds" int64 [B, L], "text" float32 [B, E] (the prior); for
+        L_align also "sentence" [B, E'] (optional) and "tma_text" [B, Z], TMA's text means, where the prior is
+        not TMA's.
+        """
+        net, config = self.net, self.net.config
+        tokens, kinds, text = batch["tokens"], batch["kinds"], batch["text"]
+        inputs, drop = None, None
+        if self.training:
+            drop = torch.rand(len(text), device=text.device) < config.condition_dropout
+            if config.pkeep < 1:
+                inputs = corrupt(tokens, kinds, net.ends, config.pkeep)
+        logits = net(tokens, kinds, text, inputs=inputs, drop_text=drop)
+        ce = cross_entropy(logits, tokens)
+        values = {"loss": ce, "ce": ce}
+        for kind, name in enumerate(net.names):
+            values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind)
+        if self.tokenizer is not None and self.tma is not None:
+            values["align"] = self._align(batch, logits, self.tokenizer, self.tma)
+            values["loss"] = ce + self.loss_config.align_weight * values["align"]
+        return values
+
+    def _align(
+        self, batch: dict[str, Any], logits: Tensor, tokenizer: Frozen[Tokenizer], tma: Frozen[Tma]
+    ) -> Tensor:
+        config = self.loss_config
+        motion_model = tma.on(logits.device)
+        text_latent = batch.get("tma_text", batch["text"])
+        if text_latent.shape[-1] != motion_model.config.latent:
+            raise UserError(
+                f"L_align compares TMA latents of width {motion_model.config.latent} and the text prior has "
+                f"{text_latent.shape[-1]}; give TMA's text means as 'tma_text' or set align_weight: 0"
+            )
+        return align_loss(
+            self.net,
+            logits,
+            batch["tokens"],
+            batch["kinds"],
+            text_latent,
+            batch.get("sentence"),
+            tokenizer=tokenizer.on(logits.device),
+            tma=motion_model,
+            gumbel_temperature=config.gumbel_temperature,
+            temperature=config.temperature,
+            threshold=config.threshold,
+            sample=self.training,
+        )
+
+
+def _check(net: InterleavedGPT, tokenizer: Tokenizer, tma: Tma) -> None:
+    """Hand-over between the stages: same vocabulary, same columns."""
+    streams = {stream.name: stream.num_codes for stream in tokenizer.streams}
+    if streams != net.num_codes or tuple(tokenizer.pattern) != net.pattern:
+        raise UserError(
+            f"the GPT's streams {net.num_codes} {net.pattern} are not the tokenizer's {streams} "
+            f"{tuple(tokenizer.pattern)}"
+        )
+    if tokenizer.dim != tma.motion_dim:
+        raise UserError(
+            f"L_align feeds the tokenizer's {tokenizer.dim} columns to a TMA of {tma.motion_dim}; "
+            "train TMA on the same columns or set align_weight: 0"
+        )

@@ -1,0 +1,116 @@
+"""Text-motion retrieval: recall, R-precision, matching score (HumanTOMATO sections 4.1.2 and D.2).
+
+All functions take row-aligned embeddings text [N, Z] and motion [N, Z], compute in float64 and return
+fractions.
+
+Ranks count the candidates strictly closer than the true one, plus half of those exactly as close: captions
+that occur twice share their places, and a collapsed encoder does not look perfect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+RECALLS = (1, 2, 3, 5, 10)
+
+
+def ranks(distance: Tensor, positive: Tensor | None = None) -> Tensor:
+    """Rank (0 = first) of each row's nearest true column: distance [N, N], float64 [N].
+
+    `positive` bool [N, N] marks the columns that count as true; the diagonal always does.
+    """
+    true = distance.diagonal()
+    if positive is not None:
+        true = torch.minimum(true, distance.masked_fill(~positive, torch.inf).amin(1))
+    closer = (distance < true[:, None]).sum(1)
+    equal = (distance == true[:, None]).sum(1)
+    return closer.double() + (equal - 1).double() / 2
+
+
+def recall(
+    text: Tensor,
+    motion: Tensor,
+    *,
+    sentence: Tensor | None = None,
+    threshold: float | None = None,
+    batch: int | None = None,
+    recalls: Sequence[int] = RECALLS,
+    seed: int = 0,
+) -> dict[str, float]:
+    """Recall@k both ways by cosine similarity, under the protocols of section D.2.
+
+    A, full set: neither option. B, threshold: `sentence` [N, E] and `threshold` (0.9): a retrieved item whose
+    caption has at least this sentence cosine with the true one is a hit. C and D: `batch` 256 or 32: the set
+    is shuffled by `seed`, cut into batches and each is a set of its own; the incomplete last one is dropped
+    (a set smaller than `batch` is one batch).
+
+    Returns:
+        "t2m/R@1" ..., "t2m/MedR" (1 = first), the same for "m2t", and "size", the number of candidates.
+    """
+    if (threshold is None) != (sentence is None):
+        raise ValueError("the threshold protocol needs both `sentence` and `threshold`")
+    text, motion = F.normalize(text.double(), dim=-1), F.normalize(motion.double(), dim=-1)
+    count = len(text)
+    size = count if batch is None else min(batch, count)
+    order = torch.arange(count)
+    if batch is not None:
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+    found: dict[str, list[Tensor]] = {"t2m": [], "m2t": []}
+    for rows in order.to(text.device)[: count // size * size].view(-1, size):
+        distance = -(text[rows] @ motion[rows].T)
+        positive = None
+        if sentence is not None and threshold is not None:
+            unit = F.normalize(sentence[rows].double(), dim=-1)
+            positive = unit @ unit.T >= threshold
+        found["t2m"].append(ranks(distance, positive))
+        found["m2t"].append(ranks(distance.T, positive))
+    out = {"size": float(size)}
+    for way, parts in found.items():
+        rank = torch.cat(parts)
+        out |= {f"{way}/R@{k}": (rank < k).double().mean().item() for k in recalls}
+        out[f"{way}/MedR"] = rank.quantile(0.5).item() + 1
+    return out
+
+
+def r_precision(
+    text: Tensor, motion: Tensor, *, batch: int = 32, top: int = 3, seed: int | None = None
+) -> Tensor:
+    """Share of texts whose own motion is among the `top` 1, 2, ... nearest of its batch; float64 [top].
+
+    Euclidean distance in consecutive batches (of a shuffle, when `seed` is given); the incomplete last one is
+    dropped. With fewer rows than `batch` the whole set is one batch. For TMA-R-Precision pass L2-normalised
+    embeddings.
+    """
+    text, motion, size = _batches(text, motion, batch, seed)
+    rank = torch.cat(
+        [ranks(torch.cdist(t, m)) for t, m in zip(text.split(size), motion.split(size), strict=True)]
+    )
+    return torch.stack([(rank < k).double().mean() for k in range(1, top + 1)])
+
+
+def matching_score(
+    text: Tensor, motion: Tensor, *, batch: int | None = None, seed: int | None = None
+) -> Tensor:
+    """Mean Euclidean distance between each text and its own motion; scalar float64.
+
+    `batch` and `seed` drop the same rows as `r_precision` does, as the public evaluators do.
+    """
+    text, motion, _ = _batches(text, motion, batch or len(text), seed)
+    return (text - motion).norm(dim=-1).mean()
+
+
+def _batches(text: Tensor, motion: Tensor, batch: int, seed: int | None) -> tuple[Tensor, Tensor, int]:
+    """Float64 rows cut to whole batches, and the batch size."""
+    if text.shape != motion.shape:
+        raise ValueError(f"text {tuple(text.shape)} and motion {tuple(motion.shape)} are not row-aligned")
+    count = len(text)
+    size = min(batch, count)
+    order = torch.arange(count)
+    if seed is not None:
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+    order = order[: count // size * size].to(text.device)
+    return text.double()[order], motion.double()[order], size

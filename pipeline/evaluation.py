@@ -1,0 +1,159 @@
+"""Figures of a run on held-out clips, each beside its trivial answer (SPEC section 8, the part built so far)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.statistics import FeatureStats
+from motionloom.models.metrics.reconstruction import accel_error, mpjpe, pa_mpjpe
+from motionloom.models.metrics.retrieval import recall_in_batches
+from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.pipeline.networks import LoadedTma
+from motionloom.pipeline.samples import Truth, joint_layout, reconstruct
+
+KEY_FRAMES = 16
+"""Moments of a clip that the nearest-clip search compares."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Mean and half-width of the 95 % interval over repetitions."""
+
+    mean: float
+    half_width: float
+
+    @staticmethod
+    def of(values: Sequence[float]) -> Interval:
+        """Of repeated measurements."""
+        array = np.asarray(values, dtype=np.float64)
+        half = 1.96 * array.std(ddof=1) / np.sqrt(len(array)) if len(array) > 1 else 0.0
+        return Interval(float(array.mean()), float(half))
+
+
+def local_joints(features: NDArray[np.float32], layout: MotionLayout) -> NDArray[np.float64]:
+    """Joints [T, N, 3] relative to the root and turned into its heading: the pose without the path it takes."""
+    layout = joint_layout(layout)
+    positions = features[..., layout.slice("positions")].astype(np.float64)
+    positions = positions.reshape(*positions.shape[:-1], layout.num_joints - 1, 3)
+    height = features[..., layout.slice("root_height")].astype(np.float64)
+    positions[..., 1] -= height
+    return np.concatenate([np.zeros_like(positions[..., :1, :]), positions], axis=-2)
+
+
+def reconstruction_figures(
+    tokenizer: Tokenizer, stats: FeatureStats, train: ShardDataset, truths: Sequence[Truth]
+) -> dict[str, float]:
+    """Errors in millimetres of the tokenizer, of the mean pose and of the nearest training clip.
+
+    `mpjpe_*` compares poses (root and heading aligned), `global_*` compares positions in the world, the path included.
+    """
+    layout = truths_layout(tokenizer)
+    body = stats.mean[tokenizer.layout.part("bodyhand")].astype(np.float32)
+    nearest = NearestClip(train)
+    rows: dict[str, list[float]] = {}
+    for truth in truths:
+        real = local_joints(truth.features, layout)
+        found = reconstruct(tokenizer, stats, truth.features)
+        constant = np.broadcast_to(body, truth.features.shape)
+        other = nearest.features(truth.features)
+        frames = len(truth.features)
+        values = {
+            "mpjpe": mpjpe(local_joints(found, layout), real),
+            "mpjpe_mean_pose": mpjpe(local_joints(constant, layout), real),
+            "mpjpe_nearest_train_clip": mpjpe(local_joints(other, layout), real),
+            "global_mpjpe": mpjpe(decode(found, layout), truth.joints),
+            "global_mpjpe_mean_pose": mpjpe(decode(constant, layout), truth.joints),
+            "global_mpjpe_nearest_train_clip": mpjpe(decode(other, layout), truth.joints),
+            "pa_mpjpe": pa_mpjpe(decode(found, layout), truth.joints),
+        }
+        if frames > 2:
+            values["accel"] = accel_error(decode(found, layout), truth.joints)
+        for name, value in values.items():
+            rows.setdefault(name, []).append(float(value))
+    return {name: float(np.mean(values)) for name, values in rows.items()}
+
+
+def truths_layout(tokenizer: Tokenizer) -> MotionLayout:
+    """The body-hand layout a tokenizer's truths are in."""
+    return joint_layout(tokenizer.layout)
+
+
+class NearestClip:
+    """The training clip whose poses, stretched to the same length, come nearest."""
+
+    def __init__(self, train: ShardDataset) -> None:
+        self.train = train
+        self.columns = train.layout.part("bodyhand")
+        layout = joint_layout(train.layout)
+        self.positions = layout.slice("positions")
+        keys = [self._key(np.asarray(train.motion(i))[:, self.columns]) for i in range(len(train))]
+        self.keys = np.stack(keys)
+        self.norms = np.square(self.keys).sum(1)
+
+    def _key(self, features: NDArray[np.float32]) -> NDArray[np.float64]:
+        return stretch(features[:, self.positions], KEY_FRAMES).ravel()
+
+    def features(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Features [T, D] of that clip, stretched to T frames (velocities scaled with time)."""
+        distance = self.norms - 2 * self.keys @ self._key(features)
+        found = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
+        out = stretch(found, len(features))
+        layout = joint_layout(self.train.layout)
+        for field in ("root_yaw_velocity", "root_xz_velocity", "velocities"):
+            out[:, layout.slice(field)] *= len(found) / len(features)
+        return out.astype(np.float32)
+
+
+def stretch(values: NDArray[np.float32], frames: int) -> NDArray[np.float64]:
+    """Linear resampling of [T, D] to `frames` rows, first and last kept."""
+    at = np.linspace(0, len(values) - 1, frames)
+    low = np.floor(at).astype(int)
+    high = np.minimum(low + 1, len(values) - 1)
+    weight = (at - low)[:, None]
+    return values[low].astype(np.float64) * (1 - weight) + values[high] * weight
+
+
+def embed_motions(
+    tma: LoadedTma, stats: FeatureStats, motions: Sequence[NDArray[np.float32]], batch: int = 64
+) -> Tensor:
+    """TMA latents [n, 256] of body-hand features; longer motions are cut at the model's length."""
+    columns = tma.layout.part("bodyhand")
+    mean, std = stats.mean[columns], stats.std[columns]
+    order = np.argsort([len(m) for m in motions], kind="stable")
+    out: dict[int, Tensor] = {}
+    for start in range(0, len(order), batch):
+        rows = order[start : start + batch].tolist()
+        cut = [(motions[i][: tma.max_frames] - mean) / std for i in rows]
+        length = torch.tensor([len(m) for m in cut])
+        motion = torch.zeros(len(cut), int(length.max()), len(columns))
+        for row, values in enumerate(cut):
+            motion[row, : len(values)] = torch.from_numpy(values.astype(np.float32))
+        for i, latent in zip(rows, tma.embed_motion(motion, length), strict=True):
+            out[i] = latent
+    return torch.stack([out[i] for i in range(len(motions))])
+
+
+def retrieval_figures(text: Tensor, motion: Tensor, *, size: int, repeats: int, seed: int) -> dict[str, Interval]:
+    """Recall@1/2/3 both ways among `size` (protocols C and D): mean over batches, interval over repetitions."""
+    rows: dict[str, list[float]] = {}
+    for repeat in range(repeats):
+        generator = torch.Generator().manual_seed(seed * 1000 + repeat)
+        for name, (query, key) in {"t2m": (text, motion), "m2t": (motion, text)}.items():
+            recall = recall_in_batches(query, key, size=size, ks=(1, 2, 3), generator=generator)
+            for k, value in recall.items():
+                rows.setdefault(f"{name}_r{k}", []).append(float(value))
+    return {name: Interval.of(values) for name, values in rows.items()}
+
+
+def chance(k: int, size: int) -> float:
+    """Recall@k of a guess."""
+    return k / size

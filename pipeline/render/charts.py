@@ -1,0 +1,206 @@
+"""Line and bar charts as small inline SVG, drawn without any library so that a report stays one light file.
+
+Colours come from the page's style (`.s0` to `.s7`, `.axis`), so charts follow the light and dark theme. Long
+curves are thinned to the lowest and highest point of each of 200 stretches, which keeps every spike.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+WIDTH, HEIGHT = 640, 320
+LEFT, RIGHT, TOP, BOTTOM = 62, 24, 14, 46
+STRETCHES = 200
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve: x and y [K]; points that are not finite are left out; `dashed` sets validation off."""
+
+    name: str
+    x: ArrayLike
+    y: ArrayLike
+    dashed: bool = False
+
+
+def line_chart(
+    lines: Sequence[Line], *, x_label: str = "step", y_label: str = "", log_y: bool = False, title: str = ""
+) -> str:
+    """SVG of curves over one pair of axes, with a legend and the data for the page's hover script."""
+    curves = [_finite(line, log_y) for line in lines]
+    filled = [(x, y) for x, y in curves if len(x)]
+    if not filled:
+        return _svg(title, [_text(WIDTH / 2, HEIGHT / 2, "no data yet", "middle")], None)
+    low_x = min(float(x.min()) for x, _ in filled)
+    high_x = max(float(x.max()) for x, _ in filled)
+    low_y = min(float(y.min()) for _, y in filled)
+    high_y = max(float(y.max()) for _, y in filled)
+    x_axis, y_axis = _Axis(low_x, high_x, LEFT, WIDTH - RIGHT), _Axis(low_y, high_y, HEIGHT - BOTTOM, TOP)
+    parts = _axes(x_axis, y_axis, x_label, y_label, log_y)
+    hover = []
+    for index, (line, (x, y)) in enumerate(zip(lines, curves, strict=True)):
+        x, y = _thin(x, y)
+        points = [
+            (round(x_axis(a), 1), round(y_axis(b), 1)) for a, b in zip(x.tolist(), y.tolist(), strict=True)
+        ]
+        path = " ".join(f"{px:g},{py:g}" for px, py in points)
+        dash = ' stroke-dasharray="6 4"' if line.dashed else ""
+        if len(points) > 1:
+            parts.append(f'<polyline class="curve s{index % 8}" points="{path}"{dash}/>')
+        else:
+            parts += [
+                f'<circle class="dot s{index % 8}" cx="{px:g}" cy="{py:g}" r="4"/>' for px, py in points
+            ]
+        raw = np.power(10, y) if log_y else y
+        values = [
+            [float(f"{a:.6g}"), float(f"{b:.4g}")] for a, b in zip(x.tolist(), raw.tolist(), strict=True)
+        ]
+        hover.append({"name": line.name, "at": points, "values": values})
+    return _svg(title, parts, {"x": x_label, "lines": hover}) + _legend(lines)
+
+
+def bar_chart(
+    values: ArrayLike,
+    *,
+    x_label: str = "",
+    y_label: str = "",
+    title: str = "",
+    labels: Sequence[str] | None = None,
+) -> str:
+    """SVG of one bar per value [K] (a histogram when bars are many); zero bars are marked below the axis."""
+    heights = np.nan_to_num(np.asarray(values, np.float64).ravel())
+    if not len(heights):
+        return _svg(title, [_text(WIDTH / 2, HEIGHT / 2, "no data yet", "middle")], None)
+    x_axis = _Axis(0, len(heights), LEFT, WIDTH - RIGHT, nice=False)
+    y_axis = _Axis(min(0.0, float(heights.min())), max(float(heights.max()), 1e-9), HEIGHT - BOTTOM, TOP)
+    parts = _axes(x_axis, y_axis, x_label, y_label, False, x_ticks=labels is None)
+    step = x_axis(1) - x_axis(0)
+    gap = 0.18 * step if step > 4 else 0.0
+    wide, zero = step - gap, y_axis(0)
+    for index, height in enumerate(heights.tolist()):
+        x, y = x_axis(index) + gap / 2, y_axis(height)
+        name = labels[index] if labels is not None else str(index)
+        tip = f"<title>{escape(name)}: {height:g}</title>"
+        if height == 0 and len(heights) > 16:
+            parts.append(
+                f'<rect class="dead" x="{x:.2f}" y="{zero:.1f}" width="{wide:.2f}" height="5">{tip}</rect>'
+            )
+            continue
+        top, tall = min(y, zero), abs(zero - y)
+        parts.append(
+            f'<rect class="bar" x="{x:.2f}" y="{top:.1f}" width="{wide:.2f}" height="{tall:.1f}">{tip}</rect>'
+        )
+    if labels is not None:
+        for index, label in enumerate(labels):
+            parts.append(_text(x_axis(index + 0.5), HEIGHT - BOTTOM + 17, label[:14], "middle"))
+    return _svg(title, parts, None)
+
+
+class _Axis:
+    """A linear map from values to pixels whose ends are moved out to round numbers."""
+
+    def __init__(self, low: float, high: float, start: float, end: float, nice: bool = True) -> None:
+        if high - low < 1e-12 * max(abs(low), abs(high), 1e-300):
+            pad = abs(low) * 0.1 or 0.5
+            low, high = low - pad, high + pad
+        rough = (high - low) / 5
+        power = 10 ** math.floor(math.log10(rough))
+        self.step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough * 0.999)
+        self.low = math.floor(low / self.step) * self.step if nice else low
+        self.high = math.ceil(high / self.step) * self.step if nice else high
+        self.start, self.end = start, end
+
+    def __call__(self, value: float) -> float:
+        return self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start)
+
+    def ticks(self) -> list[float]:
+        first = math.ceil(self.low / self.step - 1e-9)
+        last = math.floor(self.high / self.step + 1e-9)
+        return [k * self.step for k in range(first, last + 1)]
+
+
+def _finite(line: Line, log_y: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x, y = np.asarray(line.x, np.float64).ravel(), np.asarray(line.y, np.float64).ravel()
+    if len(x) != len(y):
+        raise ValueError(f"line '{line.name}': {len(x)} x values but {len(y)} y values")
+    good = np.isfinite(x) & np.isfinite(y)
+    if log_y:
+        good &= y > 0
+    x, y = x[good], y[good]
+    return x, np.log10(y) if log_y else y
+
+
+def _thin(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    if len(x) <= 2 * STRETCHES:
+        return x, y
+    keep = {0, len(x) - 1}
+    for stretch in np.array_split(np.arange(len(x)), STRETCHES):
+        keep |= {int(stretch[np.argmin(y[stretch])]), int(stretch[np.argmax(y[stretch])])}
+    index = np.array(sorted(keep))
+    return x[index], y[index]
+
+
+def _axes(x: _Axis, y: _Axis, x_label: str, y_label: str, log_y: bool, x_ticks: bool = True) -> list[str]:
+    parts = []
+    for tick in y.ticks():
+        at = y(tick)
+        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
+        parts.append(_text(LEFT - 8, at + 4, _number(10**tick if log_y else tick), "end"))
+    base = HEIGHT - BOTTOM
+    parts.append(f'<line class="axis" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{base}" y2="{base}"/>')
+    for tick in x.ticks() if x_ticks else ():
+        parts.append(_text(x(tick), base + 17, _number(tick), "middle"))
+    parts.append(_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, x_label, "middle"))
+    if y_label:
+        middle = (TOP + base) / 2
+        parts.append(
+            f'<text transform="translate(14 {middle:g}) rotate(-90)" text-anchor="middle">'
+            f"{escape(y_label)}</text>"
+        )
+    return parts
+
+
+def _number(value: float) -> str:
+    if value == 0 or abs(value) < 1e-12:
+        return "0"
+    if abs(value) >= 1e6:
+        return f"{value / 1e6:g}M"
+    if abs(value) >= 1e4:
+        return f"{value / 1e3:g}k"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:g}"
+
+
+def _text(x: float, y: float, text: str, anchor: str) -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
+
+
+def _legend(lines: Sequence[Line]) -> str:
+    if len(lines) < 2:
+        return ""
+    marks = "".join(
+        f'<span><i class="key s{k % 8}{" dashed" if line.dashed else ""}"></i>{escape(line.name)}</span>'
+        for k, line in enumerate(lines)
+    )
+    return f'<div class="legend">{marks}</div>'
+
+
+def _svg(title: str, parts: Sequence[str], hover: dict[str, Any] | None) -> str:
+    data = (
+        ""
+        if hover is None
+        else f' data-hover="{escape(json.dumps(hover, separators=(",", ":")), quote=True)}"'
+    )
+    label = escape(title or "chart", quote=True)
+    return (
+        f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}"{data}>'
+        + "".join(parts)
+        + "</svg>"
+    )

@@ -1,0 +1,180 @@
+"""A report as one self-contained HTML page built from blocks: text, tables, charts, pictures, motion viewers.
+
+Every string handed in is untrusted and escaped; nothing is loaded from outside. The viewer's script is inlined
+once however many viewers the page holds, and only if it holds one.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+
+from numpy.typing import ArrayLike
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.charts import Line, bar_chart, line_chart
+from motionloom.pipeline.render.files import write_text
+from motionloom.pipeline.render.viewer import (
+    ViewerMotion,
+    fill,
+    resource,
+    safe_json,
+    viewer_data,
+    viewer_script,
+)
+
+Value = str | float | int | None
+PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+
+
+class Page:
+    """Collects blocks in order; `write` makes the file. Each `add_` returns the page, so calls chain."""
+
+    def __init__(self, title: str, subtitle: str = "") -> None:
+        self.title, self.subtitle = title, subtitle
+        self._blocks: list[str] = []
+        self._contents: list[tuple[str, str]] = []
+        self._viewers = 0
+
+    def add_heading(self, text: str) -> Page:
+        """Start a section; sections are listed at the head of the page."""
+        anchor = f"section-{len(self._contents) + 1}"
+        self._contents.append((anchor, text))
+        self._blocks.append(f'<h2 id="{anchor}">{escape(text)}</h2>')
+        return self
+
+    def add_text(self, text: str) -> Page:
+        """Paragraphs, parted by empty lines."""
+        for paragraph in text.split("\n\n"):
+            if paragraph.strip():
+                self._blocks.append(f"<p>{escape(paragraph.strip())}</p>")
+        return self
+
+    def add_table(
+        self, columns: Sequence[str], rows: Sequence[Sequence[Value]], caption: str = "", digits: int = 3
+    ) -> Page:
+        """A table; numbers stand right with `digits` decimals, None is a dash."""
+        for row in rows:
+            if len(row) != len(columns):
+                raise UserError(f"table '{caption}': a row has {len(row)} cells for {len(columns)} columns")
+        numeric = [
+            any(_is_number(row[k]) for row in rows)
+            and all(_is_number(row[k]) or row[k] is None for row in rows)
+            for k in range(len(columns))
+        ]
+        align = [' class="number"' if flag else "" for flag in numeric]
+        head = "".join(f"<th{a}>{escape(name)}</th>" for name, a in zip(columns, align, strict=True))
+        body = "".join(
+            "<tr>"
+            + "".join(f"<td{a}>{_cell(v, digits)}</td>" for v, a in zip(row, align, strict=True))
+            + "</tr>"
+            for row in rows
+        )
+        title = f"<caption>{escape(caption)}</caption>" if caption else ""
+        self._blocks.append(
+            f'<div class="scroll"><table>{title}<thead><tr>{head}</tr></thead>'
+            f"<tbody>{body}</tbody></table></div>"
+        )
+        return self
+
+    def add_facts(self, facts: Mapping[str, Value]) -> Page:
+        """A short list of names and values, shown as tiles."""
+        tiles = "".join(
+            f"<div><dt>{escape(name)}</dt><dd>{_cell(_short(value), 3)}</dd></div>"
+            for name, value in facts.items()
+        )
+        self._blocks.append(f'<dl class="facts">{tiles}</dl>')
+        return self
+
+    def add_plot(
+        self, lines: Sequence[Line], title: str, x_label: str = "step", y_label: str = "", log_y: bool = False
+    ) -> Page:
+        """A line chart; neighbouring charts stand side by side where the window is wide enough."""
+        chart = line_chart(lines, x_label=x_label, y_label=y_label, log_y=log_y, title=title)
+        return self._add_chart(chart, title)
+
+    def add_bars(
+        self,
+        values: ArrayLike,
+        title: str,
+        x_label: str = "",
+        y_label: str = "",
+        labels: Sequence[str] | None = None,
+    ) -> Page:
+        """A bar chart, for example the uses of each code of a codebook; unused ones are marked."""
+        return self._add_chart(
+            bar_chart(values, x_label=x_label, y_label=y_label, labels=labels, title=title), title
+        )
+
+    def add_viewer(self, motions: Sequence[ViewerMotion], note: str = "") -> Page:
+        """Motions that play in the page, with their own controls below."""
+        self._viewers += 1
+        name = f"viewer-{self._viewers}"
+        if note:
+            self.add_text(note)
+        data = safe_json(viewer_data(motions))
+        self._blocks.append(
+            f'<div class="mlv viewer" id="{name}"></div>'
+            f'<script type="application/json" id="{name}-data">{data}</script>'
+            f'<script>motionloomViewer(document.getElementById("{name}"), '
+            f'JSON.parse(document.getElementById("{name}-data").textContent), {{ page: false }});</script>'
+        )
+        return self
+
+    def add_image(self, image: Path | bytes, alt: str, caption: str = "") -> Page:
+        """A PNG or JPEG, embedded."""
+        data = image if isinstance(image, bytes) else image.read_bytes()
+        kind = next((mime for magic, mime in PICTURES.items() if data.startswith(magic)), None)
+        if kind is None:
+            raise UserError(f"'{alt}': only PNG and JPEG pictures can be put into a page")
+        text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+        source = f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+        self._blocks.append(f'<figure><img src="{source}" alt="{escape(alt, quote=True)}">{text}</figure>')
+        return self
+
+    def html(self) -> str:
+        """The whole page."""
+        links = "".join(f'<a href="#{anchor}">{escape(text)}</a>' for anchor, text in self._contents)
+        contents = f'<nav aria-label="Sections">{links}</nav>' if len(self._contents) > 1 else ""
+        return fill(
+            resource("page.html"),
+            TITLE=escape(self.title),
+            SUBTITLE=f"<p>{escape(self.subtitle)}</p>" if self.subtitle else "",
+            STYLE=resource("page.css") + (resource("viewer.css") if self._viewers else ""),
+            SCRIPT=viewer_script() if self._viewers else "",
+            CONTENTS=contents,
+            BODY="\n".join(self._blocks),
+            HOVER=resource("page.js"),
+        )
+
+    def write(self, path: Path) -> None:
+        """Write the page atomically."""
+        write_text(path, self.html())
+
+    def _add_chart(self, chart: str, title: str) -> Page:
+        block = f'<figure class="plot"><figcaption>{escape(title)}</figcaption>{chart}</figure>'
+        if self._blocks and self._blocks[-1].startswith('<div class="plots">'):
+            self._blocks[-1] = self._blocks[-1].removesuffix("</div>") + block + "</div>"
+        else:
+            self._blocks.append(f'<div class="plots">{block}</div>')
+        return self
+
+
+def _is_number(value: Value) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _short(value: Value) -> Value:
+    return f"{value:.4g}" if isinstance(value, float) else value
+
+
+def _cell(value: Value, digits: int) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, float):
+        return escape(
+            f"{value:.{digits}f}" if 1e-3 <= abs(value) < 1e5 or value == 0 else f"{value:.{digits}g}"
+        )
+    return escape(f"{value:,}" if _is_number(value) else str(value))

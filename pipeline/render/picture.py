@@ -1,0 +1,117 @@
+"""Contact sheets: motions as rows, a few poses each along time, captions as text; PNG for documents."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of
+from motionloom.pipeline.render.figure import Figure, figure_for
+from motionloom.pipeline.render.files import write_bytes
+from motionloom.pipeline.render.lettering import font, wrap
+from motionloom.pipeline.render.raster import Pose, draw_pose, halve
+
+SKELETONS = {52: "smplx52", 22: "smpl22"}
+PAPER, INK, SOFT, LINE = (255, 255, 255), (29, 35, 48), (91, 100, 117), (226, 230, 237)
+
+
+def contact_sheet(
+    path: Path,
+    joints: Sequence[NDArray[Any]],
+    labels: Sequence[str],
+    captions: Sequence[str],
+    frames: int = 6,
+    *,
+    parents: Sequence[int] | None = None,
+    fps: float = 20.0,
+    cell: tuple[int, int] = (180, 236),
+    view: str = "3/4",
+) -> None:
+    """Write a PNG: a row per motion [T, N, 3] (metres) with label, caption and `frames` poses over time.
+
+    `parents` may be left out for 52 or 22 SMPL-X joints. Poses stand in mid-cell, with their times.
+    """
+    if not len(joints) == len(labels) == len(captions) or not len(joints) or frames < 1:
+        raise UserError(
+            "contact_sheet needs as many labels and captions as motions, and at least one of each"
+        )
+    width, height = cell
+    heading = 48 if _two_lines(labels, captions, width * frames) else 30
+    rows = [np.asarray(clip, np.float64) for clip in joints]
+    # One scale for the whole sheet, so that rows can be compared.
+    tall = max(float(np.percentile(r[..., 1].max(axis=1), 98)) - floor_of(r) + 0.2 for r in rows)
+    radius = max(
+        float(np.percentile(np.linalg.norm(r[..., [0, 2]] - r[:, :1, [0, 2]], axis=-1).max(axis=1), 90))
+        for r in rows
+    )
+    yaw, pitch = VIEWS[view]
+    big = (2 * width, 2 * height)
+    distance = fit_distance(float(np.clip(tall, 0.3, 5)), float(np.clip(radius, 0.2, 2)), *big)
+    camera = Camera(yaw, pitch, distance, *big)
+    sheet = Image.new("RGB", (2 * width * frames, 2 * (height + heading) * len(rows)), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    stamps = []
+    for row, clip in enumerate(rows):
+        top = row * (height + heading)
+        figure = _figure(clip, parents)
+        nodes, scale, floor = figure.nodes(clip), figure.scale(clip), floor_of(clip)
+        draw.rectangle(
+            [0, 2 * (top + heading), sheet.width, 2 * (top + heading + height)], fill=(247, 248, 251)
+        )
+        draw.line([0, 2 * top, sheet.width, 2 * top], fill=LINE, width=2)
+        for column, k in enumerate(np.linspace(0, len(clip) - 1, frames).round().astype(int)):
+            target = np.array([clip[k, 0, 0], floor + 0.47 * tall, clip[k, 0, 2]])
+            corner = (2 * column * width, 2 * (top + heading))
+            draw_pose(draw, camera, figure, Pose(nodes[k], target, floor, scale), at=corner)
+            stamps.append((column * width + 8, top + heading + height - 20, f"{k / fps:.1f} s"))
+    small = halve(sheet)
+    _words(small, labels, captions, stamps, height + heading)
+    data = io.BytesIO()
+    small.save(data, "PNG", optimize=True)
+    write_bytes(path, data.getvalue())
+
+
+def _two_lines(labels: Sequence[str], captions: Sequence[str], width: int) -> bool:
+    return any(
+        font(14, bold=True).getlength(label) + font(14).getlength(caption) + 34 > width
+        for label, caption in zip(labels, captions, strict=True)
+    )
+
+
+def _words(
+    sheet: Image.Image,
+    labels: Sequence[str],
+    captions: Sequence[str],
+    stamps: Sequence[tuple[int, int, str]],
+    pitch: int,
+) -> None:
+    """Labels in bold, captions beside them, times small."""
+    draw = ImageDraw.Draw(sheet)
+    bold, plain, tiny = font(14, bold=True), font(14), font(11)
+    for row, (label, caption) in enumerate(zip(labels, captions, strict=True)):
+        x = 10.0
+        if label:
+            draw.text((x, row * pitch + 6), label, fill=INK, font=bold)
+            x += float(bold.getlength(label)) + 14
+        for number, line in enumerate(wrap(caption, sheet.width - x - 10, plain, 2)):
+            draw.text((x, row * pitch + 6 + 18 * number), line, fill=SOFT if label else INK, font=plain)
+    for x_at, y_at, text in stamps:
+        draw.text((x_at, y_at), text, fill=SOFT, font=tiny)
+
+
+def _figure(clip: NDArray[np.float64], parents: Sequence[int] | None) -> Figure:
+    if clip.ndim != 3 or not np.isfinite(clip).all():
+        raise UserError(f"contact_sheet draws finite joints [T, N, 3], got {list(clip.shape)}")
+    if parents is None:
+        if clip.shape[1] not in SKELETONS:
+            raise UserError(f"contact_sheet needs parents for a skeleton of {clip.shape[1]} joints")
+        parents = Skeleton.named(SKELETONS[clip.shape[1]]).parents
+    return figure_for(parents, clip)

@@ -1,0 +1,128 @@
+"""MP4 of one motion: frames drawn with Pillow, piped to the ffmpeg that ships with imageio-ffmpeg (H.264)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of, smooth_path
+from motionloom.pipeline.render.figure import figure_for
+from motionloom.pipeline.render.files import part_path
+from motionloom.pipeline.render.lettering import font, wrap
+from motionloom.pipeline.render.raster import SKY, Pose, draw_ground, draw_pose, halve
+
+Progress = Callable[[int, int], None]
+
+
+def write_mp4(
+    path: Path,
+    joints: NDArray[Any],
+    skeleton: Skeleton,
+    fps: float,
+    caption: str = "",
+    *,
+    size: tuple[int, int] = (512, 512),
+    view: str = "3/4",
+    follow: bool = True,
+    progress: Progress | None = None,
+) -> None:
+    """Film joints [T, N, 3] (metres, Y up); `progress(done, total)` is called after every frame.
+
+    The file appears under its name only when it is whole. `size` is rounded up to even numbers for H.264.
+    """
+    import imageio_ffmpeg  # the binary is looked up on import: only for those who film
+
+    width, height = (side + side % 2 for side in size)
+    frames = render_frames(joints, skeleton, fps, caption, size=(width, height), view=view, follow=follow)
+    part = part_path(path)
+    writer = imageio_ffmpeg.write_frames(
+        str(part),
+        (width, height),
+        fps=fps,
+        codec="libx264",
+        pix_fmt_out="yuv420p",
+        macro_block_size=2,
+        output_params=["-preset", "veryfast", "-crf", "20", "-movflags", "+faststart"],
+        ffmpeg_log_level="error",
+    )
+    try:
+        writer.send(None)
+        for done, frame in enumerate(frames, start=1):
+            writer.send(frame.tobytes())
+            if progress is not None:
+                progress(done, len(joints))
+        writer.close()
+        part.replace(path)
+    finally:
+        writer.close()
+        part.unlink(missing_ok=True)
+
+
+def render_frames(
+    joints: NDArray[Any],
+    skeleton: Skeleton,
+    fps: float,
+    caption: str = "",
+    *,
+    size: tuple[int, int] = (512, 512),
+    view: str = "3/4",
+    follow: bool = True,
+) -> Iterator[Image.Image]:
+    """Yield one RGB picture of `size` per frame of joints [T, N, 3]."""
+    exact = np.asarray(joints, np.float64)
+    if exact.ndim != 3 or exact.shape[1:] != (len(skeleton), 3) or not len(exact):
+        raise UserError(
+            f"joints must be [T, {len(skeleton)}, 3] for {skeleton.name}, got {list(exact.shape)}"
+        )
+    if not np.isfinite(exact).all():
+        raise UserError("joints hold NaN or infinity; nothing sensible can be filmed")
+    if view not in VIEWS:
+        raise UserError(f"no view '{view}'; known: {', '.join(VIEWS)}")
+    return _frames(exact, skeleton, fps, caption, size, view, follow)
+
+
+def _frames(
+    joints: NDArray[np.float64],
+    skeleton: Skeleton,
+    fps: float,
+    caption: str,
+    size: tuple[int, int],
+    view: str,
+    follow: bool,
+) -> Iterator[Image.Image]:
+    figure = figure_for(skeleton.parents, joints)
+    nodes, scale, floor = figure.nodes(joints), figure.scale(joints), floor_of(joints)
+    target = smooth_path(joints[:, 0], fps)
+    if not follow:
+        target[:] = (target.min(axis=0) + target.max(axis=0)) / 2
+    height = float(np.clip(np.percentile(joints[..., 1].max(axis=1), 98) - floor + 0.2 * scale, 0.3, 5))
+    spread = np.linalg.norm(joints[..., [0, 2]] - target[:, None][..., [0, 2]], axis=-1).max(axis=1)
+    radius = float(np.clip(np.percentile(spread, 90 if follow else 100) + 0.06, 0.2, 12))
+    target[:, 1] = floor + 0.46 * height
+    yaw, pitch = VIEWS[view]
+    big = (2 * size[0], 2 * size[1])
+    camera = Camera(yaw, pitch, fit_distance(height, radius, *big), *big)
+    face = font(max(11, size[1] // 30))
+    lines = wrap(caption, size[0] - 24, face, 2) if caption else []
+    sky = Image.new("RGB", big, SKY)
+    for frame in range(len(joints)):
+        image = sky.copy()
+        draw = ImageDraw.Draw(image)
+        pose = Pose(nodes[frame], target[frame], floor, scale)
+        draw_ground(draw, camera, pose, joints[:, 0])
+        draw_pose(draw, camera, figure, pose)
+        small = halve(image)
+        if lines:
+            below = ImageDraw.Draw(small)
+            step = size[1] // 30 * 1.35
+            for row, line in enumerate(lines):
+                y = size[1] - 10 - step * (len(lines) - row)
+                below.text((12, y), line, fill=(36, 42, 56), font=face)
+        yield small

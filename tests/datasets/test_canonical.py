@@ -1,0 +1,206 @@
+"""Heading, canonical pose, mirroring, resampling and retargeting, on a figure that walks and turns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from motionloom.datasets.motion.canonical import (
+    canonicalize,
+    facing,
+    ground,
+    heading,
+    mirror,
+    resample,
+    resample_quaternions,
+    retarget,
+    turn,
+)
+from motionloom.datasets.motion.kinematics import forward_kinematics
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+
+FPS = 20.0
+BODY = Skeleton.named("smpl22")
+
+
+def walk(turned: float, seconds: float = 5.0, fps: float = FPS, skeleton: Skeleton = BODY) -> NDArray:
+    """A figure [T, N, 3] that walks at 1 m/s with swinging legs and turns left by `turned` radians in all."""
+    frames = int(seconds * fps) + 1
+    time = np.arange(frames) / fps
+    angle = turned * time / seconds
+    local = np.tile(np.eye(3), (frames, len(skeleton), 1, 1))
+    local[:, 0] = Rotation.from_rotvec(angle[:, None] * [0, 1, 0]).as_matrix()
+    swing = 0.5 * np.sin(2 * np.pi * time)[:, None]
+    local[:, skeleton.index("left_hip")] = Rotation.from_rotvec(swing * [1, 0, 0]).as_matrix()
+    local[:, skeleton.index("right_hip")] = Rotation.from_rotvec(-swing * [1, 0, 0]).as_matrix()
+    step = np.exp(1j * angle) / fps
+    path = np.concatenate([[0], np.cumsum(step[:-1])])
+    root = np.stack([path.imag, np.full(frames, 0.95), path.real], axis=-1)
+    return forward_kinematics(local, root, skeleton.offsets, skeleton.parents)[0]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5, -0.5, 3.0, -3.0])
+def test_heading_of_a_standing_figure_is_the_angle_it_was_turned_by(angle: float) -> None:
+    joints = turn(np.repeat(BODY.rest_joints[None], 10, axis=0), angle)
+    np.testing.assert_allclose(heading(joints, FPS), angle, atol=1e-12)
+
+
+def test_left_is_plus_x_and_a_left_turn_makes_the_heading_grow() -> None:
+    joints = walk(np.pi / 2)
+    angle = heading(joints, FPS)
+    assert BODY.rest_joints[BODY.index("left_hip"), 0] > 0
+    assert np.all(np.diff(angle) > 0)
+    assert angle[0] == pytest.approx(0.0, abs=1e-9)
+    assert angle[-1] == pytest.approx(np.pi / 2, abs=1e-9)
+    assert joints[-1, 0, 0] > 2.0, "the path must bend towards +X"
+
+
+def test_the_mirror_image_of_a_left_turn_turns_right() -> None:
+    joints = walk(2.0)
+    mirrored = mirror(joints, BODY)
+    np.testing.assert_allclose(heading(mirrored, FPS), -heading(joints, FPS), atol=1e-9)
+    assert np.all(np.diff(heading(mirrored, FPS)) < 0)
+    assert mirrored[-1, 0, 0] < -2.0
+    left, right = BODY.index("left_foot"), BODY.index("right_foot")
+    np.testing.assert_allclose(mirrored[:, left], joints[:, right] * [-1, 1, 1])
+
+
+@pytest.mark.parametrize("name", ["smpl22", "smplx52"])
+def test_mirror_twice_is_the_same_and_the_rest_pose_is_its_own_mirror(name: str) -> None:
+    skeleton = Skeleton.named(name)
+    joints = np.random.default_rng(0).normal(size=(4, len(skeleton), 3))
+    np.testing.assert_array_equal(mirror(mirror(joints, skeleton), skeleton), joints)
+    np.testing.assert_allclose(mirror(skeleton.rest_joints, skeleton), skeleton.rest_joints, atol=1e-12)
+
+
+def test_a_steady_spin_of_three_turns_is_followed_without_lag() -> None:
+    joints = walk(6 * np.pi)
+    np.testing.assert_allclose(heading(joints, FPS), np.linspace(0, 6 * np.pi, len(joints)), atol=1e-9)
+
+
+@given(st.integers(2, 60), st.integers(0, 2**31 - 1))
+@settings(max_examples=25, deadline=None)
+def test_heading_equals_a_slow_gaussian_over_the_point_reflected_angle(frames: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    raw = np.cumsum(rng.uniform(-0.5, 0.5, size=frames))
+    joints = np.stack([turn(BODY.rest_joints, angle) for angle in raw])
+    fps = 10.0
+    reach = int(4 * fps + 0.5)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / fps) ** 2)
+    weights /= weights.sum()
+
+    def reflected(index: int) -> float:
+        if index < 0:
+            return 2 * raw[0] - reflected(-index)
+        if index >= frames:
+            return 2 * raw[-1] - reflected(2 * (frames - 1) - index)
+        return float(raw[index])
+
+    slow = [sum(w * reflected(t + k - reach) for k, w in enumerate(weights)) for t in range(frames)]
+    fast = heading(joints, fps)
+    np.testing.assert_allclose(fast - fast[0], np.asarray(slow) - slow[0], atol=1e-9)
+    assert fast[0] == pytest.approx(facing(joints)[0], abs=1e-12)
+
+
+def test_frames_that_face_nowhere_keep_the_last_heading() -> None:
+    joints = walk(0.6)
+    angle = facing(joints)
+    joints[30:40] = joints[30:40, :1]
+    held = facing(joints)
+    np.testing.assert_allclose(held[30:40], angle[29])
+    np.testing.assert_allclose(held[40:], angle[40:])
+    joints[:5] = joints[:5, :1]
+    np.testing.assert_allclose(facing(joints)[:5], angle[5])
+    np.testing.assert_array_equal(facing(np.zeros((3, 22, 3))), 0.0)
+
+
+@given(st.floats(-9, 9), st.floats(-5, 5), st.floats(-5, 5), st.floats(-2, 2))
+@settings(max_examples=25, deadline=None)
+def test_canonical_joints_do_not_depend_on_place_or_first_heading(
+    angle: float, x: float, z: float, height: float
+) -> None:
+    joints = canonicalize(walk(1.0))
+    np.testing.assert_allclose(
+        canonicalize(turn(joints, angle) + np.array([x, height, z])), joints, atol=1e-9
+    )
+    assert joints[..., 1].min() == 0.0
+    np.testing.assert_allclose(joints[0, 0, [0, 2]], 0.0, atol=1e-12)
+    assert facing(joints)[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_canonicalize_keeps_the_float_type_and_the_input() -> None:
+    joints = walk(1.0).astype(np.float32)
+    before = joints.copy()
+    assert canonicalize(joints).dtype == np.float32
+    np.testing.assert_array_equal(joints, before)
+    batch = np.stack([joints, turn(joints, 1.0) + np.float32(1.0)])
+    np.testing.assert_allclose(canonicalize(batch)[1], canonicalize(joints), atol=1e-5)
+
+
+def test_ground_turns_left_by_multiplication() -> None:
+    forward = np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(ground(forward) * np.exp(1j * np.pi / 2), ground(np.array([1.0, 0, 0])))
+
+
+@pytest.mark.parametrize(("fps_in", "fps_out"), [(60, 20), (30, 20), (20, 30), (24, 20), (29.97, 20)])
+def test_resampling_a_straight_line_in_time_keeps_the_line(fps_in: float, fps_out: float) -> None:
+    values = np.arange(61)[:, None] / fps_in * [[1.0, -2.0]]
+    out = resample(values, fps_in, fps_out)
+    assert len(out) == int(60 * fps_out / fps_in + 1e-9) + 1
+    np.testing.assert_allclose(out, np.arange(len(out))[:, None] / fps_out * [[1.0, -2.0]], atol=1e-9)
+
+
+def test_resampling_takes_input_frames_where_they_fall_on_output_frames() -> None:
+    joints = np.random.default_rng(0).normal(size=(31, 22, 3)).astype(np.float32)
+    np.testing.assert_array_equal(resample(joints, 60, 20), joints[::3])
+    np.testing.assert_array_equal(resample(joints, 30, 30), joints)
+    np.testing.assert_array_equal(resample(joints[:1], 30, 20), joints[:1])
+    assert resample(joints, 30, 20).dtype == np.float32
+    with pytest.raises(UserError, match="frame rates must be positive"):
+        resample(joints, 0, 20)
+    with pytest.raises(UserError, match="without frames"):
+        resample(joints[:0], 30, 20)
+
+
+def test_quaternion_resampling_equals_scipys_slerp_whatever_the_signs() -> None:
+    rng = np.random.default_rng(1)
+    steps = Rotation.from_rotvec(rng.normal(scale=0.3, size=(16, 3)))
+    pose = Rotation.identity()
+    keys = []
+    for step in steps:
+        pose = pose * step
+        keys.append(pose.as_quat())
+    quaternions = np.array(keys) * rng.choice([-1, 1], size=(16, 1))
+    out = resample_quaternions(quaternions[:, None], 30, 20)[:, 0]
+    want = Slerp(np.arange(16) / 30, Rotation.from_quat(quaternions))(np.arange(len(out)) / 20)
+    assert (Rotation.from_quat(out) * want.inv()).magnitude().max() < 1e-7
+    np.testing.assert_allclose(np.linalg.norm(out, axis=-1), 1.0, atol=1e-12)
+
+
+def test_retargeting_gives_the_wanted_bones_and_keeps_directions() -> None:
+    joints = walk(1.0)
+    scale = np.random.default_rng(2).uniform(0.7, 1.4, size=(22, 1))
+    offsets = BODY.offsets * scale
+    out = retarget(joints, BODY, offsets)
+    parents = list(BODY.parents[1:])
+    before, after = joints[:, 1:] - joints[:, parents], out[:, 1:] - out[:, parents]
+    lengths = np.linalg.norm(offsets[1:], axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(after, axis=-1), np.tile(lengths, (len(out), 1)), atol=1e-9)
+    np.testing.assert_allclose(np.cross(before, after), 0.0, atol=1e-9)
+    legs = [np.linalg.norm(o[[5, 8]], axis=-1).sum() for o in (BODY.offsets, offsets)]
+    np.testing.assert_allclose(out[:, 0], joints[:, 0] * legs[1] / legs[0], atol=1e-9)
+
+
+def test_retargeting_to_the_same_skeleton_changes_nothing_and_batches_agree() -> None:
+    joints = walk(1.0)
+    np.testing.assert_allclose(retarget(joints, BODY), joints, atol=1e-9)
+    batch = np.stack([joints, 1.3 * joints])
+    np.testing.assert_allclose(retarget(batch, BODY), np.stack([joints, joints]), atol=1e-9)
+    assert np.isfinite(retarget(np.zeros_like(joints), BODY)).all()
+    with pytest.raises(UserError, match=r"needs joints \[\.\.\., 22, 3\]"):
+        retarget(joints[:, :21], BODY)

@@ -1,0 +1,111 @@
+"""Interleaving: against a slow reference for any pattern, and the paper's 149 tokens."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from motionloom.models.gpt.tokens import (
+    PAD,
+    closing_length,
+    deinterleave,
+    interleave,
+    kind_of_slot,
+    pad_sequences,
+    stream_names,
+)
+
+PATTERNS = st.lists(st.sampled_from(["a", "b", "c"]), min_size=1, max_size=5).map(tuple)
+
+
+def random_codes(
+    pattern: tuple[str, ...], batch: int, groups: int, seed: int
+) -> tuple[dict[str, torch.Tensor], dict[str, int]]:
+    generator = torch.Generator().manual_seed(seed)
+    ends = {name: 3 + 2 * i for i, name in enumerate(stream_names(pattern))}
+    codes = {
+        name: torch.randint(0, ends[name], (batch, groups * pattern.count(name)), generator=generator)
+        for name in ends
+    }
+    return codes, ends
+
+
+def reference(
+    codes: dict[str, torch.Tensor], pattern: tuple[str, ...], ends: dict[str, int], row: int, groups: int
+) -> list[tuple[int, int]]:
+    """(token, kind) one by one, each stream read through its own iterator."""
+    names = list(dict.fromkeys(pattern))
+    streams = {name: iter(codes[name][row].tolist()) for name in names}
+    out = [(next(streams[name]), names.index(name)) for _ in range(groups) for name in pattern]
+    return out + [(ends[name], k) for k, name in enumerate(names)]
+
+
+@settings(max_examples=60, deadline=None)
+@given(pattern=PATTERNS, groups=st.lists(st.integers(1, 6), min_size=1, max_size=4), seed=st.integers(0, 999))
+def test_interleave_equals_reference_and_inverts(
+    pattern: tuple[str, ...], groups: list[int], seed: int
+) -> None:
+    codes, ends = random_codes(pattern, len(groups), max(groups), seed)
+    out = interleave(codes, pattern, ends=ends, groups=torch.tensor(groups))
+    for row, count in enumerate(groups):
+        expected = reference(codes, pattern, ends, row, count)
+        assert out.length[row] == len(expected) == count * len(pattern) + closing_length(pattern)
+        size = len(expected)
+        assert list(zip(out.tokens[row, :size].tolist(), out.kinds[row, :size].tolist(), strict=True)) == expected
+        assert (out.tokens[row, size:] == PAD).all()
+        assert (out.kinds[row, size:] == 0).all()
+    back = deinterleave(out.tokens, pattern, ends=ends)
+    assert back.groups.tolist() == groups
+    for name in ends:
+        per_group = pattern.count(name)
+        for row, count in enumerate(groups):
+            valid = count * per_group
+            assert torch.equal(back.codes[name][row, :valid], codes[name][row, :valid])
+            assert (back.codes[name][row, valid:] == 0).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(pattern=PATTERNS, groups=st.integers(1, 5), seed=st.integers(0, 999))
+def test_open_sequences(pattern: tuple[str, ...], groups: int, seed: int) -> None:
+    codes, ends = random_codes(pattern, 2, groups, seed)
+    out = interleave(codes, pattern)
+    closed = interleave(codes, pattern, ends=ends)
+    assert torch.equal(out.tokens, closed.tokens[:, : out.tokens.shape[1]])
+    for length in (None, out.length):
+        back = deinterleave(out.tokens, pattern, length=length)
+        assert all(torch.equal(back.codes[name], codes[name]) for name in codes)
+    cut = deinterleave(out.tokens[:, :-1], pattern)  # an unfinished group is dropped
+    assert cut.groups.tolist() == [groups - 1] * 2
+
+
+def test_paper_length() -> None:
+    codes = {"body": torch.zeros(1, 98, dtype=torch.int64), "hand": torch.zeros(1, 49, dtype=torch.int64)}
+    out = interleave(codes, ("body", "body", "hand"), ends={"body": 512, "hand": 512})
+    assert out.tokens.shape == (1, 149)
+    assert out.length.tolist() == [149]
+    assert out.tokens[0, -2:].tolist() == [512, 512]
+    assert out.kinds[0, -5:].tolist() == [0, 0, 1, 0, 1]
+
+
+def test_kinds_follow_first_appearance() -> None:
+    assert stream_names(("hand", "body", "hand")) == ("hand", "body")
+    assert kind_of_slot(("hand", "body", "hand")) == [0, 1, 0]
+
+
+def test_mistakes_are_named() -> None:
+    codes = {"a": torch.tensor([[0, 1, 2, 3]]), "b": torch.tensor([[0]])}
+    with pytest.raises(ValueError, match="stream 'b' holds 1 codes; 2 groups of 1 are 2"):
+        interleave(codes, ("a", "a", "b"))
+    with pytest.raises(ValueError, match="outside its stream's codebook"):
+        interleave({"a": torch.tensor([[0, 3]])}, ("a",), ends={"a": 3})
+
+
+def test_pad_sequences() -> None:
+    rows = [
+        interleave({"a": torch.arange(n)[None]}, ("a",), ends={"a": 9}) for n in (1, 4, 2)
+    ]
+    out = pad_sequences(rows)
+    assert out.tokens.tolist() == [[0, 9, -1, -1, -1], [0, 1, 2, 3, 9], [0, 1, 9, -1, -1]]
+    assert out.length.tolist() == [2, 5, 3]
