@@ -44,4 +44,4 @@ def gather_rows_with_grad(x: Tensor) -> Tensor:
     """Like `gather_rows`, and gradients flow back to the rank that owns each row (contrastive negatives)."""
     if not is_distributed():
         return x
-    return torch.cat(all_gather_autograd(x.contiguous()))
+    return torch.cat(all_gather_autograd(x.contiguous()))  # type: ignore[no-untyped-call]

@@ -14,8 +14,9 @@ from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.statistics import FeatureStats
-from motionloom.models.metrics.reconstruction import accel_error, mpjpe, pa_mpjpe
-from motionloom.models.metrics.retrieval import recall_in_batches
+from motionloom.datasets.synth.measure import agrees
+from motionloom.models.metrics.reconstruction import accel, mpjpe, pa_mpjpe
+from motionloom.models.metrics.retrieval import recall
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.networks import LoadedTma
 from motionloom.pipeline.samples import Truth, joint_layout, reconstruct
@@ -66,19 +67,16 @@ def reconstruction_figures(
         constant = np.broadcast_to(body, truth.features.shape)
         other = nearest.features(truth.features)
         frames = len(truth.features)
-        values = {
-            "mpjpe": mpjpe(local_joints(found, layout), real),
-            "mpjpe_mean_pose": mpjpe(local_joints(constant, layout), real),
-            "mpjpe_nearest_train_clip": mpjpe(local_joints(other, layout), real),
-            "global_mpjpe": mpjpe(decode(found, layout), truth.joints),
-            "global_mpjpe_mean_pose": mpjpe(decode(constant, layout), truth.joints),
-            "global_mpjpe_nearest_train_clip": mpjpe(decode(other, layout), truth.joints),
-            "pa_mpjpe": pa_mpjpe(decode(found, layout), truth.joints),
-        }
+        rebuilt, target = torch.from_numpy(decode(found, layout)), torch.from_numpy(truth.joints)
+        values = {"pa_mpjpe": pa_mpjpe(rebuilt, target)}
         if frames > 2:
-            values["accel"] = accel_error(decode(found, layout), truth.joints)
+            values["accel"] = accel(rebuilt, target)
+        for suffix, features in (("", found), ("_mean_pose", constant), ("_nearest_train_clip", other)):
+            pose, place = torch.from_numpy(local_joints(features, layout)), torch.from_numpy(decode(features, layout))
+            values[f"mpjpe{suffix}"] = mpjpe(pose, torch.from_numpy(real))
+            values[f"global_mpjpe{suffix}"] = mpjpe(place, target, root=None)
         for name, value in values.items():
-            rows.setdefault(name, []).append(float(value))
+            rows.setdefault(name, []).append(float(value.mean()))
     return {name: float(np.mean(values)) for name, values in rows.items()}
 
 
@@ -146,14 +144,30 @@ def retrieval_figures(text: Tensor, motion: Tensor, *, size: int, repeats: int, 
     """Recall@1/2/3 both ways among `size` (protocols C and D): mean over batches, interval over repetitions."""
     rows: dict[str, list[float]] = {}
     for repeat in range(repeats):
-        generator = torch.Generator().manual_seed(seed * 1000 + repeat)
-        for name, (query, key) in {"t2m": (text, motion), "m2t": (motion, text)}.items():
-            recall = recall_in_batches(query, key, size=size, ks=(1, 2, 3), generator=generator)
-            for k, value in recall.items():
-                rows.setdefault(f"{name}_r{k}", []).append(float(value))
+        for name, value in recall(text, motion, batch=size, recalls=(1, 2, 3), seed=seed * 1000 + repeat).items():
+            if "/R@" in name:
+                rows.setdefault(name.replace("/R@", "_r"), []).append(value)
     return {name: Interval.of(values) for name, values in rows.items()}
 
 
 def chance(k: int, size: int) -> float:
     """Recall@k of a guess."""
     return k / size
+
+
+def truth_agreement(
+    motions: Sequence[tuple[Truth, NDArray[np.float64], NDArray[np.float32] | None]], fps: float
+) -> dict[str, float]:
+    """Share of motions that do what their clip's caption says, for each attribute that can be measured.
+
+    Only clips of the synthetic source know what they really do.
+    """
+    rows: dict[str, list[bool]] = {}
+    for truth, joints, face in motions:
+        if truth.truth is None:
+            continue
+        found = agrees(truth.truth, joints, face, fps)
+        for name, value in found.items():
+            rows.setdefault(name, []).append(value)
+        rows.setdefault("everything", []).append(all(found.values()))
+    return {name: float(np.mean(values)) for name, values in rows.items()}

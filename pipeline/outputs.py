@@ -14,7 +14,7 @@ from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.kinematics import joints_to_rotations
 from motionloom.pipeline.bundle import GeneratedMotion
 from motionloom.pipeline.files import atomic
-from motionloom.pipeline.render.face import face_controls
+from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
@@ -60,7 +60,7 @@ def viewer_motion(motion: GeneratedMotion, label: str, group: str = "") -> Viewe
         label=label,
         caption=motion.caption,
         group=group,
-        face_controls=None if motion.face is None else face_controls(motion.face),
+        face_controls=None if motion.face is None else synthetic_face_controls(motion.face),
     )
 
 

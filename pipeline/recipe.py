@@ -8,7 +8,7 @@
       tokenizer: {kind: h2vq, net: {width: 128}, train: {steps: 600}}
 
 A stage's inputs are found by role: a stage that needs `data` takes the stage called `data` unless its `inputs:` names
-another. `extends:` starts from another recipe file beside this one. `--set stage.field=value` overrides one value.
+another (or `null`, for an input it can do without). `extends:` starts from another recipe file beside this one. `--set stage.field=value` overrides one value.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ class Recipe:
         stages: dict[str, Any] = {}
         for stage in self.stages:
             entry: dict[str, Any] = {"kind": stage.kind.name, **stage.config.dump()}
-            renamed = {role: name for role, name in stage.inputs.items() if role != name}
+            roles = [role.removesuffix("?") for role in stage.kind.inputs]
+            renamed = {role: stage.inputs.get(role) for role in roles if stage.inputs.get(role) != role}
             stages[stage.name] = {**entry, "inputs": renamed} if renamed else entry
         data = {
             "name": self.name,
@@ -138,7 +139,10 @@ def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
     out = dict(base)
     for key, value in change.items():
         old = out.get(key)
-        out[key] = _merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+        both = isinstance(old, dict) and isinstance(value, dict)
+        # A stage of another kind has other fields, so it replaces the old one whole.
+        same_kind = both and value.get("kind", old.get("kind")) == old.get("kind")
+        out[key] = _merge(old, value) if same_kind else value
     return out
 
 
@@ -208,6 +212,8 @@ def _resolve(name: str, kind: StageKind, renamed: Any, before: list[str], where:
     inputs = {}
     for role, optional in roles.items():
         source = renamed.get(role, role)
+        if source is None and optional:
+            continue
         if source in before:
             inputs[role] = source
         elif role in renamed or not optional:

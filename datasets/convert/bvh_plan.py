@@ -140,7 +140,8 @@ def _decide(
     contents: dict[str, str] = {}
     unreadable: set[str] = set()
     other_rate = 0
-    for clip in found:
+    # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
+    for clip in sorted(found, key=lambda clip: table.find(clip.path) is None):
         row = table.find(clip.path)
         try:
             clip_id = row.id if row else check_id(str(PurePosixPath(clip.path).with_suffix("")), clip.label)

@@ -18,8 +18,8 @@ from motionloom.datasets.motion.layout import FACE_DIMS, MotionLayout
 from motionloom.datasets.schema import UserError
 
 _GROUP_FRAMES = 800
-"""Clips are encoded in groups of about so many frames. Measured: larger groups leave the cache and run at half
-the speed, single clips of 200 frames pay as much for calls as for arithmetic."""
+"""Clips are encoded in groups of about so many frames. Measured: larger groups leave the cache and run at
+half the speed, single clips of 200 frames pay as much for calls as for arithmetic."""
 
 
 def encode(

@@ -1,7 +1,9 @@
 """Copying pieces of clips into one normalised, zero-padded batch array: the loader's inner loop.
 
 A window is subtracted and scaled while it is in the processor's cache, straight from the mapped tar into its
-place in the batch: no intermediate array, no tensor per sample.
+place in the batch: no intermediate array, no tensor per sample. When all columns are wanted, a window is one
+run of memory and is treated as one long row (mean and scale repeated per frame), which halves the time of
+broadcasting over rows.
 """
 
 from __future__ import annotations
@@ -30,15 +32,30 @@ class Crops:
         self.width = len(chosen)
         self._mean = stats.mean[chosen]
         self._scale = 1.0 / stats.std[chosen]
+        self._mean_row, self._scale_row = self._mean, self._scale
         self._runs = _runs(chosen)
 
     def fill(self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int) -> None:
         """Normalised frames `start .. start + length` of `clip` into `out` [T >= length, C], then zeros."""
         target = out[:length]
-        for source, place in self._runs:
-            np.subtract(clip[start : start + length, source], self._mean[place], out=target[:, place])
-        np.multiply(target, self._scale, out=target)
-        out[length:] = 0.0
+        if self.width == clip.shape[1]:
+            row = target.reshape(-1)  # a view: both are contiguous
+            mean, scale = self._repeated(length)
+            np.subtract(clip[start : start + length].reshape(-1), mean, out=row)
+            np.multiply(row, scale, out=row)
+        else:
+            for source, place in self._runs:
+                np.subtract(clip[start : start + length, source], self._mean[place], out=target[:, place])
+            np.multiply(target, self._scale, out=target)
+        if length < len(out):
+            out[length:] = 0.0
+
+    def _repeated(self, length: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Mean and scale of `length` frames as one row; kept for the longest length asked for."""
+        size = length * self.width
+        if len(self._mean_row) < size:
+            self._mean_row, self._scale_row = np.tile(self._mean, length), np.tile(self._scale, length)
+        return self._mean_row[:size], self._scale_row[:size]
 
 
 def _runs(columns: NDArray[np.int64]) -> list[tuple[slice, slice]]:

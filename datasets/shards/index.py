@@ -198,17 +198,39 @@ def _index_problem(index: SplitIndex, shards: list[ShardInfo]) -> str | None:
     ends = index.id_ends
     if ends[0] < 0 or (np.diff(ends) < 0).any() or ends[-1] != len(index.id_bytes):
         return "the clip ids are damaged"
+    if (samples < 1).any():
+        return "a shard of the manifest has no samples"
     firsts = np.cumsum(samples) - samples
-    for shard, first in zip(shards, firsts, strict=True):
-        rows = slice(int(first), int(first) + shard.samples)
-        frames, start, end = index.frames[rows], index.offsets[rows], index.offsets[rows] + index.sizes[rows]
-        if int(frames.sum(dtype=np.int64)) != shard.frames or (frames < 1).any():
-            return f"shard {shard.name} has other frame counts than the manifest says"
-        if (start < 0).any() or (end < start).any() or (end > shard.bytes).any():
-            return f"shard {shard.name} has members outside the file"
-        if not np.isin(index.itemsize[rows], (2, 4)).all():
-            return f"shard {shard.name} holds motion that is neither float32 nor float16"
-        motion = MEMBERS.index("motion.npy")
-        if (index.data[rows] < start[:, motion]).any() or (index.data[rows] > end[:, motion]).any():
-            return f"shard {shard.name} has motion values outside their member"
+    for wrong, message in (
+        (_wrong_frames(index, shards, firsts), "has other frame counts than the manifest says"),
+        (_outside(index, shards, firsts), "has members outside the file"),
+        ((index.itemsize != 2) & (index.itemsize != 4), "holds motion that is neither float32 nor float16"),
+    ):
+        if wrong.any():
+            at = int(wrong.argmax())
+            shard = at if len(wrong) == len(shards) else int(np.searchsorted(firsts, at, side="right")) - 1
+            return f"shard {shards[shard].name} {message}"
     return None
+
+
+def _wrong_frames(index: SplitIndex, shards: list[ShardInfo], firsts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Per shard: frames that are not positive or do not add up."""
+    totals = np.add.reduceat(index.frames.astype(np.int64), firsts)
+    least = np.minimum.reduceat(index.frames, firsts)
+    stated = np.array([shard.frames for shard in shards], dtype=np.int64)
+    wrong: NDArray[np.bool_] = (totals != stated) | (least < 1)
+    return wrong
+
+
+def _outside(index: SplitIndex, shards: list[ShardInfo], firsts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Per shard: any member, or any motion's values, that leave the file. Column by column, to stay small."""
+    size = np.array([shard.bytes for shard in shards], dtype=np.int64)
+    wrong = np.zeros(len(shards), dtype=np.bool_)
+    for column in range(len(MEMBERS)):
+        start = index.offsets[:, column]
+        lowest = np.minimum.reduceat(start, firsts)
+        # No int64 sum can wrap here: an offset beyond the file is refused by the first comparison already.
+        wrong |= (lowest < 0) | (np.maximum.reduceat(start, firsts) > size)
+        wrong |= np.maximum.reduceat(start + index.sizes[:, column], firsts) > size
+    wrong |= (np.minimum.reduceat(index.data, firsts) < 0) | (np.maximum.reduceat(index.data, firsts) > size)
+    return wrong

@@ -11,8 +11,10 @@ import io
 import json
 import mmap
 import re
+from bisect import bisect_right
 from collections import OrderedDict
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +66,7 @@ class ShardDataset:
         self.layout = manifest_layout(manifest)
         self._index = index
         self._shards = [shard for shard in manifest.shards if shard.split == split]
-        self._first = np.cumsum([0] + [shard.samples for shard in self._shards])
+        self._first = list(accumulate((shard.samples for shard in self._shards), initial=0))
         self._maps: OrderedDict[int, mmap.mmap] = OrderedDict()
 
     @staticmethod
@@ -123,10 +125,10 @@ class ShardDataset:
         """Features of clip `i`, [T, D]: a read-only view into the tar (a copy if stored as float16)."""
         shard = self._shard_of(i)
         index = self._index
-        frames, width = int(index.frames[i]), self.layout.dim
-        kind = np.float32 if index.itemsize[i] == 4 else np.float16
-        values = np.frombuffer(self._map(shard), kind, frames * width, int(index.data[i]))
-        return values.reshape(frames, width).astype(np.float32, copy=False)
+        shape, start = (int(index.frames[i]), self.layout.dim), int(index.data[i])
+        if index.itemsize[i] == 4:
+            return np.ndarray(shape, np.float32, self._map(shard), start)
+        return np.ndarray(shape, np.float16, self._map(shard), start).astype(np.float32)
 
     def meta(self, i: int) -> ClipMeta:
         """Metadata of clip `i`."""
@@ -182,9 +184,9 @@ class ShardDataset:
         return self._map(self._shard_of(i))[start : start + size]
 
     def _shard_of(self, i: int) -> int:
-        if not 0 <= i < len(self):
+        if not 0 <= i < self._first[-1]:
             raise IndexError(f"clip {i} of {len(self)}")
-        return int(np.searchsorted(self._first, i, side="right")) - 1
+        return bisect_right(self._first, i) - 1
 
     def _where(self, i: int, member: str) -> str:
         shard = self._shard_of(i)
@@ -219,7 +221,7 @@ class ShardDataset:
         index, column = self._index, MEMBERS.index("motion.npy")
         end = index.offsets[:, column] + index.sizes[:, column]
         size = index.frames.astype(np.int64) * self.layout.dim * index.itemsize
-        bad = np.flatnonzero(index.data + size != end)
+        bad = np.flatnonzero((index.data + size != end) | (index.data < index.offsets[:, column]))
         if len(bad):
             where = self._where(int(bad[0]), "motion.npy")
             raise UserError(f"{where}: not {self.layout.dim} columns wide as layout {self.layout.name} wants")

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import threadpoolctl
+import threadpoolctl  # type: ignore[import-untyped]
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Dropped, ShardInfo, Split, UserError

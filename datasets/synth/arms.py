@@ -12,11 +12,11 @@ from motionloom.datasets.synth.truth import Span, Truth
 
 Vec = tuple[float, float, float]
 Hold = tuple[float, Vec | None, float, Vec | None]
-"""One arm key: seconds, direction shoulder to wrist (chest axes, +X outwards), reach, bend. None = hanging."""
+"""One arm key: seconds, direction to the wrist (chest axes, +X outwards), reach, bend; None = hanging."""
 
 
 def play(track: Track, side: int, holds: Sequence[Hold]) -> None:
-    """Move one arm through keys on great circles around the shoulder, with a minimum-jerk ease between them."""
+    """Move one arm through keys on great circles around the shoulder, easing from key to key."""
     arm, t = track.arms[side], track.t
     rest, rest_bend, rest_reach = unit(arm.direction.mean(0)), unit(arm.bend.mean(0)), float(arm.reach.mean())
     at = np.array([h[0] for h in holds])
@@ -42,7 +42,7 @@ def slerp(a: Array, b: Array, weight: Array) -> Array:
 
 
 def to_point(x: float, y: float, z: float) -> tuple[Vec, float]:
-    """Direction and reach that bring the wrist to a point of the chest frame (x outwards from the midline)."""
+    """Direction and reach that bring the wrist to a point seen from the chest (x outwards)."""
     away = np.array([x, y, z]) - SHOULDER
     far = float(np.linalg.norm(away))
     return (float(away[0]), float(away[1]), float(away[2])), min(far / ARM, 0.985)
@@ -61,8 +61,9 @@ def punch(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     period = min(period, (seconds - 0.9) / count)
     begin = rng.uniform(0.5, max(0.51, seconds - count * period - 0.4))
     track = Track.standing(seconds, fps, rng, width=rng.uniform(0.02, 0.08))
-    guard, near = to_point(rng.uniform(0.08, 0.14), rng.uniform(0.1, 0.18), rng.uniform(0.26, 0.34))
-    strike = (-rng.uniform(0.12, 0.28), rng.uniform(-0.08, 0.16), 1.0)
+    guard, near = to_point(rng.uniform(0.12, 0.17), rng.uniform(0.06, 0.14), rng.uniform(0.2, 0.26))
+    # The chest turns away from the striking arm: straight ahead is outwards of the chest.
+    strike = (rng.uniform(0.2, 0.36), rng.uniform(-0.08, 0.16), 1.0)
     mine: list[Hold] = [(begin - 0.5, None, 0.0, None), (begin - 0.05, guard, near, GUARD_BEND)]
     times, effort = [0.0], [0.0]
     for k in range(count):
@@ -96,7 +97,7 @@ def punch(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
 
 def wave(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
     """Lift a hand (or both) beside the head and swing the forearm from side to side."""
-    seconds = span.pick(rng)
+    seconds = span.pick(rng, at_least=2.8)
     track = Track.standing(seconds, fps, rng)
     up = rng.uniform(0.5, 0.75) * min(1.0, seconds / 2.5)
     begin = rng.uniform(0.05, 0.2 * seconds)
@@ -156,7 +157,7 @@ def clap(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
         arm.direction[:] = arm.direction.mean(0)
         play(track, side, holds)
         arm.roll -= 0.35 * on
-        # Hands continue the forearms, which come in at an angle: turn the fingers forward so that palms meet flat.
+        # Forearms come in at an angle: turn the fingers forward so that palms meet flat.
         arm.flex -= 0.35 * on
     track.head[:, 0] += 0.08 * on
     track.lower_to_reach()

@@ -1,7 +1,7 @@
 """Dances whose poses lie on the beats: between two beats the body eases from one pose to the next.
 
-A minimum-jerk ease has no speed at its ends, so every beat is a minimum of the body's speed: exactly what Beat Align
-(UDE section 4.3) looks for.
+A minimum-jerk ease has no speed at its ends, so every beat is a minimum of the body's speed: exactly what
+Beat Align (UDE section 4.3) looks for.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def dance(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     seconds = span.pick(rng, at_least=min(4.0, span.high))
     track = Track.standing(seconds, fps, rng, width=rng.uniform(0.0, 0.05))
     track.first_beat = offset
-    beats = offset + beat * np.arange(-1, int(seconds / beat) + 3)
+    beats: Array = np.asarray(offset + beat * np.arange(-1, int(seconds / beat) + 3), dtype=np.float64)
     amount = rng.uniform(0.8, 1.2)
     even = np.where(np.arange(len(beats)) % 2 == 0, 1.0, -1.0)
     side_to_side = keys(track.t, beats, even)

@@ -1,9 +1,9 @@
-"""Face expressions as trajectories of 50 FLAME-like expression values, and the classifier that reads them back.
+"""Face expressions as trajectories of 50 FLAME-like values, and the classifier that reads them back.
 
-FLAME's own expression basis is licensed, so the generator fixes its own: column k of `BASIS` is a damped cosine
-(most of it in the first components, as in a PCA basis), made orthonormal by QR. Columns 0-3 are happy, sad, angry and
-surprised, column 4 is the blink, columns 5-7 small talk-like movement. An emotion at its apex has length about
-`APEX`, so single values are of the order of a standard normal.
+FLAME's own expression basis is licensed, so the generator fixes its own: column k of `BASIS` is a damped
+cosine (most of it in the first components, as in a PCA basis), made orthonormal by QR. Columns 0-3 are happy,
+sad, angry and surprised, column 4 is the blink, columns 5-7 small talk-like movement. An emotion at its apex
+has length about `APEX`, so single values are of the order of a standard normal.
 """
 
 from __future__ import annotations

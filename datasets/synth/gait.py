@@ -1,7 +1,7 @@
 """Locomotion from footsteps: a plan of where and when each foot lands becomes feet, root, sway and arm swing.
 
-The ball of a foot is exactly still between landing and lift-off, the heel rolls over it, and the root follows the
-middle of the two feet, so legs reach what they stand on and planted feet cannot slide.
+The ball of a foot is exactly still between landing and lift-off, the heel rolls over it, and the root follows
+the middle of the two feet, so legs reach what they stand on and planted feet cannot slide.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from motionloom.datasets.synth.pose import BALL, STAND, Track
 
 @dataclass(frozen=True)
 class Step:
-    """One step: which foot, when it swings (seconds), where its ball lands (x, z), which way it then points."""
+    """One step: which foot, when it swings (seconds), where its ball lands (x, z), where it points."""
 
     foot: int
     start: float
@@ -37,7 +37,7 @@ class Stride:
 
     step_seconds: float
     swing_share: float = 0.8
-    """Swing time over step time; below 1 both feet share the floor (walking), above 1 both leave it (running)."""
+    """Swing time over step time; below 1 both feet share the floor (walk), above 1 both leave it (run)."""
     height: float = 0.04
     off: float = 0.75
     land: float = -0.3
@@ -100,7 +100,7 @@ def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: fl
             yaw += s * (step.yaw - before_yaw)
             before, before_yaw = np.asarray(step.xz), step.yaw
             phase = np.clip((t - step.start) / span, 0.0, 1.0)
-            lift[foot] += step.height * np.sin(np.pi * phase**0.85) ** 2
+            lift[foot] += step.height * np.sin(np.pi * phase**0.85) ** 1.5
             roll = min(0.22, 0.45 * span)
             previous = times[-1]
             times += [max(step.start - roll, previous + 1e-3), step.start + 0.22 * span]
@@ -137,7 +137,7 @@ def _carry(x: Array) -> Array:
 
 
 def swing_body(track: Track, lead: Array, stride: Stride, moving: Array, amount: float = 1.0) -> None:
-    """Pelvis and chest twist against each other, arms swing against the legs; `moving` [T] fades it in and out."""
+    """Pelvis and chest twist against each other, arms against the legs; `moving` [T] fades it all."""
     swing = lead * amount
     track.pelvis[:, 1] += -0.09 * swing
     track.spine[:, 1] += 0.2 * swing

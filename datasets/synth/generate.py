@@ -1,7 +1,7 @@
 """Synthetic clips from (seed, index) alone, and shards of them.
 
-`make_clip` is a pure function: a clip does not depend on how many there are, on the worker that makes it or on its
-neighbours. `synthesize` writes them through the shard writer like any other converter.
+`make_clip` is a pure function: a clip does not depend on how many there are, on the worker that makes it or
+on its neighbours. `synthesize` writes them through the shard writer like any other converter.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class SynthConfig(Config):
     music: bool = False
     """Give every dance its audio."""
     size_spread: float = Field(0.02, ge=0, le=0.15)
-    """Standard deviation of body size from clip to clip, as a fraction; 0 = all clips on the uniform skeleton."""
-    hold_out: list[dict[str, Any]] = []
+    """Standard deviation of body size, as a fraction; 0 = all clips on the uniform skeleton."""
+    hold_out: list[dict[str, Any]] = Field(default_factory=list)
     """Combinations of truth values kept for testing, for example `[{"action": "kick", "side": "left"}]`."""
 
     @field_validator("actions")
@@ -93,13 +93,17 @@ class SynthConfig(Config):
         for combination in combinations:
             wrong = sorted(set(combination) - set(known))
             if wrong or not combination:
-                raise ValueError(f"no truth attribute {', '.join(wrong) or 'given'}; known: {', '.join(known)}")
+                raise ValueError(
+                    f"no truth attribute {', '.join(wrong) or 'given'}; known: {', '.join(known)}"
+                )
         return combinations
 
     @model_validator(mode="after")
     def _consistent(self) -> SynthConfig:
         if self.max_seconds < max(5.0, self.min_seconds):
-            raise ValueError("max_seconds must be at least 5 (slow bows and repeated squats need it) and at least min_seconds")
+            raise ValueError(
+                "max_seconds must be at least 5 (repeated squats need it) and at least min_seconds"
+            )
         if self.val_fraction + self.test_fraction >= 1:
             raise ValueError("val_fraction and test_fraction leave nothing to train on")
         return self
@@ -159,7 +163,7 @@ def truth_of(index: int, config: SynthConfig) -> Truth:
 
 
 def split_of(index: int, config: SynthConfig) -> Split:
-    """Split of a clip: held-out combinations test, the rest by a low-discrepancy sequence (exact shares early)."""
+    """Split of a clip: held-out combinations test, the rest by a low-discrepancy sequence."""
     truth = truth_of(index, config)
     for combination in config.hold_out:
         if all(getattr(truth, key) == value for key, value in combination.items()):

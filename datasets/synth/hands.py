@@ -1,7 +1,8 @@
-"""Hand shapes as finger rotations: relaxed, fist, point, spread, pinch, and fingers that wave one after another.
+"""Hand shapes as finger rotations: relaxed, fist, point, spread, pinch, fingers that wave in turn.
 
-Angles are written for the left hand of the T-pose (palm down, fingers along +X): flexion turns a finger towards the
-palm, spreading turns it about Y. Finger order is SMPL-X's: index, middle, pinky, ring, thumb, three joints each.
+Angles are written for the left hand of the T-pose (palm down, fingers along +X): flexion turns a finger
+towards the palm, spreading turns it about Y. Finger order is SMPL-X's: index, middle, pinky, ring, thumb,
+three joints each.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _FLEX: dict[str, tuple[tuple[float, float, float], ...]] = {
     "fist": ((1.35, 1.6, 1.0), (1.4, 1.65, 1.0), (1.4, 1.6, 1.0), (1.42, 1.65, 1.0)),
     "point": ((0.02, 0.06, 0.05), (1.35, 1.6, 1.0), (1.4, 1.6, 1.0), (1.4, 1.65, 1.0)),
     "spread": ((-0.05, 0.02, 0.0), (-0.05, 0.02, 0.0), (-0.02, 0.04, 0.0), (-0.04, 0.02, 0.0)),
-    "pinch": ((0.78, 0.75, 0.35), (0.35, 0.35, 0.2), (0.25, 0.25, 0.15), (0.3, 0.3, 0.2)),
+    "pinch": ((0.85, 0.85, 0.3), (0.35, 0.35, 0.2), (0.25, 0.25, 0.15), (0.3, 0.3, 0.2)),
     "wave_fingers": ((0.5, 0.5, 0.3), (0.5, 0.5, 0.3), (0.5, 0.5, 0.3), (0.5, 0.5, 0.3)),
 }
 _FAN = np.array([-0.06, -0.02, 0.1, 0.04])
@@ -29,13 +30,13 @@ _THUMB: dict[str, tuple[tuple[float, float, float], ...]] = {
     "fist": ((0.7, 0.75, -0.55), (0.1, 0.6, -0.35), (0.0, 0.5, -0.2)),
     "point": ((0.7, 0.7, -0.5), (0.1, 0.55, -0.35), (0.0, 0.5, -0.2)),
     "spread": ((0.0, -0.45, 0.1), (0.0, -0.15, 0.0), (0.0, -0.05, 0.0)),
-    "pinch": ((0.65, 0.25, -0.6), (0.1, 0.1, -0.2), (0.0, 0.1, -0.1)),
+    "pinch": ((0.33, 0.59, -0.33), (0.0, -0.11, -0.11), (0.0, -0.02, -0.34)),
     "wave_fingers": ((0.25, 0.0, -0.2), (0.0, 0.1, -0.1), (0.0, 0.1, -0.1)),
 }
 
 
 def shape_hand(shape: str, t: Array, rng: np.random.Generator) -> Array:
-    """Local finger rotations [T, 15, 3, 3] of one hand; a shape is taken from a relaxed hand in the first moments."""
+    """Local finger rotations [T, 15, 3, 3] of one hand, which takes its shape in the first moments."""
     flex, fan, thumb = _angles("relaxed", rng)
     n = len(t)
     if shape == "relaxed":

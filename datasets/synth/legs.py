@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from motionloom.datasets.synth.arms import Hold, play
+from motionloom.datasets.synth.arms import Hold, Vec, play
 from motionloom.datasets.synth.maths import Array, ease, keys
 from motionloom.datasets.synth.pose import BALL, Track
 from motionloom.datasets.synth.truth import Span, Truth
@@ -16,7 +18,7 @@ def jump(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     """Crouch, push off, fly on a ballistic path, land softly; `count` times, on the spot or forward."""
     count = truth.count or 1
     height = rng.uniform(0.14, 0.3) * (0.8 if count == 3 else 1.0)
-    flight = 2 * np.sqrt(2 * height / GRAVITY)
+    flight = 2 * math.sqrt(2 * height / GRAVITY)
     dip, rise, absorb, rest = 0.32, 0.2, 0.2, 0.34
     period = dip + rise + flight + absorb + rest
     seconds = span.pick(rng, at_least=count * period + 0.5, at_most=count * period + 2.2)
@@ -27,11 +29,11 @@ def jump(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     track = Track.standing(seconds, fps, rng)
     t, low = track.t, -rng.uniform(0.2, 0.28)
     top, land = 0.045, -0.16
-    speed = np.sqrt(2 * GRAVITY * height)
+    speed = math.sqrt(2 * GRAVITY * height)
     y = np.zeros(len(t))
     air = np.zeros(len(t))
     pitch, crouch, travel = np.zeros(len(t)), np.zeros(len(t)), np.zeros(len(t))
-    swing: list[Hold] = []
+    swing: list[tuple[float, Vec]] = []
     leap = rng.uniform(0.25, 0.5) if truth.direction == "forward" else 0.0
     for k in range(count):
         a = begin + k * period
@@ -152,7 +154,7 @@ def kick(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     track = Track.standing(seconds, fps, rng, width=rng.uniform(-0.02, 0.02))
     rest = track.ball[leg, 0].copy()
     height, far = rng.uniform(0.6, 0.95), rng.uniform(0.68, 0.8)
-    chamber = rest + [-0.02 * sign, 0.38, 0.06]
+    chamber = rest + np.array([-0.02 * sign, 0.38, 0.06])
     end = np.array([rest[0] - 0.04 * sign, height, BALL[1] + far])
     times, places, pitches, effort = [0.0], [rest], [0.0], [0.0]
     for k in range(count):

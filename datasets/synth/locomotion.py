@@ -27,8 +27,8 @@ def walk(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     if truth.direction in ("clockwise", "counterclockwise"):
         # A whole circle in the time there is: a slow walker takes a small one.
         speed *= 0.92
-        seconds = span.pick(rng, at_least=min(4.5, span.high))
-        angle = rng.uniform(1.65, 2.1) * np.pi * (-1 if truth.direction == "clockwise" else 1)
+        seconds = span.pick(rng, at_least=min(5.0, span.high))
+        angle = rng.uniform(1.5, 1.95) * np.pi * (-1 if truth.direction == "clockwise" else 1)
         return _walk(rng, fps, seconds, speed, angle, backward=False)
     return _walk(rng, fps, span.pick(rng), speed, 0.0, backward=backward)
 
@@ -75,7 +75,7 @@ def run(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track
     step = rng.uniform(0.33, 0.37)
     stride = Stride(
         step_seconds=step,
-        swing_share=1.32,
+        swing_share=1.45,
         height=rng.uniform(0.2, 0.3),
         off=1.15,
         land=-0.1,
@@ -102,7 +102,8 @@ def _walk(
     pace = abs(speed) * (1.35 if backward else 1.0)
     stride = Stride(
         step_seconds=float(np.clip(0.6 - 0.13 * (pace - 1.0) - 0.12 * max(pace - 1.2, 0), 0.36, 0.72))
-        * rng.uniform(0.94, 1.06),
+        * rng.uniform(0.94, 1.06)
+        * (0.85 if abs(angle) > 4 else 1.0),
         swing_share=0.78,
         height=rng.uniform(0.02, 0.045),
         off=0.25 if backward else rng.uniform(0.6, 0.85),
@@ -133,7 +134,9 @@ def _along(
     total = seconds + 2 * warm
     begin = lead_in if lead_in else 0.0
     count = max(3, int((total - begin - 0.2) / stride.step_seconds) - 1)
-    length = speed * stride.step_seconds
+    # The middle of the feet cuts the corners of the stations: longer steps keep the speed on an arc.
+    bend = abs(angle) / count
+    length = speed * stride.step_seconds / (np.cos(0.5 * bend) * np.exp(-0.09 * bend**2))
     share = np.arange(count + 1) / count
     if corner:
         share = ease((share - 0.25) / 0.5)

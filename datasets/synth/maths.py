@@ -78,7 +78,7 @@ def smooth(x: Array, seconds: float, fps: float) -> Array:
 
 
 def lower_envelope(x: Array, seconds: float, fps: float) -> Array:
-    """A smooth curve [T] that never rises above x [T]: running minimum, then an average over the same window."""
+    """A smooth curve [T] never above x [T]: running minimum, then an average over the same window."""
     half = max(1, round(seconds * fps))
     size = 2 * half + 1
     low = minimum_filter1d(x, size, mode="nearest")

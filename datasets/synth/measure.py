@@ -1,8 +1,9 @@
 """Says what a motion does from its joints alone, to prove captions true and to judge generated motion.
 
-`measure` recognises the action by a cascade of physical signs (who flies, who travels, who turns, who sinks, whose
-foot or hand leaves its place) and then reads direction, side, count and speed. `agrees` compares with a truth record,
-reading each attribute as the *claimed* action defines it, so one wrong action does not hide a right limb.
+`measure` recognises the action by a cascade of physical signs (who flies, who travels, who turns, who sinks,
+whose foot or hand leaves its place) and then reads direction, side, count and speed. `agrees` compares with a
+truth record, reading each attribute as the *claimed* action defines it, so one wrong action does not hide a
+right limb.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import find_peaks
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth import face as faces
@@ -89,7 +91,7 @@ def agrees(
             continue
         got = found.get(name)
         if name == "bpm":
-            out[name] = got is not None and abs(got - wanted) <= 0.05 * wanted
+            out[name] = got is not None and wanted is not None and abs(got - wanted) <= 0.05 * wanted
         else:
             out[name] = bool(got == wanted)
     if joints.shape[1] >= 52:
@@ -102,8 +104,9 @@ def agrees(
 
 
 def _action(s: Signals) -> str:
-    flights, moved, turned = len(_flights(s)), abs(float(s.travel[-1])), abs(_turned(s))
-    if flights >= 2 and _pace(s) > 1.6:
+    moved, turned = abs(float(s.travel[-1])), abs(_turned(s))
+    flights = len(_flights(s))
+    if _pace(s) > 1.6 and (flights >= 2 or s.balls.max() > 0.13):
         return "run"
     if flights and s.drop.min() < -0.05:
         return "jump"
@@ -127,19 +130,17 @@ def _action(s: Signals) -> str:
 
 def _arm_action(s: Signals) -> str:
     waves, tops = [_waves(s, side) for side in (0, 1)], s.wrists[:, :, 1].max(1)
-    if max(waves) >= 2:
+    if max(waves) >= 3:
         return "wave"
     if tops.max() > 0.6:
         hand = int(np.argmax(tops))
         top = int(np.argmax(s.wrists[hand, :, 1]))
         return "raise" if s.wrists[hand, top, 2] < 0.28 else "reach"
-    if _claps(s) >= 1:
-        return "clap"
     hand, direction = _reach(s)
     forward = s.wrists[hand, :, 2]
-    if direction == "forward" and s.longest(forward > 0.8 * forward.max()) < 0.5:
+    if direction == "forward" and forward.max() > 0.78 and s.longest(forward > 0.85 * forward.max()) < 0.5:
         return "punch"
-    return "reach"
+    return "clap" if _claps(s) >= 1 else "reach"
 
 
 def _attributes(s: Signals, action: str) -> dict[str, Any]:
@@ -168,9 +169,9 @@ def _attributes(s: Signals, action: str) -> dict[str, Any]:
         return {"side": SIDES[leg], "count": s.peaks(s.balls[leg], 0.4)}
     if action == "punch":
         hand = int(np.argmax(s.wrists[:, :, 2].max(1)))
-        return {"side": SIDES[hand], "count": s.peaks(s.wrists[hand, :, 2], 0.2, 0.7)}
+        return {"side": SIDES[hand], "count": s.peaks(s.wrists[hand, :, 2], 0.15, 0.7)}
     if action == "wave":
-        return {"side": _both(np.array([_waves(s, side) >= 2 for side in (0, 1)]))}
+        return {"side": _both(np.array([_waves(s, side) >= 3 for side in (0, 1)]))}
     if action == "raise":
         return {"side": _both(s.wrists[:, :, 1].max(1) > 0.6)}
     if action == "clap":
@@ -193,12 +194,13 @@ def _reach(s: Signals) -> tuple[int, str]:
 
 
 def _waves(s: Signals, side: int) -> int:
-    """How often a raised hand swings out to the side."""
+    """How often a raised hand turns back between left and right."""
     raised = s.wrists[side, :, 1] > 0.12
     if not raised.any():
         return 0
     start, end = max(runs(raised), key=lambda run: run[1] - run[0])
-    return s.peaks(s.wrists[side, start:end, 0], 0.1)
+    aside = s.wrists[side, start:end, 0]
+    return sum(len(find_peaks(sign * aside, prominence=0.1)[0]) for sign in (1, -1))
 
 
 def _claps(s: Signals) -> int:

@@ -32,7 +32,9 @@ def hand_shape(joints: NDArray[Any], side: int, fps: float) -> str:
     wrist, hand = (part[start:] for part in _hand(x, side))
     index, middle, pinky, ring = np.median(curl, axis=0)
     size = np.linalg.norm(hand[:, _MIDDLE, 0] - wrist, axis=-1)
-    pinch = np.median(np.linalg.norm(hand[:, _THUMB, 2] - hand[:, _INDEX, 2], axis=-1) / np.maximum(size, 1e-6))
+    pinch = np.median(
+        np.linalg.norm(hand[:, _THUMB, 2] - hand[:, _INDEX, 2], axis=-1) / np.maximum(size, 1e-6)
+    )
     fan = np.median(_angle(hand[:, _INDEX, 1] - hand[:, _INDEX, 0], hand[:, _PINKY, 1] - hand[:, _PINKY, 0]))
     others = (middle + pinky + ring) / 3
     if others > 1.7:

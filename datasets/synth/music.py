@@ -14,7 +14,7 @@ def beat_times(bpm: float, offset: float, seconds: float) -> NDArray[np.float64]
     """Times of the beats that lie inside the clip."""
     beat = 60.0 / bpm
     times = offset + beat * np.arange(-1, int(seconds / beat) + 2)
-    return times[(times >= 0) & (times < seconds)]
+    return np.asarray(times[(times >= 0) & (times < seconds)], dtype=np.float64)
 
 
 def render(bpm: float, offset: float, seconds: float, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -42,7 +42,9 @@ def render(bpm: float, offset: float, seconds: float, rng: np.random.Generator) 
     decay = np.exp(-np.arange(length) / (0.012 * SAMPLE_RATE))
     for k, at in enumerate(beat_times(bpm, offset, seconds)):
         pitch = 1600.0 if k % 4 == 0 else 1100.0
-        click = np.sin(2 * np.pi * pitch * np.arange(length) / SAMPLE_RATE) + 0.5 * rng.standard_normal(length)
+        click = np.sin(2 * np.pi * pitch * np.arange(length) / SAMPLE_RATE) + 0.5 * rng.standard_normal(
+            length
+        )
         a = round(at * SAMPLE_RATE)
         part = min(length, total - a)
         out[a : a + part] += 0.45 * (decay * click)[:part]

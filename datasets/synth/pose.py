@@ -1,10 +1,10 @@
 """`Track`: a whole-body pose over time in animator's terms, and its solution to joint positions.
 
-A clip is written as what an animator would key: root path and heading, pelvis and spine lean, where the balls of the
-feet are, where the wrists are as seen from the chest, finger rotations. `solve` turns that into local rotations of
-`smplx52` with closed-form two-bone IK for legs and arms (knees bend forward, elbows never past straight), then forward
-kinematics. Arms are written for the left side with +X pointing *outwards*; the right side is its mirror image, so one
-set of numbers serves both.
+A clip is written as what an animator would key: root path and heading, pelvis and spine lean, where the balls
+of the feet are, where the wrists are as seen from the chest, finger rotations. `solve` turns that into local
+rotations of `smplx52` with closed-form two-bone IK for legs and arms (knees bend forward, elbows never past
+straight), then forward kinematics. Arms are written for the left side with +X pointing *outwards*; the right
+side is its mirror image, so one set of numbers serves both.
 """
 
 from __future__ import annotations
@@ -85,9 +85,7 @@ class Track:
         self.fingers = np.tile(np.eye(3), (2, n, 15, 1, 1))
 
     @staticmethod
-    def standing(
-        seconds: float, fps: float, rng: np.random.Generator, width: float | None = None
-    ) -> Track:
+    def standing(seconds: float, fps: float, rng: np.random.Generator, width: float | None = None) -> Track:
         """A person who stands still but breathes; stance width and posture differ from clip to clip."""
         frames = max(8, round(seconds * fps))
         track = Track(np.arange(frames) / fps, fps)
@@ -124,7 +122,7 @@ class Track:
         return out
 
     def lower_to_reach(self, seconds: float = 0.1) -> None:
-        """Lower the root where a leg would be longer than it is, smoothly, so that the feet stay where they are."""
+        """Lower the root smoothly where a standing leg would be too short, so that feet stay in place."""
         hips = np.stack([self._pelvis_rotation() @ OFFSETS[1 + side] for side in (0, 1)])
         away = self._ankles() - hips - self.root
         flat = (away[..., [0, 2]] ** 2).sum(-1)

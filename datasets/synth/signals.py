@@ -1,7 +1,8 @@
 """One-dimensional signals of a motion that its description can be read from.
 
-Lengths are divided by the person's size (straight-leg length over that of the uniform skeleton), so that thresholds
-are metres of a 1.7 m adult. Headings come from the hips alone, so a twisting chest does not count as a turn.
+Lengths are divided by the person's size (straight-leg length over that of the uniform skeleton), so that
+thresholds are metres of a 1.7 m adult. Headings come from the hips alone, so a twisting chest does not count
+as a turn.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def tempo(signals: Signals) -> float:
 
 
 def rise_time(signal: Array, fps: float) -> float:
-    """Seconds of the first rise of a signal [T] from rest to its top, judged by its 10 % and 90 % crossings."""
+    """Seconds of the first rise of a signal [T] from rest to its top, by its 10 % and 90 % crossings."""
     low, high = float(signal[0]), float(signal.max())
     share = (signal - low) / max(high - low, 1e-6)
     end = _crossing(share, 0.9, 0)

@@ -1,4 +1,4 @@
-"""What a clip is going to do, drawn before it is animated: the one source of both the motion and its captions."""
+"""What a clip is going to do, drawn before it is animated: the source of both motion and captions."""
 
 from __future__ import annotations
 
@@ -113,9 +113,7 @@ def draw(action: str, rng: np.random.Generator) -> Truth:
         # As many as fit into five seconds without changing the pace.
         count = min(count, {"slowly": 1, None: 2, "quickly": 3}[speed])
     left, right = _hands(action, side, rng)
-    return Truth(
-        action, direction, side, count, speed, left, right, str(rng.choice(FACES)), bpm, style
-    )
+    return Truth(action, direction, side, count, speed, left, right, str(rng.choice(FACES)), bpm, style)
 
 
 def _one(rng: np.random.Generator, options: tuple[Any, ...]) -> Any:

@@ -2,7 +2,7 @@
 
 | file             | content |
 |------------------|---------|
-| `keys.npy`       | uint8 [n, 32], sha256 of each caption's UTF-8, ascending; row i of all below is the same |
+| `keys.npy`       | uint8 [n, 32], sha256 of each caption's UTF-8, ascending; row i is the same below |
 | `captions.jsonl` | the captions themselves, one JSON string a line |
 | `sentence.npy`   | float32 [n, E], unit length |
 | `offsets.npy`    | int64 [n + 1]: the tokens of caption i are rows `offsets[i] : offsets[i + 1]` |
@@ -207,7 +207,7 @@ def _write(
     entries = [entry(key) for key in keys]
     offsets = np.concatenate([[0], np.cumsum([len(tokens) for _, tokens in entries])]).astype(np.int64)
     (folder / "cache.json").unlink(missing_ok=True)
-    arrays = {
+    arrays: dict[str, NDArray] = {
         "keys.npy": np.frombuffer(b"".join(keys), dtype=np.uint8).reshape(len(keys), 32),
         "sentence.npy": np.stack([sentence for sentence, _ in entries]).astype(np.float32),
         "offsets.npy": offsets,
@@ -222,5 +222,5 @@ def _write(
     write_json(folder / "cache.json", info.dump())
 
 
-def _save_array(values: NDArray[np.generic], file: BinaryIO) -> None:
+def _save_array(values: NDArray, file: BinaryIO) -> None:
     np.save(file, values, allow_pickle=False)

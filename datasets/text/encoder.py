@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,7 +26,7 @@ from motionloom.datasets.schema import UserError
 
 @dataclass(frozen=True)
 class EncodedText:
-    """Captions as arrays: `sentence` [n, E] of unit length, `tokens` [n, S, E], zero where `mask` is false."""
+    """Captions as arrays: `sentence` [n, E] of unit length, `tokens` [n, S, E] (padding 0), `mask`."""
 
     sentence: NDArray[np.float32]
     tokens: NDArray[np.float32]
@@ -125,8 +126,8 @@ def _model_type(folder: Path) -> str:
         return str(json.loads((folder / "config.json").read_text(encoding="utf-8"))["model_type"])
     except (OSError, ValueError, KeyError, TypeError):
         raise UserError(
-            f"{folder}: not a sentence-transformers or transformers model (no modules.json, no config.json with "
-            f"a model_type); name the folder that holds the model's files, or 'minilm'"
+            f"{folder}: not a sentence-transformers or transformers model (no modules.json, no config.json "
+            f"with a model_type); name the folder that holds the model's files, or 'minilm'"
         ) from None
 
 
@@ -134,13 +135,14 @@ def _sentence_model(where: Path | str, *, device: str, local: bool) -> Any:
     from sentence_transformers import SentenceTransformer
 
     try:
-        return SentenceTransformer(
-            str(where),
-            device=device,
-            local_files_only=local,
-            trust_remote_code=False,
-            model_kwargs={"use_safetensors": True},
-        )
+        with _no_progress_bars():
+            return SentenceTransformer(
+                str(where),
+                device=device,
+                local_files_only=local,
+                trust_remote_code=False,
+                model_kwargs={"use_safetensors": True},
+            )
     except Exception as error:  # every library below raises its own kind for a bad folder or no network
         raise _not_loadable(where, local, error) from error
 
@@ -149,14 +151,29 @@ def _clip_model(where: Path | str, *, device: str, local: bool) -> tuple[Any, An
     from transformers import AutoTokenizer, CLIPTextModelWithProjection
 
     try:
-        model = CLIPTextModelWithProjection.from_pretrained(
-            str(where), local_files_only=local, use_safetensors=True
-        )
+        with _no_progress_bars():
+            model = CLIPTextModelWithProjection.from_pretrained(
+                str(where), local_files_only=local, use_safetensors=True
+            )
         tokenizer = AutoTokenizer.from_pretrained(str(where), local_files_only=local, trust_remote_code=False)
     except Exception as error:  # as above
         raise _not_loadable(where, local, error) from error
     nn.Module.to(model, device)
     return model, tokenizer
+
+
+@contextmanager
+def _no_progress_bars() -> Iterator[None]:
+    """The library draws a bar for every model it loads, even one that takes 50 ms."""
+    from transformers.utils import logging
+
+    shown = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()  # type: ignore[no-untyped-call]
+    try:
+        yield
+    finally:
+        if shown:
+            logging.enable_progress_bar()  # type: ignore[no-untyped-call]
 
 
 def _not_loadable(where: Path | str, local: bool, error: Exception) -> UserError:

@@ -22,11 +22,11 @@ from motionloom.models.tokenizer.base import Tokenizer
 class GptLossConfig(Config):
     """Weight and temperatures of the alignment term."""
 
-    align_weight: float = Field(0.1, ge=0)
+    align_weight: float = Field(default=0.1, ge=0)
     """eta [ours]; 0 turns L_align off, and the tokenizer and TMA are then not needed."""
-    gumbel_temperature: float = Field(1.0, gt=0)
-    temperature: float = Field(0.1, gt=0)
-    threshold: float = Field(0.85, ge=-1, le=1)
+    gumbel_temperature: float = Field(default=1.0, gt=0)
+    temperature: float = Field(default=0.1, gt=0)
+    threshold: float = Field(default=0.85, ge=-1, le=1)
 
 
 class GptModule(StageModule):

@@ -32,18 +32,18 @@ from motionloom.models.tokenizer.base import Stream
 class GptConfig(Config):
     """Sizes and regularisation of a GPT; the defaults are the paper config."""
 
-    layers: int = Field(18, ge=1)
+    layers: int = Field(default=18, ge=1)
     """T2M-GPT's 9 + 9 blocks (base and head)."""
-    dim: int = Field(1024, ge=2)
-    heads: int = Field(16, ge=1)
-    ff: int = Field(4096, ge=1)
-    dropout: float = Field(0.1, ge=0, lt=1)
-    attention_dropout: float = Field(0.1, ge=0, lt=1)
-    block_size: int = Field(150, ge=2)
+    dim: int = Field(default=1024, ge=2)
+    heads: int = Field(default=16, ge=1)
+    ff: int = Field(default=4096, ge=1)
+    dropout: float = Field(default=0.1, ge=0, lt=1)
+    attention_dropout: float = Field(default=0.1, ge=0, lt=1)
+    block_size: int = Field(default=150, ge=2)
     """Text input + tokens: 149 + 1."""
-    condition_dropout: float = Field(0.1, ge=0, lt=1)
+    condition_dropout: float = Field(default=0.1, ge=0, lt=1)
     """Share of samples trained without text, for guidance [ours]; 0 turns guidance off."""
-    pkeep: float = Field(1.0, gt=0, le=1)
+    pkeep: float = Field(default=1.0, gt=0, le=1)
     """Probability that an input token is kept; the others become random codes of their stream (T2M-GPT uses
     0.5).
     """

@@ -87,8 +87,9 @@ def generate(
         seed: One seed, from which `sample_seeds` makes one per row, or one per sample. Pass slices of
             `sample_seeds` to get the same results whatever the batch size is.
 
-    Returns: Codes per stream int64 [B, G * per_group], 0 behind each sample's `groups`; G is the longest
-    sample's length.
+    Returns:
+        Codes per stream int64 [B, G * per_group], 0 behind each sample's `groups`; G is the longest sample's
+        length.
     """
     batch, device = len(text), text.device
     limit = _limits(gpt, batch, max_groups, groups, device)

@@ -27,7 +27,8 @@ def frechet_distance(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tenso
     product = root @ cov_b @ root
     shared = torch.linalg.eigvalsh((product + product.T) / 2).clamp(min=0).sqrt().sum()
     distance = (mean_a - mean_b).square().sum() + cov_a.trace() + cov_b.trace() - 2 * shared
-    return distance.clamp(min=0)
+    out: Tensor = distance.clamp(min=0)
+    return out
 
 
 def fid(a: Tensor, b: Tensor) -> Tensor:

@@ -44,7 +44,8 @@ def mpjpe(pred: Tensor, target: Tensor, *, root: int | None = 0) -> Tensor:
     """
     if root is not None:
         pred, target = pred - pred[..., root : root + 1, :], target - target[..., root : root + 1, :]
-    return 1000 * (pred - target).norm(dim=-1).mean(-1)
+    out: Tensor = 1000 * torch.linalg.vector_norm(pred - target, dim=-1).mean(-1)
+    return out
 
 
 def procrustes(pred: Tensor, target: Tensor) -> Tensor:
@@ -59,7 +60,8 @@ def procrustes(pred: Tensor, target: Tensor) -> Tensor:
     sign[..., -1] = torch.where(torch.linalg.det(u @ vh) < 0, -1.0, 1.0)
     rotation = (u * sign[..., None, :]) @ vh
     scale = (s * sign).sum(-1) / a.square().sum((-1, -2)).clamp(min=torch.finfo(a.dtype).tiny)
-    return scale[..., None, None] * (a @ rotation) + target_mean
+    aligned: Tensor = scale[..., None, None] * (a @ rotation) + target_mean
+    return aligned
 
 
 def pa_mpjpe(pred: Tensor, target: Tensor) -> Tensor:
@@ -70,7 +72,8 @@ def pa_mpjpe(pred: Tensor, target: Tensor) -> Tensor:
 def accel(pred: Tensor, target: Tensor) -> Tensor:
     """Mean joint acceleration error per inner frame, mm / frame^2: [..., T, N, 3] -> [..., T - 2]."""
     second = (pred - target).diff(n=2, dim=-3)
-    return 1000 * second.norm(dim=-1).mean(-1)
+    out: Tensor = 1000 * torch.linalg.vector_norm(second, dim=-1).mean(-1)
+    return out
 
 
 def joint_errors(
@@ -78,21 +81,20 @@ def joint_errors(
 ) -> JointErrors:
     """Error sums of a padded batch: pred, target [B, T, N, 3] metres, length int64 [B].
 
-    `joints` (indices) restricts the mean to body or hands; `root` indexes the full skeleton and aligns each
-    frame before the choice of joints.
+    `joints` (indices) restricts the mean to body or hands. MPJPE and PA-MPJPE align joint `root` of each
+    frame first (an index into the full skeleton); ACCEL does not, as in the public metrics. What lies behind
+    `length` is never read.
     """
     pred, target = pred.double(), target.double()
-    pred, target = pred - pred[:, :, root : root + 1], target - target[:, :, root : root + 1]
-    moved, goal = pred, target
-    if joints is not None:
-        moved, goal = pred[:, :, joints], target[:, :, joints]
+    keep = slice(None) if joints is None else joints
     real = length_mask(length, pred.shape[1])
+    moved = (pred - pred[:, :, root : root + 1])[real][:, keep]
+    goal = (target - target[:, :, root : root + 1])[real][:, keep]
     inner = length_mask((length - 2).clamp(min=0), max(0, pred.shape[1] - 2))
-    zero = torch.zeros((), dtype=torch.float64, device=pred.device)
     return JointErrors(
-        torch.where(real, mpjpe(moved, goal, root=None), zero).sum(),
-        torch.where(real, pa_mpjpe(moved, goal), zero).sum(),
-        torch.where(inner, accel(moved, goal), zero).sum(),
+        mpjpe(moved, goal, root=None).sum(),
+        pa_mpjpe(moved, goal).sum(),
+        accel(pred[:, :, keep], target[:, :, keep])[inner].sum(),
         real.sum(),
         inner.sum(),
     )

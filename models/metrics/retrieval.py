@@ -86,8 +86,12 @@ def r_precision(
     embeddings.
     """
     text, motion, size = _batches(text, motion, batch, seed)
+    width = text.shape[1]
     rank = torch.cat(
-        [ranks(torch.cdist(t, m)) for t, m in zip(text.split(size), motion.split(size), strict=True)]
+        [
+            ranks(torch.cdist(t, m))
+            for t, m in zip(text.view(-1, size, width), motion.view(-1, size, width), strict=True)
+        ]
     )
     return torch.stack([(rank < k).double().mean() for k in range(1, top + 1)])
 
@@ -100,7 +104,8 @@ def matching_score(
     `batch` and `seed` drop the same rows as `r_precision` does, as the public evaluators do.
     """
     text, motion, _ = _batches(text, motion, batch or len(text), seed)
-    return (text - motion).norm(dim=-1).mean()
+    out: Tensor = torch.linalg.vector_norm(text - motion, dim=-1).mean()
+    return out
 
 
 def _batches(text: Tensor, motion: Tensor, batch: int, seed: int | None) -> tuple[Tensor, Tensor, int]:

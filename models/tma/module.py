@@ -18,12 +18,12 @@ from motionloom.models.tma.network import Tma
 class TmaLossConfig(Config):
     """Weights of the loss terms and the negative filter; the defaults are the paper's."""
 
-    reconstruction: float = Field(1.0, ge=0)
-    kl: float = Field(1e-5, ge=0)
-    latent: float = Field(1e-5, ge=0)
-    contrastive: float = Field(0.1, ge=0)
-    temperature: float = Field(0.1, gt=0)
-    threshold: float = Field(0.85, ge=-1, le=1)
+    reconstruction: float = Field(default=1.0, ge=0)
+    kl: float = Field(default=1e-5, ge=0)
+    latent: float = Field(default=1e-5, ge=0)
+    contrastive: float = Field(default=0.1, ge=0)
+    temperature: float = Field(default=0.1, gt=0)
+    threshold: float = Field(default=0.85, ge=-1, le=1)
     """Captions with a higher sentence cosine are not negatives of each other."""
 
 

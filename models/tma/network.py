@@ -25,13 +25,13 @@ from motionloom.models.layers.transformer import Transformer, length_mask, sinus
 class TmaConfig(Config):
     """Sizes of TMA; the defaults are the paper config."""
 
-    latent: int = Field(256, ge=2)
-    ff: int = Field(1024, ge=1)
-    layers: int = Field(6, ge=1)
-    heads: int = Field(4, ge=1)
-    dropout: float = Field(0.1, ge=0, lt=1)
-    attention_dropout: float = Field(0.1, ge=0, lt=1)
-    frame_stride: int = Field(1, ge=1)
+    latent: int = Field(default=256, ge=2)
+    ff: int = Field(default=1024, ge=1)
+    layers: int = Field(default=6, ge=1)
+    heads: int = Field(default=4, ge=1)
+    dropout: float = Field(default=0.1, ge=0, lt=1)
+    attention_dropout: float = Field(default=0.1, ge=0, lt=1)
+    frame_stride: int = Field(default=1, ge=1)
     """Every n-th frame is fed and reconstructed; 1 is the paper."""
 
 

@@ -42,10 +42,14 @@ class Camera:
         return np.stack([x, y, depth, scale], axis=-1)
 
 
-def fit_distance(height: float, radius: float, width: int, tall: int) -> float:
-    """Distance from which a figure of this height and radius (metres) fills a `width` x `tall` picture."""
+def fit_distance(height: float, radius: float, width: int, tall: int, travel: float = 0.0) -> float:
+    """Distance from which a figure of this height and radius (metres) fills a `width` x `tall` picture.
+
+    It may move `travel` metres either way.
+    """
     tan = np.tan(FIELD_OF_VIEW / 2)
-    return float(max(height / 2 * 1.1 / tan, radius * 1.08 * tall / (tan * width)) + radius * 0.3)
+    up, across = max(height * 0.58, radius * 1.05) + 0.25 * travel, (radius + travel) * 1.08
+    return float(max(up / tan, across * tall / (tan * width)) + radius * 0.3 + travel * 0.7)
 
 
 def smooth_path(root: NDArray[Any], fps: float, seconds: float = 0.8) -> NDArray[np.float64]:

@@ -1,7 +1,8 @@
-"""From 50 expression values to the five controls the viewer's face is drawn with.
+"""From expression coefficients to the five controls of the drawn face.
 
-The controls are read along the synthetic source's expression directions (`datasets/synth/face.py`). Expressions fitted
-with FLAME's own basis have other directions; their faces move, but what they show is not to be trusted.
+Only the synthetic source's basis has a public meaning (happy, sad, angry, surprised, blink; it stands in
+`datasets.synth.face`). FLAME coefficients of licensed data follow another basis: their faces stay neutral
+unless the caller brings controls.
 """
 
 from __future__ import annotations
@@ -13,15 +14,23 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.synth.face import APEX, BASIS
 
+BLINK_HEIGHT = 1.6
+"""Length of a full blink along its basis column."""
 
-def face_controls(face: NDArray[Any]) -> NDArray[np.float64]:
-    """Expression [T, 50] -> smile, brow, eye-open, mouth-open, frown [T, 5]; neutral is (0, 0, 1, 0, 0)."""
-    weights = np.asarray(face, dtype=np.float64) @ BASIS[:, :5]
-    happy, sad, angry, surprised = np.clip(weights[:, :4] / APEX, 0.0, 1.3).T
-    blink = np.clip(weights[:, 4] / 1.6, 0.0, 1.0)
-    smile = happy - 0.9 * sad - 0.5 * angry
-    brow = surprised - angry + 0.35 * sad
-    eyes = (1.0 + 0.45 * surprised - 0.25 * happy - 0.2 * sad) * (1.0 - blink)
-    mouth = 0.9 * surprised + 0.3 * happy
-    frown = angry + 0.5 * sad
-    return np.stack([smile, brow, eyes, mouth, frown], axis=1)
+
+def synthetic_face_controls(expression: NDArray[Any]) -> NDArray[np.float64]:
+    """Synthetic expression [T, 50] to controls [T, 5]: smile, brow, eye-open, mouth-open, frown."""
+    weights = np.asarray(expression, np.float64) @ BASIS
+    happy, sad, angry, surprised = np.clip(weights[:, :4] / APEX, 0, 1.2).T
+    blink = np.clip(weights[:, 4] / BLINK_HEIGHT, 0, 1)
+    open_eyes = 1 + 0.6 * surprised - 0.25 * happy - 0.15 * sad - 0.2 * angry
+    return np.stack(
+        [
+            happy,
+            surprised + 0.35 * sad - 0.9 * angry,
+            open_eyes * (1 - blink),
+            np.clip(0.9 * surprised + 0.25 * happy, 0, 1.2),
+            np.maximum(sad, 0.6 * angry),
+        ],
+        axis=-1,
+    )

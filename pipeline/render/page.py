@@ -1,7 +1,7 @@
 """A report as one self-contained HTML page built from blocks: text, tables, charts, pictures, motion viewers.
 
-Every string handed in is untrusted and escaped; nothing is loaded from outside. The viewer's script is inlined
-once however many viewers the page holds, and only if it holds one.
+Every string handed in is untrusted and escaped; nothing is loaded from outside. The viewer's script is
+inlined once, and only into pages that hold a viewer.
 """
 
 from __future__ import annotations

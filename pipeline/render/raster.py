@@ -1,8 +1,8 @@
 """Draws one pose as an anti-aliased picture with Pillow: the viewer's figure in flat, cel-like shading.
 
 Everything is drawn at twice the size and halved, which costs less than drawing smooth edges. A limb is a nest
-of shapes: dark rim, body colour, and ever narrower lights towards the lamp. All outlines of a pose come from one
-array operation, because a picture has about 200 of them and a film hundreds of pictures.
+of shapes: dark rim, body colour, and ever narrower lights towards the lamp. All outlines of a pose come from
+one array operation, because a picture has about 200 of them and a film hundreds of pictures.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from motionloom.pipeline.render.figure import CENTRE, SKIN, Figure
 
 Colour = tuple[int, int, int]
 SOLE = 0.03
-# Metres nearer than its middle: limbs must stand out this far to be painted over the trunk, the neck goes under.
+# Metres nearer than its middle: a limb must stand out so far to hide the trunk; the neck goes under the chin.
 BIAS = {CENTRE: 0.05, SKIN: -0.06}
 PALETTE: dict[int, Colour] = {0: (119, 130, 154), 1: (47, 143, 196), 2: (229, 121, 63), 3: (237, 199, 163)}
 HAIR: Colour = (90, 68, 54)
@@ -188,7 +188,10 @@ def _head(
     centre = at[head.head] + up * size[1] * 0.62 + front * size[2] * 0.12
     hair = centre + (up * 0.03 - front * 0.024) * pose.scale
     parts = [(centre, size, PALETTE[SKIN]), (hair, HAIR_SIZE * pose.scale, HAIR)]
-    parts.sort(key=lambda part: -float(camera.project(part[0], pose.target)[2]))
+    # Seen from the side, the hair lies behind the skull: it needs a lead to be painted over it.
+    over = (hair - centre) @ camera.axes[2] > 0.012 * pose.scale
+    if not over:
+        parts.reverse()
     for middle, half, colour in parts:
         seen = camera.project(middle, pose.target) + offset
         flat = (axes @ camera.axes[:2].T) * half[:, None] * seen[3]

@@ -100,15 +100,18 @@ def _frames(
     figure = figure_for(skeleton.parents, joints)
     nodes, scale, floor = figure.nodes(joints), figure.scale(joints), floor_of(joints)
     target = smooth_path(joints[:, 0], fps)
-    if not follow:
-        target[:] = (target.min(axis=0) + target.max(axis=0)) / 2
-    height = float(np.clip(np.percentile(joints[..., 1].max(axis=1), 98) - floor + 0.2 * scale, 0.3, 5))
     spread = np.linalg.norm(joints[..., [0, 2]] - target[:, None][..., [0, 2]], axis=-1).max(axis=1)
-    radius = float(np.clip(np.percentile(spread, 90 if follow else 100) + 0.06, 0.2, 12))
-    target[:, 1] = floor + 0.46 * height
+    travel = 0.0
+    if not follow:
+        low, high = target.min(axis=0), target.max(axis=0)
+        travel = float(np.linalg.norm((high - low)[[0, 2]])) / 2
+        target[:] = (low + high) / 2
+    height = float(np.clip(np.percentile(joints[..., 1].max(axis=1), 98) - floor + 0.2 * scale, 0.3, 5))
+    radius = float(np.clip(np.percentile(spread, 90) + 0.06, 0.2, 4))
+    target[:, 1] = floor + 0.455 * height
     yaw, pitch = VIEWS[view]
     big = (2 * size[0], 2 * size[1])
-    camera = Camera(yaw, pitch, fit_distance(height, radius, *big), *big)
+    camera = Camera(yaw, pitch, fit_distance(height, radius, *big, travel), *big)
     face = font(max(11, size[1] // 30))
     lines = wrap(caption, size[0] - 24, face, 2) if caption else []
     sky = Image.new("RGB", big, SKY)

@@ -2,8 +2,8 @@
 
 * The file opens from disk without a network: own script and style are inlined, a policy forbids any request.
 * Positions travel as 16-bit integers over each clip's own bounding box (about 0.1 mm over 8 m) in base64.
-* Titles, labels and captions are untrusted: they enter the page only as JSON without `<`, `>` and `&`, and the
-  script puts them on screen through `textContent`.
+* Titles, labels and captions are untrusted: they enter the page only as JSON without `<`, `>` and `&`, and
+  the script puts them on screen through `textContent`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class ViewerMotion:
 
     `joints` [T, N, 3] metres, Y up; `parents` [N] with -1 for the root; `label` is the chip ('truth',
     'generated'); motions with one `group` share a row. `face_controls` [T, 5] are smile, brow (-1 lowered,
-    1 raised), eye-open (0 closed, 1 neutral), mouth-open and frown; neutral is (0, 0, 1, 0, 0).
+    1 raised), eye-open (0 closed, 1 neutral), mouth-open and frown (mouth corners down, inner brows up);
+    neutral is (0, 0, 1, 0, 0).
     """
 
     joints: NDArray[Any]

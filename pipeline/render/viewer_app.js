@@ -90,8 +90,8 @@ function mountViewer(root, data, options) {
   const lensOf = (cell, width, height) => {
     const { clip, room } = cell, local = localFrame(clip);
     const [x, z] = state.follow || state.close ? pathAt(clip, local) : clip.frame.middle;
-    let distance = fitDistance(room.height, state.follow ? room.radius : room.radius + room.travel, width, height);
-    const target = [x, clip.floor + room.height * 0.48, z];
+    let distance = fitDistance(room.height, room.radius, state.follow ? 0 : room.travel, width, height);
+    const target = [x, clip.floor + room.height * 0.455, z];
     if (state.close && clip.figure.head) {
       const nodes = nodesAt(clip, clip.figure, local);
       headPose(nodes, clip.figure.head, clip.scale).centre.forEach((v, k) => { target[k] = v; });

@@ -83,8 +83,9 @@ function faceAt(clip, frame, neutral) {
   return neutral.map((_, c) => mix(clip.face[5 * k + c], clip.face[5 * next + c], frame - k));
 }
 
-/* Distance from which a figure of this height and radius fits a cell. */
-function fitDistance(height, radius, width, tall) {
+/* Distance from which a figure of this height and radius fits a cell, while it moves `travel` metres either way. */
+function fitDistance(height, radius, travel, width, tall) {
   const tan = Math.tan(FIELD_OF_VIEW / 2);
-  return Math.max((height / 2) * 1.1 / tan, (radius * 1.08 * tall) / (tan * width)) + radius * 0.3;
+  const up = Math.max(height * 0.58, radius * 1.05) + 0.25 * travel, across = (radius + travel) * 1.08;
+  return Math.max(up / tan, (across * tall) / (tan * width)) + radius * 0.3 + travel * 0.7;
 }

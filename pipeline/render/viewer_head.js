@@ -79,6 +79,7 @@ function drawHead(ctx, lens, pose, face, theme, tones) {
   const hair = [0.087, 0.1, 0.094].map((v) => v * scale);
   parts.push({ size: hair, centre: place(0, 0.03 * scale, -0.024 * scale), tones: theme.tones.hair });
   for (const part of parts) part.depth = project(lens, part.centre)[2];
+  parts[3].depth += 0.012 * scale; // seen from the side, the hair lies behind the skull
   parts.sort((p, q) => q.depth - p.depth);
   for (const part of parts) fillEllipsoid(ctx, lens, pose, part.size, part.centre, part.tones);
   drawFace(ctx, lens, pose, face, theme, scale);
@@ -111,10 +112,12 @@ function drawFace(ctx, lens, pose, face, theme, scale) {
     ctx.closePath();
     ctx.fillStyle = theme.feature;
     ctx.fill();
-    const raise = clamp(brow, -1.5, 1.5) * 0.013;
+    // Lowered brows make an angry V, a frown lifts their inner ends as sorrow does.
+    const lift = clamp(brow, -1.5, 1.5), raise = lift * (lift > 0 ? 0.013 : 0.004);
+    const inner = 0.007 * frown + Math.min(lift, 0) * 0.013;
     tracePoints(ctx, path([
-      [side * 0.014, 0.031 + raise - 0.013 * frown], [side * 0.032, 0.039 + raise - 0.003 * frown],
-      [side * 0.052, 0.033 + raise * 0.8 + 0.004 * frown],
+      [side * 0.014, 0.031 + raise + inner], [side * 0.032, 0.039 + raise + 0.25 * inner],
+      [side * 0.052, 0.033 + raise * 0.8 - 0.003 * frown],
     ]));
     ctx.lineWidth = clamp(0.0065 * pixel, 1, 7);
     ctx.strokeStyle = theme.brow;

@@ -11,7 +11,7 @@ function buildCells(clips) {
   for (const [name, members] of rows) {
     const shared = members.every((clip) => clip.caption === members[0].caption) && members[0].caption === name;
     const row = element("div", { className: "mlv-row" });
-    row.style.setProperty("--mlv-columns", String(Math.min(members.length, 4)));
+    row.style.setProperty("--mlv-columns", String(members.length % 3 === 0 ? 3 : Math.min(members.length, 4)));
     const section = element("section", { className: "mlv-group" });
     if (name && !shared) section.append(element("h2", { textContent: name }));
     section.append(row);

@@ -12,7 +12,7 @@ from motionloom.datasets.motion.features import decode
 from motionloom.pipeline.artifact import Artifact
 from motionloom.pipeline.bundle import Bundle, GeneratedMotion, SamplingConfig, text_encoder_of
 from motionloom.pipeline.render.charts import Line
-from motionloom.pipeline.render.face import face_controls
+from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.samples import Truth, joint_layout, reconstruct, spread, truth_of
@@ -64,15 +64,15 @@ def _motions(bundle: Bundle, truths: list[Truth], generated: list[GeneratedMotio
     for number, (truth, made) in enumerate(zip(truths, generated, strict=True), start=1):
         group = f"{number}"
         words = truth.caption if truth.face_caption == truth.caption else f"{truth.caption} {truth.face_caption}"
-        face = None if truth.face is None else face_controls(truth.face)
+        face = None if truth.face is None else synthetic_face_controls(truth.face)
         again = face
         if truth.face is not None and bundle.face is not None:
-            again = face_controls(_face_again(bundle, truth))
+            again = synthetic_face_controls(_face_again(bundle, truth))
         rebuilt = decode(reconstruct(bundle.tokenizer, bundle.stats, truth.features), layout)
         for label, joints, controls in (
             ("recorded", truth.joints, face),
             ("reconstruction", rebuilt, again),
-            ("generated", made.joints, None if made.face is None else face_controls(made.face)),
+            ("generated", made.joints, None if made.face is None else synthetic_face_controls(made.face)),
         ):
             out.append(ViewerMotion(joints, layout.fps, parents, label, words, group, controls))
     return out

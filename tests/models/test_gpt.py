@@ -136,7 +136,13 @@ def test_corruption_stays_in_the_stream() -> None:
 
 def test_paper_config_has_228_million_parameters() -> None:
     config = GptConfig()
-    assert (config.layers, config.dim, config.heads, config.ff, config.block_size) == (18, 1024, 16, 4096, 150)
+    assert (config.layers, config.dim, config.heads, config.ff, config.block_size) == (
+        18,
+        1024,
+        16,
+        4096,
+        150,
+    )
     assert config.dropout == 0.1
     with torch.device("meta"):
         gpt = InterleavedGPT(config, (Stream("body", 512, 2), Stream("hand", 512, 1)), PATTERN, 256)
@@ -186,7 +192,9 @@ def test_alignment_reaches_every_code_head() -> None:
     """
     module, batch = align_module()
     values = module.losses(batch)
-    assert values["loss"].item() == pytest.approx(values["ce"].item() + 0.1 * values["align"].item(), rel=1e-5)
+    assert values["loss"].item() == pytest.approx(
+        values["ce"].item() + 0.1 * values["align"].item(), rel=1e-5
+    )
     values["align"].backward()
     for head in module.net.heads:
         gradient = head.weight.grad
@@ -232,7 +240,7 @@ def test_frozen_neighbours_cannot_change() -> None:
         optimizer.zero_grad()
         module.losses(batch)["loss"].backward()
         optimizer.step()
-    after = {k: v for k, v in [*tokenizer.state_dict().items(), *tma.state_dict().items()]}
+    after = dict([*tokenizer.state_dict().items(), *tma.state_dict().items()])
     assert all(torch.equal(after[k], v) for k, v in before.items())
     tma.train()
     assert not module.tma.on(torch.device("cpu")).training

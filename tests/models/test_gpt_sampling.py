@@ -32,7 +32,9 @@ def rows_equal(one: object, row: int, many: object, at: int) -> bool:
     if groups != int(many.groups[at]):
         return False
     return all(
-        torch.equal(one.codes[s.name][row, : groups * s.per_group], many.codes[s.name][at, : groups * s.per_group])
+        torch.equal(
+            one.codes[s.name][row, : groups * s.per_group], many.codes[s.name][at, : groups * s.per_group]
+        )
         for s in STREAMS
     )
 
@@ -187,8 +189,17 @@ def test_learns_a_toy_grammar() -> None:
     assert values["ce"] < 0.1
     assert values["accuracy_body"] > 0.97
     assert values["accuracy_hand"] > 0.97
-    for settings in ({"temperature": 0}, {"top_p": 0.8, "seed": 5}, {"top_p": 0.8, "cfg_scale": 1.5, "seed": 6}):
+    for settings in (
+        {"temperature": 0},
+        {"top_p": 0.8, "seed": 5},
+        {"top_p": 0.8, "cfg_scale": 1.5, "seed": 6},
+    ):
         out = generate(net, text, **settings)
         assert torch.equal(out.groups, groups), settings
         assert torch.equal(out.codes["body"], codes["body"])
         assert torch.equal(out.codes["hand"], codes["hand"])
+
+
+def test_bfloat16_weights_sample(gpt: InterleavedGPT) -> None:
+    out = generate(gpt.to(torch.bfloat16), torch.randn(3, 6), groups=torch.tensor([2, 3, 1]), seed=0)
+    assert out.groups.tolist() == [2, 3, 1]

@@ -53,7 +53,10 @@ def test_interleave_equals_reference_and_inverts(
         expected = reference(codes, pattern, ends, row, count)
         assert out.length[row] == len(expected) == count * len(pattern) + closing_length(pattern)
         size = len(expected)
-        assert list(zip(out.tokens[row, :size].tolist(), out.kinds[row, :size].tolist(), strict=True)) == expected
+        assert (
+            list(zip(out.tokens[row, :size].tolist(), out.kinds[row, :size].tolist(), strict=True))
+            == expected
+        )
         assert (out.tokens[row, size:] == PAD).all()
         assert (out.kinds[row, size:] == 0).all()
     back = deinterleave(out.tokens, pattern, ends=ends)
@@ -103,9 +106,7 @@ def test_mistakes_are_named() -> None:
 
 
 def test_pad_sequences() -> None:
-    rows = [
-        interleave({"a": torch.arange(n)[None]}, ("a",), ends={"a": 9}) for n in (1, 4, 2)
-    ]
+    rows = [interleave({"a": torch.arange(n)[None]}, ("a",), ends={"a": 9}) for n in (1, 4, 2)]
     out = pad_sequences(rows)
     assert out.tokens.tolist() == [[0, 9, -1, -1, -1], [0, 1, 2, 3, 9], [0, 1, 9, -1, -1]]
     assert out.length.tolist() == [2, 5, 3]

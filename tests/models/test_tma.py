@@ -70,7 +70,13 @@ def test_wrong_widths_are_refused(net: Tma) -> None:
 
 def test_paper_config() -> None:
     config = TmaConfig()
-    assert (config.latent, config.ff, config.layers, config.heads, config.frame_stride) == (256, 1024, 6, 4, 1)
+    assert (config.latent, config.ff, config.layers, config.heads, config.frame_stride) == (
+        256,
+        1024,
+        6,
+        4,
+        1,
+    )
     with torch.device("meta"):
         count = sum(p.numel() for p in Tma(config, 313, 384).parameters())
     per_layer = 4 * 256 * 256 + 2 * 256 * 1024

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
+from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.losses import (
     false_negatives,
     info_nce,
@@ -141,27 +142,50 @@ def test_masked_reconstruction_equals_frame_by_frame(lengths: list[int], seed: i
 def test_two_ranks_equal_one_process(tmp_path: Path) -> None:
     """Loss and every gradient of DDP on two gloo ranks = one process with the concatenated batch, to 1e-5."""
     generator = torch.Generator().manual_seed(3)
-    batch = {
-        "motion": torch.randn(6, 12, 7, generator=generator),
-        "length": torch.tensor([12, 5, 3, 9, 12, 11]),  # ranks hold different numbers of real frames
-        "text_tokens": torch.randn(6, 4, 5, generator=generator),
-        "text_mask": torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
-        "sentence": torch.eye(6)[[0, 1, 2, 1, 3, 4]],  # a duplicate caption across the ranks
+    sentence = torch.eye(6)[[0, 1, 2, 1, 3, 4]]  # a duplicate caption across the ranks
+    groups = torch.tensor([5, 2, 1, 3, 4, 5])  # ranks hold different numbers of real tokens, and of frames
+    codes = {"body": (6, 10), "hand": (6, 5)}
+    sequence = interleave(
+        {name: torch.randint(0, 9, shape, generator=generator) for name, shape in codes.items()},
+        ("body", "body", "hand"),
+        ends={"body": 9, "hand": 9},
+        groups=groups,
+    )
+    batches = {
+        "tma": {
+            "motion": torch.randn(6, 12, 7, generator=generator),
+            "length": torch.tensor([12, 5, 3, 9, 12, 11]),
+            "text_tokens": torch.randn(6, 4, 5, generator=generator),
+            "text_mask": torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
+            "sentence": sentence,
+        },
+        "gpt": {
+            **sequence._asdict(),
+            "text": torch.randn(6, 16, generator=generator),
+            "sentence": sentence.clone(),
+        },
     }
-    save_file(batch, tmp_path / "batch.safetensors")
+    for name, batch in batches.items():
+        save_file(batch, tmp_path / f"{name}.safetensors")
     worker = Path(__file__).with_name("tma_ddp_worker.py")
     ranks = [
         subprocess.Popen([sys.executable, "-P", str(worker), str(rank), "2", str(tmp_path)])
         for rank in range(2)
     ]
-    assert [process.wait(timeout=120) for process in ranks] == [0, 0]
-    result = load_file(tmp_path / "result.safetensors")
+    try:
+        assert [process.wait(timeout=200) for process in ranks] == [0, 0]
+    finally:
+        for process in ranks:
+            process.kill()
 
-    module = runpy.run_path(str(worker))["build"]()
-    loss = module.losses(batch)["loss"]
-    loss.backward()
-    close(result.pop("loss"), loss.detach(), rtol=1e-5)
-    expected = {name: p.grad for name, p in module.net.named_parameters() if p.grad is not None}
-    assert set(result) == set(expected)
-    for name, grad in expected.items():
-        close(result[name], grad, rtol=1e-5, atol=1e-5)
+    builders = runpy.run_path(str(worker))["BUILDERS"]
+    for name, batch in batches.items():
+        result = load_file(tmp_path / f"{name}_result.safetensors")
+        module = builders[name]()
+        loss = module.losses(batch)["loss"]
+        loss.backward()
+        close(result.pop("loss"), loss.detach(), rtol=1e-5)
+        expected = {key: p.grad for key, p in module.net.named_parameters() if p.grad is not None}
+        for key, grad in result.items():
+            close(grad, expected.pop(key, torch.zeros_like(grad)), rtol=1e-5, atol=1e-5)
+        assert expected == {}

@@ -1,0 +1,296 @@
+"""The synthetic source: captions are true, bodies move like bodies, clips follow from their index alone."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.motion.features import decode, encode
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.synth.generate import (
+    Clip,
+    SynthConfig,
+    make_clip,
+    make_sample,
+    split_of,
+    synthesize,
+    truth_of,
+)
+from motionloom.datasets.synth.measure import agrees, measure
+from motionloom.datasets.synth.truth import ACTIONS
+
+FPS = 30.0
+CONFIG = SynthConfig(seed=2024, music=True)
+CLIPS = 280
+
+
+@pytest.fixture(scope="module")
+def clips() -> list[Clip]:
+    return [make_clip(index, CONFIG) for index in range(CLIPS)]
+
+
+@pytest.fixture(scope="module")
+def verdicts(clips: list[Clip]) -> list[dict[str, bool]]:
+    return [agrees(clip.truth, clip.joints, clip.face, FPS) for clip in clips]
+
+
+def test_captions_are_true(clips: list[Clip], verdicts: list[dict[str, bool]]) -> None:
+    right: dict[tuple[str, str], list[bool]] = defaultdict(list)
+    for clip, verdict in zip(clips, verdicts, strict=True):
+        for attribute, ok in verdict.items():
+            right[clip.truth["action"], attribute].append(ok)
+            right["all", attribute].append(ok)
+        right["all", "everything"].append(all(verdict.values()))
+        right[clip.truth["action"], "everything"].append(all(verdict.values()))
+    assert {action for action, _ in right} == {*ACTIONS, "all"}
+    rates = {key: float(np.mean(values)) for key, values in right.items()}
+    wrong = {key: rate for key, rate in rates.items() if rate < (0.98 if key[0] == "all" else 0.95)}
+    assert not wrong
+
+
+@pytest.mark.parametrize("layout", ["body133", "wholebody313"])
+def test_captions_are_true_in_other_layouts(layout: str) -> None:
+    config = SynthConfig(seed=5, layout=layout)
+    fps = config.motion_layout.fps
+    made = [make_clip(index, config) for index in range(84)]
+    verdicts = [agrees(clip.truth, clip.joints, None, fps) for clip in made]
+    assert np.mean([all(verdict.values()) for verdict in verdicts]) >= 0.97
+    for clip in made:
+        assert clip.joints.shape[1:] == (config.motion_layout.num_joints, 3)
+        assert not clip.face_texts and "face" not in clip.truth
+        assert ("left_hand" in clip.truth) == (layout == "wholebody313")
+
+
+def test_truth_survives_the_features(clips: list[Clip]) -> None:
+    layout = MotionLayout.named("wholebody363")
+    good = []
+    for clip in clips[:56]:
+        joints = decode(encode(clip.joints, layout, face=clip.face), layout)
+        good.append(all(agrees(clip.truth, joints, clip.face, FPS).values()))
+    assert np.mean(good) >= 0.96
+
+
+def test_lies_are_found_out(clips: list[Clip]) -> None:
+    swap = {"left": "right", "right": "left", "forward": "backward", "backward": "forward", "up": "forward"}
+    swap |= {"clockwise": "counterclockwise", "counterclockwise": "clockwise", "down": "up", "both": "left"}
+    faces = {"happy": "sad", "sad": "happy", "angry": "neutral", "surprised": "angry", "neutral": "happy"}
+    lies = believed = 0
+    for clip in clips:
+        for attribute in ("direction", "side", "count", "left_hand", "face", "bpm", "action"):
+            value = clip.truth[attribute]
+            if value is None:
+                continue
+            lie: object
+            if attribute in ("count", "bpm"):
+                lie = value + (1 if attribute == "count" else 15)
+            elif attribute == "action":
+                lie = "walk" if value != "walk" else "jump"
+            elif attribute == "face":
+                lie = faces[value]
+            elif attribute == "left_hand":
+                lie = "fist" if value != "fist" else "spread"
+            else:
+                lie = swap[value]
+            lies += 1
+            believed += agrees({**clip.truth, attribute: lie}, clip.joints, clip.face, FPS)[attribute]
+    assert lies > 800
+    assert believed == 0
+
+
+def test_mirror_swaps_left_and_right(clips: list[Clip]) -> None:
+    mirror = Skeleton.named("smplx52").mirror
+    swap = {
+        "left": "right",
+        "right": "left",
+        "clockwise": "counterclockwise",
+        "counterclockwise": "clockwise",
+    }
+    for clip in clips[:70]:
+        mirrored = clip.joints[:, mirror] * np.array([-1.0, 1.0, 1.0])
+        was, now = measure(clip.joints, FPS), measure(mirrored, FPS)
+        assert now.action == was.action
+        assert now.side == swap.get(was.side or "", was.side)
+        assert now.direction == swap.get(was.direction or "", was.direction)
+        assert (now.left_hand, now.right_hand) == (was.right_hand, was.left_hand)
+
+
+def test_circles_and_turns_by_plain_geometry(clips: list[Clip]) -> None:
+    """Seen from above, X points right and Z down the page; clockwise means turning to one's right."""
+    seen = 0
+    for clip in clips:
+        direction, root = clip.truth["direction"], clip.joints[:, 0]
+        if clip.truth["action"] == "walk" and direction in ("forward", "backward"):
+            seen += 1
+            assert (root[-1, 2] - root[0, 2] > 0) == (direction == "forward")
+        if clip.truth["action"] == "walk" and direction in ("clockwise", "counterclockwise"):
+            seen += 1
+            # The person starts off towards +Z; their left is +X, and the circle lies on the side of the turn.
+            middle = 0.5 * (root[:, 0].max() + root[:, 0].min())
+            assert (middle > 0) == (direction == "counterclockwise")
+        if clip.truth["action"] == "turn":
+            seen += 1
+            hips = clip.joints[-1, 1] - clip.joints[-1, 2]
+            facing_x = -hips[2] if clip.truth["style"] != "around" else None
+            if facing_x is not None:
+                assert (facing_x > 0) == (direction == "left")
+    assert seen >= 35
+
+
+def test_feet_stay_where_they_stand(clips: list[Clip]) -> None:
+    slides = []
+    for clip in clips:
+        balls = clip.joints[:, (10, 11)]
+        still = (balls[1:, :, 1] < 0.004) & (balls[:-1, :, 1] < 0.004)
+        speed = np.linalg.norm(np.diff(balls[..., [0, 2]], axis=0), axis=-1) * FPS
+        if clip.truth["action"] != "dance":
+            slides.append(speed[still])
+    slide = np.concatenate(slides)
+    assert slide.mean() < 0.03
+    assert np.percentile(slide, 95) < 0.1
+
+
+def test_somebody_always_stands_on_the_floor(clips: list[Clip]) -> None:
+    for clip in clips:
+        lowest = clip.joints[..., 1].min(axis=1)
+        assert lowest.min() == pytest.approx(0.0, abs=1e-9)
+        if clip.truth["action"] not in ("jump", "run"):
+            assert lowest.max() < 0.03, clip.texts[0]
+
+
+def test_runs_and_jumps_leave_the_floor(clips: list[Clip]) -> None:
+    for clip in clips:
+        if clip.truth["action"] in ("jump", "run"):
+            both_up = clip.joints[:, (10, 11), 1].min(axis=1) > 0.02
+            assert both_up.mean() > 0.03, clip.texts[0]
+
+
+def test_joints_bend_the_right_way(clips: list[Clip]) -> None:
+    for clip in clips:
+        x = clip.joints
+        for side in (0, 1):
+            hip, knee, ankle = (x[:, j + side] for j in (1, 4, 7))
+            thigh, shin = knee - hip, ankle - knee
+            # The hinge of a knee that bends forward points to the person's left, as the hip line does.
+            bend, left = np.cross(thigh, shin), x[:, 1] - x[:, 2]
+            angle = np.arcsin(
+                np.clip(
+                    np.linalg.norm(bend, axis=-1)
+                    / (np.linalg.norm(thigh, axis=-1) * np.linalg.norm(shin, axis=-1)),
+                    0,
+                    1,
+                )
+            )
+            bent = angle > 0.2
+            assert ((bend * left).sum(-1)[bent] < 0).mean() < 0.01 or not bent.any(), clip.texts[0]
+            shoulder, elbow, wrist = (x[:, j + side] for j in (16, 18, 20))
+            reach = np.linalg.norm(wrist - shoulder, axis=-1)
+            arm = np.linalg.norm(elbow - shoulder, axis=-1) + np.linalg.norm(wrist - elbow, axis=-1)
+            assert (reach / arm).max() < 0.99
+
+
+def test_bones_keep_their_length_and_motion_is_smooth(clips: list[Clip]) -> None:
+    skeleton = Skeleton.named("smplx52")
+    parents = np.array(skeleton.parents[1:])
+    rest = np.linalg.norm(skeleton.offsets[1:], axis=-1)
+    for clip in clips:
+        assert np.isfinite(clip.joints).all() and np.isfinite(clip.face).all()
+        bones = np.linalg.norm(clip.joints[:, 1:] - clip.joints[:, parents], axis=-1)
+        scale = bones / rest
+        assert np.ptp(scale) < 1e-6
+        assert 0.9 < scale.mean() < 1.1
+        speed = np.linalg.norm(np.diff(clip.joints, axis=0), axis=-1) * FPS
+        assert speed.max() < 12.0, clip.texts[0]
+        seconds = len(clip.joints) / FPS
+        assert CONFIG.min_seconds - 0.1 <= seconds <= CONFIG.max_seconds + 0.1
+
+
+def test_hands_keep_out_of_the_body(clips: list[Clip]) -> None:
+    """Wrists stay outside a 9 cm cylinder around the spine."""
+    for clip in clips:
+        a, b = clip.joints[:, None, 3], clip.joints[:, None, 12]
+        wrists = clip.joints[:, 20:22]
+        along = ((wrists - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1)
+        gap = np.linalg.norm(wrists - a - np.clip(along, 0, 1)[..., None] * (b - a), axis=-1)
+        assert gap.min() > 0.09, clip.texts[0]
+
+
+def test_a_clip_depends_on_nothing_but_seed_and_index() -> None:
+    small, large = SynthConfig(clips=4, seed=9, music=True), SynthConfig(clips=999, seed=9, music=True)
+    for index in (3, 0, 2):
+        one, two = make_clip(index, small), make_clip(index, large)
+        np.testing.assert_array_equal(one.joints, two.joints)
+        np.testing.assert_array_equal(one.face, two.face)
+        assert (one.texts, one.face_texts, one.truth) == (two.texts, two.face_texts, two.truth)
+    other = make_clip(0, SynthConfig(seed=10))
+    assert other.truth != one.truth or len(other.joints) != len(one.joints)
+
+
+def test_actions_are_balanced_and_splits_have_their_shares() -> None:
+    config = SynthConfig(seed=1)
+    names = [truth_of(index, config).action for index in range(14 * 20)]
+    assert {names.count(action) for action in ACTIONS} == {20}
+    splits = [split_of(index, config) for index in range(1000)]
+    assert abs(splits.count("test") - 150) <= 3
+    assert abs(splits.count("val") - 50) <= 3
+
+
+def test_held_out_combinations_are_tested_only() -> None:
+    config = SynthConfig(seed=1, hold_out=[{"action": "kick", "side": "left"}])
+    for index in range(300):
+        truth = truth_of(index, config)
+        if truth.action == "kick" and truth.side == "left":
+            assert split_of(index, config) == "test"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"actions": ["fly"]}, "fly"),
+        ({"clip": 3}, "did you mean 'clips'"),
+        ({"max_seconds": 3.0}, "max_seconds"),
+        ({"hold_out": [{"colour": "red"}]}, "colour"),
+        ({"val_fraction": 0.6, "test_fraction": 0.5}, "nothing to train"),
+    ],
+)
+def test_wrong_options_are_named(options: dict[str, object], words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        SynthConfig.parse(options, "recipe.yaml: synth")
+
+
+def test_measure_refuses_what_it_cannot_read() -> None:
+    with pytest.raises(UserError, match="joints of shape"):
+        measure(np.zeros((10, 5, 3)), FPS)
+    with pytest.raises(UserError, match="no 'action'"):
+        agrees({}, np.zeros((10, 22, 3)), None, FPS)
+
+
+def test_samples_fit_their_layout() -> None:
+    config = SynthConfig(seed=4, music=True, actions=["dance", "bow"])
+    for index in range(4):
+        sample = make_sample(index, config)
+        assert sample.motion.dtype == np.float32
+        assert sample.motion.shape == (sample.meta.frames, 363)
+        assert (sample.wav is not None) == (sample.meta.truth or {})["action"].startswith("dance")
+        assert len(sample.texts) >= 2 and len(sample.face_texts) == 2
+
+
+def test_shards_are_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
+    config = SynthConfig(clips=16, seed=3, music=True)
+    one = synthesize(config, tmp_path / "one", workers=1, progress=False)
+    two = synthesize(config, tmp_path / "two", workers=2, progress=False)
+    assert [s.sha256 for s in one.shards] == [s.sha256 for s in two.shards]
+    assert sum(s.samples for s in one.shards) == 16 and not one.dropped
+    shard = tmp_path / "one" / f"{one.shards[0].name}"
+    assert hashlib.sha256(shard.read_bytes()).hexdigest() == one.shards[0].sha256
+    dataset = ShardDataset.open(tmp_path / "one", "train", expect=config.motion_layout)
+    meta = dataset.meta(0)
+    index = int(meta.id.rsplit("-", 1)[1])
+    np.testing.assert_array_equal(dataset.motion(0), make_sample(index, config).motion)
+    assert meta.truth == make_clip(index, config).truth
