@@ -1,7 +1,8 @@
 """Typed records at the project's borders: configs, captions, clip metadata, the shard manifest.
 
-Everything read from outside (YAML recipes, `meta.json`, `manifest.json`) passes through one of these models, so a
-misspelt key or a wrong type is refused in one sentence that names the file, the key and the nearest valid name.
+Everything read from outside (YAML recipes, `meta.json`, `manifest.json`) passes through one of these models,
+so a misspelt key or a wrong type is refused in one sentence that names the file, the key and the nearest
+valid name.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Config(BaseModel):
 
     @classmethod
     def parse(cls, data: Any, where: str) -> Self:
-        """Validate `data`; raise `UserError` naming `where` (a file or a dotted key) and the nearest valid name."""
+        """Validate `data`; a `UserError` names `where` (a file or a dotted key) and the nearest name."""
         try:
             return cls.model_validate(data)
         except ValidationError as error:
@@ -65,8 +66,9 @@ def explain(error: ValidationError, model: type[BaseModel], where: str) -> str:
         elif item["type"] == "missing":
             lines.append(f"{where}: key '{key}' is required")
         else:
-            shown = repr(item.get("input"))[:60]
-            lines.append(f"{where}: key '{key}' = {shown}: {item['msg'].removeprefix('Value error, ')}")
+            message = item["msg"].removeprefix("Value error, ")
+            shown = f"key '{key}' = {item.get('input')!r:.60}: " if loc else ""
+            lines.append(f"{where}: {shown}{message}")
     return "\n".join(lines)
 
 
@@ -111,7 +113,7 @@ class ClipMeta(Config):
     has_face: bool = True
     mirror_of: str | None = None
     truth: dict[str, Any] | None = None
-    """What a synthetic clip really does (action, direction, side, count, hand, face); measured against captions."""
+    """What a synthetic clip really does (action, direction, side, count, hand, face)."""
 
 
 class ShardInfo(Config):
@@ -133,7 +135,7 @@ class Dropped(Config):
 
 
 class Manifest(Config):
-    """`manifest.json` beside the shards; written last, so a folder without one is an unfinished conversion."""
+    """`manifest.json` beside the shards; written last, so a folder without one is unfinished."""
 
     schema_version: int = SCHEMA_VERSION
     name: str

@@ -1,7 +1,8 @@
 """Base of the stages' LightningModules: one seeded step, one optimizer, plain scalar logs.
 
-Every random draw of a training step (dropout, latents, code resets, Gumbel noise) comes from a generator state that
-is a pure function of (seed, step, rank), so a run that was killed and resumed repeats the undisturbed run bit for bit.
+Every random draw of a training step (dropout, latents, code resets, Gumbel noise) comes from a generator
+state that is a pure function of (seed, step, rank), so a run that was killed and resumed repeats the
+undisturbed run bit for bit.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class StageModule(L.LightningModule):
         self.max_steps = max_steps
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Losses and scalar metrics of one batch; the entry "loss" is minimised, the others are only logged."""
+        """Losses and scalar metrics of one batch; "loss" is minimised, the others are only logged."""
         raise NotImplementedError
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:

@@ -1,12 +1,15 @@
-"""`artifact.json`: what a finished stage made, from what, with which config. Written last, so it means "finished".
+"""`artifact.json`: what a finished stage made, from what, with which config; written last of all.
 
-It holds no times and no machine facts: an undisturbed run and one that was killed and resumed write the same bytes.
+It holds no times and no machine facts: an undisturbed run and one that was killed and resumed write the same
+bytes.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+
+from pydantic import Field
 
 from motionloom.datasets.schema import Config
 from motionloom.pipeline.files import sha256_file, write_json
@@ -41,7 +44,7 @@ class Artifact(Config):
     seed: int
     config: dict[str, Any]
     inputs: dict[str, InputStage]
-    outputs: dict[str, OutputFile] = {}
+    outputs: dict[str, OutputFile] = Field(default_factory=dict)
 
     @staticmethod
     def find(folder: Path) -> Artifact | None:

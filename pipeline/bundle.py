@@ -1,4 +1,4 @@
-"""Everything that turns a caption into motion: text encoder, TMA, GPT, tokenizer, statistics, and the face line.
+"""Everything that turns a caption into motion: text encoder, TMA, GPT, tokenizer, statistics, face line.
 
 A bundle opens from a run folder or from an exported one; both hold one folder per part.
 """
@@ -23,7 +23,7 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.datasets.text.encoder import EncodedText, TextEncoder, load_text_encoder
 from motionloom.models.gpt.network import InterleavedGPT
-from motionloom.models.gpt.sampling import generate
+from motionloom.models.gpt.sampling import generate, sample_seeds
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.artifact import Artifact
 from motionloom.pipeline.model_store import LayoutFacts
@@ -84,7 +84,9 @@ class Bundle:
         """Open a run folder or an exported folder."""
         if (folder / "bundle.json").is_file():
             facts = BundleFile.load_json(folder / "bundle.json")
-            return Bundle.from_parts({p: folder / p for p in PARTS if (folder / p).is_dir()}, facts.text_encoder)
+            return Bundle.from_parts(
+                {p: folder / p for p in PARTS if (folder / p).is_dir()}, facts.text_encoder
+            )
         return Bundle.from_run(folder)
 
     @staticmethod
@@ -148,30 +150,36 @@ class Bundle:
         if len(faces) != len(captions):
             raise UserError(f"{len(captions)} captions but {len(faces)} face captions")
         sampling = sampling or SamplingConfig()
+        # One seed a motion, so that how they are batched plays no part.
+        seeds = sample_seeds(seed, 2 * len(captions))
         out: list[GeneratedMotion] = []
         for start in range(0, len(captions), batch):
             part = slice(start, start + batch)
-            out += self._batch(list(captions[part]), faces[part], seconds, seed + start, sampling)
+            both = seeds[: len(captions)][part], seeds[len(captions) :][part]
+            out += self._batch(list(captions[part]), faces[part], seconds, both, sampling)
         return out
 
     def _batch(
-        self, captions: list[str], faces: list[str], seconds: float | None, seed: int, sampling: SamplingConfig
+        self,
+        captions: list[str],
+        faces: list[str],
+        seconds: float | None,
+        seeds: tuple[list[int], list[int]],
+        sampling: SamplingConfig,
     ) -> list[GeneratedMotion]:
         groups = self._groups(seconds, len(captions))
-        codes, lengths = self._sample(self.gpt, self.prior, captions, groups, seed, sampling)
+        codes, lengths = self._sample(self.gpt, self.prior, captions, groups, seeds[0], sampling)
         body = self._decode(self.tokenizer, codes, lengths)
         expressions: list[NDArray[np.float32]] | list[None] = [None] * len(captions)
         if self.face is not None:
             tokenizer, gpt, prior = self.face
             # The face takes the body's length, so that both share one time line.
-            face_codes, _ = self._sample(gpt, prior, faces, lengths, seed + 1_000_003, sampling)
+            face_codes, _ = self._sample(gpt, prior, faces, lengths, seeds[1], sampling)
             expressions = self._decode(tokenizer, face_codes, lengths)
         out = []
         for row, caption in enumerate(captions):
             joints = decode(body[row], self._joint_layout)
-            out.append(
-                GeneratedMotion(caption, faces[row], body[row], joints, expressions[row], self.layout)
-            )
+            out.append(GeneratedMotion(caption, faces[row], body[row], joints, expressions[row], self.layout))
         return out
 
     @cached_property
@@ -186,11 +194,19 @@ class Bundle:
             return None
         groups = round(seconds * self.layout.fps / self.tokenizer.group_frames)
         if not 1 <= groups <= self.max_groups:
-            raise UserError(f"{seconds:g} s is out of reach: this model makes 0.2 to {self.max_seconds:.1f} s")
+            raise UserError(
+                f"{seconds:g} s is out of reach: this model makes 0.2 to {self.max_seconds:.1f} s"
+            )
         return torch.full((count,), groups)
 
     def _sample(
-        self, gpt: InterleavedGPT, prior: str, texts: list[str], groups: Tensor | None, seed: int, s: SamplingConfig
+        self,
+        gpt: InterleavedGPT,
+        prior: str,
+        texts: list[str],
+        groups: Tensor | None,
+        seeds: list[int],
+        s: SamplingConfig,
     ) -> tuple[dict[str, Tensor], Tensor]:
         text = self.embed(texts, prior)
         result = generate(
@@ -201,7 +217,7 @@ class Bundle:
             top_k=s.top_k or None,
             top_p=s.top_p,
             cfg_scale=s.cfg_scale,
-            seed=seed,
+            seed=seeds,
         )
         return result.codes, result.groups
 
@@ -217,7 +233,7 @@ class Bundle:
     def _decode(
         self, tokenizer: Tokenizer, codes: dict[str, Tensor], groups: Tensor
     ) -> list[NDArray[np.float32]]:
-        """Features in their own units, one array [T, D] a sample; each is decoded alone so padding plays no part."""
+        """Features in their own units, [T, D] a sample; each is decoded alone, so padding plays no part."""
         columns = tokenizer.columns.numpy()
         out = []
         for row, count in enumerate(groups.tolist()):
@@ -233,7 +249,7 @@ def part_folders(run: Path) -> dict[str, Path]:
     recipe = _resolved(run)
     stages = recipe["stages"]
     roles = {part: part for part in PARTS if part in stages}
-    for name, entry in stages.items():
+    for entry in stages.values():
         if entry["kind"] == "generate":
             roles.update({r: s for r, s in entry.get("inputs", {}).items() if r in PARTS})
     found = {role: run / "stages" / stage for role, stage in roles.items()}

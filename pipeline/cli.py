@@ -1,12 +1,13 @@
 """The command line: a thin layer on the Python API.
 
-Exit codes: 0 done; 1 the check found problems; 2 a mistake in the call, the recipe or the data (one sentence on
-standard error says which and how to fix it); 130 interrupted. Anything else is a bug and shows its traceback.
+Exit codes: 0 done; 1 the check found problems; 2 a mistake in the call, the recipe or the data (one sentence
+on standard error says which and how to fix it); 130 interrupted. A bug shows its traceback and
+gives 1.
 """
 
 from __future__ import annotations
 
-import sys
+import traceback
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +17,7 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli_data import data_app
 from motionloom.pipeline.console import make_console, quiet_libraries
+from motionloom.pipeline.process import TeamLost, leave
 
 app = typer.Typer(
     name="motionloom",
@@ -30,7 +32,8 @@ app.add_typer(data_app, name="data")
 
 RunFolder = Annotated[Path, typer.Argument(help="A run folder (runs/NAME), or a folder made by export.")]
 Sets = Annotated[
-    list[str] | None, typer.Option("--set", "-s", help="Override one value: stage.field=value. May be repeated.")
+    list[str] | None,
+    typer.Option("--set", "-s", help="Override one value: stage.field=value. May be repeated."),
 ]
 
 
@@ -48,18 +51,24 @@ def info() -> None:
 @app.command()
 def run(
     recipe: Annotated[str, typer.Argument(help="A shipped recipe's name (see info) or a .yaml file.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; default runs/NAME of the recipe.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Run folder; default runs/NAME of the recipe.")
+    ] = None,
     sets: Sets = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan with the reason for each stage.")] = False,
-    first: Annotated[str | None, typer.Option("--from", help="Run this stage and all below it again.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the plan with the reason for each stage.")
+    ] = False,
+    first: Annotated[
+        str | None, typer.Option("--from", help="Run this stage and all below it again.")
+    ] = None,
     until: Annotated[str | None, typer.Option(help="Only this stage and what it needs.")] = None,
     only: Annotated[str | None, typer.Option(help="Only this stage; its inputs must be finished.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Run the selected stages even if finished.")] = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
 
-    Finished stages are skipped, changed ones and those below them run again. Kill it at any moment and start it
-    again: it goes on where it was.
+    Finished stages are skipped, changed ones and those below them run again. Kill it at any moment and start
+    it again: it goes on where it was.
 
     Example: `motionloom run humantomato-tiny --dry-run`
 
@@ -81,20 +90,28 @@ def run(
 @app.command()
 def generate(
     run_folder: RunFolder,
-    captions: Annotated[list[str] | None, typer.Argument(help="What the person does; one motion each.")] = None,
-    face: Annotated[list[str] | None, typer.Option("--face", help="What the face does, one for each caption.")] = None,
+    captions: Annotated[
+        list[str] | None, typer.Argument(help="What the person does; one motion each.")
+    ] = None,
+    face: Annotated[
+        list[str] | None, typer.Option("--face", help="What the face does, one for each caption.")
+    ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("motions"),
-    formats: Annotated[str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html.")] = "npz,bvh,mp4,html",
+    formats: Annotated[
+        str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html.")
+    ] = "npz,bvh,mp4,html",
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same motion.")] = 0,
     temperature: Annotated[float, typer.Option(help="Below 1: safer, above 1: more varied.")] = 1.0,
     top_k: Annotated[int, typer.Option(help="Draw from the k likeliest tokens; 0 = all.")] = 0,
-    top_p: Annotated[float, typer.Option(help="Draw from the likeliest tokens of this total probability.")] = 0.95,
+    top_p: Annotated[
+        float, typer.Option(help="Draw from the likeliest tokens of this total probability.")
+    ] = 0.95,
     cfg: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
 ) -> None:
     """Motions from captions, as npz, BVH, MP4 and one page to watch.
 
-    Example: `motionloom generate runs/humantomato-tiny "a person waves with the left hand" --face "a happy face" -o out`
+    Example: `motionloom generate runs/humantomato-tiny "a person waves" --face "a happy face" -o out`
     """
     from motionloom.pipeline.run import generate_motions
 
@@ -115,7 +132,9 @@ def generate(
 def evaluate(
     run_folder: RunFolder,
     clips: Annotated[int | None, typer.Option(help="At most this many test clips.")] = None,
-    repeats: Annotated[int | None, typer.Option(help="Repetitions of everything that draws at random.")] = None,
+    repeats: Annotated[
+        int | None, typer.Option(help="Repetitions of everything that draws at random.")
+    ] = None,
 ) -> None:
     """Figures on the test split, each beside its trivial answer.
 
@@ -129,7 +148,9 @@ def evaluate(
 @app.command()
 def report(
     run_folder: RunFolder,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="The page; default RUN/report.html.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The page; default RUN/report.html.")
+    ] = None,
 ) -> None:
     """One self-contained page: curves, codebooks, figures and motions to watch.
 
@@ -147,7 +168,7 @@ def export(
 ) -> None:
     """One folder with all that generate needs: weights (safetensors), configs, statistics.
 
-    Example: `motionloom export runs/humantomato-tiny -o my-model && motionloom generate my-model "a person jumps"`
+    Example: `motionloom export runs/humantomato-tiny -o model && motionloom generate model "a person jumps"`
     """
     from motionloom.pipeline.run import export_run
 
@@ -155,23 +176,32 @@ def export(
 
 
 def main() -> None:
-    """Entry point: turns a user's mistake into one sentence and exit code 2."""
+    """Entry point: runs the command and ends the process with its exit code."""
     quiet_libraries()
+    leave(_exit_code())
+
+
+def _exit_code() -> int:
+    """Run the command; a user's mistake becomes one sentence on standard error."""
+    errors = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
-        app(standalone_mode=False)
+        code = app(standalone_mode=False)
     except UserError as error:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"error: {error}", style="red", markup=False)
-        sys.exit(2)
-    except typer.Exit as stop:
-        sys.exit(stop.exit_code)
+        errors.print(f"error: {error}", style="red", markup=False)
+        return 2
+    except TeamLost as error:
+        errors.print(str(error), style="red", markup=False)
+        return 1
     except (typer.Abort, KeyboardInterrupt):
-        Console(stderr=True).print("interrupted; the same command goes on from here", style="yellow")
-        sys.exit(130)
+        errors.print("interrupted; the same command goes on from here", style="yellow")
+        return 130
     except Exception as error:
         if type(error).__module__.startswith(("click", "typer")) and hasattr(error, "show"):
             error.show()
-            sys.exit(2)
-        raise
+            return 2
+        traceback.print_exc()
+        return 1
+    return code if isinstance(code, int) else 0
 
 
 if __name__ == "__main__":

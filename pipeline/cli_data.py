@@ -9,8 +9,12 @@ import typer
 
 from motionloom.pipeline.console import make_console
 
-data_app = typer.Typer(help="Shards: synthesise, convert, check, statistics.", no_args_is_help=True, rich_markup_mode="markdown")
-convert_app = typer.Typer(help="Real motion capture to shards.", no_args_is_help=True, rich_markup_mode="markdown")
+data_app = typer.Typer(
+    help="Shards: synthesise, convert, check, statistics.", no_args_is_help=True, rich_markup_mode="markdown"
+)
+convert_app = typer.Typer(
+    help="Real motion capture to shards.", no_args_is_help=True, rich_markup_mode="markdown"
+)
 data_app.add_typer(convert_app, name="convert")
 
 Out = Annotated[Path, typer.Argument(help="Folder for the shards.")]
@@ -22,7 +26,9 @@ def synth(
     out: Out,
     clips: Annotated[int, typer.Option(help="Number of clips over all splits.")] = 512,
     seed: Annotated[int, typer.Option(help="Same seed, same clips.")] = 0,
-    layout: Annotated[str, typer.Option(help="wholebody363 (body, hands, face) or body133.")] = "wholebody363",
+    layout: Annotated[
+        str, typer.Option(help="wholebody363 (body, hands, face) or body133.")
+    ] = "wholebody363",
     music: Annotated[bool, typer.Option("--music", help="Add dances with their audio.")] = False,
     workers: Workers = 2,
 ) -> None:
@@ -40,14 +46,18 @@ def synth(
 
 @convert_app.command()
 def bvh(
-    source: Annotated[Path, typer.Argument(help="Folder of .bvh files, or of .tar/.tar.xz archives of them.")],
+    source: Annotated[
+        Path, typer.Argument(help="Folder of .bvh files, or of .tar/.tar.xz archives of them.")
+    ],
     out: Out,
     joint_map: Annotated[Path, typer.Option("--joint-map", help="JSON that maps our joints to the file's.")],
     captions: Annotated[Path | None, typer.Option(help="JSON lines: id, file, captions, split.")] = None,
     fps: Annotated[float, typer.Option(help="Frame rate of the shards; clips are resampled by time.")] = 20.0,
     licence: Annotated[str, typer.Option(help="Licence of the clips, kept in every sample.")] = "unknown",
     limit: Annotated[int | None, typer.Option(help="Only the first N clips.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Stop at the first bad file instead of listing it.")] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Stop at the first bad file instead of listing it.")
+    ] = False,
     plan: Annotated[bool, typer.Option("--plan", help="Only list what would be converted.")] = False,
     workers: Workers = 2,
 ) -> None:
@@ -57,14 +67,20 @@ def bvh(
     """
     from motionloom.pipeline.data_commands import convert_bvh_command
 
-    fields = {"source": str(source), "joint_map": str(joint_map), "captions": str(captions) if captions else None}
-    fields |= {"fps": fps, "licence": licence, "limit": limit}
+    fields = {
+        "source": source,
+        "joint_map": joint_map,
+        "captions": captions,
+        "fps": fps,
+        "licence": licence,
+        "limit": limit,
+    }
     convert_bvh_command(fields, out, plan=plan, strict=strict, workers=workers, console=make_console())
 
 
 @data_app.command()
 def check(root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")]) -> None:
-    """Checksums, schema, finite values, duplicates, splits that leak. Exit code 1 with a list when something is wrong.
+    """Checksums, schema, finite values, duplicates, splits that leak. Exit code 1 and a list of problems.
 
     Example: `motionloom data check shards`
     """
@@ -76,7 +92,9 @@ def check(root: Annotated[Path, typer.Argument(help="Folder with manifest.json."
 @data_app.command()
 def stats(
     root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
-    group: Annotated[bool, typer.Option("--group", help="Average the deviation per kind of feature (HumanML3D).")] = False,
+    group: Annotated[
+        bool, typer.Option("--group", help="Average the deviation per kind of feature (HumanML3D).")
+    ] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Also write a .safetensors file.")] = None,
 ) -> None:
     """Counts, lengths, and mean and deviation per kind of feature (training split).

@@ -8,7 +8,7 @@ import warnings
 
 from rich.console import Console
 
-from motionloom.pipeline.hardware import process_rank
+from motionloom.pipeline.process import process_rank
 
 
 def make_console() -> Console:
@@ -24,5 +24,12 @@ def quiet_libraries() -> None:
     os.environ.setdefault("TRANSFORMERS_NO_ADVISORY_WARNINGS", "1")
     for name in ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    for message in (".*does not have many workers.*", ".*Checkpoint directory.*", ".*litlogger.*", ".*sync_dist.*", ".*LeafSpec.*", ".*ckpt_path.*"):
+    for message in (
+        ".*does not have many workers.*",
+        ".*Checkpoint directory.*",
+        ".*litlogger.*",
+        ".*sync_dist.*",
+        ".*LeafSpec.*",
+        ".*ckpt_path.*",
+    ):
         warnings.filterwarnings("ignore", message)

@@ -24,16 +24,23 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
         if shards:
             minutes = sum(s.frames for s in shards) / manifest.fps / 60
             size = sum(s.bytes for s in shards) / 2**20
-            table.add_row(split, str(len(shards)), str(sum(s.samples for s in shards)), f"{minutes:.1f}", f"{size:.1f}")
+            table.add_row(
+                split, str(len(shards)), str(sum(s.samples for s in shards)), f"{minutes:.1f}", f"{size:.1f}"
+            )
     console.print(table)
     for dropped in manifest.dropped[:20]:
         console.print(f"dropped {dropped.source}: {dropped.reason}")
     if len(manifest.dropped) > 20:
         console.print(f"… and {len(manifest.dropped) - 20} more, all in {out / 'manifest.json'}")
-    console.print(f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), {manifest.fps:g} fps, {manifest.licence}")
+    console.print(
+        f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), "
+        f"{manifest.fps:g} fps, {manifest.licence}"
+    )
 
 
-def convert_bvh_command(fields: dict[str, Any], out: Path, *, plan: bool, strict: bool, workers: int, console: Console) -> None:
+def convert_bvh_command(
+    fields: dict[str, Any], out: Path, *, plan: bool, strict: bool, workers: int, console: Console
+) -> None:
     """Plan or convert."""
     config = BvhConfig.parse(fields, "data convert bvh")
     if plan:

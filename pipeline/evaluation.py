@@ -1,4 +1,4 @@
-"""Figures of a run on held-out clips, each beside its trivial answer (SPEC section 8, the part built so far)."""
+"""Figures of a run on held-out clips, each beside its trivial answer."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Interval:
 
 
 def local_joints(features: NDArray[np.float32], layout: MotionLayout) -> NDArray[np.float64]:
-    """Joints [T, N, 3] relative to the root and turned into its heading: the pose without the path it takes."""
+    """Joints [T, N, 3] relative to the root, turned into its heading: the pose without its path."""
     layout = joint_layout(layout)
     positions = features[..., layout.slice("positions")].astype(np.float64)
     positions = positions.reshape(*positions.shape[:-1], layout.num_joints - 1, 3)
@@ -55,7 +55,8 @@ def reconstruction_figures(
 ) -> dict[str, float]:
     """Errors in millimetres of the tokenizer, of the mean pose and of the nearest training clip.
 
-    `mpjpe_*` compares poses (root and heading aligned), `global_*` compares positions in the world, the path included.
+    `mpjpe_*` compares poses (root and heading aligned), `global_*` compares positions in the world, the path
+    included.
     """
     layout = truths_layout(tokenizer)
     body = stats.mean[tokenizer.layout.part("bodyhand")].astype(np.float32)
@@ -72,7 +73,10 @@ def reconstruction_figures(
         if frames > 2:
             values["accel"] = accel(rebuilt, target)
         for suffix, features in (("", found), ("_mean_pose", constant), ("_nearest_train_clip", other)):
-            pose, place = torch.from_numpy(local_joints(features, layout)), torch.from_numpy(decode(features, layout))
+            pose, place = (
+                torch.from_numpy(local_joints(features, layout)),
+                torch.from_numpy(decode(features, layout)),
+            )
             values[f"mpjpe{suffix}"] = mpjpe(pose, torch.from_numpy(real))
             values[f"global_mpjpe{suffix}"] = mpjpe(place, target, root=None)
         for name, value in values.items():
@@ -117,7 +121,8 @@ def stretch(values: NDArray[np.float32], frames: int) -> NDArray[np.float64]:
     low = np.floor(at).astype(int)
     high = np.minimum(low + 1, len(values) - 1)
     weight = (at - low)[:, None]
-    return values[low].astype(np.float64) * (1 - weight) + values[high] * weight
+    wide = values.astype(np.float64)
+    return np.asarray(wide[low] * (1 - weight) + wide[high] * weight)
 
 
 def embed_motions(
@@ -140,11 +145,15 @@ def embed_motions(
     return torch.stack([out[i] for i in range(len(motions))])
 
 
-def retrieval_figures(text: Tensor, motion: Tensor, *, size: int, repeats: int, seed: int) -> dict[str, Interval]:
-    """Recall@1/2/3 both ways among `size` (protocols C and D): mean over batches, interval over repetitions."""
+def retrieval_figures(
+    text: Tensor, motion: Tensor, *, size: int, repeats: int, seed: int
+) -> dict[str, Interval]:
+    """Recall@1/2/3 both ways among `size` (protocols C and D): mean over batches, interval over repeats."""
     rows: dict[str, list[float]] = {}
     for repeat in range(repeats):
-        for name, value in recall(text, motion, batch=size, recalls=(1, 2, 3), seed=seed * 1000 + repeat).items():
+        for name, value in recall(
+            text, motion, batch=size, recalls=(1, 2, 3), seed=seed * 1000 + repeat
+        ).items():
             if "/R@" in name:
                 rows.setdefault(name.replace("/R@", "_r"), []).append(value)
     return {name: Interval.of(values) for name, values in rows.items()}

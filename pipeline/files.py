@@ -51,7 +51,8 @@ def digest(data: Any) -> str:
 
 def remove_tree(folder: Path) -> None:
     """Delete a folder so that a kill midway never leaves it looking whole: rename first, then delete."""
+    doomed = folder.with_name(f".{folder.name}.removed")
+    shutil.rmtree(doomed, ignore_errors=True)  # left by a run that was killed here
     if folder.exists():
-        doomed = folder.with_name(f".{folder.name}.{os.getpid()}.removed")
         folder.rename(doomed)
         shutil.rmtree(doomed)

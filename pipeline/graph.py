@@ -1,8 +1,9 @@
-"""The stage graph: what will run and why, then running it (SPEC section 9).
+"""The stage graph: what will run and why, then running it.
 
-A stage's fingerprint covers its kind and version, its full resolved config, the seed, facts about outside files and
-the fingerprints of its inputs. A stage is finished when its folder holds an `artifact.json` with that fingerprint and
-every output it lists. Anything else runs, and whatever stands below it has another fingerprint and runs too.
+A stage's fingerprint covers its kind and version, its full resolved config, the seed, facts about outside
+files and the fingerprints of its inputs. A stage is finished when its folder holds an `artifact.json` with
+that fingerprint and every output it lists. Anything else runs, and whatever stands below it has another
+fingerprint and runs too.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from rich.console import Console
 from rich.table import Table
 
 from motionloom.datasets.schema import UserError
+from motionloom.models.distributed import alone
 from motionloom.pipeline.artifact import Artifact, InputStage
 from motionloom.pipeline.files import digest, remove_tree, write_json, write_text
-from motionloom.pipeline.hardware import process_rank
+from motionloom.pipeline.process import process_rank
 from motionloom.pipeline.recipe import Recipe, Stage
 from motionloom.pipeline.stage import StageContext, fingerprint_fields
+from motionloom.pipeline.team import Team
 
 Action = Literal["skip", "run", "resume", "leave"]
 
@@ -83,7 +86,9 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
     if select.only:
         for role, name in recipe.stage(select.only).inputs.items():
             if rows[name].action != "skip":
-                raise UserError(f"--only {select.only}: its input '{role}' ({name}) is not finished; run it first")
+                raise UserError(
+                    f"--only {select.only}: its input '{role}' ({name}) is not finished; run it first"
+                )
     return plan
 
 
@@ -102,7 +107,12 @@ def _fingerprint(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) ->
 
 
 def _decide(
-    stage: Stage, fingerprint: str, run: Path, rows: dict[str, PlannedStage], forced: set[str], select: Selection
+    stage: Stage,
+    fingerprint: str,
+    run: Path,
+    rows: dict[str, PlannedStage],
+    forced: set[str],
+    select: Selection,
 ) -> tuple[Action, str]:
     folder = stage_folder(run, stage.name)
     artifact = Artifact.find(folder)
@@ -177,50 +187,62 @@ def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
 
 
 def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
-    """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment."""
-    follower = process_rank() > 0
-    ran = []
-    with _lock(run, needed=not follower):
-        if not follower:
+    """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment.
+
+    With several processes each calls this with the same plan: the lead runs and writes everything, the others only
+    take part in training stages and return after the last one.
+    """
+    todo = [row for row in plan if row.action in {"run", "resume"}]
+    trained = [row for row in todo if row.stage.kind.trains]
+    leads = process_rank() == 0
+    if not leads:
+        todo = trained
+    with _lock(run, needed=leads):
+        team = Team.start(recipe.hardware) if trained else Team()
+        if leads:
             write_text(run / "recipe.yaml", recipe.to_yaml())
-        for number, row in enumerate(plan, start=1):
-            if row.action in {"skip", "leave"}:
-                continue
-            if follower and not row.stage.kind.trains:
-                _wait_for(run, row)
-                continue
-            console.print(f"[bold]\\[{number}/{len(plan)}] {row.stage.name}[/] ({row.stage.kind.summary})")
-            _run_stage(recipe, run, row, plan, console, follower)
-            ran.append(row.stage.name)
-    return ran
+        for row in todo:
+            stage, folder = row.stage, stage_folder(run, row.stage.name)
+            begin = time.perf_counter()
+            if leads:
+                place = f"{plan.index(row) + 1}/{len(plan)}"
+                console.print(f"[bold]\\[{place}] {stage.name}[/] ({stage.kind.summary})")
+                _prepare(folder, row)
+            context = StageContext(
+                name=stage.name,
+                config=stage.config,
+                folder=folder,
+                inputs={role: stage_folder(run, name) for role, name in stage.inputs.items()},
+                seed=recipe.seed,
+                hardware=recipe.hardware,
+                console=console,
+            )
+            if stage.kind.trains:
+                team.meet()
+                stage.kind.run(context)
+            else:
+                with alone():
+                    stage.kind.run(context)
+            if leads:
+                seconds = time.perf_counter() - begin
+                write_json(folder / "timing.json", {"seconds": round(seconds, 2)})
+                _artifact(recipe, row, plan).finish(folder)
+                console.print(f"    finished in {seconds:.1f} s")
+    return [row.stage.name for row in todo]
 
 
-def _run_stage(
-    recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[PlannedStage], console: Console, follower: bool
-) -> None:
-    stage, folder = row.stage, stage_folder(run, row.stage.name)
-    if not follower:
-        if row.action == "run":
-            remove_tree(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "started.json", {"fingerprint": row.fingerprint})
-    context = StageContext(
-        name=stage.name,
-        config=stage.config,
-        folder=folder,
-        inputs={role: stage_folder(run, name) for role, name in stage.inputs.items()},
-        seed=recipe.seed,
-        hardware=recipe.hardware,
-        console=console,
-    )
-    begin = time.perf_counter()
-    stage.kind.run(context)
-    if follower:
-        return
-    seconds = time.perf_counter() - begin
-    write_json(folder / "timing.json", {"seconds": round(seconds, 2)})
+def _prepare(folder: Path, row: PlannedStage) -> None:
+    """An empty folder, or the one a killed run left, marked with what is being made in it."""
+    if row.action == "run":
+        remove_tree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "started.json", {"fingerprint": row.fingerprint})
+
+
+def _artifact(recipe: Recipe, row: PlannedStage, plan: Sequence[PlannedStage]) -> Artifact:
+    stage = row.stage
     fingerprints = {p.stage.name: p.fingerprint for p in plan}
-    Artifact(
+    return Artifact(
         stage=stage.name,
         kind=stage.kind.name,
         version=stage.kind.version,
@@ -228,18 +250,7 @@ def _run_stage(
         seed=recipe.seed,
         config=stage.config.dump(),
         inputs={r: InputStage(stage=n, fingerprint=fingerprints[n]) for r, n in stage.inputs.items()},
-    ).finish(folder)
-    console.print(f"    finished in {seconds:.1f} s")
-
-
-def _wait_for(run: Path, row: PlannedStage) -> None:
-    """Other ranks wait until rank 0 has finished a stage that runs in one process."""
-    folder = stage_folder(run, row.stage.name)
-    while True:
-        artifact = Artifact.find(folder)
-        if artifact is not None and artifact.fingerprint == row.fingerprint:
-            return
-        time.sleep(0.5)
+    )
 
 
 @contextmanager
@@ -253,7 +264,9 @@ def _lock(run: Path, needed: bool) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise UserError(f"{run}: another motionloom process is working on this run; wait for it or stop it") from None
+            raise UserError(
+                f"{run}: another motionloom process is working on this run; wait for it or stop it"
+            ) from None
         file.write(str(os.getpid()))
         file.flush()
         yield

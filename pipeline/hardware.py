@@ -39,7 +39,21 @@ class Hardware(Config):
         """Processes on this node."""
         if self.devices:
             return self.devices
+        if "RANK" in os.environ and "LOCAL_WORLD_SIZE" in os.environ:  # torchrun has decided
+            return int(os.environ["LOCAL_WORLD_SIZE"])
         return torch.cuda.device_count() if self.resolved_accelerator() == "gpu" else 1
+
+    def world(self) -> int:
+        """Processes on all nodes."""
+        return self.resolved_devices() * self.nodes
+
+    def lightning_accelerator(self) -> str:
+        """Lightning's name of the accelerator."""
+        return "cuda" if self.resolved_accelerator() == "gpu" else "cpu"
+
+    def backend(self) -> str:
+        """What the processes talk through."""
+        return "nccl" if self.resolved_accelerator() == "gpu" else "gloo"
 
     def describe(self) -> str:
         """One readable line about what runs where."""
@@ -48,14 +62,7 @@ class Hardware(Config):
             where = f"{count} x {torch.cuda.get_device_name(0)}"
         else:
             why = "" if self.accelerator == "cpu" else " (no GPU found)"
-            where = f"CPU{why}, {count} process{'es' if count > 1 else ''} x {torch.get_num_threads()} threads"
+            where = (
+                f"CPU{why}, {count} process{'es' if count > 1 else ''} x {torch.get_num_threads()} threads"
+            )
         return where + (f", {nodes} nodes" if nodes > 1 else "")
-
-
-def process_rank() -> int:
-    """Global rank as the launcher states it (torchrun, SLURM, Lightning), 0 when there is none."""
-    for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK"):
-        value = os.environ.get(name)
-        if value and (name != "SLURM_PROCID" or "SLURM_NTASKS" in os.environ):
-            return int(value)
-    return 0

@@ -14,18 +14,33 @@ from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.hardware import Hardware
 from motionloom.pipeline.recipe import shipped_recipes
 
-_LIBRARIES = ("torch", "lightning", "webdataset", "numpy", "sentence-transformers", "transformers", "librosa", "roma")
+_LIBRARIES = (
+    "torch",
+    "lightning",
+    "webdataset",
+    "numpy",
+    "sentence-transformers",
+    "transformers",
+    "librosa",
+    "roma",
+)
 
 
 def show_info(console: Console) -> None:
     """Print versions, devices, text encoder and recipes."""
-    console.print(f"motionloom {metadata.version('motionloom')}, Python {platform.python_version()}, {platform.platform()}")
+    console.print(
+        f"motionloom {metadata.version('motionloom')}, "
+        f"Python {platform.python_version()}, {platform.platform()}"
+    )
     console.print(", ".join(f"{name} {metadata.version(name)}" for name in _LIBRARIES))
     console.print(f"runs on: {Hardware().describe()}")
     if torch.cuda.is_available():
         for index in range(torch.cuda.device_count()):
             memory = torch.cuda.get_device_properties(index).total_memory / 2**30
-            console.print(f"  GPU {index}: {torch.cuda.get_device_name(index)}, {memory:.0f} GiB, bf16 {torch.cuda.is_bf16_supported()}")
+            console.print(
+                f"  GPU {index}: {torch.cuda.get_device_name(index)}, {memory:.0f} GiB, "
+                f"bf16 {torch.cuda.is_bf16_supported()}"
+            )
     encoder = load_text_encoder("minilm")
     console.print(f"text encoder: {encoder.name}, {encoder.dim}-d, from the installed package")
     table = Table("recipe", "what it does", title="recipes (motionloom run NAME)", title_justify="left")

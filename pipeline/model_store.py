@@ -1,4 +1,4 @@
-"""Trained networks on disk: `model.safetensors` and `model.json` (kind, config, facts needed to build the network)."""
+"""Trained networks on disk: `model.safetensors`, and `model.json` with all that building them needs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import Field
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
@@ -37,7 +38,7 @@ class ModelFacts(Config):
     kind: str
     config: dict[str, Any]
     layout: LayoutFacts
-    extra: dict[str, Any] = {}
+    extra: dict[str, Any] = Field(default_factory=dict)
 
 
 def save_model(folder: Path, net: torch.nn.Module, facts: ModelFacts) -> None:

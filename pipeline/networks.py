@@ -56,8 +56,8 @@ class LoadedTma:
     @torch.no_grad()
     def embed_text(self, tokens: Tensor, mask: Tensor, batch: int = 256) -> Tensor:
         """Text latents [n, 256] (the means)."""
-        parts = [self.net.encode_text(t, m)[0] for t, m in zip(tokens.split(batch), mask.split(batch), strict=True)]
-        return torch.cat(parts)
+        spans = [slice(first, first + batch) for first in range(0, len(tokens), batch)]
+        return torch.cat([self.net.encode_text(tokens[span], mask[span])[0] for span in spans])
 
     def embed_captions(self, texts: list[str], cache: TextCache) -> Tensor:
         """Text latents of captions in the cache."""
@@ -79,8 +79,8 @@ def load_gpt(folder: Path, tokenizer: Tokenizer) -> tuple[InterleavedGPT, str]:
     expected = {s.name: s.num_codes for s in tokenizer.streams}
     if facts.extra["streams"] != expected or tuple(facts.extra["pattern"]) != tuple(tokenizer.pattern):
         raise UserError(
-            f"{folder}: this GPT was trained on streams {facts.extra['streams']}, the tokenizer has {expected}; "
-            f"train it again on this tokenizer"
+            f"{folder}: this GPT was trained on streams {facts.extra['streams']}, "
+            f"the tokenizer has {expected}; train it again on this tokenizer"
         )
     config = GptConfig.parse(facts.config, str(folder))
     net = InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, facts.extra["text_dim"])

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -78,7 +78,7 @@ def write_npz(path: Path, motion: GeneratedMotion, seed: int) -> Path:
         "unit": "m",
         "seed": seed,
     }
-    arrays = {"joints": motion.joints.astype(np.float32), "features": motion.features}
+    arrays: dict[str, Any] = {"joints": motion.joints.astype(np.float32), "features": motion.features}
     if motion.face is not None:
         arrays["face"] = motion.face
     with atomic(path) as temporary, temporary.open("wb") as file:

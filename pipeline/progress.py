@@ -1,4 +1,4 @@
-"""What a person sees while a stage trains, and the log that a killed run continues without gaps or repeats."""
+"""What a person sees while a stage trains, and the log that a killed run continues without a gap."""
 
 from __future__ import annotations
 
@@ -74,7 +74,9 @@ class StepProgress(Callback):
         if self.progress is not None:
             self.progress.stop()
 
-    def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
         """Close the bar so that the error is readable."""
         if self.progress is not None:
             self.progress.stop()
@@ -83,8 +85,8 @@ class StepProgress(Callback):
 class MetricLog(Callback):
     """`metrics.jsonl`: one row every 10 steps and one per validation.
 
-    Rows are kept in memory and in the checkpoint, and the file is rewritten at checkpoints, so after a kill the log
-    holds each step once.
+    Rows are kept in memory and in the checkpoint, and the file is rewritten at checkpoints, so after a kill
+    the log holds each step once.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -7,8 +7,9 @@
       stats: {kind: stats}
       tokenizer: {kind: h2vq, net: {width: 128}, train: {steps: 600}}
 
-A stage's inputs are found by role: a stage that needs `data` takes the stage called `data` unless its `inputs:` names
-another (or `null`, for an input it can do without). `extends:` starts from another recipe file beside this one. `--set stage.field=value` overrides one value.
+A stage's inputs are found by role: a stage that needs `data` takes the stage called `data` unless its
+`inputs:` names another (or `null`, for an input it can do without). `extends:` starts from another recipe
+file beside this one. `--set stage.field=value` overrides one value.
 """
 
 from __future__ import annotations
@@ -64,7 +65,9 @@ class Recipe:
         for stage in self.stages:
             if stage.name == name:
                 return stage
-        raise UserError(f"recipe {self.name} has no stage '{name}'{nearest(name, [s.name for s in self.stages])}")
+        raise UserError(
+            f"recipe {self.name} has no stage '{name}'{nearest(name, [s.name for s in self.stages])}"
+        )
 
     def to_yaml(self) -> str:
         """The resolved recipe; reading it again gives an equal recipe."""
@@ -85,7 +88,7 @@ class Recipe:
 
 
 def nearest(name: str, valid: Sequence[str]) -> str:
-    """"; did you mean 'x'?" or the list of valid names."""
+    """A hint to append: did you mean 'x'?, or the list of valid names."""
     near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
     return f"; did you mean '{near[0]}'?" if near else f"; valid names: {', '.join(valid)}"
 
@@ -105,7 +108,9 @@ def find_recipe(name_or_path: str) -> Path:
         return path
     shipped = shipped_recipes()
     if name_or_path not in shipped:
-        raise UserError(f"no recipe '{name_or_path}'{nearest(name_or_path, list(shipped))} (or give a .yaml file)")
+        raise UserError(
+            f"no recipe '{name_or_path}'{nearest(name_or_path, list(shipped))} (or give a .yaml file)"
+        )
     return shipped[name_or_path]
 
 
@@ -139,10 +144,12 @@ def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
     out = dict(base)
     for key, value in change.items():
         old = out.get(key)
-        both = isinstance(old, dict) and isinstance(value, dict)
-        # A stage of another kind has other fields, so it replaces the old one whole.
-        same_kind = both and value.get("kind", old.get("kind")) == old.get("kind")
-        out[key] = _merge(old, value) if same_kind else value
+        if isinstance(old, dict) and isinstance(value, dict):
+            # A stage of another kind has other fields, so it replaces the old one whole.
+            same_kind = value.get("kind", old.get("kind")) == old.get("kind")
+            out[key] = _merge(old, value) if same_kind else value
+        else:
+            out[key] = value
     return out
 
 
@@ -208,7 +215,9 @@ def _resolve(name: str, kind: StageKind, renamed: Any, before: list[str], where:
         raise UserError(f"{where}: stages.{name}.inputs must map roles to stages, like {{data: other_data}}")
     for role in renamed:
         if role not in roles:
-            raise UserError(f"{where}: stages.{name}.inputs: unknown role '{role}'{nearest(role, list(roles))}")
+            raise UserError(
+                f"{where}: stages.{name}.inputs: unknown role '{role}'{nearest(role, list(roles))}"
+            )
     inputs = {}
     for role, optional in roles.items():
         source = renamed.get(role, role)
@@ -218,6 +227,7 @@ def _resolve(name: str, kind: StageKind, renamed: Any, before: list[str], where:
             inputs[role] = source
         elif role in renamed or not optional:
             raise UserError(
-                f"{where}: stage '{name}' needs a stage '{source}' (role '{role}') before it{nearest(source, before)}"
+                f"{where}: stage '{name}' needs a stage '{source}' (role '{role}') before it"
+                f"{nearest(source, before)}"
             )
     return inputs

@@ -41,7 +41,10 @@ def run_recipe(
     if not todo:
         console.print(f"{run}: all {len(plan)} stages are finished, nothing to do")
     else:
-        console.print(f"{loaded.name} in {run}: {len(todo)} of {len(plan)} stages to run on {loaded.hardware.describe()}")
+        console.print(
+            f"{loaded.name} in {run}: {len(todo)} of {len(plan)} stages to run "
+            f"on {loaded.hardware.describe()}"
+        )
         execute(loaded, run, plan, console)
     for row in plan:
         page = stage_folder(run, row.stage.name) / "report.html"
@@ -93,14 +96,18 @@ def _stage_again(folder: Path, kind: str, console: Console, changes: dict[str, A
     inputs = {role: stage_folder(folder, name) for role, name in stage.inputs.items()}
     for role, path in inputs.items():
         if not (path / "artifact.json").is_file():
-            raise UserError(f"{folder}: stage '{path.name}' (role {role}) is not finished; run the recipe first")
+            raise UserError(
+                f"{folder}: stage '{path.name}' (role {role}) is not finished; run the recipe first"
+            )
     target = folder / kind
     target.mkdir(exist_ok=True)
     stage.kind.run(StageContext(stage.name, config, target, inputs, recipe.seed, recipe.hardware, console))
     return target
 
 
-def evaluate_run(folder: Path, *, clips: int | None = None, repeats: int | None = None, console: Console) -> Path:
+def evaluate_run(
+    folder: Path, *, clips: int | None = None, repeats: int | None = None, console: Console
+) -> Path:
     """Figures of a finished run; writes RUN/evaluate/metrics.json."""
     return _stage_again(folder, "evaluate", console, {"clips": clips, "repeats": repeats}) / "metrics.json"
 
@@ -131,7 +138,9 @@ def export_run(folder: Path, out: Path, *, console: Console) -> Path:
     facts = BundleFile(layout=LayoutFacts.of(bundle.layout), text_encoder=text_encoder_of(parts["text"]))
     write_json(out / "bundle.json", facts.dump())
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
-    console.print(f"{out}: {size:.1f} MiB; use it: motionloom generate {out} \"a person waves\"", soft_wrap=True)
+    console.print(
+        f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"', soft_wrap=True
+    )
     return out
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,7 +13,6 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.pipeline.sources import open_split
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,9 @@ def truth_of(dataset: ShardDataset, index: int, max_frames: int | None = None) -
 
 
 @torch.no_grad()
-def reconstruct(tokenizer: Tokenizer, stats: FeatureStats, features: NDArray[np.float32]) -> NDArray[np.float32]:
+def reconstruct(
+    tokenizer: Tokenizer, stats: FeatureStats, features: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Through the tokenizer and back, in the features' own units [T, D]; T a multiple of four."""
     columns = tokenizer.columns.numpy()
     mean, std = stats.mean[columns], stats.std[columns]
@@ -70,7 +70,8 @@ def reconstruct(tokenizer: Tokenizer, stats: FeatureStats, features: NDArray[np.
 def spread(dataset: ShardDataset, count: int) -> list[int]:
     """Clip numbers spread evenly over a split, at most `count`, different captions first."""
     seen: set[str] = set()
-    first, rest = [], []
+    first: list[int] = []
+    rest: list[int] = []
     order = np.random.default_rng(0).permutation(len(dataset))
     for index in order.tolist():
         texts = dataset.texts(index)
@@ -78,8 +79,3 @@ def spread(dataset: ShardDataset, count: int) -> list[int]:
         (rest if caption in seen else first).append(index)
         seen.add(caption)
     return (first + rest)[:count]
-
-
-def open_held_out(folder: Path, split: str) -> ShardDataset:
-    """The split samples are taken from."""
-    return open_split(folder, split)

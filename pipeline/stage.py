@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
+from pydantic.config import JsonDict
 from rich.console import Console
 
 from motionloom.datasets.schema import Config
 from motionloom.pipeline.hardware import Hardware
 
-RUNTIME = {"runtime": True}
-"""`Field(json_schema_extra=RUNTIME)`: the field changes how a stage runs, not what it makes; not fingerprinted."""
+RUNTIME: JsonDict = {"runtime": True}
+"""Marks a config field that changes how a stage runs, not what it makes: it is not fingerprinted."""
 
 
 class StageConfig(Config):

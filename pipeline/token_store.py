@@ -1,7 +1,7 @@
 """Motion tokens on disk, and the batches the GPTs train on.
 
-One `tokens-SPLIT.safetensors` per split: for each stream the codes of all clips end to end, and where each clip
-begins, counted in groups of four frames. Written once by the `tokens` stage, never re-encoded by a GPT.
+One `tokens-SPLIT.safetensors` per split: for each stream the codes of all clips end to end, and where each
+clip begins, counted in groups of four frames. Written once by the `tokens` stage, never re-encoded by a GPT.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """One training run of a stage: Lightning's Trainer, the loader, checkpoints, logs, exact resume.
 
-A Lightning "epoch" is here a *chunk* of `checkpoint_every` steps. Checkpoints are written at chunk ends only, the batch
-of step k is a pure function of (seed, k) and every step seeds its own random draws, so a resumed run repeats the
-undisturbed one bit for bit and the loader's whole state is the step number.
+A Lightning "epoch" is here a *chunk* of `checkpoint_every` steps. Checkpoints are written at chunk ends only,
+the batch of step k is a pure function of (seed, k) and every step seeds its own random draws, so a resumed
+run repeats the undisturbed one bit for bit and the loader's whole state is the step number.
 """
 
 from __future__ import annotations
@@ -53,28 +53,24 @@ class TrainConfig(Config):
 
 
 class ChunkSampler(Sampler[int]):
-    """Batch numbers of one chunk; Lightning calls `set_epoch` with the chunk's number, also after a resume."""
+    """Batch numbers of one chunk, from the number that `start` tells when the chunk begins."""
 
-    def __init__(self, chunk: int) -> None:
-        self.chunk = chunk
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Move to a chunk."""
-        self.epoch = epoch
+    def __init__(self, start: Callable[[], int], count: int) -> None:
+        self.start, self.count = start, count
 
     def __iter__(self) -> Iterator[int]:
-        return iter(range(self.epoch * self.chunk, (self.epoch + 1) * self.chunk))
+        first = self.start()
+        return iter(range(first, first + self.count))
 
     def __len__(self) -> int:
-        return self.chunk
+        return self.count
 
 
 BatchSource = Callable[[int, int, int], Dataset[Any]]
-"""(items per global micro-batch, rank, world) -> map-style dataset whose item k is this rank's batch of micro-step k."""
+"""(items per global micro-batch, rank, world) -> dataset; item k is this rank's batch of micro-step k."""
 
 EvalSource = Callable[[int, int], Dataset[Any]]
-"""(rank, world) -> sized dataset of this rank's validation batches; every rank gets equally many of equal size."""
+"""(rank, world) -> sized dataset of this rank's validation batches; every rank gets equal ones."""
 
 
 def fit(
@@ -89,7 +85,7 @@ def fit(
     hardware = context.hardware
     if hardware.threads:
         torch.set_num_threads(hardware.threads)
-    world = hardware.resolved_devices() * hardware.nodes
+    world = hardware.world()
     config.local_batch(world)
     chunk = min(config.checkpoint_every, config.steps)
     data = _Data(train, validation, config, chunk, hardware)
@@ -100,10 +96,11 @@ def fit(
         mode="max",
         save_top_k=2,
         save_on_train_epoch_end=True,
+        enable_version_counter=False,  # a torn file is written again under its own name
     )
     validate = max(1, -(-config.validate_every // chunk)) if config.validate_every and validation else None
     trainer = L.Trainer(
-        accelerator="cuda" if hardware.resolved_accelerator() == "gpu" else "cpu",
+        accelerator=hardware.lightning_accelerator(),
         devices=hardware.resolved_devices(),
         num_nodes=hardware.nodes,
         strategy=_strategy(hardware, world),
@@ -118,11 +115,19 @@ def fit(
         enable_progress_bar=False,
         enable_model_summary=False,
         use_distributed_sampler=False,
-        callbacks=[checkpoints, MetricLog(context.folder), StepProgress(context.name, config.steps, context.console)],
+        callbacks=[
+            checkpoints,
+            MetricLog(context.folder),
+            StepProgress(context.name, config.steps, context.console),
+        ],
     )
     if config.compile:
         module.compile()
-    trainer.fit(module, datamodule=data, ckpt_path=newest_checkpoint(context.folder / "checkpoints"), weights_only=True)
+    newest = newest_checkpoint(context.folder / "checkpoints")
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
+    except SystemExit:  # Lightning's answer to Ctrl-C
+        raise KeyboardInterrupt from None
 
 
 class _Data(L.LightningDataModule):
@@ -142,7 +147,9 @@ class _Data(L.LightningDataModule):
         trainer = cast(L.Trainer, self.trainer)
         micro = self.config.batch_size // self.config.accumulate
         dataset = self.train(micro, trainer.global_rank, trainer.world_size)
-        return _loader(dataset, ChunkSampler(self.chunk * self.config.accumulate), self.hardware)
+        parts = self.config.accumulate
+        sampler = ChunkSampler(lambda: trainer.global_step * parts, self.chunk * parts)
+        return _loader(dataset, sampler, self.hardware)
 
     def val_dataloader(self) -> DataLoader[Any] | list[Any]:
         if self.validation is None:
@@ -171,8 +178,8 @@ def _strategy(hardware: Hardware, world: int) -> Any:
     if world == 1:
         return "auto"
     return L.pytorch.strategies.DDPStrategy(
-        process_group_backend="nccl" if hardware.resolved_accelerator() == "gpu" else "gloo",
-        # Codebooks are made equal by the quantizers themselves; rank 0's copy must not overwrite them mid-step.
+        process_group_backend=hardware.backend(),
+        # The quantizers keep codebooks equal themselves; rank 0's copy must not overwrite them mid-step.
         broadcast_buffers=False,
     )
 

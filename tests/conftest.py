@@ -10,7 +10,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of golden vectors and real data: `MOTIONLOOM_SHARED`, else `../shared` beside the repository."""
+    """Folder of golden vectors and real data: `MOTIONLOOM_SHARED`, else `../shared` beside the repository."""
     named = os.environ.get("MOTIONLOOM_SHARED")
     if named:
         folder = Path(named)

@@ -1,4 +1,4 @@
-"""Canonical joints: heading, canonical pose, resampling in time, mirroring, retargeting (SPEC section 1).
+"""Canonical joints: heading, canonical pose, resampling in time, mirroring, retargeting.
 
 Joints are metres, Y up, right handed: a figure that faces +Z has its left side at +X. A heading is an angle
 about Y in radians: 0 is +Z, positive is a turn to the left (towards +X, counter-clockwise seen from above).

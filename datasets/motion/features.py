@@ -1,4 +1,4 @@
-"""Joints to features and back, for both families (SPEC section 1, HumanTOMATO section 4.2).
+"""Joints to features and back, for both families (HumanTOMATO section 4.2).
 
 `exact` (exact.py) is invertible and keeps the number of frames; `h3d` (h3d.py) equals the published HumanML3D
 and HumanTOMATO features, has one frame less than the joints, and retargets to the layout's skeleton first.

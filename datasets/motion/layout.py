@@ -1,4 +1,4 @@
-"""`MotionLayout`: what the columns of a motion array mean (HumanTOMATO section 4.2, SPEC section 1).
+"""`MotionLayout`: what the columns of a motion array mean (HumanTOMATO section 4.2).
 
 Every module that needs a width, a slice or a body part asks the layout; no other file knows column numbers.
 
@@ -117,8 +117,8 @@ class MotionLayout:
     def part(self, part: Part) -> NDArray[np.int64]:
         """Columns of one body part, ascending.
 
-        `body` is m^B of the paper (root, body positions, body velocities: 133), `hand` is m^H (180), `bodyhand` both
-        (313), `face` the expression (50), `all` everything.
+        `body` is m^B of the paper (root, body positions, body velocities: 133), `hand` is m^H (180),
+        `bodyhand` both (313), `face` the expression (50), `all` everything.
         """
         columns = np.arange(self.dim)
         if part == "all":

@@ -1,7 +1,7 @@
 """Skeletons are data: joint names, parents and rest offsets in metres, read from `skeletons/*.json`.
 
-Joint order of `smplx52` is SMPL-X's (22 body, 15 left hand, 15 right hand); `smpl22` is its first 22. Y is up, the
-rest pose is a T-pose that faces +Z, left is +X.
+Joint order of `smplx52` is SMPL-X's (22 body, 15 left hand, 15 right hand); `smpl22` is its first 22. Y is
+up, the rest pose is a T-pose that faces +Z, left is +X.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Batches for training: map-style datasets whose item `k` is one rank's whole share of global step `k`.
 
 Use with `DataLoader(batches, batch_size=None, sampler=range(first_step, last_step))`: a run resumes by
-starting the range elsewhere. What a batch holds depends on (seed, k) alone; the ranks' shares `[rank::world]`
-together are the global batch whatever their number. `batch_size` is always the *global* one.
+starting the range elsewhere. What a batch holds depends on (seed, k) alone; the ranks' shares one after the
+other are the global batch whatever their number. `batch_size` is always the *global* one.
 """
 
 from __future__ import annotations

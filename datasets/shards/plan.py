@@ -51,14 +51,18 @@ class BatchPlan:
         return epoch, order[start : start + self.batch_items]
 
     def local(self, k: int, rank: int, world: int) -> tuple[int, NDArray[np.int64]]:
-        """(epoch, item numbers [batch_items / world]): every `world`-th item of batch `k`, from `rank` on."""
+        """(epoch, item numbers [batch_items / world]): the rank's part of batch `k`; in rank order they are it.
+
+        Parts are contiguous, so rows gathered from the ranks stand as in the batch of a single process.
+        """
         if self.batch_items % world:
             raise UserError(
                 f"a global batch of {self.batch_items} clips does not divide over {world} ranks; "
                 f"make the batch size a multiple of the number of ranks"
             )
         epoch, items = self.batch(k)
-        return epoch, items[rank::world]
+        share = self.batch_items // world
+        return epoch, items[rank * share : (rank + 1) * share]
 
     def _permutation(self, epoch: int) -> NDArray[np.int64]:
         return permutation(self.num_items, self.seed, epoch)

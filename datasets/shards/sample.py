@@ -5,7 +5,7 @@
 | `motion.npy`      | [T, D] float32 (or float16), C order, features in the dataset's layout |
 | `texts.json`      | list of `Caption`; absent when there are none |
 | `face_texts.json` | list of `Caption` about the face; absent when there are none |
-| `audio.npy`       | [T_audio, 438] float32 audio features (SPEC section 7) |
+| `audio.npy`       | [T_audio, 438] float32 audio features |
 | `audio.flac`      | the sound itself, mono, 16 bit |
 | `meta.json`       | `ClipMeta` |
 """

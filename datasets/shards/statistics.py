@@ -1,4 +1,4 @@
-"""`FeatureStats`: per-column mean and standard deviation, computed in one pass (SPEC section 1).
+"""`FeatureStats`: per-column mean and standard deviation, computed in one pass.
 
 `Moments` holds (count, mean, sum of squared deviations) and merges by Chan's formula, so clips, shards and
 workers may be combined in any grouping. Statistics come from the training split only; whoever calls `compute`

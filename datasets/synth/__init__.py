@@ -1,1 +1,1 @@
-"""Procedural whole-body motion with captions that are true (SPEC section 2)."""
+"""Procedural whole-body motion with captions that are true."""

@@ -1,4 +1,4 @@
-"""`TextCache`: every caption encoded once, looked up by content and read from a memory map (SPEC section 4).
+"""`TextCache`: every caption encoded once, looked up by content and read from a memory map.
 
 | file             | content |
 |------------------|---------|

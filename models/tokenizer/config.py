@@ -1,4 +1,4 @@
-"""Configs of the tokenizers; the defaults are the paper's sizes (HumanTOMATO B.2, SPEC sections 3 and 10)."""
+"""Configs of the tokenizers; the defaults are the paper's sizes (HumanTOMATO B.2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Losses of the tokenizers as functions of tensors (HumanTOMATO Eqn. 3 and 6; SPEC section 3)."""
+"""Losses of the tokenizers as functions of tensors (HumanTOMATO Eqn. 3 and 6)."""
 
 from __future__ import annotations
 

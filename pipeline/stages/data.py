@@ -1,4 +1,4 @@
-"""Stages that bring shards: synthesise them, convert a BVH folder, or take a folder that already holds some."""
+"""Stages that bring shards: synthesise them, convert a BVH folder, or take those that exist."""
 
 from __future__ import annotations
 
@@ -53,7 +53,9 @@ def run_shards(context: StageContext) -> None:
     if context.config.verify:
         problems = check(root)
         if problems:
-            raise UserError(f"{root}: {len(problems)} problems, first: {problems[0]}; see: motionloom data check")
+            raise UserError(
+                f"{root}: {len(problems)} problems, first: {problems[0]}; see: motionloom data check"
+            )
     write_json(context.folder / REFERENCE, {"path": str(root)})
     _say(context, manifest)
 
@@ -63,7 +65,9 @@ def bvh_sources(config: BvhStageConfig) -> dict[str, Any]:
     source = Path(config.source).expanduser()
     if not source.is_dir():
         raise UserError(f"{source}: no such folder (the BVH source; set it with --set data.source=FOLDER)")
-    files = {p.relative_to(source).as_posix(): p.stat().st_size for p in sorted(source.rglob("*")) if p.is_file()}
+    files = {
+        p.relative_to(source).as_posix(): p.stat().st_size for p in sorted(source.rglob("*")) if p.is_file()
+    }
     steering = {}
     for name in (config.joint_map, config.captions):
         if name is not None and Path(name).expanduser().is_file():

@@ -1,4 +1,4 @@
-"""Evaluation stage: reconstruction, retrieval and generation on the test split, each beside its trivial answer."""
+"""Evaluation: reconstruction, retrieval, generation on the test split, each beside its trivial answer."""
 
 from __future__ import annotations
 
@@ -72,7 +72,9 @@ def run_evaluate(context: StageContext) -> None:
         context.console.print(table)
 
 
-def _generate(bundle: Bundle, truths: list[Truth], config: EvaluateConfig, context: StageContext) -> list[list]:
+def _generate(
+    bundle: Bundle, truths: list[Truth], config: EvaluateConfig, context: StageContext
+) -> list[list]:
     out = []
     with bar(context.console) as progress:
         task = progress.add_task("generating", total=config.repeats * len(truths), note="")
@@ -83,7 +85,7 @@ def _generate(bundle: Bundle, truths: list[Truth], config: EvaluateConfig, conte
                 motions += bundle.generate(
                     [t.caption for t in part],
                     face_captions=[t.face_caption for t in part],
-                    seed=context.seed + 7919 * repeat + start,
+                    seed=context.seed + 7919 * (repeat + 1) + start,
                     sampling=config.sampling,
                 )
                 progress.update(task, advance=len(part))
@@ -129,9 +131,7 @@ def _plain(value: Any) -> Any:
 
 def tables(figures: dict[str, Any]) -> list[Table]:
     """The figures for people."""
-    return [
-        _table(title, columns, rows) for title, columns, rows in figure_rows(figures)
-    ]
+    return [_table(title, columns, rows) for title, columns, rows in figure_rows(figures)]
 
 
 def _table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
@@ -150,15 +150,34 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
             f"Reconstruction on {figures['clips']} {figures['split']} clips, mm (lower is better)",
             ["", "pose (root and heading aligned)", "in the world", "PA-MPJPE", "ACCEL"],
             [
-                ["tokenizer", _mm(r["mpjpe"]), _mm(r["global_mpjpe"]), _mm(r["pa_mpjpe"]), _mm(r.get("accel"))],
-                ["nearest training clip", _mm(r["mpjpe_nearest_train_clip"]), _mm(r["global_mpjpe_nearest_train_clip"]), "", ""],
+                [
+                    "tokenizer",
+                    _mm(r["mpjpe"]),
+                    _mm(r["global_mpjpe"]),
+                    _mm(r["pa_mpjpe"]),
+                    _mm(r.get("accel")),
+                ],
+                [
+                    "nearest training clip",
+                    _mm(r["mpjpe_nearest_train_clip"]),
+                    _mm(r["global_mpjpe_nearest_train_clip"]),
+                    "",
+                    "",
+                ],
                 ["mean pose", _mm(r["mpjpe_mean_pose"]), _mm(r["global_mpjpe_mean_pose"]), "", ""],
             ],
         )
     )
     if "retrieval" in figures:
         found = figures["retrieval"]
-        rows = [["chance", *(f"{found['chance'][f'r{k}']:.3f}" for k in (1, 3)), *(f"{found['chance'][f'r{k}']:.3f}" for k in (1, 3)), ""]]
+        rows = [
+            [
+                "chance",
+                *(f"{found['chance'][f'r{k}']:.3f}" for k in (1, 3)),
+                *(f"{found['chance'][f'r{k}']:.3f}" for k in (1, 3)),
+                "",
+            ]
+        ]
         for name in ("real", "generated"):
             keys = ("t2m_r1", "t2m_r3", "m2t_r1", "m2t_r3", "matching_score")
             rows.append([f"{name} motion", *(_interval(found[name][key]) for key in keys)])
@@ -168,7 +187,13 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
         found = figures["agreement_with_caption"]
         names = sorted({*found["truth"], *found["generated"]})
         rows = [[n, *(_percent(found[k].get(n)) for k in ("truth", "generated"))] for n in names]
-        out.append(("Does the motion do what its caption says? (measured on the joints)", ["", "real", "generated"], rows))
+        out.append(
+            (
+                "Does the motion do what its caption says? (measured on the joints)",
+                ["", "real", "generated"],
+                rows,
+            )
+        )
     return out
 
 

@@ -14,11 +14,11 @@ from motionloom.pipeline.stage import StageConfig, StageContext
 class GenerateConfig(StageConfig):
     """Which captions, how drawn, written as what."""
 
-    captions: list[str] = []
+    captions: list[str] = Field(default_factory=list)
     """Captions to perform; empty takes `count` from the test split."""
     count: int = Field(8, ge=1)
     sampling: SamplingConfig = SamplingConfig()
-    formats: list[Format] = list(FORMATS)
+    formats: list[Format] = Field(default_factory=lambda: list(FORMATS))
 
 
 def run_generate(context: StageContext) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import torch
-from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -65,9 +64,12 @@ def run_gpt(context: StageContext) -> None:
     def batches(split: str, batch: int, rank: int, world: int, training: bool) -> TokenBatches:
         dataset = open_split(data, split)
         store = TokenStore.load(
-            context.input("tokens") / f"tokens-{split}.safetensors", {s.name: s.per_group for s in tokenizer.streams}
+            context.input("tokens") / f"tokens-{split}.safetensors",
+            {s.name: s.per_group for s in tokenizer.streams},
         )
-        captions, prior, sentences = priors(dataset, text, tma if config.prior == "tma" else None, face=config.face)
+        captions, prior, sentences = priors(
+            dataset, text, tma if config.prior == "tma" else None, face=config.face
+        )
         return TokenBatches(
             store,
             captions,
@@ -105,13 +107,15 @@ def run_gpt(context: StageContext) -> None:
 def priors(
     dataset: ShardDataset, text: TextCache, tma: LoadedTma | None, *, face: bool
 ) -> tuple[list[list[int]], Tensor, Tensor]:
-    """Captions of each clip as rows of one table of text embeddings [n, E] and of sentence embeddings [n, S]."""
+    """Captions of each clip as rows of the tables of text [n, E] and sentence embeddings [n, S]."""
     names: dict[str, int] = {}
     captions = []
     for index in range(len(dataset)):
         found = [c.text for c in captions_of(dataset, index, face=face)]
         if not found:
-            raise UserError(f"clip {dataset.ids[index]}: no {'face ' if face else ''}caption to train a GPT on")
+            raise UserError(
+                f"clip {dataset.ids[index]}: no {'face ' if face else ''}caption to train a GPT on"
+            )
         captions.append([names.setdefault(caption, len(names)) for caption in found])
     ordered = list(names)
     sentences = torch.as_tensor(text.sentence(ordered))

@@ -28,7 +28,9 @@ def run_stats(context: StageContext) -> None:
     """One streaming pass over the training split."""
     dataset = open_split(context.input("data"), "train")
     compute(dataset, group=context.config.group).save(context.folder / "stats.safetensors")
-    context.console.print(f"    {len(dataset)} clips, {int(dataset.frames.sum())} frames, {dataset.layout.dim} dimensions")
+    context.console.print(
+        f"    {len(dataset)} clips, {int(dataset.frames.sum())} frames, {dataset.layout.dim} dimensions"
+    )
 
 
 def run_text(context: StageContext) -> None:
@@ -41,4 +43,6 @@ def run_text(context: StageContext) -> None:
             captions.update(c.text for c in captions_of(dataset, index, face=True))
     encoder = load_text_encoder(context.config.encoder)
     TextCache.build(context.folder / "cache", captions, encoder, progress=context.console.is_terminal)
-    context.console.print(f"    {len(captions)} different captions, {encoder.dim}-d embeddings by {encoder.name}")
+    context.console.print(
+        f"    {len(captions)} different captions, {encoder.dim}-d embeddings by {encoder.name}"
+    )

@@ -49,8 +49,8 @@ def run_report(context: StageContext) -> None:
     page.add_heading("Watch")
     page.add_viewer(
         _motions(bundle, truths, generated),
-        "Each row is one caption: the recorded clip, what the tokenizer keeps of it, and a motion the model made "
-        "from the words alone. Drag to orbit, wheel to zoom, space to play.",
+        "Each row is one caption: the recorded clip, what the tokenizer keeps of it, and a motion that the "
+        "model made from the words alone. Drag to orbit, wheel to zoom, space to play.",
     )
     _figures(page, context.optional("evaluate"))
     _curves(page, context)
@@ -63,7 +63,9 @@ def _motions(bundle: Bundle, truths: list[Truth], generated: list[GeneratedMotio
     parents, out = layout.skeleton.parents, []
     for number, (truth, made) in enumerate(zip(truths, generated, strict=True), start=1):
         group = f"{number}"
-        words = truth.caption if truth.face_caption == truth.caption else f"{truth.caption} {truth.face_caption}"
+        words = (
+            truth.caption if truth.face_caption == truth.caption else f"{truth.caption} {truth.face_caption}"
+        )
         face = None if truth.face is None else synthetic_face_controls(truth.face)
         again = face
         if truth.face is not None and bundle.face is not None:

@@ -1,4 +1,7 @@
-"""The stage table: one line per kind. A new stage is a network file, a LightningModule file, a line here and a recipe entry."""
+"""The stage table: one line per kind.
+
+A new stage is a network file, a LightningModule file, a line here and a recipe entry.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +15,46 @@ STAGES: dict[str, StageKind] = {
     for kind in (
         StageKind("synth", "synthetic shards", data.SynthStageConfig, data.run_synth),
         StageKind("bvh", "shards from BVH", data.BvhStageConfig, data.run_bvh, external=data.bvh_sources),
-        StageKind("shards", "existing shards", data.ShardsStageConfig, data.run_shards, external=data.shards_source),
+        StageKind(
+            "shards", "existing shards", data.ShardsStageConfig, data.run_shards, external=data.shards_source
+        ),
         StageKind("stats", "mean and deviation", prepare.StatsConfig, prepare.run_stats, ("data",)),
         StageKind("text", "caption embeddings", prepare.TextConfig, prepare.run_text, ("data",)),
-        StageKind("h2vq", "H2VQ tokenizer", tokenizer.H2VQStageConfig, tokenizer.run_tokenizer, ("data", "stats"), trains=True),
-        StageKind("vq", "VQ tokenizer", tokenizer.VqStageConfig, tokenizer.run_tokenizer, ("data", "stats"), trains=True),
-        StageKind("rvq", "RVQ tokenizer", tokenizer.RvqStageConfig, tokenizer.run_tokenizer, ("data", "stats"), trains=True),
-        StageKind("tma", "text-motion alignment", tma.TmaStageConfig, tma.run_tma, ("data", "stats", "text"), trains=True),
-        StageKind("tokens", "token export", tokens.TokensConfig, tokens.run_tokens, ("data", "stats", "tokenizer")),
+        StageKind(
+            "h2vq",
+            "H2VQ tokenizer",
+            tokenizer.H2VQStageConfig,
+            tokenizer.run_tokenizer,
+            ("data", "stats"),
+            trains=True,
+        ),
+        StageKind(
+            "vq",
+            "VQ tokenizer",
+            tokenizer.VqStageConfig,
+            tokenizer.run_tokenizer,
+            ("data", "stats"),
+            trains=True,
+        ),
+        StageKind(
+            "rvq",
+            "RVQ tokenizer",
+            tokenizer.RvqStageConfig,
+            tokenizer.run_tokenizer,
+            ("data", "stats"),
+            trains=True,
+        ),
+        StageKind(
+            "tma",
+            "text-motion alignment",
+            tma.TmaStageConfig,
+            tma.run_tma,
+            ("data", "stats", "text"),
+            trains=True,
+        ),
+        StageKind(
+            "tokens", "token export", tokens.TokensConfig, tokens.run_tokens, ("data", "stats", "tokenizer")
+        ),
         StageKind(
             "gpt",
             "GPT over motion tokens",
@@ -28,8 +63,16 @@ STAGES: dict[str, StageKind] = {
             ("data", "text", "tokenizer", "tokens", "tma?"),
             trains=True,
         ),
-        StageKind("generate", "motions from captions", generate.GenerateConfig, generate.run_generate, _ALL_MODELS),
-        StageKind("evaluate", "figures on the test split", evaluate.EvaluateConfig, evaluate.run_evaluate, _ALL_MODELS),
+        StageKind(
+            "generate", "motions from captions", generate.GenerateConfig, generate.run_generate, _ALL_MODELS
+        ),
+        StageKind(
+            "evaluate",
+            "figures on the test split",
+            evaluate.EvaluateConfig,
+            evaluate.run_evaluate,
+            _ALL_MODELS,
+        ),
         StageKind(
             "report",
             "the page to watch",

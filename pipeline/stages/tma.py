@@ -34,7 +34,11 @@ class TmaStageConfig(StageConfig):
 def run_tma(context: StageContext) -> None:
     """Train the alignment model on whole clips and their captions."""
     config = context.config
-    data, stats, text = context.input("data"), open_stats(context.input("stats")), open_text(context.input("text"))
+    data, stats, text = (
+        context.input("data"),
+        open_stats(context.input("stats")),
+        open_text(context.input("text")),
+    )
     dataset = open_split(data, "train")
     columns = dataset.layout.part("bodyhand")
     torch.manual_seed(context.seed)
@@ -73,5 +77,7 @@ def run_tma(context: StageContext) -> None:
     fit(context, module, config.train, train, validation, config.optim.grad_clip)
     if module.global_rank == 0:
         extra = {"motion_dim": len(columns), "text_dim": text.dim, "max_frames": config.max_frames}
-        facts = ModelFacts(kind="tma", config=config.net.dump(), layout=LayoutFacts.of(dataset.layout), extra=extra)
+        facts = ModelFacts(
+            kind="tma", config=config.net.dump(), layout=LayoutFacts.of(dataset.layout), extra=extra
+        )
         save_model(context.folder, net, facts)

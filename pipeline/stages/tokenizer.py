@@ -1,4 +1,4 @@
-"""Tokenizer stages: H2VQ, vanilla VQ, RVQ; body-hand, body only or face (HumanTOMATO section 3.2, appendix B.2)."""
+"""Tokenizer stages: H2VQ, VQ, RVQ; body-hand, body only or face (HumanTOMATO section 3.2, appendix B.2)."""
 
 from __future__ import annotations
 
@@ -75,10 +75,18 @@ def run_tokenizer(context: StageContext) -> None:
 
     def validation(rank: int, world: int) -> Dataset[Any]:
         return EvalBatches(
-            held, stats, batch_size=8 * world, max_frames=4 * config.window, rank=rank, world=world, columns=columns
+            held,
+            stats,
+            batch_size=8 * world,
+            max_frames=4 * config.window,
+            rank=rank,
+            world=world,
+            columns=columns,
         )
 
     fit(context, module, config.train, train, validation, config.optim.grad_clip)
     if module.global_rank == 0:
-        facts = ModelFacts(kind=config.net.kind, config=config.net.dump(), layout=LayoutFacts.of(dataset.layout))
+        facts = ModelFacts(
+            kind=config.net.kind, config=config.net.dump(), layout=LayoutFacts.of(dataset.layout)
+        )
         save_model(context.folder, net, facts)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -32,11 +35,16 @@ def run_tokens(context: StageContext) -> None:
         with bar(context.console) as progress:
             task = progress.add_task(f"tokens {split}", total=len(dataset), note="")
             store = encode_split(
-                tokenizer, dataset, stats, context.config.batch_frames, lambda n: progress.update(task, advance=n)
+                tokenizer,
+                dataset,
+                stats,
+                context.config.batch_frames,
+                partial(progress.advance, task),
             )
         store.save(context.folder / f"tokens-{split}.safetensors")
         used = ", ".join(
-            f"{s.name} {len(store.codes[s.name].unique())}/{s.num_codes} codes" for s in tokenizer.streams
+            f"{s.name} {len(torch.unique(store.codes[s.name]))}/{s.num_codes} codes"
+            for s in tokenizer.streams
         )
         context.console.print(f"    {split}: {len(dataset)} clips, {int(store.starts[-1])} groups; {used}")
 
@@ -46,7 +54,7 @@ def encode_split(
     dataset: ShardDataset,
     stats: FeatureStats,
     batch_frames: int,
-    advance: object = None,
+    advance: Callable[[int], None] | None = None,
 ) -> TokenStore:
     """Codes of all clips in order. Clips are cut to a multiple of the group length and batched by length."""
     unit = tokenizer.group_frames
@@ -62,7 +70,7 @@ def encode_split(
             for name, n in per_group.items():
                 begin, count = int(starts[item]) * n, int(groups[item]) * n
                 flat[name][begin : begin + count] = codes[name][row, :count]
-        if callable(advance):
+        if advance is not None:
             advance(len(items))
     return TokenStore(flat, starts, per_group)
 

@@ -1,4 +1,4 @@
-"""Converters and clips for the shard tests, in a module of their own so that spawned workers can import them."""
+"""Converters and clips for the shard tests; a module of its own, so that spawned workers can import it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def clip(i: int, split: Split = "train") -> Sample:
 
 @dataclass(frozen=True)
 class Convert:
-    """Item i -> clip i; items in `drop` are left out, those in `bad` fail, and one may kill the process once."""
+    """Item i -> clip i; items in `drop` are left out, those in `bad` fail, one may kill the process once."""
 
     drop: tuple[int, ...] = ()
     bad: tuple[int, ...] = ()

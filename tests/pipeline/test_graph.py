@@ -36,7 +36,9 @@ def run_add(context: StageContext) -> None:
 @pytest.fixture(autouse=True)
 def toy_kinds(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setitem(table.STAGES, "root", StageKind("root", "a number", AddConfig, run_add))
-    monkeypatch.setitem(table.STAGES, "sum", StageKind("sum", "a sum", AddConfig, run_add, ("left", "right?")))
+    monkeypatch.setitem(
+        table.STAGES, "sum", StageKind("sum", "a sum", AddConfig, run_add, ("left", "right?"))
+    )
     yield
 
 
@@ -103,7 +105,9 @@ def test_lost_output_runs_again(tmp_path: Path) -> None:
 
 def test_new_version_of_a_kind_runs_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go(tmp_path)
-    monkeypatch.setitem(table.STAGES, "sum", StageKind("sum", "a sum", AddConfig, run_add, ("left", "right?"), version=2))
+    monkeypatch.setitem(
+        table.STAGES, "sum", StageKind("sum", "a sum", AddConfig, run_add, ("left", "right?"), version=2)
+    )
     assert go(tmp_path) == ["both", "one", "top"]
 
 
@@ -135,7 +139,14 @@ def test_atomic_leaves_nothing_on_error(tmp_path: Path) -> None:
 
 def test_two_processes_do_not_share_a_run(tmp_path: Path) -> None:
     holder = subprocess.Popen(
-        [sys.executable, "-P", "-c", "import fcntl,sys,time; f=open(sys.argv[1],'w'); fcntl.flock(f,2); print('held',flush=True); time.sleep(60)", str(lock_file(tmp_path))],
+        [
+            sys.executable,
+            "-P",
+            "-c",
+            "import fcntl, sys, time; file = open(sys.argv[1], 'w'); fcntl.flock(file, 2);"
+            "print('held', flush=True); time.sleep(60)",
+            str(lock_file(tmp_path)),
+        ],
         stdout=subprocess.PIPE,
         text=True,
     )

@@ -60,7 +60,10 @@ def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> N
     ("text", "says"),
     [
         ("name: x\nstages: {stats: {kind: stats}}", "needs a stage 'data'"),
-        ("name: x\nstages: {data: {kind: synth}, stats: {kind: stats, inputs: {dat: data}}}", "unknown role 'dat'"),
+        (
+            "name: x\nstages: {data: {kind: synth}, stats: {kind: stats, inputs: {dat: data}}}",
+            "unknown role 'dat'",
+        ),
         ("name: x\nstage: {}", "unknown key 'stage'; did you mean 'stages'"),
         ("name: ../x\nstages: {}", "name"),
         ("[1, 2]", "mapping"),

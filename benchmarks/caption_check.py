@@ -1,0 +1,93 @@
+"""Do generated motions do what their captions say? Measured on the joints of a body-only run.
+
+    python benchmarks/caption_check.py RUN [--samples 20]
+
+For turning captions: the net change of heading. For hand captions: how high each wrist rises above its shoulder.
+For walking and running: the distance covered and its speed.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.canonical import heading
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.pipeline.bundle import Bundle
+
+Joints = NDArray[np.float64]
+SKELETON = Skeleton.named("smpl22")
+
+
+def turned(joints: Joints, fps: float) -> float:
+    """Net turn in degrees, left positive."""
+    angle = heading(joints, fps)
+    return float(np.degrees(angle[-1] - angle[0]))
+
+
+def raised(joints: Joints, side: str) -> float:
+    """Highest the wrist gets above its shoulder, metres."""
+    wrist, shoulder = SKELETON.index(f"{side}_wrist"), SKELETON.index(f"{side}_shoulder")
+    return float((joints[:, wrist, 1] - joints[:, shoulder, 1]).max())
+
+
+def speed(joints: Joints, fps: float) -> float:
+    """Mean speed of the root over the ground, metres a second, from start to end of its path."""
+    path = np.linalg.norm(np.diff(joints[:, 0][:, [0, 2]], axis=0), axis=1).sum()
+    return float(path * fps / len(joints))
+
+
+def only(joints: Joints, side: str) -> bool:
+    """One hand up (no lower than 10 cm under the shoulder), the other hanging."""
+    other = "left" if side == "right" else "right"
+    return raised(joints, side) > UP and raised(joints, other) < DOWN
+
+
+UP, DOWN = -0.1, -0.2
+Check = Callable[[Joints, float], bool]
+CHECKS: dict[str, Check] = {
+    "a person walks and turns left.": lambda j, f: turned(j, f) > 45,
+    "a person walks and turns right.": lambda j, f: turned(j, f) < -45,
+    "a person walks forward.": lambda j, f: abs(turned(j, f)) < 45 and 0.3 < speed(j, f) < 2.0,
+    "a person runs forward.": lambda j, f: abs(turned(j, f)) < 45 and speed(j, f) > 1.6,
+    "a person raises the right hand.": lambda j, f: only(j, "right"),
+    "a person raises the left hand.": lambda j, f: only(j, "left"),
+    "a person raises both hands.": lambda j, f: min(raised(j, "left"), raised(j, "right")) > UP,
+    "a person waves the right hand.": lambda j, f: only(j, "right"),
+    "a person waves the left hand.": lambda j, f: only(j, "left"),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--samples", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    bundle = Bundle.open(args.run)
+    print(
+        "| caption | does it | median turn | wrist above shoulder: left, right | speed |\n|---|---|---|---|---|"
+    )
+    total = 0
+    for caption, check in CHECKS.items():
+        motions = bundle.generate([caption] * args.samples, seed=args.seed)
+        fps = bundle.layout.fps
+        good = sum(check(m.joints, fps) for m in motions)
+        total += good
+        turn = np.median([turned(m.joints, fps) for m in motions])
+        left, right = (np.median([raised(m.joints, s) for m in motions]) for s in ("left", "right"))
+        pace = np.median([speed(m.joints, fps) for m in motions])
+        print(
+            f"| {caption} | {good}/{args.samples} | {turn:.0f}° | {left:.2f} m, {right:.2f} m | {pace:.2f} m/s |"
+        )
+    print(f"| all | {total}/{args.samples * len(CHECKS)} | | | |")
+
+
+if __name__ == "__main__":
+    main()

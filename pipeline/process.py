@@ -1,0 +1,37 @@
+"""This process among those of a run: its rank, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import NoReturn
+
+
+class TeamLost(Exception):
+    """Another process of this run has stopped."""
+
+
+def process_rank() -> int:
+    """0 in the process that leads: the global rank as torchrun or SLURM states it, else as Lightning does.
+
+    Lightning's own launcher states the rank within a node only, so on other nodes the number is merely not 0.
+    """
+    if "RANK" in os.environ:
+        return int(os.environ["RANK"])
+    if "SLURM_PROCID" in os.environ and "SLURM_NTASKS" in os.environ:
+        return int(os.environ["SLURM_PROCID"])
+    return int(os.environ.get("NODE_RANK", 0)) + int(os.environ.get("LOCAL_RANK", 0))
+
+
+def leave(code: int) -> NoReturn:
+    """End this process; one that trained with others ends without destructors.
+
+    torch's gloo group may be destroyed while the interpreter lock is held and then waits for a thread that wants
+    that lock: the process would hang after its work is done. Every file is written by then.
+    """
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.distributed.is_available() and torch.distributed.is_initialized():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)

@@ -1,0 +1,177 @@
+"""The documents say what is so: commands parse, targets, links, recipes and Python examples exist."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import typer
+import yaml
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.pipeline.cli import app
+from motionloom.pipeline.recipe import load_recipe, shipped_recipes
+from motionloom.pipeline.stages.table import STAGES
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
+OTHER_PROGRAMS = {".", "diff", "git", "python", "sbatch"}
+LAUNCHERS = {"srun", "torchrun"}
+
+
+class Block(NamedTuple):
+    document: Path
+    line: int
+    language: str
+    text: str
+
+
+def blocks(*languages: str) -> list[Block]:
+    """Fenced code blocks, also indented ones."""
+    found = []
+    for document in DOCUMENTS:
+        text = document.read_text(encoding="utf-8")
+        for match in re.finditer(r"^( *)```(\w*)\n(.*?)^\1```$", text, re.M | re.S):
+            indent, language, body = match.groups()
+            body = re.sub(f"^{indent}", "", body, flags=re.M)
+            if language in languages:
+                found.append(Block(document, text.count("\n", 0, match.start()) + 1, language, body))
+    return found
+
+
+def commands() -> Iterator[tuple[str, list[str]]]:
+    """(where, words) of every command in a `sh` block; continued lines joined, chains taken apart."""
+    for block in blocks("sh"):
+        for line in re.sub(r"\\\n\s*", "", block.text).splitlines():
+            words = shlex.split(line, comments=True)
+            where = f"{block.document.name}:{block.line}: {line}"
+            while words:
+                end = words.index("&&") if "&&" in words else len(words)
+                yield where, words[:end]
+                words = words[end + 1 :]
+
+
+COMMANDS = list(commands())
+
+
+def parsed(words: list[str]) -> dict[str, Any]:
+    """Parameters of a `motionloom` command, read by the real command line; raises what a user would see."""
+    command: Any = typer.main.get_command(app)
+    words = words[1:]
+    while hasattr(command, "commands"):
+        assert words and words[0] in command.commands, f"no command {words[:1]}"
+        command = command.commands[words.pop(0)]
+    return dict(command.make_context(command.name, words).params) | {"command": command.name}
+
+
+def make_targets() -> set[str]:
+    return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M))
+
+
+@pytest.mark.parametrize(("where", "words"), COMMANDS, ids=[where for where, _ in COMMANDS])
+def test_command_is_real(where: str, words: list[str]) -> None:
+    if words[0] in LAUNCHERS:
+        words = words[words.index("motionloom") :]
+    program = words[0].removeprefix(".venv/bin/")
+    if program == "motionloom":
+        given = parsed(words)
+        recipe = str(given.get("recipe", ""))
+        if given["command"] == "run" and not recipe.endswith(".yaml"):
+            load_recipe(recipe, given["sets"] or ())
+    elif program == "make":
+        targets = [word for word in words[1:] if "=" not in word]
+        assert targets and set(targets) <= make_targets(), where
+    else:
+        assert program in OTHER_PROGRAMS | {"pre-commit"}, f"{where}: '{program}' is not known here"
+
+
+def test_inline_make_targets_exist() -> None:
+    for document in DOCUMENTS:
+        for code in re.findall(r"`make ([^`]+)`", document.read_text(encoding="utf-8")):
+            targets = [word for word in shlex.split(code) if "=" not in word]
+            assert set(targets) <= make_targets(), f"{document.name}: make {code}"
+
+
+def test_first_commands_of_the_readme() -> None:
+    assert [words for where, words in COMMANDS if where.startswith("README")][:2] == [
+        ["make", "demo"],
+        ["make", "test"],
+    ]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
+def test_links_and_pictures_exist(document: Path) -> None:
+    text = re.sub(r"^ *```.*?^ *```$", "", document.read_text(encoding="utf-8"), flags=re.M | re.S)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        path = (document.parent / name).resolve() if name else document
+        assert path.is_relative_to(ROOT) and path.exists(), f"{document.name}: {target} does not exist"
+        if anchor:
+            assert anchor in anchors(path), f"{document.name}: {path.name} has no heading #{anchor}"
+
+
+def anchors(document: Path) -> set[str]:
+    """Headings as GitHub names them."""
+    headings = re.findall(r"^#+ (.+)$", document.read_text(encoding="utf-8"), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("block", blocks("python"), ids=lambda b: f"{b.document.name}:{b.line}")
+def test_python_example_compiles_and_imports(block: Block) -> None:
+    for node in ast.walk(ast.parse(block.text)):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                importlib.import_module(alias.name)
+        elif isinstance(node, ast.ImportFrom):
+            module = importlib.import_module(str(node.module))
+            for alias in node.names:
+                assert hasattr(module, alias.name), f"{node.module} has no {alias.name}"
+
+
+@pytest.mark.parametrize("block", blocks("yaml"), ids=lambda b: f"{b.document.name}:{b.line}")
+def test_yaml_example_is_a_recipe(block: Block, tmp_path: Path) -> None:
+    data = yaml.safe_load(block.text)
+    if "jobs" in data:  # a workflow of a CI service, not ours
+        return
+    path = tmp_path / "recipe.yaml"
+    path.write_text(block.text, encoding="utf-8")
+    assert load_recipe(path).name == data["name"]
+
+
+def test_recipes_are_named_and_named_recipes_exist() -> None:
+    shipped = set(shipped_recipes())
+    everything = "".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
+    assert set(re.findall(r"\b(?:humantomato|ude|baselines|bvh)-[a-z]+\b", everything)) == shipped
+    readme = DOCUMENTS[0].read_text(encoding="utf-8")
+    assert all(f"`{name}`" in readme for name in shipped)
+
+
+def test_tables_follow_the_code() -> None:
+    data = (ROOT / "docs" / "data.md").read_text(encoding="utf-8").split("## Layouts")[1].split("## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (\d+) \|", data, re.M)
+    assert rows and all(MotionLayout.named(name).dim == int(width) for name, width in rows)
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    kinds = re.findall(r"^\| `(\w+)` \|", text.split("## Stages")[1].split("## ")[0], re.M)
+    assert kinds == list(STAGES)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
+def test_named_files_of_the_repository_exist(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:datasets|models|pipeline|configs|tests|docs)/[\w./-]*)`", text):
+        assert (ROOT / name).exists(), f"{document.name}: {name} does not exist"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
+def test_no_absolute_local_paths(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    assert not re.findall(r"(?:^|[\s`\"'(=:])(?:/(?!/)[A-Za-z][\w.-]*/\S*|~/\S+|[A-Z]:\\\S+)", text, re.M)
