@@ -2,8 +2,8 @@
 
     python benchmarks/caption_check.py RUN [--samples 20]
 
-For turning captions: the net change of heading. For hand captions: how high each wrist rises above its shoulder.
-For walking and running: the distance covered and its speed.
+For turning captions: the net change of heading. For hand captions: how high each wrist rises above its
+shoulder. For walking and running: the distance covered and its speed.
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ def main() -> None:
     args = parser.parse_args()
     bundle = Bundle.open(args.run)
     print(
-        "| caption | does it | median turn | wrist above shoulder: left, right | speed |\n|---|---|---|---|---|"
+        "| caption | does it | median turn | wrist above shoulder: left, right | speed |\n"
+        "|---|---|---|---|---|"
     )
     total = 0
     for caption, check in CHECKS.items():
@@ -84,7 +85,8 @@ def main() -> None:
         left, right = (np.median([raised(m.joints, s) for m in motions]) for s in ("left", "right"))
         pace = np.median([speed(m.joints, fps) for m in motions])
         print(
-            f"| {caption} | {good}/{args.samples} | {turn:.0f}° | {left:.2f} m, {right:.2f} m | {pace:.2f} m/s |"
+            f"| {caption} | {good}/{args.samples} | {turn:.0f}° | {left:.2f} m, {right:.2f} m "
+            f"| {pace:.2f} m/s |"
         )
     print(f"| all | {total}/{args.samples * len(CHECKS)} | | | |")
 

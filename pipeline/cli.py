@@ -17,7 +17,7 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli_data import data_app
 from motionloom.pipeline.console import make_console, quiet_libraries
-from motionloom.pipeline.process import TeamLost, leave
+from motionloom.pipeline.process import TeamError, leave
 
 app = typer.Typer(
     name="motionloom",
@@ -38,11 +38,24 @@ Sets = Annotated[
 
 
 @app.command()
-def info() -> None:
+def info(
+    recipe_schema: Annotated[
+        bool, typer.Option("--recipe-schema", help="Print the JSON schema of recipes, for editors.")
+    ] = False,
+) -> None:
     """Versions, devices, text encoder and shipped recipes.
 
     Example: `motionloom info`
+
+    Example: `motionloom info --recipe-schema > recipe.schema.json`
     """
+    if recipe_schema:
+        import json
+
+        from motionloom.pipeline.recipe_schema import recipe_schema as schema
+
+        typer.echo(json.dumps(schema(), indent=1))
+        return
     from motionloom.pipeline.info import show_info
 
     show_info(make_console())
@@ -189,7 +202,7 @@ def _exit_code() -> int:
     except UserError as error:
         errors.print(f"error: {error}", style="red", markup=False)
         return 2
-    except TeamLost as error:
+    except TeamError as error:
         errors.print(str(error), style="red", markup=False)
         return 1
     except (typer.Abort, KeyboardInterrupt):

@@ -52,7 +52,16 @@ def bvh(
     out: Out,
     joint_map: Annotated[Path, typer.Option("--joint-map", help="JSON that maps our joints to the file's.")],
     captions: Annotated[Path | None, typer.Option(help="JSON lines: id, file, captions, split.")] = None,
+    splits: Annotated[
+        Path | None, typer.Option(help="Folder with train.txt, val.txt, test.txt; else the captions' split.")
+    ] = None,
+    layout: Annotated[str, typer.Option(help="Feature layout of the shards: body133 or h3d263.")] = "body133",
     fps: Annotated[float, typer.Option(help="Frame rate of the shards; clips are resampled by time.")] = 20.0,
+    source_fps: Annotated[
+        float | None, typer.Option(help="True frame rate of the files, if they state a wrong one.")
+    ] = None,
+    unit: Annotated[str, typer.Option(help="Length unit of the files: m, cm, mm or inch.")] = "cm",
+    up: Annotated[str, typer.Option(help="Upward axis of the files: y or z.")] = "y",
     licence: Annotated[str, typer.Option(help="Licence of the clips, kept in every sample.")] = "unknown",
     limit: Annotated[int | None, typer.Option(help="Only the first N clips.")] = None,
     strict: Annotated[
@@ -71,7 +80,12 @@ def bvh(
         "source": source,
         "joint_map": joint_map,
         "captions": captions,
+        "splits": splits,
+        "layout": layout,
         "fps": fps,
+        "source_fps": source_fps,
+        "unit": unit,
+        "up": up,
         "licence": licence,
         "limit": limit,
     }

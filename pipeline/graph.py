@@ -189,8 +189,8 @@ def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
 def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
     """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment.
 
-    With several processes each calls this with the same plan: the lead runs and writes everything, the others only
-    take part in training stages and return after the last one.
+    With several processes each calls this with the same plan: the lead runs and writes everything, the others
+    only take part in training stages and return after the last one.
     """
     todo = [row for row in plan if row.action in {"run", "resume"}]
     trained = [row for row in todo if row.stage.kind.trains]

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from pydantic import Field
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Config, UserError
@@ -45,7 +45,7 @@ def save_model(folder: Path, net: torch.nn.Module, facts: ModelFacts) -> None:
     """Write weights and facts; the facts last."""
     state = {k: v.detach().contiguous().cpu() for k, v in net.state_dict().items()}
     with atomic(folder / "model.safetensors") as temporary:
-        save_file(state, temporary)
+        temporary.write_bytes(save(state))
     write_json(folder / "model.json", facts.dump())
 
 

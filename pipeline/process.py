@@ -7,7 +7,7 @@ import sys
 from typing import NoReturn
 
 
-class TeamLost(Exception):
+class TeamError(Exception):
     """Another process of this run has stopped."""
 
 
@@ -26,8 +26,8 @@ def process_rank() -> int:
 def leave(code: int) -> NoReturn:
     """End this process; one that trained with others ends without destructors.
 
-    torch's gloo group may be destroyed while the interpreter lock is held and then waits for a thread that wants
-    that lock: the process would hang after its work is done. Every file is written by then.
+    torch's gloo group may be destroyed while the interpreter lock is held and then waits for a thread that
+    wants that lock: the process would hang after its work is done. Every file is written by then.
     """
     torch = sys.modules.get("torch")
     if torch is not None and torch.distributed.is_available() and torch.distributed.is_initialized():

@@ -1,8 +1,8 @@
 """The processes of one run: who leads, how the others join and wait for it.
 
-The lead (rank 0) runs every stage and is the only one that writes; the others take part in training stages. They
-start together, before anything is written, so all of them see the same plan. Processes come from Lightning's launcher
-(which repeats the command) or from torchrun or SLURM.
+The lead (rank 0) runs every stage and is the only one that writes; the others take part in training stages.
+They start together, before anything is written, so all of them see the same plan. Processes come from
+Lightning's launcher (which repeats the command) or from torchrun or SLURM.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from datetime import timedelta
 
 import torch.distributed as dist
 from lightning.fabric import Fabric
-from lightning.fabric.strategies import DDPStrategy
+from lightning.fabric.strategies.ddp import DDPStrategy
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.hardware import Hardware
-from motionloom.pipeline.process import TeamLost
+from motionloom.pipeline.process import TeamError
 
 _PATIENCE = timedelta(days=30)
 """How long the others wait for a stage that only the lead runs; a dead lead ends the wait at once."""
@@ -39,8 +39,8 @@ class Team:
         launched = os.environ.get("WORLD_SIZE") if "RANK" in os.environ else None
         if launched is not None and int(launched) != world:
             raise UserError(
-                f"the launcher started {launched} processes and the recipe asks for {world}: set hardware.devices "
-                f"(processes on a node) and hardware.nodes to match it"
+                f"the launcher started {launched} processes and the recipe asks for {world}: set "
+                f"hardware.devices (processes on a node) and hardware.nodes to match it"
             )
         if world == 1:
             return Team()
@@ -65,6 +65,6 @@ class Team:
         try:
             dist.barrier(self.waiting)
         except RuntimeError as error:
-            raise TeamLost(
+            raise TeamError(
                 f"process {self.rank} of {self.world}: another process of this run has stopped ({error})"
             ) from None

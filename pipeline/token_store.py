@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -53,7 +54,7 @@ class TokenStore:
         tensors = {f"codes.{name}": flat.to(torch.int32) for name, flat in self.codes.items()}
         tensors["starts"] = torch.from_numpy(self.starts)
         with atomic(path) as temporary:
-            save_file(tensors, temporary)
+            temporary.write_bytes(save(tensors))
 
     @staticmethod
     def load(path: Path, per_group: Mapping[str, int]) -> TokenStore:
@@ -87,13 +88,17 @@ class TokenBatches(Dataset[dict[str, Any]]):
     world: int = 1
     training: bool = True
 
+    @cached_property
+    def _plan(self) -> BatchPlan:
+        lengths = np.minimum(self.store.groups, self.max_groups)
+        return BatchPlan(len(self.captions), self.batch_size, self.seed, lengths)
+
     def __len__(self) -> int:
         return -(-len(self.captions) // self.batch_size)
 
     def __getitem__(self, k: int) -> dict[str, Any]:
         if self.training:
-            plan = BatchPlan(len(self.captions), self.batch_size, self.seed)
-            epoch, items = plan.local(k, self.rank, self.world)
+            epoch, items = self._plan.local(k, self.rank, self.world)
         else:
             rows_of_all = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
             # Equal shares: the last batch repeats its last clip where the clips do not divide over the ranks.

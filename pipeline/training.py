@@ -14,7 +14,7 @@ from typing import Any, Literal, cast
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from pydantic import Field
 from torch.utils.data import DataLoader, Dataset, Sampler
 
@@ -117,6 +117,7 @@ def fit(
         use_distributed_sampler=False,
         callbacks=[
             checkpoints,
+            ResumeBetweenChunks(),
             MetricLog(context.folder),
             StepProgress(context.name, config.steps, context.console),
         ],
@@ -128,6 +129,25 @@ def fit(
         trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise KeyboardInterrupt from None
+
+
+class ResumeBetweenChunks(Callback):
+    """Makes a resumed run begin the chunk behind its checkpoint.
+
+    Lightning would go back into the finished epoch and, where that did not end with a validation, train one more
+    batch in it: the steps of all later validations and checkpoints would move.
+    """
+
+    def on_load_checkpoint(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Mark the epoch as over and no batch of the next as taken."""
+        loop = checkpoint["loops"]["fit_loop"]
+        for progress in (loop["epoch_progress"]["total"], loop["epoch_progress"]["current"]):
+            progress["completed"] = progress["processed"]
+        batches = loop["epoch_loop.batch_progress"]
+        batches["current"] = dict.fromkeys(batches["current"], 0)
+        batches["is_last_batch"] = False
 
 
 class _Data(L.LightningDataModule):
@@ -180,7 +200,7 @@ def _strategy(hardware: Hardware, world: int) -> Any:
     return L.pytorch.strategies.DDPStrategy(
         process_group_backend=hardware.backend(),
         # The quantizers keep codebooks equal themselves; rank 0's copy must not overwrite them mid-step.
-        broadcast_buffers=False,
+        forward_sync_buffers=False,
     )
 
 

@@ -7,6 +7,7 @@ decides that by the dataset it passes.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -102,7 +103,7 @@ class FeatureStats:
             "frames": str(self.frames),
         }
         with atomic_file(path) as file:
-            file.write(save({"mean": self.mean, "std": self.std}, metadata=about))
+            file.write(_sorted_header(save({"mean": self.mean, "std": self.std}, metadata=about)))
 
     @staticmethod
     def load(path: Path, *, expect: MotionLayout | None = None) -> FeatureStats:
@@ -146,6 +147,14 @@ class FeatureStats:
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_tensors": {}}
+
+
+def _sorted_header(raw: bytes) -> bytes:
+    """The same safetensors file, its header's keys in order: the library writes metadata in random order."""
+    end = 8 + int.from_bytes(raw[:8], "little")
+    header = json.dumps(json.loads(raw[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + raw[end:]
 
 
 def compute(dataset: ShardDataset, group: bool = False, progress: bool = False) -> FeatureStats:

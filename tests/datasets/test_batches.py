@@ -122,7 +122,7 @@ def test_any_number_of_ranks_sees_the_same_global_batch(
         parts_c = [captions(rank, world)[k] for rank in range(world)]
         assert torch.equal(torch.cat([part["index"] for part in parts_c]), whole["index"])
         assert torch.equal(torch.cat([part["length"] for part in parts_c]), whole["length"])
-        assert sum((part["caption"] for part in parts_c), []) == whole["caption"]
+        assert [caption for part in parts_c for caption in part["caption"]] == whole["caption"]
         for part, motion in zip(parts_c, whole["motion"].chunk(world), strict=True):
             longest = int(part["length"].max())
             assert torch.equal(part["motion"][:, :longest], motion[:, :longest])

@@ -92,3 +92,26 @@ def test_a_million_items_are_planned_quickly() -> None:
     for k in range(1000):
         plan.batch(k)
     assert time.perf_counter() - start < 1.0
+
+
+def test_lengths_lessen_padding_and_keep_the_epoch() -> None:
+    lengths = np.random.default_rng(0).integers(1, 100, size=1003)
+    plain, sorted_plan = BatchPlan(1003, 16, 5), BatchPlan(1003, 16, 5, lengths)
+
+    def padding(plan: BatchPlan) -> float:
+        batches = [lengths[plan.batch(k)[1]] for k in range(plan.batches_per_epoch)]
+        return sum(float((b.max() - b).sum()) for b in batches) / sum(float(b.sum()) for b in batches)
+
+    assert padding(sorted_plan) < 0.35 * padding(plain)
+    for epoch in range(2):
+        first = epoch * plain.batches_per_epoch
+        steps = range(first, first + plain.batches_per_epoch)
+        seen = [np.concatenate([plan.batch(k)[1] for k in steps]) for plan in (plain, sorted_plan)]
+        assert np.array_equal(np.sort(seen[0]), np.sort(seen[1]))
+    means = [lengths[sorted_plan.batch(k)[1]].mean() for k in range(sorted_plan.batches_per_epoch)]
+    assert not np.all(np.diff(means) >= 0), "batches come in random order, not from short to long"
+    assert not np.array_equal(sorted_plan.batch(0)[1], sorted_plan.batch(plain.batches_per_epoch)[1])
+
+
+def test_lengths_with_fewer_items_than_a_batch() -> None:
+    assert np.array_equal(np.sort(BatchPlan(3, 4, 0, np.array([5, 1, 9])).batch(0)[1][:3]), [0, 1, 2])

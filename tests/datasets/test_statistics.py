@@ -110,3 +110,13 @@ def test_saved_statistics_know_their_layout(train: ShardDataset, tmp_path: Path)
     (tmp_path / "stats.safetensors").write_bytes(b"broken")
     with pytest.raises(UserError, match="not a statistics file"):
         FeatureStats.load(tmp_path / "stats.safetensors")
+
+
+def test_groups_agree_with_humanml3d(shared: Path) -> None:
+    features = np.load(shared / "golden/t1_humanml3d_A.npz", allow_pickle=False)
+    golden = np.load(shared / "golden/t1_meanstd_A.npz", allow_pickle=False)
+    rows = np.concatenate([features["h3d012314__feat263"], features["aist__feat263"]])
+    layout = MotionLayout.named("h3d263")
+    stats = from_moments(Moments.of(rows), layout, group=True)
+    np.testing.assert_allclose(stats.mean, golden["mean263"], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(stats.std, golden["std263"], rtol=1e-5, atol=1e-6)

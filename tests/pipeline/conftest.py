@@ -1,8 +1,13 @@
-"""A procedural 52-joint walker for the drawing tests: limbs, curling fingers, a curved path, a face."""
+"""Shared by the pipeline tests: a procedural walker to draw, the command line, and one finished small run."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sysconfig
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.pipeline import cli
 
 Joints = NDArray[np.float64]
 
@@ -81,3 +87,98 @@ def face_track() -> Callable[[int], Joints]:
         )
 
     return track
+
+
+PROGRAM = Path(sysconfig.get_path("scripts")) / "motionloom"
+
+SMALL = """
+extends: humantomato-tiny
+name: small
+seed: 3
+hardware: {accelerator: cpu, devices: 1, threads: 1, convert_workers: 1}
+stages:
+  data: {clips: 48, min_seconds: 2.0, max_seconds: 5.0}
+  tokenizer:
+    net: {width: 24, depth: 1, code_dim: 16, num_codes: 32}
+    train: {steps: 30, batch_size: 8, checkpoint_every: 6, validate_every: 12}
+  face_tokenizer:
+    net: {width: 16, depth: 1, code_dim: 16, num_codes: 16}
+    train: {steps: 8, batch_size: 8, checkpoint_every: 5, validate_every: 5}
+  tma:
+    net: {latent: 32, ff: 64, layers: 1}
+    train: {steps: 10, batch_size: 8, checkpoint_every: 5, validate_every: 10}
+  tokens: {batch_frames: 64}
+  gpt:
+    net: {layers: 1, dim: 48, heads: 4, ff: 96}
+    train: {steps: 30, batch_size: 8, checkpoint_every: 6, validate_every: 12}
+  face_gpt:
+    net: {layers: 1, dim: 32, heads: 4, ff: 64}
+    train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}
+  generate: {count: 1}
+  evaluate: {clips: 6, repeats: 1, size: 4}
+  report: {count: 1}
+"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command left behind."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
+    """`call("data", "check", folder) -> Outcome`: a command in process, by its own entry point."""
+
+    def go(*arguments: object) -> Outcome:
+        monkeypatch.setattr("sys.argv", ["motionloom", *map(str, arguments)])
+        monkeypatch.setenv("COLUMNS", "140")
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        captured = capsys.readouterr()
+        return Outcome(int(stop.value.code or 0), captured.out, captured.err)
+
+    return go
+
+
+@pytest.fixture(scope="session")
+def start() -> Callable[..., subprocess.Popen[str]]:
+    """`start("run", recipe) -> Popen`: the installed program in a process group of its own."""
+
+    def go(*arguments: object, program: tuple[object, ...] = (PROGRAM,)) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [*map(str, program), *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "140"},
+            start_new_session=True,
+        )
+
+    return go
+
+
+@dataclass(frozen=True)
+class SmallRun:
+    """A finished run: its recipe, its folder (not to be changed) and what the program printed."""
+
+    recipe: Path
+    folder: Path
+    output: str
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any]) -> SmallRun:
+    """Every stage of a small recipe, run once for all tests."""
+    root = tmp_path_factory.mktemp("small")
+    recipe = root / "small.yaml"
+    recipe.write_text(SMALL)
+    folder = root / "run"
+    process = start("run", recipe, "--out", folder)
+    output, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, output
+    return SmallRun(recipe, folder, output)

@@ -1,0 +1,227 @@
+"""One small recipe through every command, from no data to motions that tools and browsers open."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bvhio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.pipeline.artifact import Artifact
+
+pytestmark = pytest.mark.slow
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+STAGES = [
+    "data",
+    "stats",
+    "text",
+    "tokenizer",
+    "face_tokenizer",
+    "tma",
+    "tokens",
+    "face_tokens",
+    "gpt",
+    "face_gpt",
+    "generate",
+    "evaluate",
+    "report",
+]
+WAVE = ("a person waves with the left hand", "--face", "a happy face", "--seconds", "2")
+
+
+def arrays(path: Path) -> dict[str, Any]:
+    with np.load(path, allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def only(folder: Path, suffix: str) -> Path:
+    (path,) = folder.glob(f"*{suffix}")
+    return path
+
+
+@pytest.fixture(scope="module")
+def copy(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run at another place, free to be changed."""
+    folder = tmp_path_factory.mktemp("copy") / "run"
+    shutil.copytree(small_run.folder, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def motions(copy: Path, tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any]) -> Path:
+    """What `generate` writes for one caption."""
+    folder = tmp_path_factory.mktemp("motions")
+    process = start("generate", copy, *WAVE, "--seed", 5, "-o", folder)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, output
+    assert {Path(line).suffix for line in output.splitlines()} == {".npz", ".bvh", ".mp4", ".html"}
+    return folder
+
+
+def test_a_run_ends_with_the_page(small_run: Any) -> None:
+    last = small_run.output.splitlines()[-1]
+    page = Path(last.removeprefix("watch it: "))
+    assert page == small_run.folder / "stages/report/report.html"
+    html = page.read_text()
+    assert len(html) > 100_000 and "http://" not in re.sub(r"http://www\.w3\.org/\S+", "", html)
+    for number, name in enumerate(STAGES, start=1):
+        assert f"[{number}/{len(STAGES)}] {name} (" in small_run.output
+        artifact = Artifact.find(small_run.folder / "stages" / name)
+        assert (
+            artifact is not None
+            and artifact.outputs
+            and artifact.missing(small_run.folder / "stages" / name) is None
+        )
+
+
+def test_a_second_run_does_nothing_and_says_so(small_run: Any, call: Callable[..., Any]) -> None:
+    before = {p: p.stat().st_mtime_ns for p in small_run.folder.rglob("*")}
+    done = call("run", small_run.recipe, "--out", small_run.folder)
+    assert done.code == 0
+    assert f"all {len(STAGES)} stages are finished, nothing to do" in done.out
+    assert done.out.splitlines()[-1] == small_run.output.splitlines()[-1]
+    assert {p: p.stat().st_mtime_ns for p in small_run.folder.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    ("change", "below"),
+    [
+        ("tma.optim.lr=0.001", {"tma", "gpt", "generate", "evaluate", "report"}),
+        ("face_gpt.train.steps=9", {"face_gpt", "generate", "evaluate", "report"}),
+        ("evaluate.repeats=2", {"evaluate", "report"}),
+        ("gpt.train.checkpoint_every=7", set()),
+        ("hardware.threads=2", set()),
+    ],
+)
+def test_a_change_reruns_that_stage_and_those_below(
+    change: str, below: set[str], small_run: Any, call: Callable[..., Any]
+) -> None:
+    plan = call("run", small_run.recipe, "--out", small_run.folder, "--set", change, "--dry-run")
+    assert plan.code == 0
+    rows = dict(re.findall(r"^│ (\w+) +│ \w+ +│ (\w+) +│", plan.out, re.MULTILINE))
+    assert list(rows) == STAGES
+    assert {name for name, action in rows.items() if action != "skip"} == below
+    assert f"{len(below)} of {len(STAGES)} stages would run" in plan.out
+    if below:
+        assert f"changed: {change.split('.', 1)[1].split('=')[0]}" in plan.out
+
+
+def test_changed_stages_run_and_the_others_stay(copy: Path, small_run: Any, call: Callable[..., Any]) -> None:
+    def artifacts() -> dict[str, str]:
+        return {name: (copy / "stages" / name / "artifact.json").read_text() for name in STAGES}
+
+    before = artifacts()
+    assert call("run", small_run.recipe, "--out", copy, "--set", "evaluate.clips=5").code == 0
+    changed = {name for name, text in artifacts().items() if text != before[name]}
+    assert changed == {"evaluate", "report"}
+    assert call("run", small_run.recipe, "--out", copy).code == 0
+    # The report's title is the name of the run's folder, which is the same here.
+    assert artifacts() == before
+
+
+def test_npz_says_what_it_holds(motions: Path) -> None:
+    stored = arrays(only(motions, ".npz"))
+    facts = json.loads(str(stored["metadata"]))
+    assert facts["caption"] == WAVE[0] and facts["face_caption"] == WAVE[2] and facts["seed"] == 5
+    frames = round(2 * facts["fps"])
+    assert abs(len(stored["joints"]) - frames) < 4
+    assert stored["joints"].shape[1:] == (len(facts["joint_names"]), 3) == (52, 3)
+    assert stored["features"].shape == (len(stored["joints"]), 313)
+    assert stored["face"].shape == (len(stored["joints"]), 50)
+    assert all(np.isfinite(stored[name]).all() for name in ("joints", "features", "face"))
+
+
+def test_bvh_shows_the_same_motion(motions: Path) -> None:
+    path = only(motions, ".bvh")
+    stored = arrays(only(motions, ".npz"))
+    names, joints = json.loads(str(stored["metadata"]))["joint_names"], stored["joints"]
+    motion = read_bvh(path)
+    order = [motion.joints.index(name) for name in names]
+    positions = motion.positions()[:, order] / 100
+    assert np.linalg.norm(positions - joints, axis=-1).mean() < 0.05
+    root = bvhio.readAsHierarchy(str(path)).loadPose(7)
+    found = {joint.Name: np.array(joint.PositionWorld) / 100 for joint, _, _ in root.layout()}
+    np.testing.assert_allclose([found[name] for name in names], positions[7], atol=2e-4)
+
+
+def test_film_and_page_are_whole(motions: Path) -> None:
+    frames = len(arrays(only(motions, ".npz"))["joints"])
+    counted, seconds = imageio_ffmpeg.count_frames_and_secs(str(only(motions, ".mp4")))
+    assert counted == frames and seconds > 1
+    assert WAVE[0] in (motions / "index.html").read_text()
+
+
+def test_same_seed_same_motion(copy: Path, motions: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
+    for seed, equal in ((5, True), (6, False)):
+        out = tmp_path / str(seed)
+        assert call("generate", copy, *WAVE, "--seed", seed, "-f", "npz", "-o", out).code == 0
+        again, first = arrays(only(out, ".npz")), arrays(only(motions, ".npz"))
+        assert np.array_equal(again["joints"], first["joints"]) is equal
+        assert np.array_equal(again["face"], first["face"]) is equal
+
+
+def test_an_exported_folder_works_alone(
+    small_run: Any, motions: Path, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    run, exported, elsewhere = tmp_path / "run", tmp_path / "exported", tmp_path / "else/where"
+    shutil.copytree(small_run.folder, run)
+    done = call("export", run, "-o", exported)
+    assert done.code == 0 and "motionloom generate" in done.out
+    shutil.rmtree(run)
+    shutil.copytree(exported, elsewhere)
+    shutil.rmtree(exported)
+    files = [p for p in elsewhere.rglob("*") if p.is_file()]
+    assert {p.suffix for p in files} == {".json", ".safetensors"}
+    assert not any(str(small_run.folder.parent) in p.read_text() for p in files if p.suffix == ".json")
+    out = tmp_path / "motions"
+    assert call("generate", elsewhere, *WAVE, "--seed", 5, "-f", "npz", "-o", out).code == 0
+    np.testing.assert_array_equal(
+        arrays(only(out, ".npz"))["joints"], arrays(only(motions, ".npz"))["joints"]
+    )
+
+
+def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
+    done = call("evaluate", copy, "--clips", 4, "--repeats", 2)
+    assert done.code == 0 and "nearest training clip" in done.out and "chance" in done.out
+    figures = json.loads((copy / "evaluate/metrics.json").read_text())
+    assert figures["clips"] == 4 and figures["split"] == "test"
+    assert figures["reconstruction_mm"]["mpjpe"] > 0
+    page = tmp_path / "page.html"
+    done = call("report", copy, "-o", page)
+    assert done.code == 0 and done.out.strip() == str(page)
+    assert "Figures on held-out clips" in page.read_text()
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine to drive")
+def test_the_page_plays_in_a_browser(small_run: Any) -> None:
+    from playwright.sync_api import sync_playwright
+
+    trouble: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        page = browser.new_page()
+        page.on("console", lambda m: trouble.append(m.text) if m.type in ("error", "warning") else None)
+        page.on("pageerror", lambda error: trouble.append(str(error)))
+        page.goto((small_run.folder / "stages/report/report.html").as_uri())
+        end = time.monotonic() + 30
+        while not page.evaluate("window.__viewer && window.__viewer.draws > 0"):
+            assert time.monotonic() < end, "the viewer never drew"
+            page.wait_for_timeout(50)
+        frames = set()
+        while len(frames) < 5:
+            frames.add(page.evaluate("window.__viewer.frame"))
+            assert time.monotonic() < end, "the frames do not advance"
+            page.wait_for_timeout(50)
+        browser.close()
+    assert not trouble
