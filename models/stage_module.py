@@ -16,6 +16,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from motionloom.datasets.schema import Config
+from motionloom.models.distributed import alone
 
 
 class OptimConfig(Config):
@@ -53,10 +54,11 @@ class StageModule(L.LightningModule):
         return values["loss"]
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """The same losses on held-out data."""
-        values = self.losses(batch)
+        """The same losses on held-out data; every rank gets the same batches and the same figures."""
+        with alone():
+            values = self.losses(batch)
         size = len(batch["length"])
-        self.log_dict({f"val/{k}": v for k, v in values.items()}, sync_dist=True, batch_size=size)
+        self.log_dict({f"val/{k}": v for k, v in values.items()}, batch_size=size)
 
     def configure_optimizers(self) -> Any:
         """AdamW over the trainable parameters, linear warm-up, then constant or cosine."""

@@ -1,8 +1,8 @@
 """The command line: a thin layer on the Python API.
 
 Exit codes: 0 done; 1 the check found problems; 2 a mistake in the call, the recipe or the data (one sentence
-on standard error says which and how to fix it); 130 interrupted. A bug shows its traceback and
-gives 1.
+on standard error says which and how to fix it); 130 interrupted. A bug shows
+its traceback and gives 1.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli_data import data_app
 from motionloom.pipeline.console import make_console, quiet_libraries
-from motionloom.pipeline.process import TeamError, leave
+from motionloom.pipeline.process import TeamError, leave, process_rank
 
 app = typer.Typer(
     name="motionloom",
@@ -35,6 +35,7 @@ Sets = Annotated[
     list[str] | None,
     typer.Option("--set", "-s", help="Override one value: stage.field=value. May be repeated."),
 ]
+_INTERRUPTED = 130
 
 
 @app.command()
@@ -198,23 +199,25 @@ def _exit_code() -> int:
     """Run the command; a user's mistake becomes one sentence on standard error."""
     errors = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
-        code = app(standalone_mode=False)
+        code = app(prog_name="motionloom", standalone_mode=False) or 0
     except UserError as error:
         errors.print(f"error: {error}", style="red", markup=False)
         return 2
     except TeamError as error:
-        errors.print(str(error), style="red", markup=False)
+        where = f"process {process_rank()}: another process of this run has stopped"
+        errors.print(f"{where} ({error})", style="red", markup=False)
         return 1
     except (typer.Abort, KeyboardInterrupt):
-        errors.print("interrupted; the same command goes on from here", style="yellow")
-        return 130
+        code = _INTERRUPTED
     except Exception as error:
         if type(error).__module__.startswith(("click", "typer")) and hasattr(error, "show"):
             error.show()
             return 2
         traceback.print_exc()
         return 1
-    return code if isinstance(code, int) else 0
+    if code == _INTERRUPTED:  # typer may have answered Ctrl-C itself
+        errors.print("interrupted; the same command goes on from here", style="yellow")
+    return int(code)
 
 
 if __name__ == "__main__":

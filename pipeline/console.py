@@ -36,5 +36,6 @@ def quiet_libraries() -> None:
         ".*sync_dist.*",
         ".*LeafSpec.*",
         ".*ckpt_path.*",
+        ".*dirpath has changed.*",
     ):
         warnings.filterwarnings("ignore", message)

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from motionloom.datasets.convert.bvh import BvhConfig, convert_bvh, plan_bvh
-from motionloom.datasets.schema import Manifest
+from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.check import check
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.statistics import compute
@@ -51,6 +51,8 @@ def convert_bvh_command(
 
 def check_command(root: Path, console: Console) -> int:
     """Print every problem; returns their number."""
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder")
     problems = check(root)
     for problem in problems:
         console.print(str(problem), markup=False)

@@ -194,6 +194,8 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     """
     todo = [row for row in plan if row.action in {"run", "resume"}]
     trained = [row for row in todo if row.stage.kind.trains]
+    for row in todo:
+        row.stage.config.require_fit(recipe.hardware)
     leads = process_rank() == 0
     if not leads:
         todo = trained

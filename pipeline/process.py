@@ -8,7 +8,7 @@ from typing import NoReturn
 
 
 class TeamError(Exception):
-    """Another process of this run has stopped."""
+    """Another process of this run has stopped; the message is the backend's."""
 
 
 def process_rank() -> int:

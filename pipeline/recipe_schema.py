@@ -1,4 +1,4 @@
-"""The JSON schema of recipes, from the same config classes that check them, so that editors complete and check too.
+"""The JSON schema of recipes, from the config classes that check them, so that editors complete and check.
 
 In an editor with a YAML language server, put this on a recipe's first line:
 `# yaml-language-server: $schema=recipe.schema.json`

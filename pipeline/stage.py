@@ -21,6 +21,9 @@ RUNTIME: JsonDict = {"runtime": True}
 class StageConfig(Config):
     """Base of every stage's config."""
 
+    def require_fit(self, hardware: Hardware) -> None:
+        """Refuse, before anything runs, settings that cannot run on this hardware."""
+
 
 @dataclass(frozen=True)
 class StageContext:

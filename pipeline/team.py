@@ -65,6 +65,4 @@ class Team:
         try:
             dist.barrier(self.waiting)
         except RuntimeError as error:
-            raise TeamError(
-                f"process {self.rank} of {self.world}: another process of this run has stopped ({error})"
-            ) from None
+            raise TeamError(str(error)) from None

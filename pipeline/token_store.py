@@ -70,7 +70,10 @@ class TokenStore:
 
 @dataclass(frozen=True)
 class TokenBatches(Dataset[dict[str, Any]]):
-    """Batch k of token sequences and text priors; a pure function of (seed, k)."""
+    """Batch k of token sequences and text priors; a pure function of (seed, k).
+
+    In training a rank's share of an endless order; else the clips in order, all of them on every rank.
+    """
 
     store: TokenStore
     captions: list[list[int]]
@@ -100,10 +103,8 @@ class TokenBatches(Dataset[dict[str, Any]]):
         if self.training:
             epoch, items = self._plan.local(k, self.rank, self.world)
         else:
-            rows_of_all = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
-            # Equal shares: the last batch repeats its last clip where the clips do not divide over the ranks.
-            fill = np.repeat(rows_of_all[-1:], -len(rows_of_all) % self.world)
-            epoch, items = 0, np.concatenate([rows_of_all, fill])[self.rank :: self.world]
+            epoch = 0
+            items = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
         rows, sequences = [], []
         for item in items.tolist():
             rng = np.random.default_rng([self.seed, epoch, item])

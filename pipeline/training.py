@@ -19,10 +19,14 @@ from pydantic import Field
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.models.stage_module import StageModule
+from motionloom.models.stage_module import OptimConfig, StageModule
 from motionloom.pipeline.hardware import Hardware
+from motionloom.pipeline.process import TeamError
 from motionloom.pipeline.progress import MetricLog, StepProgress
-from motionloom.pipeline.stage import RUNTIME, StageContext
+from motionloom.pipeline.stage import RUNTIME, StageConfig, StageContext
+
+_KEPT = 2
+"""Checkpoints kept: the newest, and one more in case that is torn."""
 
 
 class TrainConfig(Config):
@@ -52,6 +56,17 @@ class TrainConfig(Config):
         return self.batch_size // parts
 
 
+class TrainedStageConfig(StageConfig):
+    """Base of the configs of stages that train."""
+
+    optim: OptimConfig = OptimConfig()
+    train: TrainConfig = TrainConfig()
+
+    def require_fit(self, hardware: Hardware) -> None:
+        """The global batch must divide over the processes."""
+        self.train.local_batch(hardware.world())
+
+
 class ChunkSampler(Sampler[int]):
     """Batch numbers of one chunk, from the number that `start` tells when the chunk begins."""
 
@@ -69,8 +84,8 @@ class ChunkSampler(Sampler[int]):
 BatchSource = Callable[[int, int, int], Dataset[Any]]
 """(items per global micro-batch, rank, world) -> dataset; item k is this rank's batch of micro-step k."""
 
-EvalSource = Callable[[int, int], Dataset[Any]]
-"""(rank, world) -> sized dataset of this rank's validation batches; every rank gets equal ones."""
+EvalSource = Callable[[], Dataset[Any]]
+"""Sized dataset of all validation batches: every process reads the same, so the figures depend on no rank."""
 
 
 def fit(
@@ -85,8 +100,6 @@ def fit(
     hardware = context.hardware
     if hardware.threads:
         torch.set_num_threads(hardware.threads)
-    world = hardware.world()
-    config.local_batch(world)
     chunk = min(config.checkpoint_every, config.steps)
     data = _Data(train, validation, config, chunk, hardware)
     checkpoints = ModelCheckpoint(
@@ -94,7 +107,7 @@ def fit(
         filename="{step:08d}",
         monitor="step",
         mode="max",
-        save_top_k=2,
+        save_top_k=_KEPT,
         save_on_train_epoch_end=True,
         enable_version_counter=False,  # a torn file is written again under its own name
     )
@@ -103,7 +116,7 @@ def fit(
         accelerator=hardware.lightning_accelerator(),
         devices=hardware.resolved_devices(),
         num_nodes=hardware.nodes,
-        strategy=_strategy(hardware, world),
+        strategy=_strategy(hardware),
         precision=config.precision,
         max_steps=config.steps,
         accumulate_grad_batches=config.accumulate,
@@ -129,13 +142,20 @@ def fit(
         trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise KeyboardInterrupt from None
+    except RuntimeError as error:
+        if "by peer" in str(error):  # how the backends report a connection that broke
+            raise TeamError(str(error)) from None
+        raise
+    if trainer.is_global_zero:
+        for path in sorted((context.folder / "checkpoints").glob("*.ckpt"))[:-_KEPT]:
+            path.unlink()  # Lightning forgets the checkpoint that a killed run was resumed from
 
 
 class ResumeBetweenChunks(Callback):
     """Makes a resumed run begin the chunk behind its checkpoint.
 
-    Lightning would go back into the finished epoch and, where that did not end with a validation, train one more
-    batch in it: the steps of all later validations and checkpoints would move.
+    Lightning would go back into the finished epoch and, where that did not end with a validation, train one
+    more batch in it: the steps of all later validations and checkpoints would move.
     """
 
     def on_load_checkpoint(
@@ -174,8 +194,7 @@ class _Data(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader[Any] | list[Any]:
         if self.validation is None:
             return []
-        trainer = cast(L.Trainer, self.trainer)
-        dataset = self.validation(trainer.global_rank, trainer.world_size)
+        dataset = self.validation()
         return _loader(dataset, range(len(cast(Sized, dataset))), self.hardware)
 
 
@@ -192,10 +211,10 @@ def _loader(dataset: Dataset[Any], sampler: Any, hardware: Hardware) -> DataLoad
     )
 
 
-def _strategy(hardware: Hardware, world: int) -> Any:
+def _strategy(hardware: Hardware) -> Any:
     if hardware.strategy == "fsdp":
         return "fsdp"
-    if world == 1:
+    if hardware.world() == 1:
         return "auto"
     return L.pytorch.strategies.DDPStrategy(
         process_group_backend=hardware.backend(),

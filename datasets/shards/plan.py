@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.randomness import permutation
 
-
 POOL = 8
 """Batches sorted by length together. More leave less padding, fewer mix lengths better."""
 

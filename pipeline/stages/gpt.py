@@ -13,23 +13,21 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.text.cache import TextCache
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.stage_module import OptimConfig
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
 from motionloom.pipeline.networks import LoadedTma, load_tokenizer
 from motionloom.pipeline.sources import captions_of, held_out, open_split, open_text
-from motionloom.pipeline.stage import StageConfig, StageContext
+from motionloom.pipeline.stage import StageContext
 from motionloom.pipeline.token_store import TokenBatches, TokenStore
-from motionloom.pipeline.training import TrainConfig, fit
+from motionloom.pipeline.training import TrainConfig, TrainedStageConfig, fit
 
 Prior = Literal["tma", "sentence"]
 
 
-class GptStageConfig(StageConfig):
+class GptStageConfig(TrainedStageConfig):
     """A GPT over the tokens of one tokenizer."""
 
     net: GptConfig = GptConfig()
     loss: GptLossConfig = GptLossConfig()
-    optim: OptimConfig = OptimConfig()
     train: TrainConfig = TrainConfig(steps=300_000, batch_size=256)
     prior: Prior = "tma"
     """First input of the GPT: the TMA text latent (section 3.5) or the plain sentence embedding."""
@@ -61,7 +59,7 @@ def run_gpt(context: StageContext) -> None:
     )
     data = context.input("data")
 
-    def batches(split: str, batch: int, rank: int, world: int, training: bool) -> TokenBatches:
+    def batches(split: str, batch: int, rank: int = 0, world: int = 1, *, training: bool) -> TokenBatches:
         dataset = open_split(data, split)
         store = TokenStore.load(
             context.input("tokens") / f"tokens-{split}.safetensors",
@@ -88,8 +86,8 @@ def run_gpt(context: StageContext) -> None:
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
         return batches("train", batch, rank, world, training=True)
 
-    def validation(rank: int, world: int) -> Dataset[Any]:
-        return batches(held_out(data), 32 * world, rank, world, training=False)
+    def validation() -> Dataset[Any]:
+        return batches(held_out(data), 32, training=False)
 
     fit(context, module, config.train, train, validation, config.optim.grad_clip)
     if module.global_rank == 0:

@@ -9,21 +9,19 @@ from pydantic import Field
 from torch.utils.data import Dataset
 
 from motionloom.datasets.shards.batches import CaptionBatches, EvalBatches
-from motionloom.models.stage_module import OptimConfig
 from motionloom.models.tma.module import TmaLossConfig, TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
 from motionloom.pipeline.sources import held_out, open_split, open_stats, open_text
-from motionloom.pipeline.stage import StageConfig, StageContext
-from motionloom.pipeline.training import TrainConfig, fit
+from motionloom.pipeline.stage import StageContext
+from motionloom.pipeline.training import TrainConfig, TrainedStageConfig, fit
 
 
-class TmaStageConfig(StageConfig):
+class TmaStageConfig(TrainedStageConfig):
     """Motion and text encoders in one latent space."""
 
     net: TmaConfig = TmaConfig()
     loss: TmaLossConfig = TmaLossConfig()
-    optim: OptimConfig = OptimConfig()
     train: TrainConfig = TrainConfig(steps=50_000, batch_size=256)
     max_frames: int = Field(196, ge=8)
     """Longer clips are cropped at random."""
@@ -61,16 +59,14 @@ def run_tma(context: StageContext) -> None:
 
     held = open_split(data, held_out(data))
 
-    def validation(rank: int, world: int) -> Dataset[Any]:
+    def validation() -> Dataset[Any]:
         return EvalBatches(
             held,
             stats,
             text,
-            batch_size=32 * world,
+            batch_size=32,
             max_frames=config.max_frames,
             min_frames=config.min_frames,
-            rank=rank,
-            world=world,
             columns=columns,
         )
 

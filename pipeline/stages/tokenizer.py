@@ -9,18 +9,16 @@ from pydantic import Field
 from torch.utils.data import Dataset
 
 from motionloom.datasets.shards.batches import EvalBatches, WindowBatches
-from motionloom.models.stage_module import OptimConfig
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig, VqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
 from motionloom.pipeline.sources import held_out, open_split, open_stats
-from motionloom.pipeline.stage import StageConfig, StageContext
-from motionloom.pipeline.training import TrainConfig, fit
+from motionloom.pipeline.stage import StageContext
+from motionloom.pipeline.training import TrainConfig, TrainedStageConfig, fit
 
 
-class _TokenizerStageConfig(StageConfig):
-    optim: OptimConfig = OptimConfig()
+class _TokenizerStageConfig(TrainedStageConfig):
     train: TrainConfig = TrainConfig(steps=100_000, batch_size=256)
     window: int = Field(64, ge=4, multiple_of=4)
     """Frames of a training window."""
@@ -73,14 +71,12 @@ def run_tokenizer(context: StageContext) -> None:
 
     held = open_split(data, held_out(data))
 
-    def validation(rank: int, world: int) -> Dataset[Any]:
+    def validation() -> Dataset[Any]:
         return EvalBatches(
             held,
             stats,
-            batch_size=8 * world,
+            batch_size=8,
             max_frames=4 * config.window,
-            rank=rank,
-            world=world,
             columns=columns,
         )
 

@@ -95,7 +95,7 @@ SMALL = """
 extends: humantomato-tiny
 name: small
 seed: 3
-hardware: {accelerator: cpu, devices: 1, threads: 1, convert_workers: 1}
+hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
 stages:
   data: {clips: 48, min_seconds: 2.0, max_seconds: 5.0}
   tokenizer:

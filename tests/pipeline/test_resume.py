@@ -60,6 +60,7 @@ def test_a_run_killed_four_times_equals_the_undisturbed_one(
     assert "resuming gpt at step " in output
     assert "tokenizer (" not in output
     assert artifacts(run) == artifacts(small_run.folder)
+    assert len(list(run.glob("stages/tokenizer/checkpoints/*"))) == 2
     assert not list(run.rglob("*.tmp")) and not list(run.glob("stages/.*"))
 
 
