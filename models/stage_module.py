@@ -18,6 +18,9 @@ from torch import Tensor, nn
 from motionloom.datasets.schema import Config
 from motionloom.models.distributed import alone
 
+LOG_EVERY = 10
+"""Steps between logged figures; averaging them over ranks costs a collective each."""
+
 
 class OptimConfig(Config):
     """AdamW and its learning-rate schedule."""
@@ -46,10 +49,13 @@ class StageModule(L.LightningModule):
         raise NotImplementedError
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
-        """One step; seeds torch from (seed, step, rank) first."""
-        torch.manual_seed((self.seed * 1_000_003 + self.global_step) * 4099 + self.global_rank)
+        """One step; seeds torch from (seed, step, part of the step, rank) first."""
+        part = batch_idx % self.trainer.accumulate_grad_batches
+        key = (self.seed * 1_000_003 + self.global_step) * 4099 + self.global_rank
+        torch.manual_seed((key + (part << 48)) % 2**63)
         values = self.losses(batch)
-        self.log_dict({f"train/{k}": v.detach() for k, v in values.items()}, prog_bar=False, sync_dist=True)
+        if (self.global_step + 1) % LOG_EVERY == 0:
+            self.log_dict({f"train/{k}": v.detach() for k, v in values.items()}, sync_dist=True)
         self.log("loss", values["loss"].detach(), prog_bar=True, logger=False)
         return values["loss"]
 

@@ -12,8 +12,9 @@ from lightning.pytorch.callbacks import Callback
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from motionloom.models.stage_module import LOG_EVERY
+
 _LINE_EVERY_SECONDS = 15.0
-_LOG_EVERY_STEPS = 10
 
 
 def bar(console: Console) -> Progress:
@@ -106,7 +107,7 @@ class MetricLog(Callback):
     ) -> None:
         """Take a row every 10 steps."""
         step = trainer.global_step
-        if step % _LOG_EVERY_STEPS == 0 and (not self.rows or self.rows[-1]["step"] < step):
+        if step % LOG_EVERY == 0 and (not self.rows or self.rows[-1]["step"] < step):
             self._take(trainer, "train/")
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
