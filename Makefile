@@ -3,7 +3,7 @@
 
 PYTHON ?= python3
 VENV ?= .venv
-BIN := $(VENV)/bin
+BIN := $(abspath $(VENV))/bin
 STAMP := $(VENV)/installed
 RECIPE ?= humantomato-tiny
 DEMO_ARGS ?=
@@ -37,7 +37,7 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	@mkdir -p build/types/motionloom
 	@for d in pipeline datasets models configs; do ln -sfn ../../../$$d build/types/motionloom/$$d; done
-	cd build/types && MYPYPATH=. ../../$(BIN)/mypy --config-file ../../pyproject.toml -p motionloom.datasets -p motionloom.models -p motionloom.pipeline -p motionloom.configs
+	cd build/types && MYPYPATH=. $(BIN)/mypy --config-file ../../pyproject.toml -p motionloom.datasets -p motionloom.models -p motionloom.pipeline -p motionloom.configs
 
 clean:
 	rm -rf build .pytest_cache .mypy_cache .ruff_cache
