@@ -252,7 +252,7 @@ def part_folders(run: Path) -> dict[str, Path]:
     for entry in stages.values():
         if entry["kind"] == "generate":
             roles.update({r: s for r, s in entry.get("inputs", {}).items() if r in PARTS})
-    found = {role: run / "stages" / stage for role, stage in roles.items()}
+    found = {role: run / "stages" / stage for role, stage in roles.items() if stage}
     return {role: folder for role, folder in found.items() if (folder / "artifact.json").is_file()}
 
 
