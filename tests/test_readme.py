@@ -47,14 +47,14 @@ def blocks(*languages: str) -> list[Block]:
 
 
 def commands() -> Iterator[tuple[str, list[str]]]:
-    """(where, words) of every command in a `sh` block; continued lines joined, chains taken apart."""
+    """(where, words) of every command in a `sh` block; continued lines joined, chains taken apart, redirections cut off."""
     for block in blocks("sh"):
         for line in re.sub(r"\\\n\s*", "", block.text).splitlines():
             words = shlex.split(line, comments=True)
             where = f"{block.document.name}:{block.line}: {line}"
             while words:
                 end = words.index("&&") if "&&" in words else len(words)
-                yield where, words[:end]
+                yield where, words[: words.index(">") if ">" in words[:end] else end]
                 words = words[end + 1 :]
 
 
