@@ -47,7 +47,7 @@ def blocks(*languages: str) -> list[Block]:
 
 
 def commands() -> Iterator[tuple[str, list[str]]]:
-    """(where, words) of every command in a `sh` block; continued lines joined, chains taken apart, redirections cut off."""
+    """(where, words) of every command in a `sh` block; lines joined, chains and redirections cut."""
     for block in blocks("sh"):
         for line in re.sub(r"\\\n\s*", "", block.text).splitlines():
             words = shlex.split(line, comments=True)

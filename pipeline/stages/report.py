@@ -63,9 +63,8 @@ def _motions(bundle: Bundle, truths: list[Truth], generated: list[GeneratedMotio
     parents, out = layout.skeleton.parents, []
     for number, (truth, made) in enumerate(zip(truths, generated, strict=True), start=1):
         group = f"{number}"
-        words = (
-            truth.caption if truth.face_caption == truth.caption else f"{truth.caption} {truth.face_caption}"
-        )
+        same = truth.face_caption == truth.caption
+        words = truth.caption if same else f"{truth.caption} (face: {truth.face_caption})"
         face = None if truth.face is None else synthetic_face_controls(truth.face)
         again = face
         if truth.face is not None and bundle.face is not None:
