@@ -8,6 +8,7 @@ undisturbed run bit for bit.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import Any, Literal
 
 import lightning as L
@@ -34,7 +35,7 @@ class OptimConfig(Config):
     """Largest gradient norm; 0 turns clipping off."""
 
 
-class StageModule(L.LightningModule):
+class StageModule(L.LightningModule, ABC):
     """A network, its losses and its optimizer. Subclasses implement `losses(batch)`."""
 
     def __init__(self, net: nn.Module, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
@@ -44,9 +45,9 @@ class StageModule(L.LightningModule):
         self.seed = seed
         self.max_steps = max_steps
 
+    @abstractmethod
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Losses and scalar metrics of one batch; "loss" is minimised, the others are only logged."""
-        raise NotImplementedError
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """One step; seeds torch from (seed, step, part of the step, rank) first."""

@@ -8,6 +8,7 @@ run repeats the undisturbed one bit for bit and the loader's whole state is the 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterator, Sized
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -228,7 +229,8 @@ def newest_checkpoint(folder: Path) -> Path | None:
     for path in sorted(folder.glob("*.ckpt"), reverse=True):
         try:
             torch.load(path, map_location="cpu", weights_only=True)
-        except Exception:
+        except Exception as error:  # a torn file fails in many ways, all of which mean the same
+            warnings.warn(f"{path}: cannot be read ({type(error).__name__}), passed over", stacklevel=2)
             continue
         return path
     return None
