@@ -212,6 +212,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 _prepare(folder, row)
             context = StageContext(
                 name=stage.name,
+                recipe=recipe.name,
                 config=stage.config,
                 folder=folder,
                 inputs={role: stage_folder(run, name) for role, name in stage.inputs.items()},

@@ -101,7 +101,10 @@ def _stage_again(folder: Path, kind: str, console: Console, changes: dict[str, A
             )
     target = folder / kind
     target.mkdir(exist_ok=True)
-    stage.kind.run(StageContext(stage.name, config, target, inputs, recipe.seed, recipe.hardware, console))
+    context = StageContext(
+        stage.name, recipe.name, config, target, inputs, recipe.seed, recipe.hardware, console
+    )
+    stage.kind.run(context)
     return target
 
 

@@ -30,6 +30,8 @@ class StageContext:
     """All that a stage's function may use. `inputs` maps each role to the folder of a finished stage."""
 
     name: str
+    recipe: str
+    """Name of the recipe, for people."""
     config: Any
     folder: Path
     inputs: Mapping[str, Path]

@@ -44,8 +44,10 @@ def run_report(context: StageContext) -> None:
         seed=context.seed,
         sampling=context.config.sampling,
     )
-    run = context.inputs["gpt"].parents[1].name
-    page = Page(f"motionloom: {run}", f"{len(dataset)} clips of the {split} split were never trained on")
+    # The recipe's name, not the folder's: equal runs write equal pages wherever they lie.
+    page = Page(
+        f"motionloom: {context.recipe}", f"{len(dataset)} clips of the {split} split were never trained on"
+    )
     page.add_heading("Watch")
     page.add_viewer(
         _motions(bundle, truths, generated),
