@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from pydantic import Field
-from rich.console import Console
 from rich.table import Table
 
 from motionloom.pipeline.bundle import Bundle, SamplingConfig, text_encoder_of
@@ -207,9 +206,3 @@ def _percent(value: float | None) -> str:
 
 def _interval(value: dict[str, float]) -> str:
     return f"{value['mean']:.3f} ± {value['half_width']:.3f}"
-
-
-def print_figures(figures: dict[str, Any], console: Console) -> None:
-    """Print all tables."""
-    for table in tables(figures):
-        console.print(table)
