@@ -149,3 +149,8 @@ class Manifest(Config):
     options: dict[str, Any]
     shards: list[ShardInfo]
     dropped: list[Dropped] = []
+    licences: dict[str, int] = {}
+    """Clips under each licence, for sources that mix several."""
+    audio: dict[str, Any] | None = None
+    """Settings the audio features were made with; a model trained on them keeps these."""
+    notes: list[str] = []

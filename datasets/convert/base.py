@@ -1,4 +1,4 @@
-"""What every converter shares: the plan it shows first, splits, clip ids, and a pool for its own work.
+"""What every converter shares: the plan it shows first, and a pool for its own work.
 
 A converter plans before it converts: the plan lists what was found, what is missing and what will be left out
 and why, so nothing is skipped silently (`convert ... --plan` prints it and stops).
@@ -6,7 +6,6 @@ and why, so nothing is skipped silently (`convert ... --plan` prints it and stop
 
 from __future__ import annotations
 
-import hashlib
 import multiprocessing
 import os
 import threading
@@ -15,7 +14,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.connection import wait
-from pathlib import Path
 from typing import Generic, TypeVar
 
 import torch
@@ -24,11 +22,22 @@ from rich.table import Table
 from motionloom.datasets.schema import Dropped, Split, UserError
 from motionloom.datasets.shards.index import SPLITS
 
-TRAIN_SHARE, VAL_SHARE = 0.80, 0.05
-"""80/5/15, the split of HumanML3D and Motion-X, where a source brings none."""
-
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Subset:
+    """A part of a source (a folder of the release) beside what the official release holds."""
+
+    found: int = 0
+    """Motion files here."""
+    used: int = 0
+    """Of these, those that become samples."""
+    missing: int = 0
+    """Listed by the split files, but not here."""
+    expected: int | None = None
+    """Clips of the official release; None where it states no number."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +61,14 @@ class ConversionPlan(Generic[T]):
     ignored: int = 0
     """Files in the source that are not motion."""
     notes: list[str] = field(default_factory=list)
+    subsets: dict[str, Subset] = field(default_factory=dict)
+    """By name; empty for sources without subsets."""
+    licences: dict[str, int] = field(default_factory=dict)
+    """Clips to convert under each licence."""
+    bytes_needed: int | None = None
+    """Disk that the shards will take; None when unknown."""
+    seconds_needed: float | None = None
+    """Estimated time on the planned number of workers, from a few clips converted for the purpose."""
 
     def counts(self) -> dict[Split, int]:
         """Clips a split."""
@@ -68,8 +85,24 @@ class ConversionPlan(Generic[T]):
         told = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
         for title, drops in told:
             table.add_row(title, str(len(drops)), "", _some([f"{d.source}: {d.reason}" for d in drops]))
+        for licence, count in sorted(self.licences.items()):
+            table.add_row("licence", str(count), "", licence)
+        if self.bytes_needed is not None:
+            table.add_row("disk", "", "", f"{self.bytes_needed / 2**20:,.1f} MiB")
+        if self.seconds_needed is not None:
+            table.add_row("time", "", "", _duration(self.seconds_needed))
         for note in self.notes:
             table.add_row("note", "", "", note)
+        return table
+
+    def subset_table(self) -> Table | None:
+        """Found and missing per subset beside the official release; None for a source without subsets."""
+        if not self.subsets:
+            return None
+        table = Table("subset", "found", "to convert", "missing", "official release", title="subsets")
+        for name, subset in sorted(self.subsets.items()):
+            expected = "" if subset.expected is None else str(subset.expected)
+            table.add_row(name, str(subset.found), str(subset.used), str(subset.missing), expected)
         return table
 
     def left_out(self) -> list[Dropped]:
@@ -83,62 +116,15 @@ class ConversionPlan(Generic[T]):
             raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")
 
 
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"about {seconds:.0f} s"
+    return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"
+
+
 def _some(lines: Sequence[str], limit: int = 5) -> str:
     more = [f"... and {len(lines) - limit} more"] if len(lines) > limit else []
     return "\n".join([*lines[:limit], *more])
-
-
-def hash_split(clip_id: str) -> Split:
-    """80/5/15 by the id alone, so a clip keeps its split when others come or go."""
-    share = int.from_bytes(hashlib.sha256(clip_id.encode()).digest()[:8], "big") / 2**64
-    if share < TRAIN_SHARE:
-        return "train"
-    return "val" if share < TRAIN_SHARE + VAL_SHARE else "test"
-
-
-def check_id(clip_id: str, where: str) -> str:
-    """The id, if it can never leave a folder when something is named after it; `UserError` otherwise."""
-    parts = clip_id.split("/")
-    if (
-        not clip_id
-        or "\\" in clip_id
-        or not clip_id.isprintable()
-        or any(part in ("", ".", "..") for part in parts)
-        or ":" in parts[0]
-    ):
-        raise UserError(f"{where}: clip id '{clip_id[:80]!s}' is not a plain relative name")
-    return clip_id
-
-
-def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
-    """`train.txt`, `val.txt`, `test.txt` (one id a line) -> split of every id, and notes on repeated lines.
-
-    An id in two splits is a leak and an error; blank lines and CRLF are fine.
-    """
-    splits: dict[str, Split] = {}
-    notes: list[str] = []
-    files = [(split, folder / f"{split}.txt") for split in SPLITS if (folder / f"{split}.txt").is_file()]
-    if not files:
-        raise UserError(f"{folder}: no train.txt, val.txt or test.txt")
-    for split, path in files:
-        try:
-            lines = path.read_text(encoding="utf-8-sig").splitlines()
-        except UnicodeDecodeError as error:
-            raise UserError(f"{path}: not UTF-8 text (byte {error.start})") from None
-        here: set[str] = set()
-        for number, line in enumerate(lines, start=1):
-            clip_id = line.strip()
-            if not clip_id:
-                continue
-            where = f"{path}:{number}"
-            check_id(clip_id, where)
-            known = splits.setdefault(clip_id, split)
-            if known != split:
-                raise UserError(f"{where}: '{clip_id}' is also in {known}.txt; a clip in two splits leaks")
-            if clip_id in here:
-                notes.append(f"{where}: '{clip_id}' is listed twice; the first line counts")
-            here.add(clip_id)
-    return splits, notes
 
 
 def run_pool(work: Callable[[T], R], tasks: Sequence[T], workers: int) -> Iterator[tuple[int, R]]:

@@ -22,7 +22,8 @@ from rich.progress import Progress
 
 from motionloom.datasets.convert.archives import Batch
 from motionloom.datasets.convert.base import ConversionPlan, run_pool
-from motionloom.datasets.convert.bvh_plan import SUFFIX, BvhClip, BvhConfig, digest, drop, plan_bvh
+from motionloom.datasets.convert.bvh_plan import SUFFIX, BvhClip, BvhConfig, plan_bvh
+from motionloom.datasets.convert.conversion import digest, drop
 from motionloom.datasets.convert.feature_store import BatchIndex, StoredClip, store_batch, stored_batch
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.canonical import canonicalize, resample, retarget
@@ -30,8 +31,6 @@ from motionloom.datasets.motion.features import encode
 from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import ClipMeta, Dropped, Manifest, Split, UserError
-from motionloom.datasets.shards.files import write_json
-from motionloom.datasets.shards.index import MANIFEST_FILE
 from motionloom.datasets.shards.writer import write_dataset
 
 __all__ = ["BvhConfig", "convert_bvh", "plan_bvh"]
@@ -92,10 +91,9 @@ def convert_bvh(
         strict=strict,
         progress=progress,
         describe=StoredClip.source,
+        dropped=[*plan.left_out(), *failed],
+        notes=plan.notes,
     )
-    dropped = [*plan.left_out(), *failed, *manifest.dropped]
-    manifest = manifest.model_copy(update={"dropped": dropped})
-    write_json(out / MANIFEST_FILE, manifest.dump())
     shutil.rmtree(folder)
     return manifest
 

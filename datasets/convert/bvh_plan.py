@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -13,8 +12,10 @@ from pydantic import Field
 from rich.progress import Progress
 
 from motionloom.datasets.convert.archives import Batch, list_batches
-from motionloom.datasets.convert.base import ConversionPlan, check_id, hash_split, read_split_files
+from motionloom.datasets.convert.base import ConversionPlan
 from motionloom.datasets.convert.captions import CaptionTable, read_captions
+from motionloom.datasets.convert.conversion import digest, drop
+from motionloom.datasets.convert.splits import check_id, hash_split, read_split_files
 from motionloom.datasets.motion.bvh import read_header
 from motionloom.datasets.motion.joint_map import Unit, Up
 from motionloom.datasets.motion.layout import MotionLayout
@@ -220,14 +221,3 @@ def _frames_out(config: BvhConfig, clip: BvhClip) -> int:
     """Frames of a clip's features: `resample`'s count, less one for h3d velocities."""
     count = int((clip.frames - 1) * config.fps / (config.source_fps or clip.fps) + 1e-6) + 1
     return count - (config.motion_layout().family == "h3d")
-
-
-def drop(label: str, error: Exception) -> Dropped:
-    """The manifest's record of a clip that failed."""
-    text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-    return Dropped(source=label, reason=text.removeprefix(f"{label}: "))
-
-
-def digest(value: Any) -> str:
-    """sha256 of plain JSON data."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

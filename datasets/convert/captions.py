@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from motionloom.datasets.convert.base import check_id
+from motionloom.datasets.convert.splits import check_id
 from motionloom.datasets.schema import Caption, Split, UserError, explain
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SCHEMA_VERSION, Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.schema import SCHEMA_VERSION, Dropped, Manifest, ShardInfo, Split, UserError
 from motionloom.datasets.shards.files import sync_folder, write_json
 from motionloom.datasets.shards.index import (
     INDEX_FILE,
@@ -59,6 +59,10 @@ def write_dataset(
     progress: bool = True,
     describe: Callable[[T], str] = str,
     motion_type: MotionType = "float32",
+    dropped: Sequence[Dropped] = (),
+    licences: dict[str, int] | None = None,
+    audio: dict[str, Any] | None = None,
+    notes: Sequence[str] = (),
 ) -> Manifest:
     """Convert `items`, each already assigned to a split, into shards under `out`; return the manifest.
 
@@ -66,7 +70,8 @@ def write_dataset(
     other exception drops the item with its reason too, or stops the run when `strict`. `describe` names an
     item in the manifest's drop list and in the fingerprint that decides whether a finished shard is kept, so
     it must not change between runs; a change of the source files' *content* is not noticed unless it shows in
-    `describe` or `options`.
+    `describe` or `options`. `dropped` (clips the plan already left out), `licences`, `audio` and `notes` go
+    into the manifest as they are.
     """
     _check_arguments(name, workers, clips_per_shard, options)
     out.mkdir(parents=True, exist_ok=True)
@@ -87,10 +92,10 @@ def write_dataset(
         _remove_strays(out, name, keep={task.path for task in tasks})
         results = run_tasks(tasks, convert, workers=workers, progress=progress)
         shards = [shard for shard, _ in results if shard is not None]
-        dropped = [drop for _, drops in results for drop in drops]
+        failed = [drop for _, drops in results for drop in drops]
         if not shards:
-            reasons = "; ".join(f"{drop.source}: {drop.reason}" for drop in dropped[:3])
-            raise UserError(f"{out}: no clip survived the conversion ({len(dropped)} dropped: {reasons})")
+            reasons = "; ".join(f"{drop.source}: {drop.reason}" for drop in failed[:3])
+            raise UserError(f"{out}: no clip survived the conversion ({len(failed)} dropped: {reasons})")
         _finish_index(out, shards)
         manifest = Manifest(
             name=name,
@@ -103,7 +108,10 @@ def write_dataset(
             converter_version=converter_version,
             options=options,
             shards=shards,
-            dropped=dropped,
+            dropped=[*dropped, *failed],
+            licences=licences or {},
+            audio=audio,
+            notes=list(notes),
         )
         write_json(out / MANIFEST_FILE, manifest.dump())
         return manifest

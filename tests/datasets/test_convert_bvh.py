@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from motionloom.datasets.convert.base import hash_split, read_split_files
 from motionloom.datasets.convert.bvh import BvhConfig, convert_bvh, plan_bvh
+from motionloom.datasets.convert.splits import hash_split, read_split_files
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.canonical import canonicalize, resample
 from motionloom.datasets.motion.features import decode

@@ -1,0 +1,65 @@
+"""Splits of a source: its own split files, else 80/5/15 by a hash of the id."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from motionloom.datasets.schema import Split, UserError
+from motionloom.datasets.shards.index import SPLITS
+
+TRAIN_SHARE, VAL_SHARE = 0.80, 0.05
+"""80/5/15, the split of HumanML3D and Motion-X, where a source brings none."""
+
+
+def hash_split(clip_id: str) -> Split:
+    """80/5/15 by the id alone, so a clip keeps its split when others come or go."""
+    share = int.from_bytes(hashlib.sha256(clip_id.encode()).digest()[:8], "big") / 2**64
+    if share < TRAIN_SHARE:
+        return "train"
+    return "val" if share < TRAIN_SHARE + VAL_SHARE else "test"
+
+
+def check_id(clip_id: str, where: str) -> str:
+    """The id, if it can never leave a folder when something is named after it; `UserError` otherwise."""
+    parts = clip_id.split("/")
+    if (
+        not clip_id
+        or "\\" in clip_id
+        or not clip_id.isprintable()
+        or any(part in ("", ".", "..") for part in parts)
+        or ":" in parts[0]
+    ):
+        raise UserError(f"{where}: clip id '{clip_id[:80]!s}' is not a plain relative name")
+    return clip_id
+
+
+def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
+    """`train.txt`, `val.txt`, `test.txt` (one id a line) -> split of every id, and notes on repeated lines.
+
+    An id in two splits is a leak and an error; blank lines and CRLF are fine.
+    """
+    splits: dict[str, Split] = {}
+    notes: list[str] = []
+    files = [(split, folder / f"{split}.txt") for split in SPLITS if (folder / f"{split}.txt").is_file()]
+    if not files:
+        raise UserError(f"{folder}: no train.txt, val.txt or test.txt")
+    for split, path in files:
+        try:
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
+        except UnicodeDecodeError as error:
+            raise UserError(f"{path}: not UTF-8 text (byte {error.start})") from None
+        here: set[str] = set()
+        for number, line in enumerate(lines, start=1):
+            clip_id = line.strip()
+            if not clip_id:
+                continue
+            where = f"{path}:{number}"
+            check_id(clip_id, where)
+            known = splits.setdefault(clip_id, split)
+            if known != split:
+                raise UserError(f"{where}: '{clip_id}' is also in {known}.txt; a clip in two splits leaks")
+            if clip_id in here:
+                notes.append(f"{where}: '{clip_id}' is listed twice; the first line counts")
+            here.add(clip_id)
+    return splits, notes
