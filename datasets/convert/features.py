@@ -53,7 +53,8 @@ def require_human(joints: NDArray[Any], fps: float) -> None:
         if speed.max() > MAX_SPEED:
             frame, joint = np.unravel_index(int(speed.argmax()), speed.shape)
             raise UserError(
-                f"joint {joint} moves at {speed.max():.0f} m/s at frame {frame}: a broken fit, or a wrong frame rate"
+                f"joint {joint} moves at {speed.max():.0f} m/s at frame {frame}: "
+                f"a broken fit, or a wrong frame rate"
             )
 
 
