@@ -17,7 +17,7 @@ batch, or most of the codebook is replaced at every step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import torch
 from pydantic import Field
@@ -26,6 +26,7 @@ from torch.nn import functional
 
 from motionloom.datasets.schema import Config
 from motionloom.models.distributed import is_distributed, sum_over_ranks
+from motionloom.models.quantize.base import QuantizerOutput, usage_metrics
 from motionloom.models.quantize.draws import draw_rows
 
 
@@ -38,22 +39,6 @@ class QuantizerConfig(Config):
     """EMA constant lambda."""
     reset_below: float = Field(default=1.0, gt=0)
     """A code whose EMA count falls below this is reset."""
-
-
-class QuantizerOutput(NamedTuple):
-    """What a quantizer returns."""
-
-    quantized: Tensor
-    """[B, L, d], straight-through: the value of the codes, the gradient of z."""
-    codes: Tensor
-    """int64 [B, L], or [B, L, levels]; meaningless where the mask is False."""
-    penalty: Tensor
-    """Commitment |z - sg(z_hat)|^2, mean over valid elements, float32 scalar; summed over residual levels."""
-    metrics: dict[str, Tensor]
-    """float32 scalars ([levels] for a residual quantizer): `penalty`; `perplexity` of this batch's codes;
-    `usage`, the share of codes this batch used; `dead`, codes whose EMA count is not above `reset_below`;
-    `resets`, codes replaced in this step.
-    Over the global batch while training, over this rank's otherwise."""
 
 
 def nearest(z: Tensor, codebook: Tensor) -> Tensor:
@@ -186,10 +171,8 @@ class EmaQuantizer(nn.Module):
 
     @torch.no_grad()
     def _metrics(self, counts: Tensor) -> dict[str, Tensor]:
-        share = counts / counts.sum().clamp(min=1)
         return {
-            "perplexity": torch.exp(-(share * torch.log(share + 1e-7)).sum()),
-            "usage": (counts > 0).float().mean(),
+            **usage_metrics(counts),
             "dead": (self.ema_count <= self.config.reset_below).sum().float(),
         }
 

@@ -7,7 +7,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, QuantizerOutput
+from motionloom.models.quantize.base import QuantizerOutput
+from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig
 
 
 class ResidualQuantizer(nn.Module):

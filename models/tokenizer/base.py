@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.quantize.ema import EmaQuantizer
+from motionloom.models.quantize.base import Codebook
 from motionloom.models.tokenizer.config import BaseTokenizerConfig
 
 GROUP_FRAMES = 4
@@ -100,7 +100,7 @@ class Tokenizer(nn.Module, ABC):
         return x[..., self.columns]
 
     @abstractmethod
-    def codebooks(self) -> dict[str, EmaQuantizer]:
+    def codebooks(self) -> dict[str, Codebook]:
         """The quantizer of each stream."""
 
     @abstractmethod

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, TypedDict
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import Config
@@ -30,14 +31,35 @@ class BaseTokenizerConfig(Config):
     """Residual blocks per resolution."""
     dilation_growth: int = Field(default=3, ge=1)
     code_dim: int = Field(default=512, ge=1)
+    recon: Recon = "l2"
+    velocity_weight: float = Field(default=0.0, ge=0)
+    """Weight of the same reconstruction error between frame-to-frame differences."""
+
+    def commitment(self) -> float:
+        """Weight of the quantizers' penalty; 0 for quantizers without one."""
+        return 0.0
+
+    def loss_terms(self) -> LossTerms:
+        """Keyword arguments of `TokenizerModule` and `tokenizer_loss`."""
+        return {
+            "alpha": self.commitment(),
+            "recon": self.recon,
+            "velocity_weight": self.velocity_weight,
+        }
+
+
+class EmaTokenizerConfig(BaseTokenizerConfig):
+    """What tokenizers with learnt codebooks share."""
+
     num_codes: int = Field(default=512, ge=2)
     decay: float = Field(default=0.99, gt=0, lt=1)
     reset_below: float = Field(default=1.0, gt=0)
     alpha: float = Field(default=0.02, ge=0)
     """Weight of the commitment penalty."""
-    recon: Recon = "l2"
-    velocity_weight: float = Field(default=0.0, ge=0)
-    """Weight of the same reconstruction error between frame-to-frame differences."""
+
+    def commitment(self) -> float:
+        """`alpha`."""
+        return self.alpha
 
     def quantizer(self) -> QuantizerConfig:
         """Config of each codebook."""
@@ -45,26 +67,22 @@ class BaseTokenizerConfig(Config):
             num_codes=self.num_codes, dim=self.code_dim, decay=self.decay, reset_below=self.reset_below
         )
 
-    def loss_terms(self) -> LossTerms:
-        """Keyword arguments of `TokenizerModule` and `tokenizer_loss`."""
-        return {"alpha": self.alpha, "recon": self.recon, "velocity_weight": self.velocity_weight}
 
-
-class H2VQConfig(BaseTokenizerConfig):
+class H2VQConfig(EmaTokenizerConfig):
     """Holistic Hierarchical VQ: a hand codebook at 4x, a body codebook at 2x."""
 
     kind: Literal["h2vq"] = "h2vq"
     part: Literal["bodyhand"] = "bodyhand"
 
 
-class VqConfig(BaseTokenizerConfig):
+class VqConfig(EmaTokenizerConfig):
     """Vanilla VQ: one codebook at 4x."""
 
     kind: Literal["vq"] = "vq"
     part: Part = "bodyhand"
 
 
-class RvqConfig(BaseTokenizerConfig):
+class RvqConfig(EmaTokenizerConfig):
     """Residual VQ: `levels` codebooks at 4x. With `part: face` it is HumanTOMATO's face tokenizer (B.4)."""
 
     kind: Literal["rvq"] = "rvq"
@@ -72,5 +90,29 @@ class RvqConfig(BaseTokenizerConfig):
     levels: int = Field(default=2, ge=1)
 
 
-TokenizerConfig = Annotated[H2VQConfig | VqConfig | RvqConfig, Field(discriminator="kind")]
+class SeparateConfig(EmaTokenizerConfig):
+    """Body and hand modelled apart (Tables 5 and 22): H2VQ's rates, but neither knows of the other."""
+
+    kind: Literal["separate"] = "separate"
+    part: Literal["bodyhand"] = "bodyhand"
+
+
+class FsqConfig(BaseTokenizerConfig):
+    """Finite scalar quantization at 4x: no codebook to learn, so none to collapse. Not in the paper."""
+
+    kind: Literal["fsq"] = "fsq"
+    part: Part = "bodyhand"
+    steps: tuple[int, ...] = Field(default=(8, 5, 5, 5), min_length=1)
+    """Values of each scalar; their product, here 1000, is the number of codes."""
+
+    @field_validator("steps")
+    @classmethod
+    def _several_values(cls, steps: tuple[int, ...]) -> tuple[int, ...]:
+        if min(steps) < 3 or math.prod(steps) > 2**20:
+            raise ValueError("every scalar needs 3 values or more, and all together at most 2^20 codes")
+        return steps
+
+
+AnyTokenizerConfig = H2VQConfig | VqConfig | RvqConfig | SeparateConfig | FsqConfig
+TokenizerConfig = Annotated[AnyTokenizerConfig, Field(discriminator="kind")]
 """Any tokenizer, told apart by `kind`."""

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
+from motionloom.models.quantize.base import Codebook
 from motionloom.models.quantize.ema import EmaQuantizer
 from motionloom.models.tokenizer.base import Latents, Stream, Tokenizer, stream_metrics, token_mask
 from motionloom.models.tokenizer.config import H2VQConfig
@@ -53,7 +54,7 @@ class H2VQ(Tokenizer):
             2 * d, self.dim, width=width, doublings=1, depth=depth, dilation_growth=growth
         )
 
-    def codebooks(self) -> dict[str, EmaQuantizer]:
+    def codebooks(self) -> dict[str, Codebook]:
         """The quantizer of each stream."""
         return {"body": self.body_quantizer, "hand": self.hand_quantizer}
 

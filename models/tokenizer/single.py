@@ -10,7 +10,7 @@ from torch import Tensor
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
-from motionloom.models.quantize.ema import EmaQuantizer
+from motionloom.models.quantize.base import Codebook
 from motionloom.models.quantize.residual import ResidualQuantizer
 from motionloom.models.tokenizer.base import Latents, Stream, Tokenizer, stream_metrics, token_mask
 from motionloom.models.tokenizer.config import RvqConfig, VqConfig
@@ -35,7 +35,7 @@ class SingleTokenizer(Tokenizer):
             config.code_dim, self.dim, width=width, doublings=2, depth=depth, dilation_growth=growth
         )
 
-    def codebooks(self) -> dict[str, EmaQuantizer]:
+    def codebooks(self) -> dict[str, Codebook]:
         """The quantizer of each stream."""
         return {stream.name: self.quantizer.level(i) for i, stream in enumerate(self.streams)}
 

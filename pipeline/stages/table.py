@@ -45,6 +45,22 @@ STAGES: dict[str, StageKind] = {
             trains=True,
         ),
         StageKind(
+            "separate",
+            "body and hands apart",
+            tokenizer.SeparateStageConfig,
+            tokenizer.run_tokenizer,
+            ("data", "stats"),
+            trains=True,
+        ),
+        StageKind(
+            "fsq",
+            "FSQ tokenizer",
+            tokenizer.FsqStageConfig,
+            tokenizer.run_tokenizer,
+            ("data", "stats"),
+            trains=True,
+        ),
+        StageKind(
             "tma",
             "text-motion alignment",
             tma.TmaStageConfig,

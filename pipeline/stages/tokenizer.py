@@ -10,7 +10,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.shards.batches import EvalBatches, WindowBatches
 from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig, VqConfig
+from motionloom.models.tokenizer.config import FsqConfig, H2VQConfig, RvqConfig, SeparateConfig, VqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
 from motionloom.pipeline.sources import held_out, open_split, open_stats
@@ -42,6 +42,18 @@ class RvqStageConfig(_TokenizerStageConfig):
     """Residual codebooks (body-only data, face)."""
 
     net: RvqConfig = RvqConfig()
+
+
+class SeparateStageConfig(_TokenizerStageConfig):
+    """Body and hands apart, the ablation of H2VQ."""
+
+    net: SeparateConfig = SeparateConfig()
+
+
+class FsqStageConfig(_TokenizerStageConfig):
+    """Finite scalar quantization."""
+
+    net: FsqConfig = FsqConfig()
 
 
 def run_tokenizer(context: StageContext) -> None:

@@ -14,7 +14,14 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig, TokenizerConfig, VqConfig
+from motionloom.models.tokenizer.config import (
+    FsqConfig,
+    H2VQConfig,
+    RvqConfig,
+    SeparateConfig,
+    TokenizerConfig,
+    VqConfig,
+)
 from motionloom.models.tokenizer.h2vq import H2VQ
 
 LAYOUT = MotionLayout.named("wholebody363")
@@ -24,6 +31,8 @@ CONFIGS = {
     "vq": VqConfig(**SMALL),
     "rvq body": RvqConfig(**SMALL, part="body"),
     "rvq face": RvqConfig(**SMALL, part="face", levels=3),
+    "separate": SeparateConfig(**SMALL),
+    "fsq": FsqConfig(width=16, depth=2, code_dim=8, steps=(4, 4)),
 }
 
 

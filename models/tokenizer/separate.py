@@ -1,0 +1,100 @@
+"""`SeparateVQ`: body and hands each with an own encoder, codebook and decoder (HumanTOMATO Tables 5 and 22).
+
+The ablation of H2VQ: the same rates (two body tokens and one hand token per four frames, so the same bits),
+but the body's codes do not know the hands' and neither decoder sees the other part.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
+from motionloom.models.quantize.base import Codebook
+from motionloom.models.quantize.ema import EmaQuantizer
+from motionloom.models.tokenizer.base import Latents, Stream, Tokenizer, stream_metrics, token_mask
+from motionloom.models.tokenizer.config import SeparateConfig
+
+_HALVINGS = {"body": 1, "hand": 2}
+
+
+class SeparateVQ(Tokenizer):
+    """Streams "body" and "hand" that share nothing."""
+
+    def __init__(self, config: SeparateConfig, layout: MotionLayout) -> None:
+        if not layout.has_part("hand"):
+            raise UserError(
+                f"layout {layout.name} has no hand columns; use kind 'vq' or 'rvq' with part 'body'"
+            )
+        streams = (Stream("body", config.num_codes, 2), Stream("hand", config.num_codes, 1))
+        super().__init__(config, layout, config.part, streams, ("body", "body", "hand"))
+        whole = layout.part(config.part)
+        columns = {name: np.searchsorted(whole, layout.part(name)) for name in ("body", "hand")}
+        width, depth, growth, d = config.width, config.depth, config.dilation_growth, config.code_dim
+        for name, where in columns.items():
+            self.register_buffer(f"{name}_columns", torch.from_numpy(where))
+        self.encoders = nn.ModuleDict(
+            {
+                name: ConvEncoder(
+                    len(where), d, width=width, halvings=_HALVINGS[name], depth=depth, dilation_growth=growth
+                )
+                for name, where in columns.items()
+            }
+        )
+        self.quantizers = nn.ModuleDict(
+            {name: EmaQuantizer(config.quantizer(), salt=i) for i, name in enumerate(columns)}
+        )
+        decoders = {
+            name: ConvDecoder(
+                d, len(where), width=width, doublings=_HALVINGS[name], depth=depth, dilation_growth=growth
+            )
+            for name, where in columns.items()
+        }
+        self.decoder = _ApartDecoder(decoders, columns, d)
+
+    def codebooks(self) -> dict[str, Codebook]:
+        """The quantizer of each stream."""
+        return {name: self._book(name) for name in _HALVINGS}
+
+    def _book(self, name: str) -> EmaQuantizer:
+        book = self.quantizers[name]
+        assert isinstance(book, EmaQuantizer)
+        return book
+
+    def _quantize(self, x: Tensor, valid: Tensor | None, *, update: bool) -> Latents:
+        vectors: dict[str, Tensor] = {}
+        codes: dict[str, Tensor] = {}
+        metrics: dict[str, Tensor] = {}
+        penalty = x.new_zeros((), dtype=torch.float32)
+        for name, halvings in _HALVINGS.items():
+            z = self.encoders[name](x[..., getattr(self, f"{name}_columns")], valid)
+            out = self._book(name)(z, token_mask(valid, z.shape[1], 2**halvings), update=update)
+            vectors[name], codes[name] = out.quantized, out.codes
+            metrics |= stream_metrics(out.metrics, name)
+            penalty = penalty + out.penalty
+        return Latents(self._join(vectors), penalty, codes, metrics)
+
+    def _join(self, vectors: dict[str, Tensor]) -> Tensor:
+        return torch.cat([vectors["body"], vectors["hand"].repeat_interleave(2, dim=1)], dim=-1)
+
+
+class _ApartDecoder(nn.Module):
+    """Each part's latents through its own decoder, into its own columns."""
+
+    order: Tensor
+
+    def __init__(self, decoders: dict[str, ConvDecoder], columns: dict[str, np.ndarray], dim: int) -> None:
+        super().__init__()
+        self.decoders = nn.ModuleDict(decoders)
+        self.dim = dim
+        where = np.concatenate([columns[name] for name in decoders])
+        self.register_buffer("order", torch.from_numpy(np.argsort(where)))
+
+    def forward(self, joined: Tensor, valid: Tensor | None) -> Tensor:
+        """Joined latents [B, T / 2, 2 d], valid frames [B] or None -> [B, T, D]."""
+        body = self.decoders["body"](joined[..., : self.dim], valid)
+        hand = self.decoders["hand"](joined[:, ::2, self.dim :], valid)
+        return torch.cat([body, hand], dim=-1)[..., self.order]
