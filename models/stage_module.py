@@ -49,6 +49,10 @@ class StageModule(L.LightningModule, ABC):
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Losses and scalar metrics of one batch; "loss" is minimised, the others are only logged."""
 
+    def compile_losses(self) -> None:
+        """Compile networks and losses as one graph; seeding and logging stay outside. A break is an error."""
+        self.losses = torch.compile(self.losses, fullgraph=True)  # type: ignore[method-assign]
+
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """One step; seeds torch from (seed, step, part of the step, rank) first."""
         part = batch_idx % self.trainer.accumulate_grad_batches
@@ -61,7 +65,11 @@ class StageModule(L.LightningModule, ABC):
         return values["loss"]
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """The same losses on held-out data; every rank gets the same batches and the same figures."""
+        """The same losses on held-out data; every rank gets the same batches and the same figures.
+
+        What a loss draws here depends on (seed, batch) alone, so two validations differ by the weights only.
+        """
+        torch.manual_seed((self.seed * 1_000_003 + batch_idx) % 2**63)
         with alone():
             values = self.losses(batch)
         size = len(batch["length"])

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 import yaml
 from numpy.typing import NDArray
-from pydantic import Field
 from torch import Tensor
 
 from motionloom.datasets.motion.features import decode
@@ -26,22 +25,15 @@ from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate, sample_seeds
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.artifact import Artifact
+from motionloom.pipeline.faces import FaceGenerator, FaceKind, choose, expression, load_faces
 from motionloom.pipeline.model_store import LayoutFacts
 from motionloom.pipeline.networks import LoadedTma, load_gpt, load_tokenizer
+from motionloom.pipeline.sampling import SamplingConfig
 
-PARTS = ("stats", "text", "tokenizer", "tma", "gpt", "face_tokenizer", "face_gpt")
+PARTS = (
+    "stats", "text", "tokenizer", "tma", "gpt", "face_tokenizer", "face_gpt", "face_vae", "face_diffusion",
+)  # fmt: skip
 REQUIRED = ("stats", "tokenizer", "gpt")
-
-
-class SamplingConfig(Config):
-    """How tokens are drawn."""
-
-    temperature: float = Field(1.0, gt=0)
-    top_k: int = Field(0, ge=0)
-    """0 keeps every token."""
-    top_p: float = Field(0.95, gt=0, le=1)
-    cfg_scale: float = Field(1.0, ge=1)
-    """Classifier-free guidance; 1 is off. Needs a GPT trained with `drop_text` > 0."""
 
 
 class BundleFile(Config):
@@ -77,7 +69,8 @@ class Bundle:
     gpt: InterleavedGPT
     prior: str
     tma: LoadedTma | None
-    face: tuple[Tokenizer, InterleavedGPT, str] | None
+    faces: dict[FaceKind, FaceGenerator]
+    """The face generators here, the paper's first; empty for body-only models."""
 
     @staticmethod
     def open(folder: Path) -> Bundle:
@@ -105,10 +98,6 @@ class Bundle:
                 raise UserError(f"no finished '{role}' stage here; run the recipe to the end first")
         tokenizer = load_tokenizer(parts["tokenizer"])
         gpt, prior = load_gpt(parts["gpt"], tokenizer)
-        face = None
-        if "face_gpt" in parts and "face_tokenizer" in parts:
-            face_tokenizer = load_tokenizer(parts["face_tokenizer"])
-            face = (face_tokenizer, *load_gpt(parts["face_gpt"], face_tokenizer))
         return Bundle(
             layout=tokenizer.layout,
             stats=FeatureStats.load(parts["stats"] / "stats.safetensors"),
@@ -117,7 +106,7 @@ class Bundle:
             gpt=gpt,
             prior=prior,
             tma=LoadedTma.load(parts["tma"]) if "tma" in parts else None,
-            face=face,
+            faces=load_faces(parts),
         )
 
     @cached_property
@@ -168,14 +157,17 @@ class Bundle:
         sampling: SamplingConfig,
     ) -> list[GeneratedMotion]:
         groups = self._groups(seconds, len(captions))
-        codes, lengths = self._sample(self.gpt, self.prior, captions, groups, seeds[0], sampling)
-        body = self._decode(self.tokenizer, codes, lengths)
+        codes, lengths = self._sample(captions, groups, seeds[0], sampling)
+        body = self._decode(codes, lengths)
         expressions: list[NDArray[np.float32]] | list[None] = [None] * len(captions)
-        if self.face is not None:
-            tokenizer, gpt, prior = self.face
+        face = choose(self.faces, sampling.face_model)
+        if face is not None:
+            encoded = self.text_encoder.encode(faces)
+            prior = self._tma_text(encoded) if self.tma is not None else None
             # The face takes the body's length, so that both share one time line.
-            face_codes, _ = self._sample(gpt, prior, faces, lengths, seeds[1], sampling)
-            expressions = self._decode(tokenizer, face_codes, lengths)
+            frames = [len(motion) for motion in body]
+            made = face.make(encoded, prior, frames, seeds[1], sampling)
+            expressions = [expression(values, self.layout, self.stats) for values in made]
         out = []
         for row, caption in enumerate(captions):
             joints = decode(body[row], self._joint_layout)
@@ -200,18 +192,11 @@ class Bundle:
         return torch.full((count,), groups)
 
     def _sample(
-        self,
-        gpt: InterleavedGPT,
-        prior: str,
-        texts: list[str],
-        groups: Tensor | None,
-        seeds: list[int],
-        s: SamplingConfig,
+        self, texts: list[str], groups: Tensor | None, seeds: list[int], s: SamplingConfig
     ) -> tuple[dict[str, Tensor], Tensor]:
-        text = self.embed(texts, prior)
         result = generate(
-            gpt,
-            text,
+            self.gpt,
+            self.embed(texts),
             groups=groups,
             temperature=s.temperature,
             top_k=s.top_k or None,
@@ -221,25 +206,24 @@ class Bundle:
         )
         return result.codes, result.groups
 
-    def embed(self, texts: list[str], prior: str) -> Tensor:
-        """Text priors [n, E]."""
-        encoded: EncodedText = self.text_encoder.encode(texts)
-        if prior == "sentence":
-            return torch.as_tensor(encoded.sentence)
+    def embed(self, texts: list[str]) -> Tensor:
+        """The GPT's text priors [n, E]."""
+        encoded = self.text_encoder.encode(texts)
+        return torch.as_tensor(encoded.sentence) if self.prior == "sentence" else self._tma_text(encoded)
+
+    def _tma_text(self, encoded: EncodedText) -> Tensor:
         if self.tma is None:
             raise UserError("this GPT needs the TMA text encoder, and no tma part is here")
         return self.tma.embed_text(torch.as_tensor(encoded.tokens), torch.as_tensor(encoded.mask))
 
-    def _decode(
-        self, tokenizer: Tokenizer, codes: dict[str, Tensor], groups: Tensor
-    ) -> list[NDArray[np.float32]]:
+    def _decode(self, codes: dict[str, Tensor], groups: Tensor) -> list[NDArray[np.float32]]:
         """Features in their own units, [T, D] a sample; each is decoded alone, so padding plays no part."""
-        columns = tokenizer.columns.numpy()
+        streams, columns = self.tokenizer.streams, self.tokenizer.columns.numpy()
         out = []
         for row, count in enumerate(groups.tolist()):
-            single = {s.name: codes[s.name][row : row + 1, : count * s.per_group] for s in tokenizer.streams}
+            single = {s.name: codes[s.name][row : row + 1, : count * s.per_group] for s in streams}
             with torch.no_grad():
-                motion = tokenizer.decode(single)[0].numpy()
+                motion = self.tokenizer.decode(single)[0].numpy()
             out.append((motion * self.stats.std[columns] + self.stats.mean[columns]).astype(np.float32))
         return out
 

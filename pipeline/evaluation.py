@@ -129,7 +129,7 @@ def embed_motions(
     tma: LoadedTma, stats: FeatureStats, motions: Sequence[NDArray[np.float32]], batch: int = 64
 ) -> Tensor:
     """TMA latents [n, 256] of body-hand features; longer motions are cut at the model's length."""
-    columns = tma.layout.part("bodyhand")
+    columns = tma.layout.part(tma.part)
     mean, std = stats.mean[columns], stats.std[columns]
     order = np.argsort([len(m) for m in motions], kind="stable")
     out: dict[int, Tensor] = {}

@@ -9,7 +9,7 @@ import torch
 from pydantic import TypeAdapter
 from torch import Tensor
 
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.cache import TextCache
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
@@ -42,6 +42,8 @@ class LoadedTma:
     net: Tma
     layout: MotionLayout
     max_frames: int
+    part: Part
+    """The columns it reads."""
 
     @staticmethod
     def load(folder: Path) -> LoadedTma:
@@ -51,7 +53,7 @@ class LoadedTma:
         net = Tma(TmaConfig.parse(facts.config, str(folder)), extra["motion_dim"], extra["text_dim"])
         load_weights(folder, net)
         freeze(net)
-        return LoadedTma(net, facts.layout.layout(), int(extra["max_frames"]))
+        return LoadedTma(net, facts.layout.layout(), int(extra["max_frames"]), extra["part"])
 
     @torch.no_grad()
     def embed_text(self, tokens: Tensor, mask: Tensor, batch: int = 256) -> Tensor:
@@ -69,7 +71,7 @@ class LoadedTma:
 
     @torch.no_grad()
     def embed_motion(self, motion: Tensor, length: Tensor) -> Tensor:
-        """Motion latents [B, 256] of normalised body-hand features [B, T, D]."""
+        """Motion latents [B, 256] of normalised features [B, T, D], the columns of `part`."""
         return self.net.encode_motion(motion, length)[0]
 
 

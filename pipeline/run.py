@@ -11,12 +11,13 @@ from typing import Any, get_args
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.bundle import Bundle, BundleFile, SamplingConfig, part_folders, text_encoder_of
+from motionloom.pipeline.bundle import Bundle, BundleFile, part_folders, text_encoder_of
 from motionloom.pipeline.files import write_json
 from motionloom.pipeline.graph import Selection, execute, make_plan, plan_table, stage_folder
 from motionloom.pipeline.model_store import LayoutFacts
 from motionloom.pipeline.outputs import Format, write_motions
 from motionloom.pipeline.recipe import Recipe, load_recipe, nearest
+from motionloom.pipeline.sampling import SamplingConfig
 from motionloom.pipeline.stage import StageContext
 
 

@@ -137,7 +137,7 @@ def fit(
         ],
     )
     if config.compile:
-        module.compile()
+        module.compile_losses()
     newest = newest_checkpoint(context.folder / "checkpoints")
     try:
         trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)

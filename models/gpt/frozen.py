@@ -19,6 +19,11 @@ class Frozen(Generic[M]):
     def __init__(self, module: M) -> None:
         self._module = module.eval().requires_grad_(False)
 
-    def on(self, device: torch.device) -> M:
-        """The module on `device`, in evaluation mode whatever happened to it meanwhile."""
-        return self._module.to(device).eval()
+    def to(self, device: torch.device) -> None:
+        """Move to the device of the module that owns this."""
+        self._module.to(device)
+
+    @property
+    def module(self) -> M:
+        """The network."""
+        return self._module

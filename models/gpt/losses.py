@@ -65,8 +65,9 @@ def soft_codes(
     `sample` adds Gumbel noise (a draw from the model); without it the most likely codes are taken. Rows
     behind `groups` hold arbitrary codes.
     """
+    # As many groups as fit, not as many as there are: reading a maximum back would wait for the device.
     batch, size = len(logits), len(gpt.pattern)
-    count = int(groups.max())
+    count = logits.shape[1] // size
     steps = logits[:, : count * size].view(batch, count, size, -1)
     valid = torch.arange(count, device=logits.device)[None, :, None, None] < groups[:, None, None, None]
     out = {}

@@ -58,6 +58,12 @@ class GptModule(StageModule):
         _check(net, tokenizer, tma)
         self.tokenizer, self.tma = Frozen(tokenizer), Frozen(tma)
 
+    def on_fit_start(self) -> None:
+        """The frozen networks follow this one to its device."""
+        for frozen in (self.tokenizer, self.tma):
+            if frozen is not None:
+                frozen.to(self.device)
+
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Loss of one batch.
 
@@ -86,7 +92,7 @@ class GptModule(StageModule):
         self, batch: dict[str, Any], logits: Tensor, tokenizer: Frozen[Tokenizer], tma: Frozen[Tma]
     ) -> Tensor:
         config = self.loss_config
-        motion_model = tma.on(logits.device)
+        motion_model = tma.module
         text_latent = batch.get("tma_text", batch["text"])
         if text_latent.shape[-1] != motion_model.config.latent:
             raise UserError(
@@ -100,7 +106,7 @@ class GptModule(StageModule):
             batch["kinds"],
             text_latent,
             batch.get("sentence"),
-            tokenizer=tokenizer.on(logits.device),
+            tokenizer=tokenizer.module,
             tma=motion_model,
             gumbel_temperature=config.gumbel_temperature,
             temperature=config.temperature,

@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 from rich.table import Table
 
-from motionloom.pipeline.bundle import Bundle, SamplingConfig, text_encoder_of
+from motionloom.pipeline.bundle import Bundle, text_encoder_of
 from motionloom.pipeline.evaluation import (
     Interval,
     chance,
@@ -22,6 +22,7 @@ from motionloom.pipeline.evaluation import (
 from motionloom.pipeline.files import write_json
 from motionloom.pipeline.progress import bar
 from motionloom.pipeline.samples import Truth, spread, truth_of
+from motionloom.pipeline.sampling import SamplingConfig
 from motionloom.pipeline.sources import held_out, open_split, open_text
 from motionloom.pipeline.stage import StageConfig, StageContext
 

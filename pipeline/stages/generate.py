@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from motionloom.pipeline.bundle import Bundle, SamplingConfig, text_encoder_of
+from motionloom.pipeline.bundle import Bundle, text_encoder_of
 from motionloom.pipeline.outputs import FORMATS, Format, write_motions
 from motionloom.pipeline.samples import spread, truth_of
+from motionloom.pipeline.sampling import SamplingConfig
 from motionloom.pipeline.sources import held_out, open_split
 from motionloom.pipeline.stage import StageConfig, StageContext
 

@@ -10,12 +10,14 @@ from pydantic import Field
 
 from motionloom.datasets.motion.features import decode
 from motionloom.pipeline.artifact import Artifact
-from motionloom.pipeline.bundle import Bundle, GeneratedMotion, SamplingConfig, text_encoder_of
+from motionloom.pipeline.bundle import Bundle, GeneratedMotion, text_encoder_of
+from motionloom.pipeline.faces import GptFace
 from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.samples import Truth, joint_layout, reconstruct, spread, truth_of
+from motionloom.pipeline.sampling import SamplingConfig
 from motionloom.pipeline.sources import held_out, open_split
 from motionloom.pipeline.stage import StageConfig, StageContext
 from motionloom.pipeline.stages.evaluate import figure_rows
@@ -69,8 +71,10 @@ def _motions(bundle: Bundle, truths: list[Truth], generated: list[GeneratedMotio
         words = truth.caption if same else f"{truth.caption} (face: {truth.face_caption})"
         face = None if truth.face is None else synthetic_face_controls(truth.face)
         again = face
-        if truth.face is not None and bundle.face is not None:
-            again = synthetic_face_controls(_face_again(bundle, truth))
+        face_tokens = bundle.faces.get("gpt")
+        if truth.face is not None and isinstance(face_tokens, GptFace):
+            rebuilt = reconstruct(face_tokens.tokenizer, bundle.stats, truth.face)
+            again = synthetic_face_controls(rebuilt)
         rebuilt = decode(reconstruct(bundle.tokenizer, bundle.stats, truth.features), layout)
         for label, joints, controls in (
             ("recorded", truth.joints, face),
@@ -79,11 +83,6 @@ def _motions(bundle: Bundle, truths: list[Truth], generated: list[GeneratedMotio
         ):
             out.append(ViewerMotion(joints, layout.fps, parents, label, words, group, controls))
     return out
-
-
-def _face_again(bundle: Bundle, truth: Truth) -> np.ndarray:
-    assert bundle.face is not None and truth.face is not None
-    return reconstruct(bundle.face[0], bundle.stats, truth.face)
 
 
 def _figures(page: Page, folder: Path | None) -> None:

@@ -6,9 +6,31 @@ A new stage is a network file, a LightningModule file, a line here and a recipe 
 from __future__ import annotations
 
 from motionloom.pipeline.stage import StageKind
-from motionloom.pipeline.stages import data, evaluate, generate, gpt, prepare, report, tma, tokenizer, tokens
+from motionloom.pipeline.stages import (
+    data,
+    diffusion,
+    evaluate,
+    generate,
+    gpt,
+    prepare,
+    report,
+    tma,
+    tokenizer,
+    tokens,
+)
 
-_ALL_MODELS = ("data", "stats", "text", "tokenizer", "tma?", "gpt", "face_tokenizer?", "face_gpt?")
+_ALL_MODELS = (
+    "data",
+    "stats",
+    "text",
+    "tokenizer",
+    "tma?",
+    "gpt",
+    "face_tokenizer?",
+    "face_gpt?",
+    "face_vae?",
+    "face_diffusion?",
+)
 
 STAGES: dict[str, StageKind] = {
     kind.name: kind
@@ -65,6 +87,14 @@ STAGES: dict[str, StageKind] = {
             "text-motion alignment",
             tma.TmaStageConfig,
             tma.run_tma,
+            ("data", "stats", "text"),
+            trains=True,
+        ),
+        StageKind(
+            "diffusion",
+            "motion diffusion",
+            diffusion.DiffusionStageConfig,
+            diffusion.run_diffusion,
             ("data", "stats", "text"),
             trains=True,
         ),

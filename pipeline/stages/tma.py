@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from torch.utils.data import Dataset
 
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.batches import CaptionBatches, EvalBatches
 from motionloom.models.tma.module import TmaLossConfig, TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
@@ -27,6 +31,16 @@ class TmaStageConfig(TrainedStageConfig):
     """Longer clips are cropped at random."""
     min_frames: int = Field(16, ge=1)
     """Shorter clips are left out."""
+    part: Literal["bodyhand", "face"] = "bodyhand"
+    """What is aligned; `face` takes the face captions. Without InfoNCE (`loss.contrastive: 0`) it is TEMOS,
+    or, of the face, the paper's facial cVAE (B.5.1)."""
+
+
+def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:
+    """Columns of one part of a layout, which must have it."""
+    if not layout.has_part(part):
+        raise UserError(f"layout {layout.name} has no {part} columns; choose another part or data set")
+    return layout.part(part)
 
 
 def run_tma(context: StageContext) -> None:
@@ -38,7 +52,7 @@ def run_tma(context: StageContext) -> None:
         open_text(context.input("text")),
     )
     dataset = open_split(data, "train")
-    columns = dataset.layout.part("bodyhand")
+    columns = part_columns(dataset.layout, config.part)
     torch.manual_seed(context.seed)
     net = Tma(config.net, motion_dim=len(columns), text_dim=text.dim)
     module = TmaModule(net, config.optim, seed=context.seed, max_steps=config.train.steps, loss=config.loss)
@@ -54,6 +68,7 @@ def run_tma(context: StageContext) -> None:
             seed=context.seed,
             rank=rank,
             world=world,
+            face=config.part == "face",
             columns=columns,
         )
 
@@ -67,12 +82,18 @@ def run_tma(context: StageContext) -> None:
             batch_size=32,
             max_frames=config.max_frames,
             min_frames=config.min_frames,
+            face=config.part == "face",
             columns=columns,
         )
 
     fit(context, module, config.train, train, validation, config.optim.grad_clip)
     if module.global_rank == 0:
-        extra = {"motion_dim": len(columns), "text_dim": text.dim, "max_frames": config.max_frames}
+        extra: dict[str, Any] = {
+            "motion_dim": len(columns),
+            "text_dim": text.dim,
+            "max_frames": config.max_frames,
+        }
+        extra["part"] = config.part
         facts = ModelFacts(
             kind="tma", config=config.net.dump(), layout=LayoutFacts.of(dataset.layout), extra=extra
         )

@@ -1,0 +1,41 @@
+"""Training of the denoiser: a random time step a sample, squared error over real frames (B.5.2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.layers.transformer import length_mask
+from motionloom.models.stage_module import OptimConfig, StageModule
+from motionloom.models.tma.losses import masked_mean
+
+
+class DiffusionModule(StageModule):
+    """Trains a `MotionDiffusion` on the batches of `CaptionBatches`."""
+
+    net: MotionDiffusion
+
+    def __init__(self, net: MotionDiffusion, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.noiser = net.config.schedule.noiser()
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Loss of {"motion" [B, T, D], "length" [B], "sentence" [B, E]}.
+
+        Time steps and noise are drawn anew each call; evaluation tells every caption.
+        """
+        motion, length, text = batch["motion"], batch["length"], batch["sentence"]
+        schedule = self.net.config.schedule
+        mask = length_mask(length, motion.shape[1])
+        step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)
+        noise = torch.randn_like(motion)
+        hidden = self.net.config.condition_dropout if self.training else 0.0
+        told = torch.rand(len(motion), device=motion.device) >= hidden
+        noisy = self.noiser.add_noise(motion, noise, step)
+        found = self.net(noisy, step, text, mask, told)
+        target = motion if schedule.predicts == "sample" else noise
+        error = (found - target.float()).square()
+        return {"loss": masked_mean(error, mask[..., None].expand_as(error))}

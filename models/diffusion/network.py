@@ -1,0 +1,75 @@
+"""`MotionDiffusion`: a transformer encoder that denoises a motion given a text (HumanTOMATO B.5.2, MDM).
+
+The condition, projected text plus embedded time step, is one token in front of the frames; every frame is
+one more token. The output at the frames is the clean motion (or the noise, as the schedule says).
+`condition_dropout` hides the text from some samples, for classifier-free guidance.
+
+Legend: B batch, T frames, D motion features, E text width.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from motionloom.datasets.schema import Config
+from motionloom.models.diffusion.schedule import ScheduleConfig
+from motionloom.models.layers.transformer import Transformer, sinusoid
+
+
+class DiffusionConfig(Config):
+    """Sizes; the defaults are MDM's, "all parameter settings follow" it (B.5.2)."""
+
+    dim: int = Field(default=512, ge=2, multiple_of=2)
+    ff: int = Field(default=1024, ge=1)
+    layers: int = Field(default=8, ge=1)
+    heads: int = Field(default=4, ge=1)
+    dropout: float = Field(default=0.1, ge=0, lt=1)
+    condition_dropout: float = Field(default=0.1, ge=0, lt=1)
+    """Share of samples trained without text; 0 turns guidance off."""
+    schedule: ScheduleConfig = ScheduleConfig()
+
+
+class MotionDiffusion(nn.Module):
+    """Denoiser of motions [B, T, D] normalised, given one text vector [B, E] each."""
+
+    def __init__(self, config: DiffusionConfig, motion_dim: int, text_dim: int) -> None:
+        super().__init__()
+        self.config = config
+        self.motion_dim = motion_dim
+        self.text_dim = text_dim
+        self.enter = nn.Linear(motion_dim, config.dim)
+        self.text = nn.Linear(text_dim, config.dim)
+        self.time = nn.Sequential(
+            nn.Linear(config.dim, config.dim), nn.SiLU(), nn.Linear(config.dim, config.dim)
+        )
+        self.stack = Transformer(config.layers, config.dim, config.heads, config.ff, dropout=config.dropout)
+        self.leave = nn.Linear(config.dim, motion_dim)
+
+    def forward(self, noisy: Tensor, step: Tensor, text: Tensor, mask: Tensor, told: Tensor) -> Tensor:
+        """The clean motion (or the noise) of `noisy`; zero where masked.
+
+        Args:
+            noisy: [B, T, D].
+            step: int64 [B], time step of each sample.
+            text: [B, E].
+            mask: bool [B, T], True = real frame.
+            told: bool [B], False hides the text.
+        """
+        condition = self.text(text) * told[:, None] + self.time(_waves(step, self.config.dim))
+        frames = self.enter(noisy)
+        x = torch.cat([condition[:, None].to(frames.dtype), frames], dim=1)
+        x = x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype)
+        visible = torch.cat([mask.new_ones(len(mask), 1), mask], dim=1)
+        out: Tensor = self.leave(self.stack(x, visible)[:, 1:]).float()
+        return out * mask[..., None]
+
+
+def _waves(step: Tensor, dim: int) -> Tensor:
+    """Sinusoidal embedding [B, dim] of time steps [B]."""
+    half = torch.arange(dim // 2, device=step.device)
+    angle = step[:, None].float() * torch.exp(-math.log(10_000.0) * half / (dim // 2))
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)

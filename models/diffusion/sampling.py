@@ -1,0 +1,68 @@
+"""Motions from a trained denoiser, by diffusers' samplers."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.diffusion.schedule import Sampler
+
+
+@torch.no_grad()
+def sample_motions(
+    net: MotionDiffusion,
+    text: Tensor,
+    frames: Sequence[int],
+    *,
+    seeds: Sequence[int],
+    sampler: Sampler = "ddpm",
+    steps: int = 50,
+    guidance: float = 1.0,
+) -> list[Tensor]:
+    """Normalised motions [T, D] for text vectors [n, E], one length and one seed each.
+
+    Clips of one length are denoised together and each draws its noise from its own seed, so a motion does not
+    depend on what it is generated with. `guidance` 1 is off; above it both passes go through one forward.
+    """
+    net.eval()
+    groups: dict[int, list[int]] = defaultdict(list)
+    for row, count in enumerate(frames):
+        groups[count].append(row)
+    out: dict[int, Tensor] = {}
+    for count, rows in groups.items():
+        motion = _denoise(net, text[rows], count, [seeds[row] for row in rows], sampler, steps, guidance)
+        out.update(zip(rows, motion, strict=True))
+    return [out[row] for row in range(len(frames))]
+
+
+def _denoise(
+    net: MotionDiffusion,
+    text: Tensor,
+    frames: int,
+    seeds: Sequence[int],
+    sampler: Sampler,
+    steps: int,
+    guidance: float,
+) -> Tensor:
+    count, device = len(text), text.device
+    noise = [torch.Generator().manual_seed(seed) for seed in seeds]
+    x = torch.stack([torch.randn(frames, net.motion_dim, generator=g) for g in noise]).to(device)
+    scheduler = net.config.schedule.sampler(sampler, steps)
+    x = x * scheduler.init_noise_sigma
+    guided = guidance != 1.0
+    told = torch.ones(count * (1 + guided), dtype=torch.bool, device=device)
+    told[count:] = False
+    text = text.repeat(1 + guided, 1)
+    mask = torch.ones(len(told), frames, dtype=torch.bool, device=device)
+    extra = {} if sampler == "dpm++" else {"generator": noise}
+    for step in scheduler.timesteps:
+        given = scheduler.scale_model_input(x, step).repeat(1 + guided, 1, 1)
+        found = net(given, step.to(device).expand(len(told)), text, mask, told)
+        if guided:
+            found = found[count:] + guidance * (found[:count] - found[count:])
+        x = scheduler.step(found, step, x, **extra).prev_sample
+    return x

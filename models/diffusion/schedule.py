@@ -1,0 +1,48 @@
+"""Noise schedules and samplers: all of them diffusers' own, built from one config."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
+from pydantic import Field
+
+from motionloom.datasets.schema import Config
+
+Sampler = Literal["ddpm", "ddim", "dpm++"]
+
+
+class ScheduleConfig(Config):
+    """The noising process; the defaults are MDM's, which HumanTOMATO's facial baseline follows (B.5.2)."""
+
+    steps: int = Field(default=1000, ge=2)
+    betas: Literal["squaredcos_cap_v2", "linear"] = "squaredcos_cap_v2"
+    """Cosine (MDM) or linear from 1e-4 to 0.02 (UDE), by diffusers' names."""
+    predicts: Literal["sample", "epsilon"] = "sample"
+    """x0 (MDM) or the noise (UDE)."""
+
+    def arguments(self) -> dict[str, Any]:
+        """What every scheduler is built from."""
+        return {
+            "num_train_timesteps": self.steps,
+            "beta_schedule": self.betas,
+            "beta_start": 1e-4,
+            "beta_end": 0.02,
+            "prediction_type": self.predicts,
+        }
+
+    def noiser(self) -> DDPMScheduler:
+        """For training: `add_noise`. Motion is not bounded, so nothing is clipped."""
+        return DDPMScheduler(clip_sample=False, **self.arguments())
+
+    def sampler(self, kind: Sampler, steps: int) -> Any:
+        """A sampler set to `steps` denoising steps."""
+        made: Any
+        if kind == "ddpm":
+            made = self.noiser()
+        elif kind == "ddim":
+            made = DDIMScheduler(clip_sample=False, set_alpha_to_one=True, **self.arguments())
+        else:
+            made = DPMSolverMultistepScheduler(algorithm_type="dpmsolver++", **self.arguments())
+        made.set_timesteps(steps)
+        return made

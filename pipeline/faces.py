@@ -1,0 +1,169 @@
+"""The three facial motion generators of HumanTOMATO (section 3.4, B.4, B.5) behind one interface.
+
+The paper's own, a GPT over residual codes, and its two baselines: a text-conditioned VAE and a diffusion
+model. Each makes an expression [T, 50] for a text and a given number of frames, so whichever is used shares
+the body's time line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.statistics import FeatureStats
+from motionloom.datasets.text.encoder import EncodedText
+from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.sampling import sample_motions
+from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.gpt.sampling import generate
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
+from motionloom.pipeline.model_store import load_facts, load_weights
+from motionloom.pipeline.networks import LoadedTma, freeze, load_gpt, load_tokenizer
+from motionloom.pipeline.sampling import SamplingConfig
+
+FaceKind = Literal["gpt", "vae", "diffusion"]
+
+
+class FaceGenerator(Protocol):
+    """Text to normalised expression."""
+
+    def make(
+        self,
+        text: EncodedText,
+        prior: torch.Tensor | None,
+        frames: Sequence[int],
+        seeds: Sequence[int],
+        sampling: SamplingConfig,
+    ) -> list[torch.Tensor]:
+        """Expressions [T, 50] of encoded texts; `prior` [n, E] is TMA's embedding, where there is one."""
+
+
+@dataclass(frozen=True)
+class GptFace:
+    """Residual codes, level i before level ii, from a GPT (B.4)."""
+
+    tokenizer: Tokenizer
+    gpt: InterleavedGPT
+    prior: str
+
+    @torch.no_grad()
+    def make(
+        self,
+        text: EncodedText,
+        prior: torch.Tensor | None,
+        frames: Sequence[int],
+        seeds: Sequence[int],
+        sampling: SamplingConfig,
+    ) -> list[torch.Tensor]:
+        """See `FaceGenerator`; lengths are whole groups of four frames."""
+        given = torch.as_tensor(text.sentence) if self.prior == "sentence" else prior
+        if given is None:
+            raise UserError("this face GPT needs the TMA text encoder, and no tma part is here")
+        groups = torch.tensor([-(-count // GROUP_FRAMES) for count in frames])
+        codes = generate(
+            self.gpt, given, groups=groups, temperature=sampling.temperature, top_k=sampling.top_k or None,
+            top_p=sampling.top_p, cfg_scale=sampling.cfg_scale, seed=list(seeds),
+        ).codes  # fmt: skip
+        out = []
+        for row, count in enumerate(frames):
+            single = {
+                s.name: codes[s.name][row : row + 1, : int(groups[row]) * s.per_group]
+                for s in self.tokenizer.streams
+            }
+            out.append(self.tokenizer.decode(single)[0, :count])
+        return out
+
+
+@dataclass(frozen=True)
+class VaeFace:
+    """One latent of the text, decoded to all frames at once (B.5.1)."""
+
+    net: LoadedTma
+
+    @torch.no_grad()
+    def make(
+        self,
+        text: EncodedText,
+        prior: torch.Tensor | None,
+        frames: Sequence[int],
+        seeds: Sequence[int],
+        sampling: SamplingConfig,
+    ) -> list[torch.Tensor]:
+        """See `FaceGenerator`. The latent is drawn from the text's Gaussian; temperature scales its width."""
+        mu, logvar = self.net.net.encode_text(torch.as_tensor(text.tokens), torch.as_tensor(text.mask))
+        noise = torch.stack(
+            [torch.randn(mu.shape[1], generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        )
+        z = mu + sampling.temperature * (0.5 * logvar).exp() * noise
+        made = self.net.net.decode(z, torch.tensor(frames), max(frames))
+        return [made[row, :count] for row, count in enumerate(frames)]
+
+
+@dataclass(frozen=True)
+class DiffusionFace:
+    """Denoising from a sentence embedding (B.5.2)."""
+
+    net: MotionDiffusion
+
+    def make(
+        self,
+        text: EncodedText,
+        prior: torch.Tensor | None,
+        frames: Sequence[int],
+        seeds: Sequence[int],
+        sampling: SamplingConfig,
+    ) -> list[torch.Tensor]:
+        """See `FaceGenerator`."""
+        return sample_motions(
+            self.net, torch.as_tensor(text.sentence), frames, seeds=seeds, sampler=sampling.sampler,
+            steps=sampling.denoising_steps, guidance=sampling.cfg_scale,
+        )  # fmt: skip
+
+
+def load_faces(parts: dict[str, Path]) -> dict[FaceKind, FaceGenerator]:
+    """The generators whose stages are finished; the paper's first."""
+    out: dict[FaceKind, FaceGenerator] = {}
+    if "face_gpt" in parts and "face_tokenizer" in parts:
+        tokenizer = load_tokenizer(parts["face_tokenizer"])
+        out["gpt"] = GptFace(tokenizer, *load_gpt(parts["face_gpt"], tokenizer))
+    if "face_vae" in parts:
+        out["vae"] = VaeFace(LoadedTma.load(parts["face_vae"]))
+    if "face_diffusion" in parts:
+        out["diffusion"] = DiffusionFace(load_diffusion(parts["face_diffusion"]))
+    return out
+
+
+def choose(faces: dict[FaceKind, FaceGenerator], wanted: FaceKind | None) -> FaceGenerator | None:
+    """The generator asked for, else the first one there; None without any."""
+    if wanted is None:
+        return next(iter(faces.values()), None)
+    if wanted not in faces:
+        raise UserError(
+            f"no face generator '{wanted}' here; there is {', '.join(faces) or 'none'}: "
+            f"train its stage or choose another"
+        )
+    return faces[wanted]
+
+
+def load_diffusion(folder: Path) -> MotionDiffusion:
+    """A trained denoiser."""
+    facts = load_facts(folder)
+    config = DiffusionConfig.parse(facts.config, str(folder))
+    net = MotionDiffusion(config, facts.extra["motion_dim"], facts.extra["text_dim"])
+    load_weights(folder, net)
+    freeze(net)
+    return net
+
+
+def expression(made: torch.Tensor, layout: MotionLayout, stats: FeatureStats) -> NDArray[np.float32]:
+    """Expression in its own units [T, 50] of a normalised one."""
+    columns = layout.part("face")
+    return np.asarray(made.numpy() * stats.std[columns] + stats.mean[columns], dtype=np.float32)
