@@ -37,6 +37,7 @@ def run_recipe(
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if dry_run:
         console.print(plan_table(loaded, plan))
+        _say_estimate(loaded, console)
         console.print(f"{len(todo)} of {len(plan)} stages would run in {run}")
         return run
     if not todo:
@@ -52,6 +53,18 @@ def run_recipe(
         if row.stage.kind.name == "report" and page.is_file():
             console.print(f"watch it: {page.resolve()}", soft_wrap=True)
     return run
+
+
+def _say_estimate(recipe: Recipe, console: Console) -> None:
+    """What the trainings would take, where the recipe says enough."""
+    from motionloom.pipeline.estimate import estimate, estimate_table
+
+    if not any(stage.kind.trains for stage in recipe.stages):
+        return
+    try:
+        console.print(estimate_table(estimate(recipe)))
+    except UserError as error:
+        console.print(str(error))
 
 
 def generate_motions(

@@ -71,8 +71,9 @@ def soft_codes(
     steps = logits[:, : count * size].view(batch, count, size, -1)
     valid = torch.arange(count, device=logits.device)[None, :, None, None] < groups[:, None, None, None]
     out = {}
-    for kind, name in enumerate(gpt.names):
-        here = steps[:, :, gpt.slots == kind, : gpt.num_codes[name]]
+    for name in gpt.names:
+        slots = [i for i, stream in enumerate(gpt.pattern) if stream == name]
+        here = steps[:, :, slots, : gpt.num_codes[name]]
         here = torch.where(valid, here, 0.0).flatten(1, 2)
         if sample:
             out[name] = F.gumbel_softmax(here, tau=temperature, hard=True)

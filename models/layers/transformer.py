@@ -20,6 +20,7 @@ import math
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 
 def length_mask(length: Tensor, size: int) -> Tensor:
@@ -154,6 +155,8 @@ class Transformer(nn.Module):
         inner = dropout if attention_dropout is None else attention_dropout
         self.blocks = nn.ModuleList(Block(dim, heads, ff, dropout, inner) for _ in range(layers))
         self.norm = nn.LayerNorm(dim)
+        self.checkpointed = False
+        """Compute the inside of each block again in the backward pass instead of keeping it."""
         std = math.sqrt(2 / (5 * dim))
         for name, parameter in self.named_parameters():
             if parameter.dim() == 2:
@@ -168,8 +171,12 @@ class Transformer(nn.Module):
         """x [B, L, D]; mask bool [B, L] of visible positions or [B, L, S], or `causal`; cache to decode."""
         if mask is not None:
             mask = mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
+        again = self.checkpointed and torch.is_grad_enabled() and cache is None
         for index, block in enumerate(self.blocks):
-            x = block(x, mask, causal, None if cache is None else cache.layers[index])
+            if again:
+                x = checkpoint(block, x, mask, causal, use_reentrant=False)
+            else:
+                x = block(x, mask, causal, None if cache is None else cache.layers[index])
         out: Tensor = self.norm(x)
         return out
 

@@ -1,0 +1,203 @@
+"""What a recipe's trainings will take, before they run: parameters, tokens, bits, memory of one process.
+
+Each network is built and its loss computed on fake tensors, which have shapes but no values, so the figures
+come from the code that will run. Memory counts weights, gradients, AdamW's two moments and everything kept
+for the backward pass; workspaces of kernels and the allocator's rounding come on top.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.table import Table
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Manifest, UserError
+from motionloom.models.diffusion.module import DiffusionModule
+from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.gpt.module import GptModule
+from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.stage_module import StageModule
+from motionloom.models.tma.module import TmaModule
+from motionloom.models.tma.network import Tma
+from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.pipeline.recipe import Recipe, Stage
+from motionloom.pipeline.training import TrainedStageConfig, prepare_module
+
+_TEXT_WIDTH = {"minilm": 384}
+_USUAL_WIDTH = 768
+"""Of DistilBERT and CLIP ViT-L/14, assumed for encoders that are not loaded to look."""
+
+_CAPTION_TOKENS = 24
+_BYTES_A_PARAMETER = 16
+"""Weight, gradient and AdamW's two moments in float32."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One training stage."""
+
+    stage: str
+    parameters: int
+    local_batch: int
+    memory_bytes: int
+    note: str
+    """What its tokens are."""
+
+
+def estimate(recipe: Recipe) -> list[Estimate]:
+    """One row per training stage; `UserError` when the layout of the data is not known."""
+    layout = data_layout(recipe)
+    world = recipe.hardware.world()
+    rows = []
+    for stage in recipe.stages:
+        if not stage.kind.trains:
+            continue
+        config = stage.config
+        assert isinstance(config, TrainedStageConfig)
+        batch = config.train.local_batch(world)
+        with FakeTensorMode(allow_non_fake_inputs=True):
+            module, inputs, note = _fake(recipe, stage, layout, batch)
+            prepare_module(module, config.train)
+            parameters = sum(p.numel() for p in module.net.parameters())
+            kept = _saved_bytes(module, inputs)
+        if config.train.precision != "32-true":
+            kept //= 2
+        memory = parameters * _BYTES_A_PARAMETER + kept
+        rows.append(Estimate(stage.name, parameters, batch, memory, note))
+    return rows
+
+
+def estimate_table(rows: list[Estimate]) -> Table:
+    """For a terminal."""
+    table = Table(title="what the trainings take (one process)", title_justify="left")
+    for column in ("stage", "parameters", "batch", "memory", "tokens"):
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        parameters = f"{row.parameters / 1e6:.1f} M"
+        table.add_row(
+            row.stage, parameters, str(row.local_batch), f"{row.memory_bytes / 2**30:.1f} GiB", row.note
+        )
+    return table
+
+
+def data_layout(recipe: Recipe) -> MotionLayout:
+    """Layout of the recipe's data: as its data stage says, or as existing shards are."""
+    config: Any = recipe.stage("data").config
+    path = getattr(config, "path", None)
+    name, fps = getattr(config, "layout", None), getattr(config, "fps", None)
+    if name is None and path is not None:
+        manifest = Manifest.load_json(Path(path).expanduser() / "manifest.json")
+        return MotionLayout.named(manifest.layout, fps=manifest.fps, family=manifest.family)
+    if name is None:
+        raise UserError("the layout of the data is not known; set data.layout to see what the trainings take")
+    return MotionLayout.named(name, fps=fps or 30.0)
+
+
+def bits_per_second(net: Tokenizer) -> float:
+    """Bits that a tokenizer's codes carry for one second of motion, so that tokenizers compare fairly."""
+    groups = net.layout.fps / net.group_frames
+    return groups * sum(s.per_group * math.log2(s.num_codes) for s in net.streams)
+
+
+def _fake(
+    recipe: Recipe, stage: Stage, layout: MotionLayout, batch: int
+) -> tuple[StageModule, dict[str, Any], str]:
+    """The stage's module and a batch of the shapes it will see."""
+    config: Any = stage.config
+    kind = stage.kind.name
+    width = text_width(recipe)
+    if kind == "gpt":
+        return _fake_gpt(recipe, stage, layout, batch)
+    if kind in ("tma", "diffusion"):
+        dim = len(layout.part(config.part))
+        inputs = _captioned(batch, config.max_frames, dim, width)
+        if kind == "tma":
+            tma = Tma(config.net, dim, width)
+            return TmaModule(tma, config.optim, seed=0, max_steps=1, loss=config.loss), inputs, ""
+        denoiser = MotionDiffusion(config.net, dim, width)
+        return DiffusionModule(denoiser, config.optim, seed=0, max_steps=1), inputs, ""
+    net = build_tokenizer(config.net, layout)
+    module = TokenizerModule(net, config.optim, seed=0, max_steps=1, **config.net.loss_terms())
+    inputs = {
+        "motion": torch.empty(batch, config.window, net.dim),
+        "length": torch.full((batch,), config.window),
+    }
+    per_group = " + ".join(f"{s.per_group} {s.name}" for s in net.streams)
+    return module, inputs, f"{per_group} per 4 frames, {bits_per_second(net):.0f} bit/s"
+
+
+def _fake_gpt(
+    recipe: Recipe, stage: Stage, layout: MotionLayout, batch: int
+) -> tuple[StageModule, dict[str, Any], str]:
+    config: Any = stage.config
+    book_config: Any = recipe.stage(stage.inputs["tokenizer"]).config
+    book = build_tokenizer(book_config.net, layout)
+    width = text_width(recipe)
+    tma = None
+    if "tma" in stage.inputs:
+        tma_config: Any = recipe.stage(stage.inputs["tma"]).config
+        tma = Tma(tma_config.net, len(layout.part(tma_config.part)), width)
+    prior = tma.config.latent if config.prior == "tma" and tma is not None else width
+    net = InterleavedGPT(config.net, book.streams, book.pattern, prior)
+    align = config.loss.align_weight > 0 and tma is not None
+    module = GptModule(
+        net, config.optim, seed=0, max_steps=1, loss=config.loss,
+        tokenizer=book.freeze() if align else None, tma=tma if align else None,
+    )  # fmt: skip
+    groups = net.max_groups
+    ends = len(net.names)
+    length = groups * len(net.pattern) + ends
+    order = torch.tensor([net.names.index(name) for name in (net.pattern * groups + net.names)])
+    inputs = {
+        "tokens": torch.zeros(batch, length, dtype=torch.int64),
+        "kinds": order.expand(batch, -1),
+        "text": torch.empty(batch, prior),
+        "sentence": torch.empty(batch, width),
+    }
+    if align and tma is not None:
+        inputs["tma_text"] = torch.empty(batch, tma.config.latent)
+    parts = " + ".join(f"{groups * s.per_group} {s.name}" for s in book.streams)
+    return module, inputs, f"{parts} + {ends} End = {length} for {groups * book.group_frames} frames"
+
+
+def text_width(recipe: Recipe) -> int:
+    """Width of the recipe's text features, or what most encoders have."""
+    text = next((s for s in recipe.stages if s.kind.name == "text"), None)
+    encoder = getattr(text.config, "encoder", "minilm") if text is not None else "minilm"
+    return _TEXT_WIDTH.get(encoder, _USUAL_WIDTH)
+
+
+def _captioned(batch: int, frames: int, dim: int, width: int) -> dict[str, Any]:
+    return {
+        "motion": torch.empty(batch, frames, dim),
+        "length": torch.full((batch,), frames),
+        "text_tokens": torch.empty(batch, _CAPTION_TOKENS, width),
+        "text_mask": torch.ones(batch, _CAPTION_TOKENS, dtype=torch.bool),
+        "sentence": torch.empty(batch, width),
+    }
+
+
+def _saved_bytes(module: StageModule, inputs: dict[str, Any]) -> int:
+    """Bytes that the backward pass of one loss keeps, parameters apart."""
+    own = {p.untyped_storage()._cdata for p in module.parameters()}
+    sizes: dict[int, int] = {}
+
+    def pack(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        if storage._cdata not in own:
+            sizes[storage._cdata] = storage.nbytes()
+        return tensor
+
+    module.train()
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        module.losses(inputs)["loss"]
+    return sum(sizes.values())
