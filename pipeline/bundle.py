@@ -77,9 +77,9 @@ class Bundle:
         """Open a run folder or an exported folder."""
         if (folder / "bundle.json").is_file():
             facts = BundleFile.load_json(folder / "bundle.json")
-            return Bundle.from_parts(
-                {p: folder / p for p in PARTS if (folder / p).is_dir()}, facts.text_encoder
-            )
+            own = folder / facts.text_encoder
+            encoder = str(own) if own.is_dir() else facts.text_encoder
+            return Bundle.from_parts({p: folder / p for p in PARTS if (folder / p).is_dir()}, encoder)
         return Bundle.from_run(folder)
 
     @staticmethod

@@ -122,6 +122,10 @@ def generate(
         float, typer.Option(help="Draw from the likeliest tokens of this total probability.")
     ] = 0.95,
     cfg: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
+    face_model: Annotated[
+        str | None, typer.Option(help="gpt, vae or diffusion; default: the first the run has.")
+    ] = None,
+    steps: Annotated[int, typer.Option(help="Denoising steps of diffusion models.")] = 50,
 ) -> None:
     """Motions from captions, as npz, BVH, MP4 and one page to watch.
 
@@ -137,7 +141,14 @@ def generate(
         formats=formats,
         seconds=seconds,
         seed=seed,
-        sampling={"temperature": temperature, "top_k": top_k, "top_p": top_p, "cfg_scale": cfg},
+        sampling={
+            "temperature": temperature,
+            "top_k": top_k,
+            "top_p": top_p,
+            "cfg_scale": cfg,
+            "face_model": face_model,
+            "denoising_steps": steps,
+        },
         console=make_console(),
     )
 
@@ -157,6 +168,21 @@ def evaluate(
     from motionloom.pipeline.run import evaluate_run
 
     evaluate_run(run_folder, clips=clips, repeats=repeats, console=make_console())
+
+
+@app.command()
+def retrieval(
+    run_folder: RunFolder,
+    split: Annotated[str | None, typer.Option(help="train, val or test; default: the test split.")] = None,
+    seed: Annotated[int, typer.Option(help="Shuffles the batches of protocols C and D.")] = 0,
+) -> None:
+    """Text-motion retrieval by the run's TMA under the paper's protocols A to D.
+
+    Example: `motionloom retrieval runs/humantomato-tiny`
+    """
+    from motionloom.pipeline.retrieval import retrieval_command
+
+    retrieval_command(run_folder, split=split, seed=seed, console=make_console())
 
 
 @app.command()

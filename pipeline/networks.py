@@ -53,7 +53,7 @@ class LoadedTma:
         net = Tma(TmaConfig.parse(facts.config, str(folder)), extra["motion_dim"], extra["text_dim"])
         load_weights(folder, net)
         freeze(net)
-        return LoadedTma(net, facts.layout.layout(), int(extra["max_frames"]), extra["part"])
+        return LoadedTma(net, facts.layout.layout(), int(extra["max_frames"]), extra.get("part", "bodyhand"))
 
     @torch.no_grad()
     def embed_text(self, tokens: Tensor, mask: Tensor, batch: int = 256) -> Tensor:

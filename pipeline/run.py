@@ -11,11 +11,10 @@ from typing import Any, get_args
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.bundle import Bundle, BundleFile, part_folders, text_encoder_of
-from motionloom.pipeline.files import write_json
+from motionloom.pipeline.bundle import Bundle
 from motionloom.pipeline.graph import Selection, execute, make_plan, plan_table, stage_folder
-from motionloom.pipeline.model_store import LayoutFacts
 from motionloom.pipeline.outputs import Format, write_motions
+from motionloom.pipeline.pretrained import write_bundle
 from motionloom.pipeline.recipe import Recipe, load_recipe, nearest
 from motionloom.pipeline.sampling import SamplingConfig
 from motionloom.pipeline.stage import StageContext
@@ -143,17 +142,7 @@ def export_run(folder: Path, out: Path, *, console: Console) -> Path:
     """Copy what generation needs into one folder."""
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
-    parts = part_folders(folder)
-    bundle = Bundle.from_run(folder)
-    for role, source in parts.items():
-        if role == "text":
-            continue
-        (out / role).mkdir(parents=True, exist_ok=True)
-        for name in ("model.safetensors", "model.json", "stats.safetensors"):
-            if (source / name).is_file():
-                shutil.copyfile(source / name, out / role / name)
-    facts = BundleFile(layout=LayoutFacts.of(bundle.layout), text_encoder=text_encoder_of(parts["text"]))
-    write_json(out / "bundle.json", facts.dump())
+    write_bundle(folder, out)
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     console.print(
         f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"', soft_wrap=True

@@ -117,7 +117,7 @@ def test_two_processes_equal_one(
     run = tmp_path / "run"
     shutil.copytree(small_run.folder, run)
     output = finish(running("run", recipe, "--out", run, "--until", "gpt", *PAIR))
-    assert output.count("[4/13] tokenizer") == output.count("[7/13] tokens") == 1, "only one process speaks"
+    assert output.count("[4/15] tokenizer") == output.count("[7/15] tokens") == 1, "only one process speaks"
     assert files(run) == files(single)
     for stage in ("tokenizer", "tma"):
         assert_same_training(single, run, stage)
@@ -144,7 +144,7 @@ def test_torchrun_equals_one_process(
     output = finish(
         running(program, "run", recipe, "--out", run, "--from", "gpt", "--until", "gpt", program=torchrun)
     )
-    assert output.count("[9/13] gpt") == 1
+    assert output.count("[9/15] gpt") == 1
     assert files(run) == files(single)
     assert_same_training(single, run, "gpt")
 

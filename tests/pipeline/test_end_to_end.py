@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.artifact import Artifact
+from motionloom.pipeline.pretrained import MotionModel
 
 pytestmark = pytest.mark.slow
 
@@ -32,6 +34,8 @@ STAGES = [
     "face_tokens",
     "gpt",
     "face_gpt",
+    "face_vae",
+    "face_diffusion",
     "generate",
     "evaluate",
     "report",
@@ -182,12 +186,54 @@ def test_an_exported_folder_works_alone(
     shutil.rmtree(exported)
     files = [p for p in elsewhere.rglob("*") if p.is_file()]
     assert {p.suffix for p in files} == {".json", ".safetensors"}
+    assert json.loads((elsewhere / "skeleton.json").read_text())["name"] == "smplx52"
     assert not any(str(small_run.folder.parent) in p.read_text() for p in files if p.suffix == ".json")
     out = tmp_path / "motions"
     assert call("generate", elsewhere, *WAVE, "--seed", 5, "-f", "npz", "-o", out).code == 0
     np.testing.assert_array_equal(
         arrays(only(out, ".npz"))["joints"], arrays(only(motions, ".npz"))["joints"]
     )
+
+
+@pytest.mark.parametrize("kind", ["vae", "diffusion"])
+def test_each_face_generator_gives_its_own_face(
+    kind: str, copy: Path, motions: Path, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    first = arrays(only(motions, ".npz"))
+    for name in ("once", "again"):
+        options = ("--seed", 5, "-f", "npz", "--face-model", kind, "-o", tmp_path / name)
+        assert call("generate", copy, *WAVE, *options).code == 0
+    once, again = (arrays(only(tmp_path / name, ".npz")) for name in ("once", "again"))
+    np.testing.assert_array_equal(once["joints"], first["joints"])
+    np.testing.assert_array_equal(once["face"], again["face"])
+    assert once["face"].shape == first["face"].shape and not np.allclose(once["face"], first["face"])
+
+
+def test_from_pretrained_needs_the_saved_folder_alone(
+    copy: Path, motions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    MotionModel(copy).save_pretrained(tmp_path / "saved")
+    text = "".join(p.read_text() for p in (tmp_path / "saved").rglob("*") if p.suffix in (".json", ".md"))
+    assert str(copy) not in text
+    model = MotionModel.from_pretrained(tmp_path / "saved")
+    made = model.generate([WAVE[0]], face_captions=[WAVE[2]], seconds=2.0, seed=5)[0]
+    first = arrays(only(motions, ".npz"))
+    np.testing.assert_array_equal(made.joints.astype(np.float32), first["joints"].astype(np.float32))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    with pytest.raises(UserError, match="nobody/none: no such folder, and the hub does not give it"):
+        MotionModel.from_pretrained("nobody/none", local_files_only=True)
+
+
+def test_retrieval_under_four_protocols(copy: Path, call: Callable[..., Any]) -> None:
+    done = call("retrieval", copy)
+    assert done.code == 0
+    rows = json.loads((copy / "retrieval.json").read_text())["protocols"]
+    assert [row["protocol"] for row in rows] == list("ABCD")
+    whole, threshold = rows[0]["figures"], rows[1]["figures"]
+    for k in (1, 2, 3, 5, 10):
+        assert f"R@{k}" in done.out
+        assert threshold[f"t2m/R@{k}"] >= whole[f"t2m/R@{k}"], "more counts as a hit"
+    assert whole["t2m/R@1"] <= whole["t2m/R@3"] <= whole["t2m/R@10"] <= 1
 
 
 def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..., Any]) -> None:

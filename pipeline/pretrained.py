@@ -1,0 +1,146 @@
+"""`MotionModel`: a trained model in one folder, saved, loaded and shared through the hub.
+
+    model = MotionModel.from_pretrained("exported")        # a folder, or a name on the Hugging Face hub
+    motions = model.generate(["a person waves"], seed=1)
+    motions[0].joints                                      # [T, N, 3] metres
+
+The folder holds weights (safetensors), configs, statistics, the skeleton and, where it does not come with the
+installation, the text encoder: nothing else is needed, and nothing in it is ever unpickled or run.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub import ModelHubMixin, snapshot_download
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.bundle import (
+    Bundle,
+    BundleFile,
+    GeneratedMotion,
+    part_folders,
+    text_encoder_of,
+)
+from motionloom.pipeline.files import write_json
+from motionloom.pipeline.model_store import LayoutFacts
+from motionloom.pipeline.sampling import SamplingConfig
+
+_WEIGHTS = ("model.safetensors", "model.json", "stats.safetensors")
+_ENCODER = "text_encoder"
+_ENCODER_FILES = (".safetensors", ".json", ".txt", ".model", ".md")
+"""What a text encoder's folder may bring along; pickled weights and code stay behind."""
+
+
+class MotionModel(
+    ModelHubMixin,
+    library_name="motionloom",
+    pipeline_tag="text-to-3d",
+    tags=["human-motion", "text-to-motion", "whole-body"],
+):
+    """Captions to whole-body motions."""
+
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder)
+        self.bundle = Bundle.open(self.folder)
+        # The mixin would write our argument, a local path, into the config.json that the hub wants.
+        self._hub_mixin_config = {"format": "motionloom bundle"}
+
+    @classmethod
+    def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> MotionModel:
+        """A folder, or a name on the hub; `options` are the hub's (revision, token, local_files_only)."""
+        name = pretrained_model_name_or_path
+        try:
+            return super().from_pretrained(name, **options)
+        except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise UserError(f"{name}: no such folder, and the hub does not give it ({reason})") from None
+
+    def generate(
+        self,
+        captions: Sequence[str],
+        *,
+        face_captions: Sequence[str] | None = None,
+        seconds: float | None = None,
+        seed: int = 0,
+        sampling: SamplingConfig | None = None,
+    ) -> list[GeneratedMotion]:
+        """Motions for captions, in order; the same seed and caption give the same motion."""
+        return self.bundle.generate(
+            captions, face_captions=face_captions, seconds=seconds, seed=seed, sampling=sampling
+        )
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        """Copy all that `generate` needs into the folder."""
+        if (self.folder / "bundle.json").is_file():
+            shutil.copytree(self.folder, save_directory, dirs_exist_ok=True)
+        else:
+            write_bundle(self.folder, save_directory)
+
+    @classmethod
+    def _from_pretrained(
+        cls,
+        *,
+        model_id: str,
+        revision: str | None = None,
+        cache_dir: str | Path | None = None,
+        force_download: bool = False,
+        local_files_only: bool = False,
+        token: str | bool | None = None,
+        **kwargs: Any,
+    ) -> MotionModel:
+        """Open a folder, or fetch one from the hub first."""
+        if Path(model_id).is_dir():
+            return cls(model_id)
+        folder = snapshot_download(
+            model_id, revision=revision, cache_dir=cache_dir, force_download=force_download,
+            local_files_only=local_files_only, token=token,
+            allow_patterns=["*.json", "*.safetensors", f"{_ENCODER}/*"],
+        )  # fmt: skip
+        return cls(folder)
+
+
+def write_bundle(run: Path, out: Path) -> None:
+    """Copy what generation needs of a run's finished stages into `out`; `bundle.json` is written last."""
+    parts = part_folders(run)
+    bundle = Bundle.from_run(run)  # opens every part, so a broken one is found before anything is copied
+    for role, source in parts.items():
+        if role == "text":
+            continue
+        (out / role).mkdir(parents=True, exist_ok=True)
+        for name in _WEIGHTS:
+            if (source / name).is_file():
+                shutil.copyfile(source / name, out / role / name)
+    encoder = text_encoder_of(parts["text"])
+    local = Path(encoder).expanduser()
+    if encoder != "minilm" and local.is_dir():
+        _copy_encoder(local, out / _ENCODER)
+        encoder = _ENCODER
+    skeleton = bundle.layout.skeleton
+    write_json(out / "skeleton.json", _plain(skeleton))
+    facts = BundleFile(layout=LayoutFacts.of(bundle.layout), text_encoder=encoder)
+    write_json(out / "bundle.json", facts.dump())
+
+
+def _copy_encoder(source: Path, target: Path) -> None:
+    for path in sorted(source.rglob("*")):
+        if path.is_file() and path.suffix in _ENCODER_FILES:
+            copy = target / path.relative_to(source)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
+
+
+def _plain(skeleton: Skeleton) -> dict[str, Any]:
+    made = {
+        "name": skeleton.name,
+        "joints": skeleton.joints,
+        "parents": skeleton.parents,
+        "offsets": skeleton.rest,
+    }
+    return dict(json.loads(json.dumps(made)))
