@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from motionloom.datasets.motion.features import decode
-from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.metrics.reconstruction import accel, mpjpe, pa_mpjpe
@@ -23,6 +23,11 @@ from motionloom.pipeline.samples import Truth, joint_layout, reconstruct
 
 KEY_FRAMES = 16
 """Moments of a clip that the nearest-clip search compares."""
+
+
+WRISTS = (20, 21)
+LEFT_FINGERS, RIGHT_FINGERS = range(22, 37), range(37, 52)
+"""Joints of `smplx52`."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ def local_joints(features: NDArray[np.float32], layout: MotionLayout) -> NDArray
 
 
 def reconstruction_figures(
-    tokenizer: Tokenizer, stats: FeatureStats, train: ShardDataset, truths: Sequence[Truth]
+    tokenizer: Tokenizer, stats: FeatureStats, train: ClipDataset, truths: Sequence[Truth]
 ) -> dict[str, float]:
     """Errors in millimetres of the tokenizer, of the mean pose and of the nearest training clip.
 
@@ -77,11 +82,27 @@ def reconstruction_figures(
                 torch.from_numpy(local_joints(features, layout)),
                 torch.from_numpy(decode(features, layout)),
             )
-            values[f"mpjpe{suffix}"] = mpjpe(pose, torch.from_numpy(real))
+            values |= {f"{k}{suffix}": v for k, v in pose_errors(pose, torch.from_numpy(real)).items()}
             values[f"global_mpjpe{suffix}"] = mpjpe(place, target, root=None)
         for name, value in values.items():
             rows.setdefault(name, []).append(float(value.mean()))
     return {name: float(np.mean(values)) for name, values in rows.items()}
+
+
+def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
+    """Errors per frame [T] in mm of poses [T, N, 3]: all joints and the body's from the root (`mpjpe`,
+    `mpjpe_body`), fingers from their wrists (`mpjpe_hand`), the parts of Tables 6 and 7.
+    """
+    out = {"mpjpe": mpjpe(pose, real)}
+    if pose.shape[1] > BODY_JOINTS:
+        out["mpjpe_body"] = mpjpe(pose[:, :BODY_JOINTS], real[:, :BODY_JOINTS])
+        hands = []
+        for wrist, fingers in zip(WRISTS, (LEFT_FINGERS, RIGHT_FINGERS), strict=True):
+            hands.append([wrist, *fingers])
+        # The wrist itself is at the origin of both, so its zero is taken out of the mean again.
+        each = [mpjpe(pose[:, hand], real[:, hand]) * len(hand) / (len(hand) - 1) for hand in hands]
+        out["mpjpe_hand"] = torch.stack(each).mean(0)
+    return out
 
 
 def truths_layout(tokenizer: Tokenizer) -> MotionLayout:
@@ -92,7 +113,7 @@ def truths_layout(tokenizer: Tokenizer) -> MotionLayout:
 class NearestClip:
     """The training clip whose poses, stretched to the same length, come nearest."""
 
-    def __init__(self, train: ShardDataset) -> None:
+    def __init__(self, train: ClipDataset) -> None:
         self.train = train
         self.columns = train.layout.part("bodyhand")
         layout = joint_layout(train.layout)

@@ -196,7 +196,24 @@ def _stages(file: RecipeFile, where: str) -> tuple[Stage, ...]:
             raise UserError(f"{where}: stages.{name}.kind = '{kind_name}' is no stage kind{hint}")
         kind = STAGES[kind_name]
         config = kind.config.parse(_numbers(fields), f"{where}: stages.{name}")
-        out.append(Stage(name, kind, config, _resolve(name, kind, renamed, [s.name for s in out], where)))
+        out.append(Stage(name, kind, config, _resolve(name, kind, renamed, list(file.stages), where)))
+    return _in_order(out, where)
+
+
+def _in_order(stages: list[Stage], where: str) -> tuple[Stage, ...]:
+    """The stages so that each stands behind its inputs, else as written: a recipe that `extends` another may
+    add a stage that an earlier one reads.
+    """
+    out: list[Stage] = []
+    waiting = list(stages)
+    while waiting:
+        done = {stage.name for stage in out}
+        ready = next((stage for stage in waiting if done.issuperset(stage.inputs.values())), None)
+        if ready is None:
+            names = ", ".join(stage.name for stage in waiting)
+            raise UserError(f"{where}: stages need each other in a circle: {names}")
+        waiting.remove(ready)
+        out.append(ready)
     return tuple(out)
 
 
@@ -209,7 +226,7 @@ def _numbers(value: Any) -> Any:
     return value
 
 
-def _resolve(name: str, kind: StageKind, renamed: Any, before: list[str], where: str) -> dict[str, str]:
+def _resolve(name: str, kind: StageKind, renamed: Any, known: list[str], where: str) -> dict[str, str]:
     roles = {role.removesuffix("?"): role.endswith("?") for role in kind.inputs}
     if not isinstance(renamed, dict):
         raise UserError(f"{where}: stages.{name}.inputs must map roles to stages, like {{data: other_data}}")
@@ -223,11 +240,11 @@ def _resolve(name: str, kind: StageKind, renamed: Any, before: list[str], where:
         source = renamed.get(role, role)
         if source is None and optional:
             continue
-        if source in before:
+        if source in known:
             inputs[role] = source
         elif role in renamed or not optional:
             raise UserError(
-                f"{where}: stage '{name}' needs a stage '{source}' (role '{role}') before it"
-                f"{nearest(source, before)}"
+                f"{where}: stage '{name}' needs a stage '{source}' (role '{role}')"
+                f"{nearest(source, [other for other in known if other != name])}"
             )
     return inputs

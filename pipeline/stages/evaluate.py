@@ -148,23 +148,19 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
     out.append(
         (
             f"Reconstruction on {figures['clips']} {figures['split']} clips, mm (lower is better)",
-            ["", "pose (root and heading aligned)", "in the world", "PA-MPJPE", "ACCEL"],
+            ["", "pose", "body", "fingers from the wrist", "in the world", "PA-MPJPE", "ACCEL"],
             [
                 [
-                    "tokenizer",
-                    _mm(r["mpjpe"]),
-                    _mm(r["global_mpjpe"]),
-                    _mm(r["pa_mpjpe"]),
-                    _mm(r.get("accel")),
-                ],
-                [
-                    "nearest training clip",
-                    _mm(r["mpjpe_nearest_train_clip"]),
-                    _mm(r["global_mpjpe_nearest_train_clip"]),
-                    "",
-                    "",
-                ],
-                ["mean pose", _mm(r["mpjpe_mean_pose"]), _mm(r["global_mpjpe_mean_pose"]), "", ""],
+                    title,
+                    *(_mm(r.get(f"{key}{suffix}")) for key in ("mpjpe", "mpjpe_body", "mpjpe_hand")),
+                    _mm(r[f"global_mpjpe{suffix}"]),
+                    *(_mm(r.get(key)) if not suffix else "" for key in ("pa_mpjpe", "accel")),
+                ]
+                for title, suffix in (
+                    ("tokenizer", ""),
+                    ("nearest training clip", "_nearest_train_clip"),
+                    ("mean pose", "_mean_pose"),
+                )
             ],
         )
     )

@@ -1,0 +1,144 @@
+"""Tokenizers at an equal training budget: H2VQ, RVQ, VQ, body and hands apart, FSQ (Tables 3 and 7).
+
+    python benchmarks/reconstruction_order.py WORK [--shards FOLDER] [--seeds 3] [--steps 600]
+
+Every tokenizer is trained by the same recipe on the same windows with the same widths, one run a seed, and
+measured on the test split: MPJPE in mm of all joints and of the body from the root, of the fingers from their
+wrists, and the world positions with the path. Killed and started again it goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.estimate import bits_per_second
+from motionloom.pipeline.evaluation import reconstruction_figures
+from motionloom.pipeline.networks import load_tokenizer
+from motionloom.pipeline.run import run_recipe
+from motionloom.pipeline.samples import truth_of
+from motionloom.pipeline.sources import open_split, open_stats
+
+matplotlib.use("Agg")
+
+CODES = {"num_codes": 256, "reset_below": 0.2}
+NETS: dict[str, tuple[str, dict]] = {
+    "VQ": ("vq", CODES),
+    "RVQ, 2 levels": ("rvq", {**CODES, "levels": 2}),
+    "RVQ, 3 levels": ("rvq", {**CODES, "levels": 3}),
+    "apart": ("separate", CODES),
+    "H2VQ": ("h2vq", CODES),
+    "FSQ": ("fsq", {"steps": [8, 6, 5]}),
+}
+"""Title -> stage kind and what differs. RVQ with three levels spends exactly H2VQ's bits."""
+
+COMMON = {"width": 96, "depth": 2, "code_dim": 96, "recon": "smooth_l1", "velocity_weight": 0.5}
+COLUMNS = {"mpjpe": "all", "mpjpe_body": "body", "mpjpe_hand": "fingers", "global_mpjpe": "world"}
+
+
+def recipe(work: Path, kind: str, net: dict, seed: int, args: argparse.Namespace) -> Path:
+    """The recipe file of one run; data, statistics and windows are the same for all."""
+    train = {"steps": args.steps, "batch_size": 64, "checkpoint_every": 100, "validate_every": 0}
+    stages = {
+        "data": {"kind": "shards", "path": str(args.shards.resolve()), "verify": False},
+        "stats": {"kind": "stats"},
+        "tokenizer": {
+            "kind": kind,
+            "net": {**COMMON, **net},
+            "optim": {"lr": 4.0e-4, "warmup_steps": 30, "schedule": "cosine"},
+            "train": train,
+        },
+    }
+    path = work / "recipe.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(yaml.safe_dump({"name": "order", "seed": seed, "stages": stages}))
+    return path
+
+
+def measure(run: Path, clips: int) -> dict[str, float]:
+    """Figures of one finished run, kept beside it."""
+    kept = run / "figures.json"
+    if kept.is_file():
+        return dict(json.loads(kept.read_text()))
+    net = load_tokenizer(run / "stages/tokenizer")
+    test = open_split(run / "stages/data", "test")
+    truths = [truth_of(test, i) for i in range(min(clips, len(test)))]
+    figures = reconstruction_figures(
+        net, open_stats(run / "stages/stats"), open_split(run / "stages/data", "train"), truths
+    )
+    figures["bits"] = bits_per_second(net)
+    kept.write_text(json.dumps(figures))
+    return figures
+
+
+def show(results: dict[str, list[dict[str, float]]], console: Console) -> None:
+    table = Table(
+        "tokenizer", "bit/s", *COLUMNS.values(), title="test clips, mm, mean ± deviation over seeds"
+    )
+    for title, rows in results.items():
+        cells = [_spread([row[key] for row in rows]) for key in COLUMNS]
+        table.add_row(title, f"{rows[0]['bits']:.0f}", *cells)
+    first = next(iter(results.values()))[0]
+    for name, suffix in (("nearest training clip", "_nearest_train_clip"), ("mean pose", "_mean_pose")):
+        table.add_row(name, "", *(f"{first[f'{key}{suffix}']:.1f}" for key in COLUMNS))
+    console.print(table)
+
+
+def _spread(values: Sequence[float]) -> str:
+    deviation = np.std(values, ddof=1) if len(values) > 1 else 0.0
+    return f"{np.mean(values):.1f} ± {deviation:.1f}"
+
+
+def draw(results: dict[str, list[dict[str, float]]], path: Path) -> None:
+    """Every seed as a dot, so that the order can be judged against the spread."""
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, len(COLUMNS), figsize=(12, 3), sharey=True, layout="constrained")
+    for panel, (key, title) in zip(panels, COLUMNS.items(), strict=True):
+        for row, (_name, figures) in enumerate(results.items()):
+            panel.plot([f[key] for f in figures], [row] * len(figures), "o", alpha=0.7, color="C0")
+        panel.set_title(f"{title}, mm")
+        panel.set_yticks(range(len(results)), list(results))
+        panel.grid(axis="x", alpha=0.3)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--shards", type=Path, help="whole-body shards; default: synthetic clips")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--made", type=int, default=1000, help="synthetic clips to make")
+    parser.add_argument("--clips", type=int, default=100, help="test clips at most")
+    args = parser.parse_args()
+    if args.shards is None:
+        args.shards = args.work / "shards"
+        fields = {"clips": args.made, "fps": 20, "min_seconds": 2.0, "max_seconds": 5.0, "seed": 7}
+        synthesize(SynthConfig.parse(fields, "synthetic clips"), args.shards, workers=2)
+    console = Console()
+    results: dict[str, list[dict[str, float]]] = {}
+    for seed in range(args.seeds):
+        for title, (kind, net) in NETS.items():
+            run = args.work / f"{title.replace(' ', '-').replace(',', '')}-{seed}"
+            run_recipe(recipe(run, kind, net, seed, args), run, console=console)
+            results.setdefault(title, []).append(measure(run, args.clips))
+        show(results, console)
+    draw(results, args.work / "order.png")
+    (args.work / "order.json").write_text(json.dumps(results, indent=1))
+    console.print(f"{args.work / 'order.json'}, {args.work / 'order.png'}")
+
+
+if __name__ == "__main__":
+    main()
