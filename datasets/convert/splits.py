@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from motionloom.datasets.schema import Split, UserError
@@ -10,6 +12,8 @@ from motionloom.datasets.shards.index import SPLITS
 
 TRAIN_SHARE, VAL_SHARE = 0.80, 0.05
 """80/5/15, the split of HumanML3D and Motion-X, where a source brings none."""
+
+_MIRRORED = re.compile(r"((?:.*/)?)M(\d+)")
 
 
 def hash_split(clip_id: str) -> Split:
@@ -60,6 +64,42 @@ def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
             if known != split:
                 raise UserError(f"{where}: '{clip_id}' is also in {known}.txt; a clip in two splits leaks")
             if clip_id in here:
-                notes.append(f"{where}: '{clip_id}' is listed twice; the first line counts")
+                notes.append(f"{path.name}:{number}: '{clip_id}' is listed twice; the first line counts")
             here.add(clip_id)
     return splits, notes
+
+
+def original_of(clip_id: str) -> str | None:
+    """Id of the clip that this one mirrors, None for every other name.
+
+    HumanML3D and Motion-X name them so: `humanml/M007482` mirrors `humanml/007482`.
+    """
+    found = _MIRRORED.fullmatch(clip_id)
+    return found[1] + found[2] if found else None
+
+
+def keep_mirrors_together(
+    splits: Mapping[str, Split], mirror_of: Callable[[str], str | None], folder: Path | None = None
+) -> None:
+    """`UserError` when a mirrored clip is in another split than its original: the test set would leak.
+
+    `mirror_of` says which clip an id mirrors (`original_of`), None for none; originals without a split are
+    fine. `folder` of the split files lets the error name both lines.
+    """
+    for clip_id, split in splits.items():
+        original = mirror_of(clip_id)
+        there = splits.get(original) if original is not None else None
+        if original is not None and there is not None and there != split:
+            raise UserError(
+                f"{_line_of(clip_id, split, folder)}: '{clip_id}' mirrors '{original}', which is in "
+                f"{_line_of(original, there, folder)}; a clip and its mirror image in two splits leak"
+            )
+
+
+def _line_of(clip_id: str, split: Split, folder: Path | None) -> str:
+    """Where a split file lists an id."""
+    if folder is None:
+        return f"{split}.txt"
+    path = folder / f"{split}.txt"
+    lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+    return f"{path}:{lines.index(clip_id) + 1}"

@@ -1,0 +1,143 @@
+"""Reading of `.npy` files from outside: nothing is run, guessed or half read.
+
+A file becomes an array only if it is whole, [T, width], float32 or float64, finite and within the caller's
+range. Big-endian and Fortran-ordered files are plain storage variants and are converted. Everything else is
+a `UserError` that names the file and the reason: object arrays (pickles in disguise), cut files, stray or
+missing axes. A transposed array is refused, not turned: [322, 322] could not be told apart.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+
+from motionloom.datasets.schema import UserError
+
+Limit = float | NDArray[np.float64]
+
+
+def load_array(
+    path: Path,
+    *,
+    width: int | tuple[int, ...],
+    name: str | None = None,
+    limit: Limit | None = None,
+) -> NDArray[Any]:
+    """The array [T, width] of an `.npy` file, T >= 1: float32 or float64 as stored, native bytes, C order.
+
+    `width` may be a tuple: (22, 3) reads joints [T, 22, 3]. `name` stands for the file in errors (default:
+    its path). `limit` is the largest absolute value allowed, one number or one per column ([width]). Raises
+    `UserError` for everything listed in the module's docstring, naming frame and column of a bad value.
+    """
+    label = str(path) if name is None else name
+    columns = (width,) if isinstance(width, int) else width
+    try:
+        with path.open("rb") as file:
+            shape, dtype = _header(file, label)
+            _check_shape(shape, columns, label)
+            _check_dtype(dtype, label)
+            file.seek(0)
+            found = npy_format.read_array(file, allow_pickle=False)
+    except OSError as error:
+        raise UserError(f"{label}: cannot be read ({error.strerror or error})") from None
+    values = np.ascontiguousarray(found, dtype=dtype.newbyteorder("="))
+    _check_values(values, limit, label)
+    return values
+
+
+def read_array_header(path: Path, *, name: str | None = None) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """(shape, dtype) of an `.npy` file without reading its data; `UserError` if it is not whole.
+
+    The size of the file is compared with the header, so a cut file is found here. Shape and dtype are as
+    stored; `load_array` judges them.
+    """
+    label = str(path) if name is None else name
+    try:
+        with path.open("rb") as file:
+            return _header(file, label)
+    except OSError as error:
+        raise UserError(f"{label}: cannot be read ({error.strerror or error})") from None
+
+
+def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | None = None) -> int:
+    """T of a file that `load_array` accepts as far as header and size tell; `UserError` otherwise."""
+    label = str(path) if name is None else name
+    shape, dtype = read_array_header(path, name=label)
+    _check_shape(shape, (width,) if isinstance(width, int) else width, label)
+    _check_dtype(dtype, label)
+    return shape[0]
+
+
+def _header(file: BinaryIO, label: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and dtype at the start of an open file whose size fits them."""
+    size = os.fstat(file.fileno()).st_size
+    if size == 0:
+        raise UserError(f"{label}: empty file")
+    try:
+        version = npy_format.read_magic(file)
+        # Version 3 differs only in the names of record fields, which no motion file has.
+        read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
+        shape, _, dtype = read(file)
+    except OSError:
+        raise
+    except Exception as error:  # numpy's header parser fails in many ways on broken text
+        reason = " ".join(str(error).split())[:120]
+        raise UserError(f"{label}: not an .npy file, or cut within its header ({reason})") from None
+    if dtype.hasobject:
+        raise UserError(f"{label}: object array, which would run code when read; save plain numbers")
+    if any(count < 0 for count in shape):
+        raise UserError(f"{label}: the header states a negative size {list(shape)}")
+    expected, found = math.prod(shape) * dtype.itemsize, size - file.tell()
+    if found != expected:
+        what = "truncated array" if found < expected else "more data than the header states"
+        raise UserError(f"{label}: {what}: {expected} bytes expected for {list(shape)}, {found} found")
+    return shape, dtype
+
+
+def _check_shape(shape: tuple[int, ...], columns: tuple[int, ...], label: str) -> None:
+    if len(shape) > 1 and shape[0] == 0:
+        raise UserError(f"{label}: zero length, no frames")
+    if shape[1:] == columns and len(shape) == len(columns) + 1:
+        return
+    hint = ""
+    if shape == columns:
+        hint = "; one frame without the time axis"
+    elif len(shape) == len(columns) + 2 and shape[2:] == columns:
+        hint = "; a stray batch axis"
+    elif len(shape) == 2 and shape[:1] == columns:
+        hint = "; it seems to be transposed"
+    wanted = ", ".join(str(count) for count in columns)
+    raise UserError(f"{label}: expected [T, {wanted}], found {list(shape)}{hint}")
+
+
+def _check_dtype(dtype: np.dtype[Any], label: str) -> None:
+    if dtype.kind != "f" or dtype.itemsize not in (4, 8):
+        raise UserError(f"{label}: values are {dtype.name}; expected float32 or float64")
+
+
+def _check_values(values: NDArray[Any], limit: Limit | None, label: str) -> None:
+    """`UserError` for the first value (in time order) that is not finite or beyond the limit."""
+    finite = np.isfinite(values)
+    if not finite.all():
+        where = np.argwhere(~finite)[0]
+        raise UserError(f"{label}: {values[tuple(where)]} at {_place(where)}")
+    if limit is None:
+        return
+    # Compared in pieces of the array's own type: no float64 copy of a float32 array.
+    over = np.abs(values) > np.broadcast_to(np.asarray(limit, dtype=values.dtype), values.shape)
+    if over.any():
+        where = np.argwhere(over)[0]
+        most = float(np.broadcast_to(limit, values.shape)[tuple(where)])
+        value = f"{values[tuple(where)]:.4g}"
+        raise UserError(f"{label}: absurd value {value} at {_place(where)}; at most {most:g} is sensible")
+
+
+def _place(where: NDArray[np.int64]) -> str:
+    frame, *rest = (int(index) for index in where)
+    return f"frame {frame}, column {', '.join(str(index) for index in rest)}"

@@ -1,0 +1,94 @@
+"""The converters by name. A converter is imported when it is asked for, so `--help` stays quick."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from motionloom.datasets.convert.conversion import SCAN_FILE, Conversion, ConvertConfig
+from motionloom.datasets.schema import UserError
+
+
+@dataclass(frozen=True)
+class Converter:
+    """One kind of source."""
+
+    module: str
+    """Module that holds the config class and the prepare function."""
+    config_name: str
+    prepare_name: str
+    summary: str
+    """One line for the help."""
+    example: str
+    """What follows `motionloom data convert NAME` in the example of the help."""
+    keeps_scan: bool = False
+    """Whether prepare takes `scan`: a file that remembers what it found in files that have not changed."""
+
+    def config(self) -> type[ConvertConfig]:
+        """The config class."""
+        found: type[ConvertConfig] = getattr(importlib.import_module(self.module), self.config_name)
+        return found
+
+    def prepare(
+        self, config: ConvertConfig, *, out: Path | None = None, workers: int = 1, progress: bool = False
+    ) -> Conversion[Any]:
+        """Look at the whole source and decide what becomes of every file.
+
+        With `out`, the folder of the shards, a source whose listing must read every file (archives) is read
+        once and not again by the next run or by the other parts of a conversion.
+        """
+        prepare = getattr(importlib.import_module(self.module), self.prepare_name)
+        more = {"scan": out / SCAN_FILE} if self.keeps_scan and out is not None else {}
+        made: Conversion[Any] = prepare(config, workers=workers, progress=progress, **more)
+        return made
+
+
+_HERE = "motionloom.datasets.convert"
+
+CONVERTERS: dict[str, Converter] = {
+    "humanml3d": Converter(
+        f"{_HERE}.humanml3d",
+        "HumanMl3dConfig",
+        "prepare_humanml3d",
+        "HumanML3D: new_joints or new_joint_vecs, texts and split files to shards.",
+        "HumanML3D shards",
+    ),
+    "motionx": Converter(
+        f"{_HERE}.motionx",
+        "MotionXConfig",
+        "prepare_motionx",
+        "Motion-X: SMPL-X parameters (322-d), body, hand and face texts to shards.",
+        "Motion-X shards",
+    ),
+    "aistpp": Converter(
+        f"{_HERE}.aistpp",
+        "AistppConfig",
+        "prepare_aistpp",
+        "AIST++: SMPL dances with their music to shards.",
+        "aist_plusplus_final shards",
+    ),
+    "amass": Converter(
+        f"{_HERE}.amass",
+        "AmassConfig",
+        "prepare_amass",
+        "AMASS: SMPL-H and SMPL-X .npz files to shards.",
+        "AMASS shards",
+    ),
+    "bvh": Converter(
+        f"{_HERE}.bvh",
+        "BvhConfig",
+        "prepare_bvh",
+        "BVH files of any skeleton, loose or in tar archives, to shards.",
+        "mocap shards --joint-map map.json --captions captions.jsonl --licence CC-BY-4.0",
+        keeps_scan=True,
+    ),
+}
+
+
+def converter_named(kind: str) -> Converter:
+    """The table's entry; `UserError` with the known names otherwise."""
+    if kind not in CONVERTERS:
+        raise UserError(f"unknown converter '{kind}'; known: {', '.join(CONVERTERS)}")
+    return CONVERTERS[kind]

@@ -1,0 +1,385 @@
+"""SMPL parameters to joints: golden vectors, a slow reference, made-up mesh models, and model files."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.npz import NpzFile
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.motion.smpl import BodyModel, SkeletonName, smpl_joints
+from motionloom.datasets.schema import UserError
+
+SKELETONS: tuple[SkeletonName, ...] = ("smpl22", "smplx52")
+SMPL_TREE = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19]
+FINGER_STARTS = [0, 3, 6, 9, 12]
+
+
+def tree_of(joints: int) -> list[int]:
+    """Parents of SMPL (24), SMPL-H (52) or SMPL-X (55), as their files have them."""
+    parents = list(SMPL_TREE)
+    if joints == 24:
+        return [*parents, 20, 21]
+    if joints == 55:
+        parents += [15, 15, 15]
+    for wrist in (20, 21):
+        start = len(parents)
+        parents += [wrist if i in FINGER_STARTS else start + i - 1 for i in range(15)]
+    return parents
+
+
+def rodrigues(vector: list[float]) -> list[list[float]]:
+    angle = math.sqrt(sum(v * v for v in vector))
+    if angle == 0:
+        return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    x, y, z = (v / angle for v in vector)
+    c, s = math.cos(angle), math.sin(angle)
+    return [
+        [c + x * x * (1 - c), x * y * (1 - c) - z * s, x * z * (1 - c) + y * s],
+        [y * x * (1 - c) + z * s, c + y * y * (1 - c), y * z * (1 - c) - x * s],
+        [z * x * (1 - c) - y * s, z * y * (1 - c) + x * s, c + z * z * (1 - c)],
+    ]
+
+
+def matmul(a: list[list[float]], b: list[list[float]]) -> list[list[float]]:
+    return [[sum(a[i][k] * b[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+
+
+def slow_joints(
+    rotvecs: NDArray[Any], trans: NDArray[Any], rest: NDArray[Any], parents: list[int]
+) -> NDArray[np.float64]:
+    """One frame, one joint, one number at a time, in Python floats."""
+    frames = []
+    for rotations, move in zip(rotvecs.tolist(), trans.tolist(), strict=True):
+        world: list[list[list[float]]] = []
+        joints: list[list[float]] = []
+        for joint, parent in enumerate(parents):
+            local = rodrigues(rotations[joint])
+            if parent < 0:
+                world.append(local)
+                joints.append([float(rest[0][k]) + move[k] for k in range(3)])
+                continue
+            bone = [float(rest[joint][k] - rest[parent][k]) for k in range(3)]
+            above = world[parent]
+            joints.append(
+                [joints[parent][i] + sum(above[i][k] * bone[k] for k in range(3)) for i in range(3)]
+            )
+            world.append(matmul(above, local))
+        frames.append(joints)
+    return np.array(frames)
+
+
+def made_up_model(joints: int, shapes: int = 10, *, rigid: bool = False, seed: int = 0) -> dict[str, Any]:
+    """A body model of the right form with random content.
+
+    `rigid`: each joint is regressed from vertices that move with it alone, so that regressing the posed mesh
+    must give the posed joints.
+    """
+    rng = np.random.default_rng(seed)
+    vertices = 6 * joints
+    regressor = np.zeros((joints, vertices))
+    weights = rng.dirichlet(np.full(joints, 0.1), size=vertices)
+    if rigid:
+        weights = np.zeros((vertices, joints))
+    for joint in range(joints):
+        own = slice(6 * joint, 6 * joint + 6)
+        regressor[joint, own] = rng.dirichlet(np.ones(6))
+        if rigid:
+            weights[own, joint] = 1.0
+    tree = np.array([tree_of(joints), range(joints)], dtype=np.int64).astype(np.uint32)
+    return {
+        "J_regressor": regressor,
+        "v_template": rng.normal(size=(vertices, 3)),
+        "shapedirs": 0.1 * rng.normal(size=(vertices, 3, shapes)),
+        "posedirs": (0.0 if rigid else 0.01) * rng.normal(size=(vertices, 3, 9 * (joints - 1))),
+        "kintree_table": tree,  # the root's parent is 2^32 - 1, as in the published files
+        "weights": weights,
+    }
+
+
+def posed_mesh(
+    model: dict[str, Any], rotvecs: NDArray[Any], trans: NDArray[Any], betas: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Vertices [V, 3] and joints [J, 3] of one frame by linear blend skinning with 4 x 4 matrices."""
+    parents = tree_of(len(model["J_regressor"]))
+    shaped = model["v_template"] + model["shapedirs"][:, :, : len(betas)] @ betas
+    rest = model["J_regressor"] @ shaped
+    local = np.array([rodrigues(r) for r in rotvecs.tolist()])
+    posed = shaped + np.dot(model["posedirs"], np.ravel(local[1:] - np.eye(3)))
+    world = []
+    for joint, parent in enumerate(parents):
+        step = np.eye(4)
+        step[:3, :3] = local[joint]
+        step[:3, 3] = rest[joint] - (rest[parent] if parent >= 0 else 0)
+        world.append(world[parent] @ step if parent >= 0 else step)
+    moves = []
+    for joint, matrix in enumerate(world):
+        back = np.eye(4)
+        back[:3, 3] = -rest[joint]
+        moves.append(matrix @ back)
+    blend = np.tensordot(model["weights"], np.array(moves), axes=1)
+    vertices = np.einsum("vij,vj->vi", blend[:, :3, :3], posed) + blend[:, :3, 3] + trans
+    return vertices, np.array([matrix[:3, 3] for matrix in world]) + trans
+
+
+def chosen(joints: int, skeleton: SkeletonName) -> list[int]:
+    return [*range(22), *range(joints - 30, joints)] if skeleton == "smplx52" else list(range(22))
+
+
+def random_pose(skeleton: SkeletonName, frames: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rng = np.random.default_rng(1)
+    return rng.normal(size=(frames, len(Skeleton.named(skeleton)), 3)), rng.normal(size=(frames, 3))
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS)
+def test_equals_a_slow_reference(skeleton: SkeletonName) -> None:
+    body = BodyModel.neutral(skeleton)
+    rotvecs, trans = random_pose(skeleton, 12)
+    rotvecs[0] = 0.0
+    rotvecs[1] *= 1e-9
+    rotvecs[2] *= math.pi / np.linalg.norm(rotvecs[2], axis=-1, keepdims=True)
+    rotvecs[3] *= 5.0
+    joints = smpl_joints(rotvecs, trans, body)
+    expected = slow_joints(rotvecs, trans, body.template, list(body.skeleton.parents))
+    assert joints.dtype == np.float64
+    np.testing.assert_allclose(joints, expected, atol=1e-13)
+    np.testing.assert_allclose(joints[0], body.template + trans[0], atol=1e-15)
+
+
+def test_several_clips_in_one_call_are_the_same_as_one_by_one() -> None:
+    body = BodyModel.neutral("smplx52")
+    rotvecs, trans = random_pose("smplx52", 12)
+    several = smpl_joints(rotvecs.reshape(3, 4, 52, 3), trans.reshape(3, 4, 3), body)
+    np.testing.assert_allclose(several.reshape(12, 52, 3), smpl_joints(rotvecs, trans, body), atol=1e-14)
+    assert smpl_joints(rotvecs.astype(np.float32), trans, body).shape == (12, 52, 3)
+
+
+def test_golden_body_joints(shared: Path) -> None:
+    """Poses of t4 (every 2nd frame) and joints of t1 (every 3rd) share every 6th frame of one AIST++ clip.
+
+    The bones are taken from frame 0; the other 49 frames must follow.
+    """
+    poses = np.load(shared / "golden/t4_motionx322_A.npz", allow_pickle=False)["motion322"][::3]
+    joints = np.load(shared / "golden/t1_humanml3d_A.npz", allow_pickle=False)["aist__joints"][::2]
+    rotvecs = poses[:50, :66].reshape(-1, 22, 3).astype(np.float64)
+    joints = joints[:50].astype(np.float64)
+    rest = unposed(rotvecs[0], joints[0], list(Skeleton.named("smpl22").parents))
+    body = BodyModel(Skeleton.named("smpl22"), rest - rest[0], np.zeros((22, 3, 0)), {})
+    made = smpl_joints(rotvecs, poses[:50, 309:312], body)
+    np.testing.assert_allclose(made, joints, atol=1e-6)
+
+
+def test_golden_limbs_after_turning_z_up_to_y_up(shared: Path) -> None:
+    """t4: turning our joints (x, y, z) -> (x, z, -y) equals the joints of the turned parameters.
+
+    The golden file has no spine, so arms are compared relative to their shoulders; its
+    turned parameters went through float32 half turns, good to 4e-6 m.
+    """
+    golden = np.load(shared / "golden/t4_motionx322_A.npz", allow_pickle=False)
+    names = json.loads((shared / "golden/t4_layouts.json").read_text())["motionx_137_joint_names"]
+    skeleton = Skeleton.named("smpl22")
+    limbs = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
+    mine = [skeleton.index(f"{side}_{limb}") for side in ("left", "right") for limb in limbs]
+    theirs = [names.index(f"{side}_{limb.capitalize()}") for side in "LR" for limb in limbs]
+    joints = np.zeros((150, 22, 3))
+    joints[:, mine] = golden["fz_positions137"][:, theirs]
+    joints[:, 0] = golden["fz_positions137"][:, 0]
+
+    turned = golden["processed"].astype(np.float64)[:, :66].reshape(-1, 22, 3)
+    rest = unposed(turned[0], joints[0], list(skeleton.parents))
+    body = BodyModel(skeleton, rest, np.zeros((22, 3, 0)), {})
+    source = golden["motion322"].astype(np.float64)
+    made = smpl_joints(source[:, :66].reshape(-1, 22, 3), np.zeros((150, 3)), body)
+    made = made[..., [0, 2, 1]] * [1.0, 1.0, -1.0]
+    for side in ("left", "right"):
+        legs = [skeleton.index(f"{side}_{limb}") for limb in limbs[:3]]
+        wanted = joints[:, legs] - joints[:, :1]
+        np.testing.assert_allclose(made[:, legs] - made[:, :1], wanted, atol=1e-5)
+        shoulder, *arm = (skeleton.index(f"{side}_{limb}") for limb in limbs[3:])
+        wanted = joints[:, arm] - joints[:, [shoulder]]
+        np.testing.assert_allclose(made[:, arm] - made[:, [shoulder]], wanted, atol=1e-5)
+
+
+def unposed(rotvecs: NDArray[Any], joints: NDArray[Any], parents: list[int]) -> NDArray[np.float64]:
+    """Rest joints of a posed frame."""
+    world = [np.array(rodrigues(rotvecs[0].tolist()))]
+    rest = [np.zeros(3)]
+    for joint, parent in enumerate(parents[1:], start=1):
+        world.append(world[parent] @ np.array(rodrigues(rotvecs[joint].tolist())))
+        rest.append(rest[parent] + world[parent].T @ (joints[joint] - joints[parent]))
+    return np.array(rest)
+
+
+@pytest.mark.parametrize(
+    ("joints", "skeleton"), [(24, "smpl22"), (52, "smpl22"), (55, "smpl22"), (52, "smplx52"), (55, "smplx52")]
+)
+@pytest.mark.parametrize("rigid", [False, True])
+def test_joints_of_a_mesh_model(joints: int, skeleton: SkeletonName, rigid: bool, tmp_path: Path) -> None:
+    model = made_up_model(joints, rigid=rigid)
+    path = tmp_path / "model.npz"
+    np.savez(path, **model)
+    body = BodyModel.load(path, skeleton)
+    rng = np.random.default_rng(2)
+    rotvecs, trans = rng.normal(size=(3, joints, 3)), rng.normal(size=(3, 3))
+    betas = rng.normal(size=10)
+    mine = chosen(joints, skeleton)
+    made = smpl_joints(rotvecs[:, mine], trans, body, betas)
+    for frame in range(3):
+        vertices, posed = posed_mesh(model, rotvecs[frame], trans[frame], betas)
+        np.testing.assert_allclose(made[frame], posed[mine], atol=1e-12)
+        regressed = model["J_regressor"] @ vertices
+        close = np.allclose(regressed[mine], posed[mine], atol=1e-9)
+        assert close == rigid  # through a soft mesh they are other points, which is why nobody wants them
+
+
+def test_statement_names_the_file_and_the_kind(tmp_path: Path) -> None:
+    path = tmp_path / "SMPLH_NEUTRAL.npz"
+    np.savez(path, **made_up_model(52, shapes=16))
+    statement = BodyModel.load(path, "smpl22").statement
+    assert (statement["kind"], statement["file"], statement["shape_values"]) == ("SMPL-H", path.name, 16)
+    assert len(statement["sha256"]) == 64 and str(tmp_path) not in str(statement)
+    assert "No body model" in BodyModel.neutral("smpl22").statement["sentence"]
+
+
+def test_shape_values_may_be_fewer_or_more_than_the_model_has(tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    np.savez(path, **made_up_model(52))
+    body = BodyModel.load(path, "smpl22")
+    betas = np.random.default_rng(3).normal(size=16)
+    short = np.concatenate([betas[:4], np.zeros(6)])
+    np.testing.assert_array_equal(body.rest_joints(betas), body.rest_joints(betas[:10]))
+    np.testing.assert_allclose(body.rest_joints(betas[:4]), body.rest_joints(short), atol=1e-15)
+    np.testing.assert_array_equal(body.rest_joints(None), body.template)
+    neutral = BodyModel.neutral("smpl22")
+    np.testing.assert_array_equal(neutral.rest_joints(betas), neutral.template)
+    with pytest.raises(UserError, match=r"betas are \[1, 10\]"):
+        body.rest_joints(betas[None, :10])
+
+
+@pytest.mark.parametrize(("width", "shapes"), [(20, 10), (400, 300)])
+def test_expression_of_smplx_is_no_shape(width: int, shapes: int, tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    np.savez(path, **made_up_model(55, shapes=width))
+    assert BodyModel.load(path, "smplx52").directions.shape == (52, 3, shapes)
+
+
+def test_regressor_as_non_zeros(tmp_path: Path) -> None:
+    model = made_up_model(24)
+    np.savez(tmp_path / "dense.npz", **model)
+    dense = model.pop("J_regressor")
+    row, column = np.nonzero(dense)
+    parts = {"J_regressor_row": row, "J_regressor_col": column, "J_regressor_data": dense[row, column]}
+    np.savez_compressed(tmp_path / "sparse.npz", **model, **parts)
+    loaded = [BodyModel.load(tmp_path / name, "smpl22") for name in ("dense.npz", "sparse.npz")]
+    np.testing.assert_array_equal(loaded[0].template, loaded[1].template)
+    np.savez(tmp_path / "wrong.npz", **model, **(parts | {"J_regressor_row": row + 24}))
+    with pytest.raises(UserError, match="non-zeros do not fit"):
+        BodyModel.load(tmp_path / "wrong.npz", "smpl22")
+
+
+def test_pickles_are_never_opened(tmp_path: Path) -> None:
+    path = tmp_path / "basicModel_neutral.pkl"
+    path.write_bytes(b"anything")
+    with pytest.raises(UserError, match=r"basicModel_neutral.pkl is a pickle.*numpy\.savez"):
+        BodyModel.load(path, "smpl22")
+    model = made_up_model(24) | {"J_regressor": np.array([{"a": 1}], dtype=object)}
+    np.savez(tmp_path / "model.npz", allow_pickle=True, **model)
+    with pytest.raises(UserError, match="'J_regressor' holds Python objects"):
+        BodyModel.load(tmp_path / "model.npz", "smpl22")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kintree_table": np.array([[0, 0], [0, 1]])}, r"kintree_table is \[2, 2\]; SMPL has \[2, 24\]"),
+        ({"kintree_table": np.array([[*tree_of(24)[:23], 3], range(24)])}, ""),
+        ({"kintree_table": np.array([[*tree_of(24)[:21], 3, 20, 21], range(24)])}, "not the joint tree"),
+        ({"v_template": np.zeros((144, 2))}, r"v_template is \[144, 2\]"),
+        ({"shapedirs": np.zeros((10, 3, 10))}, r"shapedirs is \[10, 3, 10\], not \[144, 3, B\]"),
+        ({"J_regressor": np.zeros((24, 5))}, r"J_regressor is \[24, 5\], not \[24, 144\]"),
+        ({"v_template": np.full((144, 3), np.nan)}, "NaN or infinity in v_template"),
+        ({"J_regressor": np.full((24, 144), "x")}, "'J_regressor' has type <U1, not numbers"),
+    ],
+)
+def test_wrong_models_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    np.savez(path, **(made_up_model(24) | change))
+    if not message:  # joints 22 and 23 are not ours
+        BodyModel.load(path, "smpl22")
+        return
+    with pytest.raises(UserError, match=message) as caught:
+        BodyModel.load(path, "smpl22")
+    assert str(path) in str(caught.value)
+
+
+def test_missing_arrays_fingers_and_files_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    np.savez(path, **made_up_model(24))
+    with pytest.raises(UserError, match="SMPL has no fingers, but skeleton smplx52 does"):
+        BodyModel.load(path, "smplx52")
+    np.savez(path, **{k: v for k, v in made_up_model(24).items() if k != "shapedirs"})
+    with pytest.raises(UserError, match="no array 'shapedirs'; there are J_regressor, kintree_table"):
+        BodyModel.load(path, "smpl22")
+    with pytest.raises(UserError, match=r"none\.npz: cannot be read \(No such file"):
+        BodyModel.load(tmp_path / "none.npz", "smpl22")
+
+
+def test_shapes_of_the_parameters_are_checked() -> None:
+    body = BodyModel.neutral("smpl22")
+    with pytest.raises(UserError, match=r"needs rotations \[T, 22, 3\].*not \[5, 24, 3\]"):
+        smpl_joints(np.zeros((5, 24, 3)), np.zeros((5, 3)), body)
+    with pytest.raises(UserError, match=r"not \[5, 22, 3\] and \[4, 3\]"):
+        smpl_joints(np.zeros((5, 22, 3)), np.zeros((4, 3)), body)
+
+
+def test_npz_reads_headers_and_refuses_what_does_not_fit(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    values = np.asfortranarray(np.random.default_rng(0).normal(size=(7, 5)))
+    np.savez_compressed(path, good=values, big=values.astype(">f4"), text="male", nothing=np.zeros((0, 3)))
+    with NpzFile(path) as file:
+        assert file.names == {"good", "big", "text", "nothing"}
+        assert (file.header("good").shape, file.header("good").size) == ((7, 5), 280)
+        np.testing.assert_array_equal(file.numbers("good"), values)
+        np.testing.assert_array_equal(file.numbers("big"), values.astype(np.float32))
+        assert file.array("text").item() == "male" and file.array("nothing").shape == (0, 3)
+        with pytest.raises(UserError, match=r"'good' of shape \[7, 5\] takes 280 bytes; more than 100"):
+            file.array("good", limit=100)
+
+    header = b"\x93NUMPY\x01\x00"
+    text = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("huge.npy", header + len(text).to_bytes(2, "little") + text + bytes(8))
+        archive.writestr("text.npy", b"hello")
+        archive.writestr("bad.npy", header + b"\x05\x00(((((")
+    with NpzFile(path, "label") as file:
+        with pytest.raises(UserError, match=r"^label: array 'huge' .* needs 8000000000\d+ bytes, the file"):
+            file.array("huge")
+        for name in ("text", "bad"):
+            with pytest.raises(UserError, match=f"^label: array '{name}' is damaged"):
+                file.header(name)
+
+
+def test_npz_finds_damage(tmp_path: Path) -> None:
+    for save in (np.savez, np.savez_compressed):
+        path = tmp_path / "a.npz"
+        save(path, values=np.random.default_rng(0).normal(size=1000))
+        data = bytearray(path.read_bytes())
+        path.write_bytes(data[:-200])
+        with pytest.raises(UserError, match=r"a\.npz: not an \.npz file, or cut off"):
+            NpzFile(path)
+        data[2000] ^= 0xFF
+        path.write_bytes(data)
+        with NpzFile(path) as file, pytest.raises(UserError, match="'values' is damaged"):
+            file.array("values")
+    path.write_bytes(b"")
+    with pytest.raises(UserError, match=r"not an \.npz file"):
+        NpzFile(path)
+    with pytest.raises(UserError, match="cannot be read"):
+        NpzFile(tmp_path)
