@@ -1,7 +1,12 @@
-"""The few collectives the models need; each is the identity when no process group is running."""
+"""The few collectives the models need; each is the identity when no process group is running.
+
+Losses are written so that their *mean over ranks* is the loss of the concatenated batch: DDP and FSDP average
+gradients over ranks, and training then equals one process with the whole batch.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -45,6 +50,22 @@ def sum_over_ranks(x: Tensor) -> Tensor:
         x = x.clone()
         dist.all_reduce(x)
     return x
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of `values` where `mask` is True, as this rank's share: the mean over ranks is that of all elements.
+
+    Ranks hold different numbers of real frames or tokens, so each divides by the mean number per rank, not by
+    its own. 0 where there are none.
+
+    Args:
+        values: Any shape.
+        mask: bool, the shape of `values` or of its leading dimensions.
+    """
+    each = math.prod(values.shape[mask.dim() :])
+    count = sum_over_ranks(mask.sum().float()) * each / world_size()
+    full = mask[(...,) + (None,) * (values.dim() - mask.dim())]
+    return torch.where(full, values, 0.0).sum() / count.clamp(min=1)
 
 
 def gather_rows(x: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.schema import Config
 from motionloom.models.distributed import alone
+from motionloom.models.sharding import sharded
 
 LOG_EVERY = 10
 """Steps between logged figures; averaging them over ranks costs a collective each."""
@@ -48,6 +49,11 @@ class StageModule(L.LightningModule, ABC):
     @abstractmethod
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Losses and scalar metrics of one batch; "loss" is minimised, the others are only logged."""
+
+    def configure_model(self) -> None:
+        """Cut the network over the ranks where the strategy lays them out for that (FSDP)."""
+        if self.device_mesh is not None:
+            self.net = sharded(self.net, self.device_mesh["data_parallel"])
 
     def compile_losses(self) -> None:
         """Compile networks and losses as one graph; seeding and logging stay outside. A break is an error."""

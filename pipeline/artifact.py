@@ -16,8 +16,8 @@ from motionloom.pipeline.files import sha256_file, write_json
 
 FILE_NAME = "artifact.json"
 
-# What a stage keeps for itself and no later stage reads.
-_PRIVATE = {"checkpoints", "started.json", "timing.json", FILE_NAME}
+# What no result depends on: a stage's own notes, and settings that a later run may change.
+_PRIVATE = {"checkpoints", "started.json", "timing.json", "reader.json", FILE_NAME}
 
 
 class OutputFile(Config):

@@ -7,13 +7,11 @@ from typing import Annotated
 
 import typer
 
+from motionloom.pipeline.cli_convert import convert_app
 from motionloom.pipeline.console import make_console
 
 data_app = typer.Typer(
     help="Shards: synthesise, convert, check, statistics.", no_args_is_help=True, rich_markup_mode="markdown"
-)
-convert_app = typer.Typer(
-    help="Real motion capture to shards.", no_args_is_help=True, rich_markup_mode="markdown"
 )
 data_app.add_typer(convert_app, name="convert")
 
@@ -44,63 +42,58 @@ def synth(
     say_manifest(synthesize(config, out, workers=workers), out, console)
 
 
-@convert_app.command()
-def bvh(
-    source: Annotated[
-        Path, typer.Argument(help="Folder of .bvh files, or of .tar/.tar.xz archives of them.")
-    ],
-    out: Out,
-    joint_map: Annotated[Path, typer.Option("--joint-map", help="JSON that maps our joints to the file's.")],
-    captions: Annotated[Path | None, typer.Option(help="JSON lines: id, file, captions, split.")] = None,
-    splits: Annotated[
-        Path | None, typer.Option(help="Folder with train.txt, val.txt, test.txt; else the captions' split.")
-    ] = None,
-    layout: Annotated[str, typer.Option(help="Feature layout of the shards: body133 or h3d263.")] = "body133",
-    fps: Annotated[float, typer.Option(help="Frame rate of the shards; clips are resampled by time.")] = 20.0,
-    source_fps: Annotated[
-        float | None, typer.Option(help="True frame rate of the files, if they state a wrong one.")
-    ] = None,
-    unit: Annotated[str, typer.Option(help="Length unit of the files: m, cm, mm or inch.")] = "cm",
-    up: Annotated[str, typer.Option(help="Upward axis of the files: y or z.")] = "y",
-    licence: Annotated[str, typer.Option(help="Licence of the clips, kept in every sample.")] = "unknown",
-    limit: Annotated[int | None, typer.Option(help="Only the first N clips.")] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="Stop at the first bad file instead of listing it.")
-    ] = False,
-    plan: Annotated[bool, typer.Option("--plan", help="Only list what would be converted.")] = False,
-    workers: Workers = 2,
-) -> None:
-    """BVH files with captions to shards.
-
-    Example: `motionloom data convert bvh mocap shards --joint-map map.json --captions captions.jsonl --plan`
-    """
-    from motionloom.pipeline.data_commands import convert_bvh_command
-
-    fields = {
-        "source": source,
-        "joint_map": joint_map,
-        "captions": captions,
-        "splits": splits,
-        "layout": layout,
-        "fps": fps,
-        "source_fps": source_fps,
-        "unit": unit,
-        "up": up,
-        "licence": licence,
-        "limit": limit,
-    }
-    convert_bvh_command(fields, out, plan=plan, strict=strict, workers=workers, console=make_console())
-
-
 @data_app.command()
-def check(root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")]) -> None:
-    """Checksums, schema, finite values, duplicates, splits that leak. Exit code 1 and a list of problems.
+def check(
+    path: Annotated[
+        Path, typer.Argument(help="Folder with manifest.json; or one source file, or a folder of such files.")
+    ],
+    layout: Annotated[
+        str | None,
+        typer.Option(
+            help="Files: layout of .npy arrays, or joints22, joints52; default smplx322 (Motion-X)."
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Files: frame rate, if not the layout's usual one.")
+    ] = None,
+    texts: Annotated[
+        str, typer.Option(help="Files: how .txt is read: auto, humanml, plain (a caption a line) or ids.")
+    ] = "auto",
+    seconds: Annotated[float | None, typer.Option(help="Files: length of the clips of captions.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Warnings count as problems.")] = False,
+) -> None:
+    """Checksums, schema, finite values, ranges, duplicates, leaks. Exit code 1 and a list of problems.
+
+    Without manifest.json, single files are checked: .tar, .npy, .npz, .pkl, .bvh, .wav, .txt.
 
     Example: `motionloom data check shards`
+
+    Example: `motionloom data check HumanML3D/new_joint_vecs --layout h3d263`
     """
     from motionloom.pipeline.data_commands import check_command
 
-    raise typer.Exit(1 if check_command(root, make_console()) else 0)
+    rules = {"layout": layout, "fps": fps, "texts": texts, "seconds": seconds}
+    raise typer.Exit(1 if check_command(path, rules, strict=strict, console=make_console()) else 0)
+
+
+@data_app.command()
+def report(
+    root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The page; default ROOT/report.html.")
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Also check the whole set, and show what was found.")
+    ] = False,
+    clips: Annotated[int, typer.Option(help="Clips to watch, at most.")] = 12,
+) -> None:
+    """One self-contained page about a data set: counts, captions, features, rejected clips, clips to watch.
+
+    Example: `motionloom data report shards -o shards.html`
+    """
+    from motionloom.pipeline.data_commands import report_command
+
+    report_command(root, out, check=check, clips=clips, console=make_console())
 
 
 @data_app.command()

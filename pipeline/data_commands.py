@@ -9,9 +9,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.convert.bvh import BvhConfig, convert_bvh, plan_bvh
+from motionloom.datasets.check_file import FILE_SUFFIXES, FileRules, check_file, check_folder
+from motionloom.datasets.convert.base import ConversionPlan
+from motionloom.datasets.convert.conversion import run_conversion
+from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.schema import Manifest, UserError
-from motionloom.datasets.shards.check import check
+from motionloom.datasets.shards.check import examine
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.statistics import compute
 
@@ -38,26 +41,122 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
     )
 
 
-def convert_bvh_command(
-    fields: dict[str, Any], out: Path, *, plan: bool, strict: bool, workers: int, console: Console
+def convert_command(
+    kind: str,
+    fields: dict[str, Any],
+    out: Path,
+    *,
+    plan: bool,
+    strict: bool,
+    workers: int,
+    clips_per_shard: int,
+    cluster: list[str] | None,
+    console: Console,
 ) -> None:
-    """Plan or convert."""
-    config = BvhConfig.parse(fields, "data convert bvh")
+    """Plan a conversion, run it here, or hand it to SLURM."""
+    converter = converter_named(kind)
+    config = converter.config().parse(fields, f"data convert {kind}")
+    shown = console.is_terminal
     if plan:
-        console.print(plan_bvh(config, workers=workers, progress=console.is_terminal).table())
+        conversion = converter.prepare(config, workers=workers, progress=shown)
+        say_plan(conversion.estimated(workers), console)
         return
-    say_manifest(convert_bvh(config, out, workers=workers, strict=strict), out, console)
+    if cluster:
+        from motionloom.pipeline.slurm_convert import ClusterConfig, submit_conversion
+
+        given = ClusterConfig.parse(_pairs(cluster), "--cluster")
+        submit_conversion(
+            kind,
+            config.dump(),
+            out,
+            cluster=given,
+            strict=strict,
+            clips_per_shard=clips_per_shard,
+            console=console,
+        )
+        return
+    conversion = converter.prepare(config, out=out, workers=workers, progress=shown)
+    manifest = run_conversion(
+        conversion, out, workers=workers, strict=strict, clips_per_shard=clips_per_shard, progress=shown
+    )
+    say_manifest(manifest, out, console)
 
 
-def check_command(root: Path, console: Console) -> int:
-    """Print every problem; returns their number."""
-    if not root.is_dir():
-        raise UserError(f"{root}: no such folder")
-    problems = check(root)
-    for problem in problems:
-        console.print(str(problem), markup=False)
-    console.print(f"{root}: {len(problems)} problems" if problems else f"{root}: no problems")
-    return len(problems)
+def say_plan(plan: ConversionPlan[Any], console: Console) -> None:
+    """The plan, per subset beside the official release where the source has subsets."""
+    subsets = plan.subset_table()
+    if subsets is not None:
+        console.print(subsets)
+    console.print(plan.table())
+
+
+def _pairs(given: list[str]) -> dict[str, str]:
+    """KEY=VALUE options as a mapping."""
+    out = {}
+    for text in given:
+        key, sign, value = text.partition("=")
+        if not sign:
+            raise UserError(f"--cluster {text}: write KEY=VALUE, for instance partition=cpu")
+        out[key.strip()] = value.strip()
+    return out
+
+
+def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: Console) -> int:
+    """Check a dataset, a file or a folder of files; prints all there is to say, returns the problems."""
+    if not path.exists():
+        raise UserError(f"{path}: no such folder or file")
+    files = path.is_file() or _holds_files(path)
+    count, warned = _check_files(path, rules, console) if files else _check_dataset(path, console)
+    if strict:
+        count += warned
+    console.print(f"{path}: {count} problems" if count else f"{path}: no problems", markup=False)
+    return count
+
+
+def _holds_files(folder: Path) -> bool:
+    """Whether a folder is no dataset, finished or not, but holds files that can be checked one by one."""
+    if (folder / "manifest.json").exists() or any(folder.glob("*.index.json")):
+        return False
+    return any(path.suffix.lower() in FILE_SUFFIXES for path in folder.rglob("*"))
+
+
+def _check_dataset(root: Path, console: Console) -> tuple[int, int]:
+    report = examine(root, progress=console.is_terminal)
+    for warning in report.warnings:
+        _say(console, f"warning: {warning}")
+    for problem in report.errors:
+        _say(console, str(problem))
+    if report.warning_kinds:
+        told = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
+        _say(console, f"{root}: warnings: {told}")
+    return sum(report.error_kinds.values()), sum(report.warning_kinds.values())
+
+
+def _check_files(path: Path, given: dict[str, Any], console: Console) -> tuple[int, int]:
+    rules = FileRules(**given)
+    bad = warned = 0
+    for verdict in [check_file(path, rules)] if path.is_file() else check_folder(path, rules):
+        _say(console, str(verdict))
+        for note in verdict.notes:
+            _say(console, f"{verdict.path}: note: {note}")
+        bad += not verdict.ok
+        warned += bool(verdict.ok and verdict.notes)
+    return bad, warned
+
+
+def _say(console: Console, text: str) -> None:
+    """Print text from a stranger's file: one line, and no control characters for the terminal to obey."""
+    shown = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
+    console.print(shown, markup=False, highlight=False, soft_wrap=True)
+
+
+def report_command(root: Path, out: Path | None, *, check: bool, clips: int, console: Console) -> None:
+    """Write the page about a data set."""
+    from motionloom.pipeline.data_report import write_data_report  # drawing is imported when it is needed
+
+    path = out or root / "report.html"
+    write_data_report(root, path, check=check, clips=clips, progress=console.is_terminal)
+    console.print(str(path), markup=False, soft_wrap=True)
 
 
 def stats_command(root: Path, *, group: bool, out: Path | None, console: Console) -> None:

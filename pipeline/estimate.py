@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,7 +17,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.gpt.module import GptModule
@@ -30,6 +29,7 @@ from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.pipeline.recipe import Recipe, Stage
+from motionloom.pipeline.stages.data import ShardsStageConfig
 from motionloom.pipeline.training import TrainedStageConfig, prepare_module
 
 _TEXT_WIDTH = {"minilm": 384}
@@ -71,7 +71,8 @@ def estimate(recipe: Recipe) -> list[Estimate]:
             kept = _saved_bytes(module, inputs)
         if config.train.precision != "32-true":
             kept //= 2
-        memory = parameters * _BYTES_A_PARAMETER + kept
+        holders = world if config.train.strategy == "fsdp" else 1
+        memory = parameters * _BYTES_A_PARAMETER // holders + kept
         rows.append(Estimate(stage.name, parameters, batch, memory, note))
     return rows
 
@@ -92,11 +93,9 @@ def estimate_table(rows: list[Estimate]) -> Table:
 def data_layout(recipe: Recipe) -> MotionLayout:
     """Layout of the recipe's data: as its data stage says, or as existing shards are."""
     config: Any = recipe.stage("data").config
-    path = getattr(config, "path", None)
+    if isinstance(config, ShardsStageConfig):
+        return config.found_layout()
     name, fps = getattr(config, "layout", None), getattr(config, "fps", None)
-    if name is None and path is not None:
-        manifest = Manifest.load_json(Path(path).expanduser() / "manifest.json")
-        return MotionLayout.named(manifest.layout, fps=manifest.fps, family=manifest.family)
     if name is None:
         raise UserError("the layout of the data is not known; set data.layout to see what the trainings take")
     return MotionLayout.named(name, fps=fps or 30.0)

@@ -203,6 +203,9 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
         team = Team.start(recipe.hardware) if trained else Team()
         if leads:
             write_text(run / "recipe.yaml", recipe.to_yaml())
+            for row in plan:
+                if row.action == "skip" and row.stage.kind.settle is not None:
+                    row.stage.kind.settle(row.stage.config, stage_folder(run, row.stage.name))
         for row in todo:
             stage, folder = row.stage, stage_folder(run, row.stage.name)
             begin = time.perf_counter()

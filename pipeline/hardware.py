@@ -21,7 +21,6 @@ class Hardware(Config):
     devices: int = Field(0, ge=0)
     """Processes on this node; 0 means every visible GPU, or one process on a CPU."""
     nodes: int = Field(1, ge=1)
-    strategy: Literal["auto", "ddp", "fsdp"] = "auto"
     workers: int = Field(0, ge=0)
     """Loader worker processes per rank."""
     convert_workers: int = Field(2, ge=1)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.features import decode, face_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.models.tokenizer.base import Tokenizer
 
@@ -35,7 +35,7 @@ def joint_layout(layout: MotionLayout) -> MotionLayout:
     return MotionLayout.named("wholebody313", fps=layout.fps, family=layout.family)
 
 
-def truth_of(dataset: ShardDataset, index: int, max_frames: int | None = None) -> Truth:
+def truth_of(dataset: ClipDataset, index: int, max_frames: int | None = None) -> Truth:
     """One clip, cut to whole groups of four frames."""
     layout = dataset.layout
     motion = np.asarray(dataset.motion(index))
@@ -67,7 +67,7 @@ def reconstruct(
     return np.asarray(out * std + mean, dtype=np.float32)
 
 
-def spread(dataset: ShardDataset, count: int) -> list[int]:
+def spread(dataset: ClipDataset, count: int) -> list[int]:
     """Clip numbers spread evenly over a split, at most `count`, different captions first."""
     seen: set[str] = set()
     first: list[int] = []

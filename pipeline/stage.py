@@ -61,6 +61,8 @@ class StageKind:
     trains: bool = False
     external: Callable[[Any], Any] | None = None
     """Facts about files outside the run (names, sizes, checksums) that belong to the fingerprint."""
+    settle: Callable[[Any, Path], None] | None = None
+    """Puts RUNTIME settings of the config into the folder of a finished stage, for those that read it."""
 
 
 def fingerprint_fields(config: BaseModel) -> dict[str, Any]:

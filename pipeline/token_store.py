@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.order import Source
 from motionloom.datasets.shards.plan import BatchPlan
 from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences
 from motionloom.pipeline.files import atomic
@@ -90,24 +91,26 @@ class TokenBatches(Dataset[dict[str, Any]]):
     rank: int = 0
     world: int = 1
     training: bool = True
+    sources: tuple[Source, ...] = ()
+    """Data sets and their weights, when several are mixed."""
 
     @cached_property
     def _plan(self) -> BatchPlan:
         lengths = np.minimum(self.store.groups, self.max_groups)
-        return BatchPlan(len(self.captions), self.batch_size, self.seed, lengths)
+        return BatchPlan(len(self.captions), self.batch_size, self.seed, lengths, self.sources)
 
     def __len__(self) -> int:
         return -(-len(self.captions) // self.batch_size)
 
     def __getitem__(self, k: int) -> dict[str, Any]:
         if self.training:
-            epoch, items = self._plan.local(k, self.rank, self.world)
+            turns, items = self._plan.local(k, self.rank, self.world)
         else:
-            epoch = 0
             items = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
+            turns = np.zeros(len(items), dtype=np.int64)
         rows, sequences = [], []
-        for item in items.tolist():
-            rng = np.random.default_rng([self.seed, epoch, item])
+        for item, turn in zip(items.tolist(), turns.tolist(), strict=True):
+            rng = np.random.default_rng([self.seed, turn, item])
             choice = int(rng.integers(len(self.captions[item]))) if self.training else 0
             rows.append(self.captions[item][choice])
             sequences.append(self._sequence(item, rng))

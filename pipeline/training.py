@@ -11,16 +11,18 @@ import json
 import warnings
 from collections.abc import Callable, Iterator, Sized
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, ClassVar, Literal, cast
 
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy, Strategy
 from pydantic import Field
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.layers.transformer import Transformer
+from motionloom.models.sharding import make_whole
 from motionloom.models.stage_module import OptimConfig, StageModule
 from motionloom.pipeline.hardware import Hardware
 from motionloom.pipeline.process import TeamError
@@ -39,8 +41,18 @@ class TrainConfig(Config):
     batch_size: int = Field(256, ge=1)
     """Global batch, over all processes and accumulated parts."""
     accumulate: int = Field(1, ge=1)
-    """Parts the batch of a step is cut into."""
+    """Parts the batch of a step is cut into, so that less memory is needed; the gradient is the mean of theirs.
+
+    Equal to the whole batch where a loss is a mean over samples and the parts hold equally many real frames
+    or tokens. Two things cannot be: a contrastive loss sees the negatives of its own part only, and a learnt
+    codebook is updated with every part (an average and resets over smaller batches). More processes instead
+    of more parts change neither.
+    """
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
+    strategy: Literal["ddp", "fsdp"] = Field("ddp", json_schema_extra=RUNTIME)
+    """What several processes hold: each the whole network (`ddp`), or each a part of the weights, gradients
+    and optimizer state (`fsdp`: gpt stages, for networks that do not fit; not with compile or 16-mixed).
+    One process holds all; the results are the same."""
     compile: bool = False
     """Compile networks and losses with torch.compile, as one graph."""
     checkpoint_activations: bool = Field(False, json_schema_extra=RUNTIME)
@@ -65,12 +77,31 @@ class TrainConfig(Config):
 class TrainedStageConfig(StageConfig):
     """Base of the configs of stages that train."""
 
+    shardable: ClassVar[bool] = False
+    """Whether `train.strategy: fsdp` can cut the network: it must be used through `forward` alone."""
+
     optim: OptimConfig = OptimConfig()
     train: TrainConfig = TrainConfig()
 
     def require_fit(self, hardware: Hardware) -> None:
-        """The global batch must divide over the processes."""
+        """The global batch must divide over the processes, and FSDP suit the network and the arithmetic."""
         self.train.local_batch(hardware.world())
+        if self.train.strategy == "fsdp":
+            self._require_shardable()
+
+    def _require_shardable(self) -> None:
+        if not self.shardable:
+            raise UserError(
+                "train.strategy fsdp is for gpt stages: the other networks fit on every GPU, and learnt "
+                "codebooks must be whole on every process; set train.strategy: ddp"
+            )
+        if self.train.compile:
+            raise UserError(
+                "train.compile makes one graph and train.strategy fsdp gathers weights between the blocks; "
+                "set one of them back"
+            )
+        if self.train.precision == "16-mixed":
+            raise UserError("train.strategy fsdp has no gradient scaler; set train.precision: bf16-mixed")
 
 
 class ChunkSampler(Sampler[int]):
@@ -122,7 +153,7 @@ def fit(
         accelerator=hardware.lightning_accelerator(),
         devices=hardware.resolved_devices(),
         num_nodes=hardware.nodes,
-        strategy=_strategy(hardware),
+        strategy=_strategy(hardware, config),
         precision=config.precision,
         max_steps=config.steps,
         accumulate_grad_batches=config.accumulate,
@@ -145,6 +176,7 @@ def fit(
     if config.compile:
         module.compile_losses()
     newest = newest_checkpoint(context.folder / "checkpoints")
+    net = module.net
     try:
         trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C
@@ -153,6 +185,9 @@ def fit(
         if "by peer" in str(error):  # how the backends report a connection that broke
             raise TeamError(str(error)) from None
         raise
+    if module.net is not net:  # the strategy has trained a sharded copy
+        make_whole(module.net, net)
+        module.net = net
     if trainer.is_global_zero:
         for path in sorted((context.folder / "checkpoints").glob("*.ckpt"))[:-_KEPT]:
             path.unlink()  # Lightning forgets the checkpoint that a killed run was resumed from
@@ -225,12 +260,18 @@ def _loader(dataset: Dataset[Any], sampler: Any, hardware: Hardware) -> DataLoad
     )
 
 
-def _strategy(hardware: Hardware) -> Any:
-    if hardware.strategy == "fsdp":
-        return "fsdp"
+def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
     if hardware.world() == 1:
         return "auto"
-    return L.pytorch.strategies.DDPStrategy(
+    if config.strategy == "fsdp":
+        return ModelParallelStrategy(
+            data_parallel_size=hardware.world(),
+            tensor_parallel_size=1,
+            # One file with everything, as DDP writes it: a run may be resumed with the other strategy.
+            save_distributed_checkpoint=False,
+            process_group_backend=hardware.backend(),
+        )
+    return DDPStrategy(
         process_group_backend=hardware.backend(),
         # The quantizers keep codebooks equal themselves; rank 0's copy must not overwrite them mid-step.
         forward_sync_buffers=False,

@@ -45,6 +45,17 @@ class Batch:
         """Name of the batch in reports."""
         return self.archive or self.files[0]
 
+    def state(self) -> list[tuple[str, int, int]]:
+        """Name, size and time of the last change (ns) of every file; size -1 when it cannot be looked at."""
+        out = []
+        for name in (self.archive,) if self.archive is not None else self.files:
+            try:
+                about = (self.root / name).stat()
+                out.append((name, about.st_size, about.st_mtime_ns))
+            except OSError:
+                out.append((name, -1, 0))
+        return out
+
     def read(self, suffix: str) -> Iterator[SourceFile]:
         """Every file with `suffix`, in archive order. `UserError` when the archive is damaged there."""
         if self.archive is not None:

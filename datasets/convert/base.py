@@ -1,4 +1,4 @@
-"""What every converter shares: the plan it shows first, and a pool for its own work.
+"""What every converter shares: the plan it shows first.
 
 A converter plans before it converts: the plan lists what was found, what is missing and what will be left out
 and why, so nothing is skipped silently (`convert ... --plan` prints it and stops).
@@ -6,24 +6,16 @@ and why, so nothing is skipped silently (`convert ... --plan` prints it and stop
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from multiprocessing.connection import wait
 from typing import Generic, TypeVar
 
-import torch
 from rich.table import Table
 
 from motionloom.datasets.schema import Dropped, Split, UserError
 from motionloom.datasets.shards.index import SPLITS
 
 T = TypeVar("T")
-R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -125,45 +117,3 @@ def _duration(seconds: float) -> str:
 def _some(lines: Sequence[str], limit: int = 5) -> str:
     more = [f"... and {len(lines) - limit} more"] if len(lines) > limit else []
     return "\n".join([*lines[:limit], *more])
-
-
-def run_pool(work: Callable[[T], R], tasks: Sequence[T], workers: int) -> Iterator[tuple[int, R]]:
-    """(position, result) of every task as it finishes, in spawned processes of one thread each.
-
-    One worker or one task runs here, also on one thread. `work` and `tasks` must be picklable.
-    """
-    if workers <= 1 or len(tasks) <= 1:
-        before = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            for position, task in enumerate(tasks):
-                yield position, work(task)
-        finally:
-            torch.set_num_threads(before)
-        return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(tasks)), context, initializer=_start_worker)
-    try:
-        futures = {pool.submit(work, task): position for position, task in enumerate(tasks)}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    except BrokenProcessPool:
-        raise UserError(
-            "a conversion worker was killed (out of memory?); run again with fewer workers: "
-            "finished work is kept"
-        ) from None
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _start_worker() -> None:
-    """One thread, and an end when the parent dies, even by SIGKILL."""
-    torch.set_num_threads(1)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    threading.Thread(target=_exit_after, args=(parent.sentinel,), daemon=True).start()
-
-
-def _exit_after(sentinel: int) -> None:
-    wait([sentinel])
-    os._exit(1)

@@ -7,6 +7,7 @@ estimates and the manifest are here, once.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -20,12 +21,18 @@ from typing import Any, Generic, TypeVar
 from pydantic import ConfigDict, Field
 
 from motionloom.datasets.convert.base import ConversionPlan
+from motionloom.datasets.convert.first_step import FirstStep, Take
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Config, Dropped, Manifest, Split, UserError
+from motionloom.datasets.shards.pool import Workers
 from motionloom.datasets.shards.sample import MotionType, Sample
-from motionloom.datasets.shards.writer import write_dataset
+from motionloom.datasets.shards.tasks import Part
+from motionloom.datasets.shards.writer import WORK_FOLDER, write_dataset
 
 T = TypeVar("T")
+
+SCAN_FILE = ".scan.json"
+"""Inside the folder of the shards: what converters remember of their source; may be deleted at any time."""
 
 _TRIAL_CLIPS, _TRIAL_SECONDS = 8, 5.0
 """Clips converted for the time estimate, and when to stop earlier."""
@@ -93,27 +100,41 @@ class Conversion(Generic[T]):
     """What the output depends on, as plain JSON; never a local path."""
     motion_type: MotionType = "float32"
     audio: dict[str, Any] | None = None
+    first: FirstStep[T] | None = None
+    """For sources where clips cannot be read one by one; `convert` must then give the same samples."""
 
     def estimated(self, workers: int) -> ConversionPlan[T]:
         """The plan with disk and time: bytes by the frame counts, time by converting a few clips."""
         plan = self.plan
         width = self.layout.dim * (2 if self.motion_type == "float16" else 4)
         needed = sum(plan.frames.values()) * width + len(plan.items) * 4096
-        chosen = [item for _, item in limited(plan.items, self.describe, _TRIAL_CLIPS)]
+        each = self._trial()
+        seconds = None if each is None else each * len(plan.items) / workers
+        return dataclasses.replace(plan, bytes_needed=needed, seconds_needed=seconds)
+
+    def _trial(self) -> float | None:
+        """Seconds a clip takes, measured on a few; None when there are none."""
+        if not self.plan.items:
+            return None
+        if self.first is not None:
+            batch = self.first.batches[self.first.batch_of(self.plan.items[0][1])]
+            batch.trial(0.0)  # pays for imports
+            start = time.perf_counter()
+            clips = batch.trial(_TRIAL_SECONDS)
+            return (time.perf_counter() - start) / clips if clips else None
+        # The first clip pays for imports, so it is converted twice and only the second time counts.
+        chosen = [item for _, item in limited(self.plan.items, self.describe, _TRIAL_CLIPS)]
         start, done = time.perf_counter(), 0
-        for item in chosen:
-            try:
+        for position, item in enumerate([chosen[0], *chosen]):
+            with contextlib.suppress(Exception):  # the real run reports it; here only time counts
                 self.convert(item)
-            except Exception:  # the real run reports it; here only time counts
-                done += 1
+            if position == 0:
+                start = time.perf_counter()
                 continue
             done += 1
-            if done == 1:
-                start, done = time.perf_counter(), 0  # the first pays for imports
-            elif time.perf_counter() - start > _TRIAL_SECONDS:
+            if time.perf_counter() - start > _TRIAL_SECONDS:
                 break
-        seconds = (time.perf_counter() - start) / done * len(plan.items) / workers if done else None
-        return dataclasses.replace(plan, bytes_needed=needed, seconds_needed=seconds)
+        return (time.perf_counter() - start) / done
 
 
 def run_conversion(
@@ -125,19 +146,31 @@ def run_conversion(
     seed: int = 0,
     clips_per_shard: int = 256,
     progress: bool = True,
+    part: Part | None = None,
 ) -> Manifest:
     """Write the shards. `strict` stops when anything is missing or cannot be read.
 
     Same input and options give the same bytes for any `workers`; a killed run goes on at the first unfinished
-    shard.
+    shard. With `part`, only that part is made, without a manifest (the one returned tells of the part); the
+    run without one then finds the shards of all parts, makes what is missing and writes index and manifest.
     """
     plan = conversion.plan
     if strict:
         plan.require_whole()
+    folder, first = out / WORK_FOLDER, conversion.first
+    if first is None and part is not None and part.step == "features":
+        raise UserError(
+            f"{conversion.converter}: this source has no features step; run the parts of 'shards'"
+        )
+
+    def run_first(items: Sequence[T], pool: Workers) -> None:
+        assert first is not None
+        first.run(items, folder, pool, part=part, progress=progress)
+
     return write_dataset(
         out,
         plan.items,
-        conversion.convert,
+        conversion.convert if first is None else Take(first.take, folder),
         name=conversion.name,
         layout=conversion.layout,
         licence=conversion.licence,
@@ -155,6 +188,8 @@ def run_conversion(
         licences=plan.licences,
         audio=conversion.audio,
         notes=plan.notes,
+        first=None if first is None else run_first,
+        part=part,
     )
 
 

@@ -9,11 +9,13 @@ import re
 import warnings
 from dataclasses import dataclass, field
 from decimal import ROUND_DOWN, ROUND_HALF_UP, Decimal, InvalidOperation
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.decimal_text import parse_decimals
 from motionloom.datasets.schema import UserError
 
 Floats = NDArray[np.float64]
@@ -64,6 +66,12 @@ def load_text(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     return data.removeprefix(b"\xef\xbb\xbf"), where
+
+
+def read_header(source: Path | str | bytes, *, name: str | None = None) -> MotionSection:
+    """Frame count and frame rate of a clip; the hierarchy and the values are not checked."""
+    data, where = load_text(source, name)
+    return find_motion(data, where)
 
 
 def find_motion(data: bytes, where: str) -> MotionSection:
@@ -117,11 +125,11 @@ def read_values(data: bytes, start: int, frames: int, width: int, where: str) ->
     if not body:
         raise UserError(f"{where}: the header says {frames} frames, 0 found")
     text = np.frombuffer(body, dtype=np.uint8)
-    inside = text > 32
-    begins = inside.copy()
-    begins[1:] &= ~inside[:-1]
-    line_starts = np.concatenate([[0], np.flatnonzero(text == 10) + 1])
-    counts = np.add.reduceat(begins, line_starts, dtype=np.int64)
+    starts, ends = _words(text)
+    # A line's numbers are those that start before the next line does.
+    counts = np.diff(
+        np.searchsorted(starts, np.flatnonzero(text == ord("\n"))), prepend=0, append=len(starts)
+    )
     lines = data.count(b"\n", 0, start) + 1 + np.flatnonzero(counts)
     counts = counts[counts > 0]
     wrong = np.flatnonzero(counts != width)
@@ -133,15 +141,32 @@ def read_values(data: bytes, start: int, frames: int, width: int, where: str) ->
         )
     if len(counts) != frames:
         raise UserError(f"{where}: the header says {frames} frames, {len(counts)} found")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # numpy only warns when it stops at a bad word
-        try:
-            values = np.fromstring(body, dtype=np.float64, sep=" ")
-        except (ValueError, DeprecationWarning):
-            values = np.empty(0)
+    values = parse_decimals(text, starts, ends)
+    if values is None:
+        values = _parse_numbers(body)
     if len(values) != frames * width or not np.isfinite(values).all():
         raise _bad_word(body, lines, width, where)
     return values.reshape(frames, width)
+
+
+def _words(text: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Where runs of visible characters start, and where they end (the first position after)."""
+    visible = text > 32
+    edges = np.empty(len(text) + 1, dtype=np.bool_)
+    edges[0], edges[-1] = visible[0], visible[-1]
+    np.not_equal(visible[1:], visible[:-1], out=edges[1:-1])
+    at = np.flatnonzero(edges)
+    return at[0::2].copy(), at[1::2].copy()
+
+
+def _parse_numbers(body: bytes) -> Floats:
+    """Any numbers in text, by numpy's reader; fewer than there are when one is not a number."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # numpy only warns when it stops at a bad word
+        try:
+            return np.fromstring(body, dtype=np.float64, sep=" ")
+        except (ValueError, DeprecationWarning):
+            return np.empty(0)
 
 
 def _bad_word(body: bytes, lines: NDArray[np.int64], width: int, where: str) -> UserError:
@@ -160,8 +185,16 @@ def _shown(text: bytes) -> str:
 
 
 def parse_hierarchy(text: bytes, where: str) -> Hierarchy:
-    """Parse everything before MOTION."""
-    return _HierarchyParser(where).parse(text)
+    """Parse everything before MOTION. The files of a collection mostly share one hierarchy, so it is kept."""
+    try:
+        return _parse_hierarchy(text)
+    except UserError:
+        return _HierarchyParser(where).parse(text)  # fails again, with the name of the file
+
+
+@lru_cache(maxsize=8)
+def _parse_hierarchy(text: bytes) -> Hierarchy:
+    return _HierarchyParser("").parse(text)
 
 
 class _HierarchyParser:

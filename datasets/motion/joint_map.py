@@ -97,8 +97,11 @@ class JointMap:
                 )
         world = motion.positions()
         index = {name: i for i, name in enumerate(motion.joints)}
-        parts = [world[:, [index[name] for name in names]].mean(axis=1) for names in self.sources]
-        joints = np.stack(parts, axis=1) * METRES[unit]
+        joints = world[:, [index[names[0]] for names in self.sources]]
+        for joint, names in enumerate(self.sources):
+            if len(names) > 1:
+                joints[:, joint] = world[:, [index[name] for name in names]].mean(axis=1)
+        joints *= METRES[unit]
         if up == "z":
             joints = np.stack([joints[..., 0], joints[..., 2], -joints[..., 1]], axis=-1)
         return joints

@@ -66,6 +66,9 @@ _KNOWN: dict[str, tuple[str, float, Family, tuple[tuple[str, int], ...]]] = {
     "smplx322": ("smplx52", 30.0, "raw", _SMPLX322),
 }
 
+LAYOUTS = tuple(_KNOWN)
+"""Names of all layouts."""
+
 
 @dataclass(frozen=True)
 class MotionLayout:

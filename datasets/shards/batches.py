@@ -1,7 +1,8 @@
 """Batches for training: map-style datasets whose item `k` is one rank's whole share of global step `k`.
 
 Use with `DataLoader(batches, batch_size=None, sampler=range(first_step, last_step))`: a run resumes by
-starting the range elsewhere. What a batch holds depends on (seed, k) alone; the ranks' shares one after the
+starting the range elsewhere. What a batch holds depends on the data, its order and
+(seed, k) alone; the ranks' shares one after the
 other are the global batch whatever their number. `batch_size` is always the *global* one.
 """
 
@@ -16,10 +17,10 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.crops import Crops, padded_length
 from motionloom.datasets.shards.plan import BatchPlan
 from motionloom.datasets.shards.randomness import uniform
-from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.datasets.text.cache import TextCache
 
@@ -60,7 +61,7 @@ class WindowBatches(Dataset[MotionBatch]):
 
     def __init__(
         self,
-        dataset: ShardDataset,
+        dataset: ClipDataset,
         stats: FeatureStats,
         *,
         window: int,
@@ -80,20 +81,21 @@ class WindowBatches(Dataset[MotionBatch]):
         self.window = window
         self.windows_per_clip = windows_per_clip
         self.seed, self.rank, self.world = seed, rank, world
-        self.plan = BatchPlan(len(dataset), batch_size // windows_per_clip, seed)
+        self.plan = BatchPlan(len(dataset), batch_size // windows_per_clip, seed, sources=dataset.sources())
         self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
 
     def __len__(self) -> int:
         return ENDLESS
 
     def __getitem__(self, k: int) -> MotionBatch:
-        epoch, clips = self.plan.local(k, self.rank, self.world)
+        turns, clips = self.plan.local(k, self.rank, self.world)
         per_clip = self.windows_per_clip
         frames = self.dataset.frames[clips]
-        draws = uniform(self.seed, _WINDOW, epoch, clips[:, None], np.arange(per_clip)[None])
+        draws = uniform(self.seed, _WINDOW, turns[:, None], clips[:, None], np.arange(per_clip)[None])
         starts = (draws * (np.maximum(frames - self.window, 0) + 1)[:, None]).astype(np.int64)
         length = np.minimum(frames, self.window)
         motion = np.empty((len(clips) * per_clip, self.window, self.crops.width), dtype=np.float32)
+        self.dataset.prefetch(clips.tolist(), ("motion.npy",))
         for row, clip in enumerate(clips.tolist()):
             source = self.dataset.motion(clip)
             for j in range(per_clip):
@@ -109,7 +111,7 @@ class _CaptionedClips:
 
     def __init__(
         self,
-        dataset: ShardDataset,
+        dataset: ClipDataset,
         stats: FeatureStats,
         text: TextCache | None,
         *,
@@ -132,9 +134,14 @@ class _CaptionedClips:
         if len(self.clips) == 0:
             kind = "face captions" if face else "captions"
             raise UserError(
-                f"{dataset.root}: no clip of split '{dataset.split}' has {kind} and {min_frames} frames; "
+                f"{dataset.where}: no clip of split '{dataset.split}' has {kind} and {min_frames} frames; "
                 f"lower min_frames or convert data with {kind}"
             )
+
+    def prefetch(self, clips: NDArray[np.int64]) -> None:
+        """Have the dataset bring in what `captions` and `make` will read of `clips`."""
+        texts = ["face_texts.json" if self.face else "texts.json"] if self.text is not None else []
+        self.dataset.prefetch(clips.tolist(), ["motion.npy", *texts])
 
     def captions(self, clip: int) -> list[tuple[str, int, int]]:
         """(text, first frame, frame behind the last) of each caption that covers `min_frames` or more.
@@ -184,7 +191,7 @@ class CaptionBatches(Dataset[CaptionBatch]):
 
     def __init__(
         self,
-        dataset: ShardDataset,
+        dataset: ClipDataset,
         stats: FeatureStats,
         text: TextCache,
         *,
@@ -201,21 +208,23 @@ class CaptionBatches(Dataset[CaptionBatch]):
             dataset, stats, text, max_frames=max_frames, min_frames=min_frames, face=face, columns=columns
         )
         self.seed, self.rank, self.world = seed, rank, world
-        self.plan = BatchPlan(len(self.source.clips), batch_size, seed)
+        clips = self.source.clips
+        self.plan = BatchPlan(len(clips), batch_size, seed, sources=dataset.sources(clips))
         self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
 
     def __len__(self) -> int:
         return ENDLESS
 
     def __getitem__(self, k: int) -> CaptionBatch:
-        epoch, items = self.plan.local(k, self.rank, self.world)
+        turns, items = self.plan.local(k, self.rank, self.world)
         clips = self.source.clips[items]
-        which = uniform(self.seed, _CAPTION, epoch, clips)
+        self.source.prefetch(clips)
+        which = uniform(self.seed, _CAPTION, turns, clips)
         spans = []
         for clip, draw in zip(clips.tolist(), which, strict=True):
             choices = self.source.captions(clip)
             spans.append(choices[int(draw * len(choices))])
-        return self.source.make(clips, spans, uniform(self.seed, _CROP, epoch, clips))
+        return self.source.make(clips, spans, uniform(self.seed, _CROP, turns, clips))
 
 
 class EvalBatches(Dataset[CaptionBatch]):
@@ -228,7 +237,7 @@ class EvalBatches(Dataset[CaptionBatch]):
 
     def __init__(
         self,
-        dataset: ShardDataset,
+        dataset: ClipDataset,
         stats: FeatureStats,
         text: TextCache | None = None,
         *,
@@ -259,6 +268,7 @@ class EvalBatches(Dataset[CaptionBatch]):
         valid = np.concatenate([np.ones(len(rows), bool), np.zeros(missing, bool)])[self.rank :: self.world]
         rows = np.concatenate([rows, np.repeat(rows[-1:], missing)])[self.rank :: self.world]
         clips = source.clips[rows]
+        source.prefetch(clips)
         if source.text is None:
             spans = [("", 0, int(frames)) for frames in source.dataset.frames[clips]]
         else:

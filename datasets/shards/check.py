@@ -1,25 +1,30 @@
 """`check`: read a whole dataset as a stranger would and list everything wrong with it.
 
-Checked: manifest and index present and consistent, no stray or missing shard, size and sha256, tar structure,
-every member's schema, motion width and finiteness, and ids that appear twice or in two splits (a mirrored
-clip counts as its original, or the test split leaks into training).
+Errors: manifest or index absent or contradicting the tars, stray or missing shards, size and sha256, tar
+structure, members that do not parse, NaN, values no motion can have (`ranges.py`), empty captions, sound that
+cannot be read, and clips that leak from one split into another (`duplicates.py`).
+
+Warnings: values beyond what a person can do, clips without captions, captions that reach past their clip, the
+same motion twice in one split, a licence the manifest does not know, no training split.
+
+One shard's directory and one clip are in memory at a time, and 40 bytes for every clip.
 """
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from rich.progress import track
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import ClipMeta, Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.schema import Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.shards.check_clip import CheckedClip, check_clip
+from motionloom.datasets.shards.duplicates import ClipTable
 from motionloom.datasets.shards.files import sha256_of
+from motionloom.datasets.shards.findings import Findings, Problem
 from motionloom.datasets.shards.index import (
     INDEX_FILE,
     SPLITS,
@@ -30,159 +35,151 @@ from motionloom.datasets.shards.index import (
     load_index,
 )
 from motionloom.datasets.shards.reader import load_manifest, manifest_layout
-from motionloom.datasets.shards.sample import captions_from_json, require_finite
-from motionloom.datasets.shards.tar import TarClip, read_npy_header, scan_tar
+from motionloom.datasets.shards.tar import scan_tar
 
 
 @dataclass(frozen=True)
-class Problem:
-    """One thing wrong: `where` names a file, and a key where there is one."""
+class CheckReport:
+    """The outcome for a whole dataset. All findings are counted, at most a thousand of one kind listed."""
 
-    where: str
-    message: str
-
-    def __str__(self) -> str:
-        return f"{self.where}: {self.message}"
+    errors: list[Problem]
+    warnings: list[Problem]
+    error_kinds: dict[str, int]
+    warning_kinds: dict[str, int]
+    clips: int
+    """Sound clips."""
+    frames: int
 
 
 def check(root: Path, *, progress: bool = False) -> list[Problem]:
-    """Everything wrong with the dataset in `root`; an empty list when it is sound."""
+    """Everything wrong with the dataset in `root`; an empty list when it is sound. Warnings are left out."""
+    return examine(root, progress=progress).errors
+
+
+def examine(root: Path, *, progress: bool = False) -> CheckReport:
+    """Errors and warnings of the dataset in `root`. Never raises for what it finds in the data."""
     try:
         manifest = load_manifest(root)
         layout = manifest_layout(manifest)
     except UserError as error:
-        return [Problem(str(root), str(error))]
-    problems = list(_stray_files(root, manifest))
-    homes: dict[str, tuple[str, str]] = {}
-    originals: list[tuple[str, str, str]] = []
-    for shard in track(manifest.shards, "checking shards", disable=not progress):
+        problem = Problem(str(root), str(error).removeprefix(f"{root}: "))
+        return CheckReport([problem], [], {"manifest": 1}, {}, 0, 0)
+    findings, frames = Findings(), 0
+    _stray_files(root, manifest, findings)
+    table = ClipTable(root, manifest.shards, layout)
+    widths: dict[int, str] = {}
+    for number, shard in enumerate(track(manifest.shards, "checking shards", disable=not progress)):
         try:
-            for clip, meta in _checked_clips(root / shard.name, shard, layout, problems):
-                where = f"{shard.name}: '{clip.key}'"
-                if meta.id in homes:
-                    other, split = homes[meta.id]
-                    kind = "also" if split == shard.split else f"of split '{split}' also"
-                    problems.append(Problem(where, f"id '{meta.id}' is {kind} {other}"))
-                homes.setdefault(meta.id, (where, shard.split))
-                if meta.mirror_of is not None:
-                    originals.append((where, shard.split, meta.mirror_of))
-        except UserError as error:
-            problems.append(Problem(shard.name, str(error).removeprefix(f"{root / shard.name}: ")))
-    for where, here, original in originals:
-        if original in homes and homes[original][1] != here:
-            there = homes[original][1]
-            problems.append(
-                Problem(where, f"mirrors '{original}', which is in split '{there}', not '{here}'")
-            )
+            for row, key, clip in _checked_clips(root / shard.name, shard, layout, findings):
+                where = f"{shard.name}: '{key}'"
+                table.add(number, row, clip.meta, clip.motion)
+                frames += clip.meta.frames
+                for kind, message in clip.oddities:
+                    findings.warn(kind, where, message)
+                _against_manifest(where, clip, manifest, widths, findings)
+        except (UserError, OSError) as error:
+            findings.error("tar", shard.name, str(error).removeprefix(f"{root / shard.name}: "))
+    table.report(findings)
+    if not any(shard.split == "train" for shard in manifest.shards):
+        findings.warn("no training split", str(root), "no clips in split 'train'")
     for split in SPLITS:
         shards = [shard for shard in manifest.shards if shard.split == split]
         if shards:
-            problems += _index_problems(root, split, shards)
-    return problems
+            _check_index(root, split, shards, findings)
+    return CheckReport(
+        findings.all_errors(str(root)),
+        findings.all_warnings(str(root)),
+        dict(findings.error_kinds),
+        dict(findings.warning_kinds),
+        len(table),
+        frames,
+    )
 
 
-def _stray_files(root: Path, manifest: Manifest) -> Iterator[Problem]:
+def _stray_files(root: Path, manifest: Manifest, findings: Findings) -> None:
     listed = [shard.name for shard in manifest.shards]
     for name in sorted({name for name in listed if listed.count(name) > 1}):
-        yield Problem(name, "listed twice in the manifest")
+        findings.error("manifest", name, "listed twice in the manifest")
     for path in sorted(root.glob("*.tar")):
         if path.name not in listed:
-            yield Problem(path.name, "not in the manifest; delete it or convert again")
+            findings.error("manifest", path.name, "not in the manifest; delete it or convert again")
 
 
 def _checked_clips(
-    path: Path, shard: ShardInfo, layout: MotionLayout, problems: list[Problem]
-) -> Iterator[tuple[TarClip, ClipMeta]]:
-    """The clips of one shard whose metadata can be read; what is wrong on the way goes to `problems`."""
+    path: Path, shard: ShardInfo, layout: MotionLayout, findings: Findings
+) -> Iterator[tuple[int, str, CheckedClip]]:
+    """(row, key, clip) of every sound clip of one shard; what is wrong on the way goes to `findings`."""
     if not path.exists():
-        problems.append(Problem(shard.name, "the shard is missing"))
+        findings.error("shard", shard.name, "the shard is missing")
         return
     size = path.stat().st_size
     if size != shard.bytes:
-        problems.append(
-            Problem(shard.name, f"{size} bytes, the manifest says {shard.bytes}: truncated or changed")
-        )
+        changed = f"{size} bytes, the manifest says {shard.bytes}: truncated or changed"
+        findings.error("shard", shard.name, changed)
     elif sha256_of(path) != shard.sha256:
-        problems.append(Problem(shard.name, "the sha256 is not the manifest's: damaged"))
+        findings.error("shard", shard.name, "the sha256 is not the manifest's: damaged")
     clips = scan_tar(path)
     if len(clips) != shard.samples:
-        problems.append(Problem(shard.name, f"{len(clips)} samples, the manifest says {shard.samples}"))
+        findings.error("shard", shard.name, f"{len(clips)} samples, the manifest says {shard.samples}")
     frames = 0
     with path.open("rb") as file:
-        for clip in clips:
+        for row, clip in enumerate(clips):
             try:
-                meta = _checked_clip(file, path, clip, shard, layout)
+                checked = check_clip(file, path, clip, shard, layout)
             except (UserError, ValueError) as error:
                 message = str(error).removeprefix(f"{path}: ")
-                problems.append(Problem(f"{shard.name}: '{clip.key}'", message))
+                findings.error("clip", f"{shard.name}: '{clip.key}'", message)
                 continue
-            frames += meta.frames
-            yield clip, meta
+            frames += checked.meta.frames
+            yield row, clip.key, checked
     if frames != shard.frames:
-        problems.append(Problem(shard.name, f"{frames} sound frames, the manifest says {shard.frames}"))
+        findings.error("shard", shard.name, f"{frames} sound frames, the manifest says {shard.frames}")
 
 
-def _checked_clip(
-    file: BinaryIO, path: Path, clip: TarClip, shard: ShardInfo, layout: MotionLayout
-) -> ClipMeta:
-    """The metadata of one clip after reading all its members; raises at the first thing wrong."""
-
-    def member(name: str) -> bytes:
-        start, size = clip.members[name]
-        file.seek(start)
-        return file.read(size)
-
-    where = f"{path}: '{clip.key}.meta.json'"
-    meta = ClipMeta.parse(json.loads(member("meta.json")), where)
-    stated = (meta.layout, meta.family, meta.fps, meta.skeleton, meta.split)
-    wanted = (layout.name, layout.family, layout.fps, layout.skeleton_name, shard.split)
-    if stated != wanted:
-        raise ValueError(f"meta.json says layout, family, fps, skeleton, split = {stated}, not {wanted}")
-    motion = _array(member("motion.npy"), f"{path}: '{clip.key}.motion.npy'")
-    if motion.shape != (meta.frames, layout.dim):
-        raise ValueError(f"motion.npy is {list(motion.shape)}, wanted {[meta.frames, layout.dim]}")
-    require_finite("motion.npy", motion)
-    for name in ("texts.json", "face_texts.json"):
-        if name in clip.members:
-            captions_from_json(member(name), f"{path}: '{clip.key}.{name}'")
-    if "audio.npy" in clip.members:
-        require_finite("audio.npy", _array(member("audio.npy"), f"{path}: '{clip.key}.audio.npy'"))
-    return meta
+def _against_manifest(
+    where: str, clip: CheckedClip, manifest: Manifest, widths: dict[int, str], findings: Findings
+) -> None:
+    """Whether a sound clip fits what the manifest says of all clips."""
+    licence = clip.meta.licence
+    if licence not in {manifest.licence, *manifest.licences}:
+        findings.warn("licence", where, f"licence '{licence}' is not in the manifest")
+    if clip.audio_width is not None:
+        widths.setdefault(clip.audio_width, where)
+        first = next(iter(widths))
+        if clip.audio_width != first:
+            other = f"audio.npy has {clip.audio_width} columns, that of {widths[first]} has {first}"
+            findings.error("audio", where, other)
 
 
-def _array(raw: bytes, where: str) -> np.ndarray:
-    header = read_npy_header(io.BytesIO(raw), where)
-    if header.data + int(np.prod(header.shape)) * header.dtype.itemsize != len(raw):
-        raise UserError(f"{where}: the array is cut short or too long")
-    return np.frombuffer(raw, header.dtype, offset=header.data).reshape(header.shape)
-
-
-def _index_problems(root: Path, split: Split, shards: list[ShardInfo]) -> list[Problem]:
+def _check_index(root: Path, split: Split, shards: list[ShardInfo], findings: Findings) -> None:
     """Whether both indices say what the tars say."""
-    problems = []
-    built = []
+    before = findings.error_kinds["index"]
+    # A generator: the JSON indices of a large split would not fit into memory together.
+    rebuilt = SplitIndex.build(_sound_indices(root, shards, findings))
+    if findings.error_kinds["index"] > before:
+        return
+    try:
+        flat = load_index(root, split, shards)
+    except UserError as error:
+        findings.error("index", INDEX_FILE, str(error).removeprefix(f"{root / INDEX_FILE}: "))
+        return
+    if any(
+        not np.array_equal(getattr(flat, field.name), getattr(rebuilt, field.name)) for field in fields(flat)
+    ):
+        other = f"split '{split}' says something else than the shards' own indices"
+        findings.error("index", INDEX_FILE, other)
+
+
+def _sound_indices(root: Path, shards: list[ShardInfo], findings: Findings) -> Iterator[ShardIndex]:
     for shard in shards:
         path = root / shard.name
         try:
             stored = ShardIndex.load_json(index_path(path))
             entries = clip_entries(path, [clip.id for clip in stored.clips])
         except (UserError, OSError, ValueError) as error:
-            problems.append(Problem(index_path(path).name, f"does not fit its tar: {error}"))
+            findings.error("index", index_path(path).name, f"does not fit its tar: {error}")
             continue
         if stored.shard != shard or stored.clips != entries:
-            problems.append(Problem(index_path(path).name, "other contents than the tar or the manifest"))
-        built.append(stored)
-    if problems:
-        return problems
-    try:
-        flat = load_index(root, split, shards)
-    except UserError as error:
-        return [Problem(INDEX_FILE, str(error))]
-    rebuilt = SplitIndex.build(built)
-    if any(
-        not np.array_equal(getattr(flat, field.name), getattr(rebuilt, field.name)) for field in fields(flat)
-    ):
-        problems.append(
-            Problem(INDEX_FILE, f"split '{split}' says something else than the shards' own indices")
-        )
-    return problems
+            findings.error("index", index_path(path).name, "other contents than the tar or the manifest")
+            continue
+        yield stored

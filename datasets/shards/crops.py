@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.reader import ShardDataset, require_layout
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.reader import require_layout
 from motionloom.datasets.shards.statistics import FeatureStats
 
 
@@ -22,7 +23,7 @@ class Crops:
     """Reads normalised pieces of a dataset's clips, all columns or some (`columns`, ascending, [C])."""
 
     def __init__(
-        self, dataset: ShardDataset, stats: FeatureStats, columns: NDArray[np.int64] | None = None
+        self, dataset: ClipDataset, stats: FeatureStats, columns: NDArray[np.int64] | None = None
     ) -> None:
         require_layout(stats.layout, dataset.layout, "feature statistics")
         chosen = np.arange(dataset.layout.dim) if columns is None else np.asarray(columns)

@@ -5,10 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
+import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, cast
+
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}\.tmp")
 
 
 class HashingFile:
@@ -33,10 +37,10 @@ class HashingFile:
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """A binary file that appears under `path` only when the block ends without error, synced.
 
-    The temporary name starts with a dot and holds the process id, so a worker that outlives a killed run
-    cannot rename another run's half-written file into place.
+    The temporary name starts with a dot and ends in a random number, so no worker, of an earlier run or on
+    another machine, can rename another's half-written file into place.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
         with temporary.open("wb") as file:
             yield file
@@ -46,6 +50,13 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Delete what killed writers left in `folder`. Only for who knows that nobody is writing there."""
+    for path in folder.iterdir():
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -22,7 +22,7 @@ import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import BinaryIO, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,23 +163,30 @@ def save_index(root: Path, splits: dict[Split, SplitIndex]) -> None:
 
 
 def load_index(root: Path, split: Split, shards: list[ShardInfo]) -> SplitIndex:
+    """The arrays of one split of a dataset folder, checked against the manifest's rows for it."""
+    path = root / INDEX_FILE
+    try:
+        with path.open("rb") as file:
+            return read_index(file, str(path), split, shards)
+    except OSError:
+        raise UserError(f"{path}: no such file; convert the dataset again") from None
+
+
+def read_index(file: BinaryIO, where: str, split: Split, shards: list[ShardInfo]) -> SplitIndex:
     """The arrays of one split, checked against the manifest's rows for it.
 
     Every offset is checked to lie inside its shard here, once for all clips, so reading a clip needs no
     checks.
     """
-    path = root / INDEX_FILE
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[f"{split}.{name}"] for name in _ARRAYS}
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; convert the dataset again") from None
-    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path}: not a readable index ({error}); convert the dataset again") from None
+    except (KeyError, ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise UserError(f"{where}: not a readable index ({error}); convert the dataset again") from None
     index = SplitIndex(**arrays)
     problem = _index_problem(index, shards)
     if problem:
-        raise UserError(f"{path}: split '{split}': {problem}; convert the dataset again")
+        raise UserError(f"{where}: split '{split}': {problem}; convert the dataset again")
     return index
 
 

@@ -1,70 +1,98 @@
-"""Runs shard tasks in this process or in a pool of spawned ones, and turns their deaths into sentences."""
+"""Independent tasks in this process or in spawned ones, each on one thread; deaths become sentences."""
 
 from __future__ import annotations
 
 import errno
 import multiprocessing
 import os
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.connection import wait
-from typing import TypeVar
+from types import TracebackType
+from typing import Self, TypeVar
 
-from rich.progress import Progress
+import threadpoolctl  # type: ignore[import-untyped]
 
-from motionloom.datasets.schema import Dropped, ShardInfo, UserError
-from motionloom.datasets.shards.tasks import Convert, ShardTask, write_shard
+from motionloom.datasets.schema import UserError
 
 T = TypeVar("T")
-Result = tuple[ShardInfo | None, list[Dropped]]
+R = TypeVar("R")
 
 
-def run_tasks(
-    tasks: list[ShardTask[T]], convert: Convert[T], *, workers: int, progress: bool
-) -> list[Result]:
-    """Results in task order, whatever order the workers finish in."""
-    results: dict[int, Result] = {}
-    with Progress(disable=not progress) as bar:
-        shown = bar.add_task("writing shards", total=len(tasks))
-        for position, result in _finished_tasks(tasks, convert, workers):
-            results[position] = result
-            bar.advance(shown)
-    return [results[position] for position in range(len(tasks))]
+class Workers:
+    """`count` processes, started when two or more tasks first need them and kept until the block ends.
 
+    Spawned, because the parent may hold threads; one pool for all steps of a conversion, because a worker
+    spends seconds on its imports.
+    """
 
-def _finished_tasks(
-    tasks: list[ShardTask[T]], convert: Convert[T], workers: int
-) -> Iterator[tuple[int, Result]]:
-    try:
-        if workers == 1 or len(tasks) <= 1:
-            for position, task in enumerate(tasks):
-                yield position, write_shard(task, convert)
-            return
-        pool = ProcessPoolExecutor(
-            min(workers, len(tasks)), multiprocessing.get_context("spawn"), initializer=_exit_with_parent
-        )
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def run(self, work: Callable[[T], R], tasks: Sequence[T]) -> Iterator[tuple[int, R]]:
+        """(position, result) of every task as it finishes.
+
+        `work` and the tasks must be picklable when there are several of each. `UserError` when a worker is
+        killed or the disk is full.
+        """
         try:
+            if self.count <= 1 or len(tasks) <= 1:
+                for position, task in enumerate(tasks):
+                    yield position, on_one_thread(work, task)
+                return
+            if self._pool is None:
+                context = multiprocessing.get_context("spawn")
+                self._pool = ProcessPoolExecutor(
+                    min(self.count, len(tasks)), context, initializer=_exit_with_parent
+                )
             futures = {
-                pool.submit(write_shard, task, convert): position for position, task in enumerate(tasks)
+                self._pool.submit(on_one_thread, work, task): position for position, task in enumerate(tasks)
             }
             for future in as_completed(futures):
                 yield futures[future], future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-    except BrokenProcessPool:
-        raise UserError(
-            "a conversion worker was killed (out of memory?); run again with fewer workers: "
-            "finished shards are kept"
-        ) from None
-    except OSError as error:
-        if error.errno == errno.ENOSPC:
-            folder = tasks[0].path.parent
+        except BrokenProcessPool:
             raise UserError(
-                f"{folder}: the disk is full; free space and run again: finished shards are kept"
+                "a conversion worker was killed (out of memory?); run again with fewer workers: "
+                "finished work is kept"
             ) from None
-        raise
+        except OSError as error:
+            if error.errno == errno.ENOSPC:
+                raise UserError("the disk is full; free space and run again: finished work is kept") from None
+            raise
+
+
+def on_one_thread(work: Callable[[T], R], task: T) -> R:
+    """Sums in numerical libraries depend on their thread count; one thread makes bytes reproducible."""
+    with _one_thread():
+        return work(task)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    torch = sys.modules.get("torch")
+    before = torch.get_num_threads() if torch else 0
+    with threadpoolctl.threadpool_limits(1):
+        if torch:
+            torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            if torch:
+                torch.set_num_threads(before)
 
 
 def _exit_with_parent() -> None:

@@ -18,8 +18,13 @@ _MUL_2 = np.uint64(0x94D049BB133111EB)
 
 def permutation(count: int, *key: int) -> NDArray[np.int64]:
     """A permutation of `0 .. count-1` ([count]) decided by `key` (non-negative integers) alone."""
-    words = np.random.PCG64(np.random.SeedSequence(key)).random_raw(count)
-    return np.argsort(words, kind="stable")
+    return np.argsort(words(count, *key), kind="stable")
+
+
+def words(count: int, *key: int) -> NDArray[np.uint64]:
+    """`count` random 64-bit words decided by `key` (non-negative integers) alone."""
+    raw: NDArray[np.uint64] = np.random.PCG64(np.random.SeedSequence(key)).random_raw(count)
+    return raw
 
 
 def uniform(*counters: ArrayLike) -> NDArray[np.float64]:

@@ -1,18 +1,19 @@
-"""`ShardDataset`: random access to the clips of one split, straight from the tar files.
+"""`ShardDataset`: random access to the clips of one split, in a folder or on a server.
 
-Opening reads `manifest.json` and the split's arrays of `index.npz`, and looks at the sizes of the shard
-files; no shard is opened before one of its clips is asked for. A motion is then a view into the memory-mapped
-tar, so the page cache is the only cache and every loader process shares it.
+Opening reads `manifest.json` and the split's arrays of `index.npz`, and, in a folder, looks at the sizes of
+the shard files; no shard is opened before one of its clips is asked for. A motion is then a view into the
+memory-mapped tar (of the folder, or of the local cache of a server's shards), so the page cache is the only
+cache and every loader process shares it.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
-import mmap
 import re
 from bisect import bisect_right
-from collections import OrderedDict
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
@@ -22,33 +23,50 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SCHEMA_VERSION, Caption, ClipMeta, Manifest, Split, UserError
+from motionloom.datasets.shards.access import Access, MappedShards, RangedShards
+from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.files import sha256_of
-from motionloom.datasets.shards.index import MANIFEST_FILE, SPLITS, SplitIndex, load_index
+from motionloom.datasets.shards.index import INDEX_FILE, MANIFEST_FILE, SPLITS, read_index
+from motionloom.datasets.shards.order import Source
+from motionloom.datasets.shards.reading import Reading
+from motionloom.datasets.shards.retry import MissingFileError
 from motionloom.datasets.shards.sample import MEMBERS, captions_from_json
+from motionloom.datasets.shards.store import LocalStore, Store, open_store
+from motionloom.datasets.shards.stream import StreamedShards
 from motionloom.datasets.shards.tar import read_npy_header
 
-OPEN_SHARDS = 256
-"""Shards mapped at a time in one process; the least recently used is let go."""
-
+_MOTION = MEMBERS.index("motion.npy")
 _SHARD_NAME = re.compile(r"[A-Za-z0-9_-]+-(?:train|val|test)-(\d{6,})\.tar")
 
 
 def load_manifest(root: Path) -> Manifest:
     """The manifest of a dataset folder; `UserError` when unfinished, of another version or odd."""
-    path = root / MANIFEST_FILE
-    if not path.exists():
+    return read_manifest(LocalStore(root))[0]
+
+
+def read_manifest(store: Store, digest: str | None = None) -> tuple[Manifest, str]:
+    """(manifest, its sha256). With `digest` it must still be that one."""
+    where = store.where(MANIFEST_FILE)
+    try:
+        raw = store.read_manifest(digest)
+    except MissingFileError:
         raise UserError(
-            f"{root}: no {MANIFEST_FILE}, so the conversion is unfinished or this is no dataset; convert it"
-        )
-    manifest = Manifest.load_json(path)
+            f"{store.place}: no {MANIFEST_FILE}, so the conversion is unfinished or this is no dataset; "
+            f"convert it"
+        ) from None
+    try:
+        data = json.loads(raw)
+    except ValueError as error:
+        raise UserError(f"{where}: not valid JSON ({error})") from None
+    manifest = Manifest.parse(data, where)
     if manifest.schema_version != SCHEMA_VERSION:
         raise UserError(
-            f"{path}: schema version {manifest.schema_version}, not {SCHEMA_VERSION}; convert again"
+            f"{where}: schema version {manifest.schema_version}, not {SCHEMA_VERSION}; convert again"
         )
     for shard in manifest.shards:
         if not _SHARD_NAME.fullmatch(shard.name) or f"-{shard.split}-" not in shard.name:
-            raise UserError(f"{path}: '{shard.name}' is not the name of a shard of split '{shard.split}'")
-    return manifest
+            raise UserError(f"{where}: '{shard.name}' is not the name of a shard of split '{shard.split}'")
+    return manifest, hashlib.sha256(raw).hexdigest()
 
 
 def manifest_layout(manifest: Manifest) -> MotionLayout:
@@ -59,48 +77,52 @@ def manifest_layout(manifest: Manifest) -> MotionLayout:
 class ShardDataset:
     """The clips of one split, in shard order (already shuffled). Cheap to pickle into loader workers."""
 
-    def __init__(self, root: Path, split: Split, manifest: Manifest, index: SplitIndex) -> None:
-        self.root = root
+    def __init__(self, store: Store, split: Split, manifest: Manifest, digest: str, reading: Reading) -> None:
+        self.where = store.place
         self.split: Split = split
         self.manifest = manifest
         self.layout = manifest_layout(manifest)
-        self._index = index
+        self.reading = reading
+        self._digest = digest
+        self._store = store
         self._shards = [shard for shard in manifest.shards if shard.split == split]
         self._first = list(accumulate((shard.samples for shard in self._shards), initial=0))
-        self._maps: OrderedDict[int, mmap.mmap] = OrderedDict()
+        try:
+            with store.open_index(digest) as file:
+                self._index = read_index(file, store.where(INDEX_FILE), split, self._shards)
+        except MissingFileError as error:
+            raise UserError(f"{error}; convert the dataset again") from None
+        self._access = self._make_access()
 
     @staticmethod
     def open(
-        root: Path | str, split: str, *, expect: MotionLayout | None = None, verify: bool = False
+        root: Path | str,
+        split: str,
+        *,
+        expect: MotionLayout | None = None,
+        verify: bool = False,
+        reading: Reading | None = None,
     ) -> ShardDataset:
-        """Open one split. `expect` refuses another layout, family or fps; `verify` checks sha256."""
-        root = Path(root)
+        """Open one split of a folder or URL (`file:`, `http:`, `https:`, `s3:`).
+
+        `expect` refuses another layout, family or fps. In a folder every shard's size is checked and, with
+        `verify`, its sha256; on a server a shard is checked when it is first read (`reading` says how).
+        """
+        reading = reading or Reading()
         known = next((name for name in SPLITS if name == split), None)
         if known is None:
             raise UserError(f"no split '{split}'; known: {', '.join(SPLITS)}")
-        manifest = load_manifest(root)
+        store = open_store(root, reading.cache)
+        manifest, digest = read_manifest(store)
         if expect is not None:
-            require_layout(manifest_layout(manifest), expect, str(root))
+            require_layout(manifest_layout(manifest), expect, store.place)
         shards = [shard for shard in manifest.shards if shard.split == known]
         if not shards:
-            raise UserError(f"{root}: split '{split}' has no clips")
-        for shard in shards:
-            path = root / shard.name
-            try:
-                size = path.stat().st_size
-            except OSError:
-                raise UserError(f"{path}: the shard is missing; copy it back or convert again") from None
-            if size != shard.bytes:
-                raise UserError(
-                    f"{path}: {size} bytes, the manifest says {shard.bytes}: truncated or changed; "
-                    f"copy it back or convert again"
-                )
-            if verify and sha256_of(path) != shard.sha256:
-                raise UserError(
-                    f"{path}: the sha256 is not the manifest's: damaged; copy it back or convert again"
-                )
-        index = load_index(root, known, shards)
-        dataset = ShardDataset(root, known, manifest, index)
+            raise UserError(f"{store.place}: split '{split}' has no clips")
+        if isinstance(store, LocalStore):
+            for shard in shards:
+                _check_file(store.root / shard.name, shard.bytes, shard.sha256 if verify else None)
+        dataset = ShardDataset(store, known, manifest, digest, reading)
         dataset._check_motion_sizes()
         return dataset
 
@@ -122,13 +144,14 @@ class ShardDataset:
         return self._index.sizes[:, MEMBERS.index(member)] > 0
 
     def motion(self, i: int) -> NDArray[np.float32]:
-        """Features of clip `i`, [T, D]: a read-only view into the tar (a copy if stored as float16)."""
-        shard = self._shard_of(i)
+        """Features of clip `i`, [T, D]: a read-only view of the stored bytes (a copy if float16)."""
         index = self._index
-        shape, start = (int(index.frames[i]), self.layout.dim), int(index.data[i])
+        buffer, start = self._access.member(self._shard_of(i), i, _MOTION)
+        start += int(index.data[i]) - int(index.offsets[i, _MOTION])
+        shape = (int(index.frames[i]), self.layout.dim)
         if index.itemsize[i] == 4:
-            return np.ndarray(shape, np.float32, self._map(shard), start)
-        return np.ndarray(shape, np.float16, self._map(shard), start).astype(np.float32)
+            return np.ndarray(shape, np.float32, buffer, start)
+        return np.ndarray(shape, np.float16, buffer, start).astype(np.float32)
 
     def meta(self, i: int) -> ClipMeta:
         """Metadata of clip `i`."""
@@ -175,13 +198,47 @@ class ShardDataset:
         raw = self._member(i, member)
         return captions_from_json(raw, self._where(i, member)) if raw else []
 
+    def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
+        """Told before a batch is made, so that remote clips are read in one go; changes nothing."""
+        if self._ahead:
+            self._access.prefetch([(self._shard_of(i), i) for i in clips], members)
+
+    def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
+        """One source: `clips` (all when None), with their shards if the order is the streamed one."""
+        count = len(self) if clips is None else len(clips)
+        if self.reading.order == "global":
+            return (Source(0, count, name=self.where),)
+        shards = np.repeat(
+            np.arange(len(self._shards), dtype=np.int32), [shard.samples for shard in self._shards]
+        )
+        group = self.reading.shards_per_group
+        return (
+            Source(0, count, shards=shards if clips is None else shards[clips], group=group, name=self.where),
+        )
+
+    def parts(self) -> list[tuple[ClipDataset, float]]:
+        """Itself."""
+        return [(self, 1.0)]
+
+    def _make_access(self) -> Access:
+        reading, shards, index = self.reading, self._shards, self._index
+        self._ahead = True
+        if reading.mode == "streamed":
+            group = reading.shards_per_group
+            return StreamedShards(self._store, shards, index, self._first, group)
+        if not self._store.mappable:
+            return RangedShards(self._store, shards, index)
+        self._ahead = False
+        local = isinstance(self._store, LocalStore)
+        return MappedShards(self._store, shards, index, room=0 if local else reading.cache.limit)
+
     def _member(self, i: int, member: str) -> bytes:
         column = MEMBERS.index(member)
         size = int(self._index.sizes[i, column])
         if size == 0:
             return b""
-        start = int(self._index.offsets[i, column])
-        return self._map(self._shard_of(i))[start : start + size]
+        buffer, start = self._access.member(self._shard_of(i), i, column)
+        return buffer[start : start + size]
 
     def _shard_of(self, i: int) -> int:
         if not 0 <= i < self._first[-1]:
@@ -192,29 +249,7 @@ class ShardDataset:
         shard = self._shard_of(i)
         name = self._shards[shard].name
         number = name.removesuffix(".tar").rpartition("-")[2]
-        return f"{self.root / name}: '{number}-{i - self._first[shard]:06d}.{member}'"
-
-    def _map(self, shard: int) -> mmap.mmap:
-        """The mapped tar. Views keep a dropped map alive until they go, so letting go is always safe."""
-        found = self._maps.get(shard)
-        if found is not None:
-            self._maps.move_to_end(shard)
-            return found
-        info = self._shards[shard]
-        path = self.root / info.name
-        try:
-            with path.open("rb") as file:
-                found = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        except (OSError, ValueError) as error:
-            raise UserError(f"{path}: cannot be read ({error})") from None
-        if len(found) != info.bytes:
-            raise UserError(
-                f"{path}: {len(found)} bytes, the manifest says {info.bytes}: truncated while in use"
-            )
-        self._maps[shard] = found
-        if len(self._maps) > OPEN_SHARDS:
-            self._maps.popitem(last=False)
-        return found
+        return f"{self._store.where(name)}: '{number}-{i - self._first[shard]:06d}.{member}'"
 
     def _check_motion_sizes(self) -> None:
         """Every motion fills its member exactly, so no later read can leave the file or mix two clips."""
@@ -226,14 +261,28 @@ class ShardDataset:
             where = self._where(int(bad[0]), "motion.npy")
             raise UserError(f"{where}: not {self.layout.dim} columns wide as layout {self.layout.name} wants")
 
-    def __getstate__(self) -> tuple[Path, Split]:
-        return self.root, self.split
+    def __getstate__(self) -> tuple[str, Split, str, Reading]:
+        return self._store.place, self.split, self._digest, self.reading
 
-    def __setstate__(self, state: tuple[Path, Split]) -> None:
-        root, split = state
-        manifest = load_manifest(root)
-        shards = [shard for shard in manifest.shards if shard.split == split]
-        ShardDataset.__init__(self, root, split, manifest, load_index(root, split, shards))
+    def __setstate__(self, state: tuple[str, Split, str, Reading]) -> None:
+        place, split, digest, reading = state
+        store = open_store(place, reading.cache)
+        manifest, _ = read_manifest(store, digest)
+        ShardDataset.__init__(self, store, split, manifest, digest, reading)
+
+
+def _check_file(path: Path, size: int, sha256: str | None) -> None:
+    try:
+        found = path.stat().st_size
+    except OSError:
+        raise UserError(f"{path}: the shard is missing; copy it back or convert again") from None
+    if found != size:
+        raise UserError(
+            f"{path}: {found} bytes, the manifest says {size}: truncated or changed; "
+            f"copy it back or convert again"
+        )
+    if sha256 is not None and sha256_of(path) != sha256:
+        raise UserError(f"{path}: the sha256 is not the manifest's: damaged; copy it back or convert again")
 
 
 def require_layout(found: MotionLayout, wanted: MotionLayout, where: str) -> None:

@@ -56,7 +56,8 @@ def encode_sample(
     motion = np.asarray(sample.motion)
     if motion.ndim != 2 or motion.shape[1] != layout.dim or motion.shape[0] < 1:
         raise ValueError(f"motion is {list(motion.shape)}, layout {layout.name} wants [T >= 1, {layout.dim}]")
-    stored = np.ascontiguousarray(motion, dtype=motion_type)
+    with np.errstate(over="ignore"):  # what float16 cannot hold becomes infinite and is refused below
+        stored = np.ascontiguousarray(motion, dtype=motion_type)
     require_finite("motion", stored)
     meta = sample.meta
     stated = (meta.layout, meta.family, meta.fps, meta.skeleton)

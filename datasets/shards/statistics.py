@@ -22,8 +22,9 @@ from torch import Tensor
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import ClipDataset, in_order
 from motionloom.datasets.shards.files import atomic_file
-from motionloom.datasets.shards.reader import ShardDataset, require_layout
+from motionloom.datasets.shards.reader import require_layout
 
 STD_FLOOR = 1e-4
 """Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
@@ -35,7 +36,7 @@ Values = TypeVar("Values", NDArray[np.float32], Tensor)
 class Moments:
     """Streaming mean and variance of rows, float64. `mean` and `m2` are [D]."""
 
-    count: int
+    count: float
     mean: NDArray[np.float64]
     m2: NDArray[np.float64]
 
@@ -60,10 +61,14 @@ class Moments:
         m2 = self.m2 + other.m2 + np.square(delta) * (self.count * other.count / count)
         return Moments(count, mean, m2)
 
+    def counted(self, times: float) -> Moments:
+        """As if every row stood there so many times."""
+        return Moments(self.count * times, self.mean, self.m2 * times)
+
     @property
     def std(self) -> NDArray[np.float64]:
         """Population standard deviation, [D]."""
-        return np.sqrt(self.m2 / max(self.count, 1))
+        return np.sqrt(self.m2 / (self.count or 1))
 
 
 @dataclass(frozen=True)
@@ -157,16 +162,23 @@ def _sorted_header(raw: bytes) -> bytes:
     return len(header).to_bytes(8, "little") + header + raw[end:]
 
 
-def compute(dataset: ShardDataset, group: bool = False, progress: bool = False) -> FeatureStats:
+def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -> FeatureStats:
     """Statistics of every frame of `dataset`, in one pass.
 
     `group` gives all columns of one feature field the mean of their stds, as HumanML3D does, so that a
-    field's joints keep their relative sizes.
+    field's joints keep their relative sizes. In a mix each data set counts as often as its weight has it
+    drawn: with weights equal to the numbers of clips this is the statistics of all clips together.
     """
-    layout = dataset.layout
+    layout, parts = dataset.layout, dataset.parts()
     moments = Moments.none(layout.dim)
-    for i in track(range(len(dataset)), "feature statistics", disable=not progress):
-        moments = moments.merge(Moments.of(dataset.motion(i)))
+    total = sum(weight for _, weight in parts)
+    for part, weight in parts:
+        own = Moments.none(layout.dim)
+        clips = in_order(part, "motion.npy")
+        for i in track(clips, "feature statistics", total=len(part), disable=not progress):
+            own = own.merge(Moments.of(part.motion(i)))
+        times = weight / total * len(dataset) / len(part)
+        moments = moments.merge(own.counted(times) if len(parts) > 1 else own)
     return from_moments(moments, layout, group=group)
 
 
@@ -179,4 +191,4 @@ def from_moments(moments: Moments, layout: MotionLayout, *, group: bool = False)
         for name, _ in layout.fields:
             std[layout.slice(name)] = std[layout.slice(name)].mean()
     std = np.maximum(std, STD_FLOOR)
-    return FeatureStats(moments.mean.astype(np.float32), std.astype(np.float32), layout, moments.count)
+    return FeatureStats(moments.mean.astype(np.float32), std.astype(np.float32), layout, round(moments.count))

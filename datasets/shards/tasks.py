@@ -10,14 +10,10 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
-
-import threadpoolctl  # type: ignore[import-untyped]
+from typing import Any, Generic, Literal, TypeVar
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Dropped, ShardInfo, Split, UserError
@@ -28,6 +24,30 @@ from motionloom.datasets.shards.sample import DropClip, MotionType, Sample, enco
 
 T = TypeVar("T")
 Convert = Callable[[T], Sample | list[Sample]]
+Result = tuple[ShardInfo | None, list[Dropped]]
+"""A shard (None when every clip of it was dropped) and what was dropped."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One machine's share of a conversion: every `count`-th task from `index` (from 0) on.
+
+    `step` is `shards`, or `features` for the sources that need that step first.
+    """
+
+    index: int
+    count: int
+    step: Literal["features", "shards"] = "shards"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.index < self.count:
+            raise UserError(
+                f"part {self.index} of {self.count}: parts are numbered from 0 to {self.count - 1}"
+            )
+
+    def has(self, position: int) -> bool:
+        """Whether the task at `position` of all tasks is this part's."""
+        return position % self.count == self.index
 
 
 @dataclass(frozen=True)
@@ -72,16 +92,13 @@ def plan_shards(
     return tasks
 
 
-def write_shard(task: ShardTask[T], convert: Convert[T]) -> tuple[ShardInfo | None, list[Dropped]]:
-    """Write one shard and its index, or find it already there. None when every clip of it was dropped."""
-    finished = _finished(task)
-    if finished is not None:
-        return finished.shard, finished.dropped
+def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
+    """Write one shard and its index."""
     from webdataset.writer import TarWriter  # imports torch: two seconds that kept shards do not pay
 
     ids: list[str] = []
     dropped: list[Dropped] = []
-    with _one_thread(), atomic_file(task.path) as file:
+    with atomic_file(task.path) as file:
         hashing = HashingFile(file)
         with TarWriter(hashing, encoder=False, user="", group="", mtime=0) as tar:
             for label, item in task.named_items:
@@ -137,34 +154,21 @@ def _convert_item(
         return Dropped(source=label, reason=reason)
 
 
-def _finished(task: ShardTask[T]) -> ShardIndex | None:
-    """The index of a shard that an earlier run finished from the same inputs, if its tar is unchanged."""
+def finished_shard(task: ShardTask[Any], *, verify: bool = True) -> Result | None:
+    """What an earlier run made of `task` from the same inputs, or None when it must be made.
+
+    `verify` reads the tar and compares its sha256; else its size will do.
+    """
     path = index_path(task.path)
-    if not path.exists():
-        return None
     try:
         index = ShardIndex.load_json(path)
     except UserError:
         return None
     if index.fingerprint != task.fingerprint or (task.strict and any(index.dropped)):
         return None
-    if index.shard is None:
-        return index
-    if not task.path.exists() or task.path.stat().st_size != index.shard.bytes:
-        return None
-    return index if sha256_of(task.path) == index.shard.sha256 else None
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Sums in numerical libraries depend on their thread count; one thread makes bytes reproducible."""
-    torch = sys.modules.get("torch")
-    before = torch.get_num_threads() if torch else 0
-    with threadpoolctl.threadpool_limits(1):
-        if torch:
-            torch.set_num_threads(1)
-        try:
-            yield
-        finally:
-            if torch:
-                torch.set_num_threads(before)
+    if index.shard is not None:
+        if not task.path.exists() or task.path.stat().st_size != index.shard.bytes:
+            return None
+        if verify and sha256_of(task.path) != index.shard.sha256:
+            return None
+    return index.shard, index.dropped

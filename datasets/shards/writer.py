@@ -3,7 +3,8 @@
 - The plan is fixed before anything is converted: items of a split are shuffled once by the seed and cut into
   shards. A dropped item is simply absent from its shard, so what one shard holds never depends on another.
 - One task per shard, run in this process or in a pool of spawned ones, each on one thread: the number of
-  workers cannot change a byte.
+  workers cannot change a byte. Several machines may each write a `Part` of the shards; a run without a part
+  then finds them and adds what only one writer can: `index.npz` and `manifest.json`.
 - Killed at any moment and run again, the result is the same: tar, then its index, then (all shards done)
   `index.npz`, then `manifest.json`, each renamed into place from a temporary file. A shard is kept on the
   second run when its index carries the same fingerprint and its sha256 still fits.
@@ -11,20 +12,21 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
+
+from rich.progress import Progress
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SCHEMA_VERSION, Dropped, Manifest, ShardInfo, Split, UserError
-from motionloom.datasets.shards.files import sync_folder, write_json
+from motionloom.datasets.shards.files import remove_temporaries, sync_folder, write_json
 from motionloom.datasets.shards.index import (
-    INDEX_FILE,
     MANIFEST_FILE,
     SPLITS,
     ShardIndex,
@@ -32,11 +34,25 @@ from motionloom.datasets.shards.index import (
     index_path,
     save_index,
 )
-from motionloom.datasets.shards.pool import run_tasks
+from motionloom.datasets.shards.lock import folder_lock
+from motionloom.datasets.shards.pool import Workers
 from motionloom.datasets.shards.sample import MotionType
-from motionloom.datasets.shards.tasks import Convert, plan_shards
+from motionloom.datasets.shards.tasks import (
+    Convert,
+    Part,
+    Result,
+    ShardTask,
+    finished_shard,
+    plan_shards,
+    write_shard,
+)
 
 T = TypeVar("T")
+
+WORK_FOLDER = ".work"
+"""Inside the folder of the shards: what a first step makes; removed when the manifest stands."""
+
+FirstStep = Callable[[Sequence[T], Workers], None]
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -63,6 +79,8 @@ def write_dataset(
     licences: dict[str, int] | None = None,
     audio: dict[str, Any] | None = None,
     notes: Sequence[str] = (),
+    first: FirstStep[T] | None = None,
+    part: Part | None = None,
 ) -> Manifest:
     """Convert `items`, each already assigned to a split, into shards under `out`; return the manifest.
 
@@ -71,11 +89,15 @@ def write_dataset(
     item in the manifest's drop list and in the fingerprint that decides whether a finished shard is kept, so
     it must not change between runs; a change of the source files' *content* is not noticed unless it shows in
     `describe` or `options`. `dropped` (clips the plan already left out), `licences`, `audio` and `notes` go
-    into the manifest as they are.
+    into the manifest as they are. `first` is called with the items of the shards that are not finished, if
+    there are any, before these are written; it may use `out / WORK_FOLDER`.
+
+    With `part` only that part is made and no manifest is written; the one returned tells of the part. Parts
+    may run at once; the run without a part excludes all others.
     """
     _check_arguments(name, workers, clips_per_shard, options)
     out.mkdir(parents=True, exist_ok=True)
-    with _folder_lock(out):
+    with folder_lock(out, shared=part is not None), Workers(workers) as pool:
         _check_same_dataset(out, name)
         made_from = {
             "schema_version": SCHEMA_VERSION,
@@ -88,15 +110,11 @@ def write_dataset(
             out, items, name=name, layout=layout, made_from=made_from, clips_per_shard=clips_per_shard,
             seed=seed, strict=strict, describe=describe, motion_type=motion_type,
         )  # fmt: skip
-        (out / MANIFEST_FILE).unlink(missing_ok=True)
-        _remove_strays(out, name, keep={task.path for task in tasks})
-        results = run_tasks(tasks, convert, workers=workers, progress=progress)
+        if part is None:
+            _remove_strays(out, name, keep={task.path for task in tasks})
+        results = _make(tasks, convert, first, part, pool, out, progress)
         shards = [shard for shard, _ in results if shard is not None]
         failed = [drop for _, drops in results for drop in drops]
-        if not shards:
-            reasons = "; ".join(f"{drop.source}: {drop.reason}" for drop in failed[:3])
-            raise UserError(f"{out}: no clip survived the conversion ({len(failed)} dropped: {reasons})")
-        _finish_index(out, shards)
         manifest = Manifest(
             name=name,
             layout=layout.name,
@@ -113,24 +131,53 @@ def write_dataset(
             audio=audio,
             notes=list(notes),
         )
-        write_json(out / MANIFEST_FILE, manifest.dump())
+        if part is None:
+            if not shards:
+                told = "; ".join(f"{drop.source}: {drop.reason}" for drop in [*failed, *dropped][:3])
+                raise UserError(f"{out}: no clip survived the conversion ({told or 'there was none'})")
+            _finish_index(out, shards)
+            write_json(out / MANIFEST_FILE, manifest.dump())
+            shutil.rmtree(out / WORK_FOLDER, ignore_errors=True)
         return manifest
 
 
-@contextmanager
-def _folder_lock(out: Path) -> Iterator[None]:
-    """Refuse a second writer in the same folder; the kernel frees the lock when the process dies."""
-    handle = os.open(out, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(
-                f"{out}: another conversion is writing here; wait for it or choose another folder"
-            ) from None
-        yield
-    finally:
-        os.close(handle)
+def _make(
+    tasks: list[ShardTask[T]],
+    convert: Convert[T],
+    first: FirstStep[T] | None,
+    part: Part | None,
+    pool: Workers,
+    out: Path,
+    progress: bool,
+) -> list[Result]:
+    """Find or write the shards of `part` (all without one); results in task order."""
+    features_only = part is not None and part.step == "features"
+    mine = [task for position, task in enumerate(tasks) if features_only or not part or part.has(position)]
+    with ThreadPoolExecutor(pool.count) as threads:  # hashing runs outside the interpreter's lock
+        found = list(threads.map(lambda task: finished_shard(task, verify=not features_only), mine))
+    todo = [position for position, result in enumerate(found) if result is None]
+    if todo:
+        (out / MANIFEST_FILE).unlink(missing_ok=True)
+        if first is not None:
+            first([item for position in todo for _, item in mine[position].named_items], pool)
+    if features_only:
+        return []
+    with Progress(disable=not progress) as bar:
+        shown = bar.add_task("writing shards", total=len(mine), completed=len(mine) - len(todo))
+        for at, result in pool.run(_Write(convert), [mine[position] for position in todo]):
+            found[todo[at]] = result
+            bar.advance(shown)
+    return [result for result in found if result is not None]
+
+
+@dataclass(frozen=True)
+class _Write(Generic[T]):
+    """`write_shard` with its converter, for the pool."""
+
+    convert: Convert[T]
+
+    def __call__(self, task: ShardTask[T]) -> Result:
+        return write_shard(task, self.convert)
 
 
 def _check_arguments(name: str, workers: int, clips_per_shard: int, options: dict[str, Any]) -> None:
@@ -146,22 +193,24 @@ def _check_arguments(name: str, workers: int, clips_per_shard: int, options: dic
 
 def _check_same_dataset(out: Path, name: str) -> None:
     """Never write over another dataset's folder."""
-    path = out / MANIFEST_FILE
-    if path.exists():
-        found = Manifest.load_json(path).name
-        if found != name:
-            raise UserError(f"{out} holds dataset '{found}', not '{name}'; choose another folder")
+    try:
+        found = json.loads((out / MANIFEST_FILE).read_bytes()).get("name")
+    except FileNotFoundError:
+        return
+    except (ValueError, AttributeError):
+        raise UserError(f"{out / MANIFEST_FILE}: not a manifest; choose another folder") from None
+    if found != name:
+        raise UserError(f"{out} holds dataset '{found}', not '{name}'; choose another folder")
 
 
 def _remove_strays(out: Path, name: str, keep: set[Path]) -> None:
     """Delete temporary files of killed runs, and shards of this dataset that the plan does not have."""
     names = {path.name for path in keep} | {index_path(path).name for path in keep}
     shard = re.compile(rf"{re.escape(name)}-({'|'.join(SPLITS)})-\d{{6,}}\.(tar|index\.json)")
-    temporary = re.compile(
-        rf"\.({shard.pattern}|{re.escape(INDEX_FILE)}|{re.escape(MANIFEST_FILE)})\.\d+\.tmp"
-    )
+    for folder in (out, *out.glob(".*/")):
+        remove_temporaries(folder)
     for path in out.iterdir():
-        if temporary.fullmatch(path.name) or (shard.fullmatch(path.name) and path.name not in names):
+        if shard.fullmatch(path.name) and path.name not in names:
             path.unlink()
     sync_folder(out)
 

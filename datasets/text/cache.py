@@ -9,8 +9,7 @@
 | `tokens.npy`     | float16 [sum, E], without padding |
 | `cache.json`     | encoder name, E, n; written last, so its presence means the rest is whole |
 
-Captions are encoded in an order that depends on the set of captions alone, so building the same cache again
-gives the same bytes. Adding captions encodes only the new ones.
+`datasets/text/build.py` makes these files.
 """
 
 from __future__ import annotations
@@ -18,20 +17,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from functools import partial
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.datasets.shards.files import atomic_file, write_json, write_with
 from motionloom.datasets.text.encoder import TextEncoder
-
-BATCH = 64
-_FILES = ("keys.npy", "captions.jsonl", "sentence.npy", "offsets.npy", "tokens.npy")
 
 
 class CacheInfo(Config):
@@ -82,21 +74,10 @@ class TextCache:
     def build(
         folder: Path | str, captions: Iterable[str], encoder: TextEncoder, progress: bool = True
     ) -> TextCache:
-        """Encode the captions that are not there yet; another encoder's cache is replaced."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        wanted = {key_of(text): text for text in captions}
-        if not wanted:
-            raise UserError("no captions to encode: the dataset has none")
-        old = _reusable(folder, encoder)
-        known = old.keys() if old else set()
-        new = sorted(wanted.keys() - known)
-        if old is not None and not new:
-            return old
-        texts = {**(old.captions_by_key() if old else {}), **wanted}
-        fresh = _encode({key: wanted[key] for key in new}, encoder, progress)
-        _write(folder, texts, fresh, old, encoder)
-        return TextCache.open(folder)
+        """`build_text_cache` in this process, with an encoder that is loaded already."""
+        from motionloom.datasets.text.build import build_with_encoder  # which needs this module
+
+        return build_with_encoder(Path(folder), captions, encoder, progress)
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -122,6 +103,10 @@ class TextCache:
         """Every caption here."""
         lines = (self.folder / "captions.jsonl").read_text(encoding="utf-8").splitlines()
         return {key_of(text): text for text in map(json.loads, lines)}
+
+    def lengths(self) -> NDArray[np.int64]:
+        """Number of tokens of each row, [n]."""
+        return np.asarray(np.diff(self._offsets))
 
     def row(self, key: bytes) -> int | None:
         """Row of a caption's key, or None."""
@@ -158,69 +143,3 @@ class TextCache:
 def key_of(caption: str) -> bytes:
     """sha256 of a caption's UTF-8 bytes, exactly as written."""
     return hashlib.sha256(caption.encode()).digest()
-
-
-def _reusable(folder: Path, encoder: TextEncoder) -> TextCache | None:
-    """The cache in `folder` when it is whole and of the same encoder."""
-    try:
-        found = TextCache.open(folder)
-    except UserError:
-        return None
-    return found if (found.encoder, found.dim) == (encoder.name, encoder.dim) else None
-
-
-def _encode(
-    captions: dict[bytes, str], encoder: TextEncoder, progress: bool
-) -> dict[bytes, tuple[NDArray[np.float32], NDArray[np.float16]]]:
-    """Key -> (sentence [E], tokens [S, E]).
-
-    Sorted by length first: little padding, and an order that is a function of the set alone.
-    """
-    order = sorted(captions.items(), key=lambda pair: (len(pair[1]), pair[0]))
-    out = {}
-    for start in track(range(0, len(order), BATCH), "encoding captions", disable=not progress):
-        part = order[start : start + BATCH]
-        encoded = encoder.encode([text for _, text in part])
-        for i, (key, _) in enumerate(part):
-            out[key] = (encoded.sentence[i], encoded.tokens[i][encoded.mask[i]].astype(np.float16))
-    return out
-
-
-def _write(
-    folder: Path,
-    texts: dict[bytes, str],
-    fresh: dict[bytes, tuple[NDArray[np.float32], NDArray[np.float16]]],
-    old: TextCache | None,
-    encoder: TextEncoder,
-) -> None:
-    """Merge and write every file; `cache.json` goes first and comes back last."""
-    keys = sorted(texts)
-
-    def entry(key: bytes) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
-        if key in fresh:
-            return fresh[key]
-        assert old is not None
-        row = old.row(key)
-        assert row is not None
-        return old.entry(row)
-
-    entries = [entry(key) for key in keys]
-    offsets = np.concatenate([[0], np.cumsum([len(tokens) for _, tokens in entries])]).astype(np.int64)
-    (folder / "cache.json").unlink(missing_ok=True)
-    arrays: dict[str, NDArray] = {
-        "keys.npy": np.frombuffer(b"".join(keys), dtype=np.uint8).reshape(len(keys), 32),
-        "sentence.npy": np.stack([sentence for sentence, _ in entries]).astype(np.float32),
-        "offsets.npy": offsets,
-        "tokens.npy": np.concatenate([tokens for _, tokens in entries]),
-    }
-    for name, values in arrays.items():
-        write_with(folder / name, partial(_save_array, values))
-    with atomic_file(folder / "captions.jsonl") as file:
-        for key in keys:
-            file.write(json.dumps(texts[key], ensure_ascii=False).encode() + b"\n")
-    info = CacheInfo(encoder=encoder.name, dim=encoder.dim, count=len(keys))
-    write_json(folder / "cache.json", info.dump())
-
-
-def _save_array(values: NDArray, file: BinaryIO) -> None:
-    np.save(file, values, allow_pickle=False)

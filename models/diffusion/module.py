@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.distributed import masked_mean
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.stage_module import OptimConfig, StageModule
-from motionloom.models.tma.losses import masked_mean
 
 
 class DiffusionModule(StageModule):
@@ -38,4 +38,4 @@ class DiffusionModule(StageModule):
         found = self.net(noisy, step, text, mask, told)
         target = motion if schedule.predicts == "sample" else noise
         error = (found - target.float()).square()
-        return {"loss": masked_mean(error, mask[..., None].expand_as(error))}
+        return {"loss": masked_mean(error, mask)}

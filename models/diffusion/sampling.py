@@ -64,5 +64,6 @@ def _denoise(
         found = net(given, step.to(device).expand(len(told)), text, mask, told)
         if guided:
             found = found[count:] + guidance * (found[:count] - found[count:])
-        x = scheduler.step(found, step, x, **extra).prev_sample
+        stepped: Tensor = scheduler.step(found, step, x, **extra).prev_sample
+        x = stepped
     return x

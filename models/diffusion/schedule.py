@@ -31,9 +31,9 @@ class ScheduleConfig(Config):
             "prediction_type": self.predicts,
         }
 
-    def noiser(self) -> DDPMScheduler:
+    def noiser(self) -> Any:
         """For training: `add_noise`. Motion is not bounded, so nothing is clipped."""
-        return DDPMScheduler(clip_sample=False, **self.arguments())
+        return DDPMScheduler(clip_sample=False, **self.arguments())  # type: ignore[no-untyped-call]
 
     def sampler(self, kind: Sampler, steps: int) -> Any:
         """A sampler set to `steps` denoising steps."""
@@ -41,8 +41,12 @@ class ScheduleConfig(Config):
         if kind == "ddpm":
             made = self.noiser()
         elif kind == "ddim":
-            made = DDIMScheduler(clip_sample=False, set_alpha_to_one=True, **self.arguments())
+            made = DDIMScheduler(  # type: ignore[no-untyped-call]
+                clip_sample=False, set_alpha_to_one=True, **self.arguments()
+            )
         else:
-            made = DPMSolverMultistepScheduler(algorithm_type="dpmsolver++", **self.arguments())
+            made = DPMSolverMultistepScheduler(  # type: ignore[no-untyped-call]
+                algorithm_type="dpmsolver++", **self.arguments()
+            )
         made.set_timesteps(steps)
         return made

@@ -16,7 +16,8 @@ class QuantizerOutput(NamedTuple):
     codes: Tensor
     """int64 [B, L], or [B, L, levels]; meaningless where the mask is False."""
     penalty: Tensor
-    """Commitment |z - sg(z_hat)|^2, mean over valid elements, float32 scalar; summed over residual levels."""
+    """Commitment |z - sg(z_hat)|^2, mean over valid elements, float32 scalar; summed over residual levels.
+    While training, this rank's share: the mean over ranks is that of the global batch."""
     metrics: dict[str, Tensor]
     """float32 scalars ([levels] for a residual quantizer): `penalty`; `perplexity` of this batch's codes;
     `usage`, the share of codes this batch used; `dead`, codes whose EMA count is not above `reset_below`;

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import Config
-from motionloom.models.distributed import is_distributed, sum_over_ranks
+from motionloom.models.distributed import is_distributed, sum_over_ranks, world_size
 from motionloom.models.quantize.base import QuantizerOutput, usage_metrics
 from motionloom.models.quantize.draws import draw_rows
 
@@ -55,16 +55,11 @@ def cluster_sums(z: Tensor, codes: Tensor, num_codes: int) -> Tensor:
     return sums.index_add_(0, codes, z)
 
 
-def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean of [..., d] over the positions where mask [...] is True (0 if there are none) and over d."""
-    if mask is None:
-        return values.mean()
-    total = values.masked_fill(~mask[..., None], 0.0).sum()
-    return total / (mask.sum() * values.shape[-1]).clamp(min=1)
-
-
 class EmaQuantizer(nn.Module):
     """Nearest code, straight-through; see the module docstring.
+
+    A vector that is not finite counts as padding: a float16 overflow costs the optimizer one step, which the
+    gradient scaler leaves out, and must not stay in the codebook for good.
 
     All state is in buffers (`codebook`, `ema_sum`, `ema_count`, `initialised`, `draws`) and is float32
     whatever the model is cast to; the arithmetic is float32 under autocast too.
@@ -111,20 +106,24 @@ class EmaQuantizer(nn.Module):
         with torch.autocast(z.device.type, enabled=False):
             full = z.float()
             rows = full.detach().reshape(-1, full.shape[-1])
-            flat_mask = None if mask is None else mask.reshape(-1)
-            if flat_mask is not None:
-                rows = rows.masked_fill(~flat_mask[:, None], 0.0)
+            real = rows.isfinite().all(1)
+            if mask is not None:
+                real = real & mask.reshape(-1)
+            rows = rows.masked_fill(~real[:, None], 0.0)
             if update and not self._is_initialised:
-                self._initialise(rows, flat_mask)
+                self._initialise(rows, real)
             codes = nearest(rows, self.codebook)
             chosen = functional.embedding(codes, self.codebook).view_as(full)
             error = full - chosen
-            penalty = masked_mean(error.square(), mask)
-            used = rows.new_ones(len(rows)) if flat_mask is None else flat_mask.float()
-            counts = rows.new_zeros(self.config.num_codes).index_add_(0, codes, used)
+            counts = rows.new_zeros(self.config.num_codes).index_add_(0, codes, real.float())
             resets = rows.new_zeros(())
             if update:
-                counts, resets = self._update(rows, flat_mask, codes, counts)
+                counts, resets = self._update(rows, real, codes, counts)
+            # The counts are global after an update: dividing by their mean per rank makes the mean over ranks
+            # the penalty of the whole batch, whatever each rank's number of real vectors is.
+            number = counts.sum() * error.shape[-1] / (world_size() if update else 1)
+            squares = error.square().masked_fill(~real.view(z.shape[:-1])[..., None], 0.0)
+            penalty = squares.sum() / number.clamp(min=1)
             metrics = {"penalty": penalty.detach(), **self._metrics(counts), "resets": resets}
             straight = full - error.detach()
         return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
@@ -134,13 +133,13 @@ class EmaQuantizer(nn.Module):
         return functional.embedding(codes, self.codebook)
 
     @torch.no_grad()
-    def _draw(self, rows: Tensor, mask: Tensor | None) -> Tensor:
+    def _draw(self, rows: Tensor, mask: Tensor) -> Tensor:
         drawn = draw_rows(rows, mask, self.config.num_codes, salt=self.salt, step=self.draws)
         self.draws.add_(1)
         return drawn
 
     @torch.no_grad()
-    def _initialise(self, rows: Tensor, mask: Tensor | None) -> None:
+    def _initialise(self, rows: Tensor, mask: Tensor) -> None:
         drawn = sum_over_ranks(self._draw(rows, mask))
         self.codebook.copy_(drawn)
         self.ema_sum.copy_(drawn * self.config.reset_below)
@@ -150,7 +149,7 @@ class EmaQuantizer(nn.Module):
 
     @torch.no_grad()
     def _update(
-        self, rows: Tensor, mask: Tensor | None, codes: Tensor, counts: Tensor
+        self, rows: Tensor, mask: Tensor, codes: Tensor, counts: Tensor
     ) -> tuple[Tensor, Tensor]:
         """EMA step and Code Reset from the global batch; returns its counts [K] and the number of resets."""
         sums = cluster_sums(rows, codes, self.config.num_codes)  # padded rows are zero

@@ -13,24 +13,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from motionloom.models.distributed import gather_rows, gather_rows_with_grad, sum_over_ranks, world_size
-
-
-def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Sum of `values` where `mask` over the mean number of unmasked elements per rank; `mask` has the shape
-    of `values`.
-
-    Dividing by the global count over the number of ranks is what makes the mean over ranks a mean over all
-    elements.
-    """
-    count = sum_over_ranks(mask.sum().float()) / world_size()
-    return torch.where(mask, values, 0.0).sum() / count.clamp(min=1)
+from motionloom.models.distributed import gather_rows, gather_rows_with_grad, masked_mean
 
 
 def reconstruction_loss(pred: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     """SmoothL1 over the real frames: pred and target [B, T, D], mask bool [B, T]."""
     error = F.smooth_l1_loss(pred.float(), target.float(), reduction="none")
-    return masked_mean(error, mask[..., None].expand_as(error))
+    return masked_mean(error, mask)
 
 
 def kl_divergence(mu_q: Tensor, logvar_q: Tensor, mu_p: Tensor, logvar_p: Tensor) -> Tensor:

@@ -1,4 +1,7 @@
-"""Losses of the tokenizers as functions of tensors (HumanTOMATO Eqn. 3 and 6)."""
+"""Losses of the tokenizers as functions of tensors (HumanTOMATO Eqn. 3 and 6).
+
+Distributed: like `models.distributed.masked_mean`, the mean over ranks is the loss of the concatenated batch.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from motionloom.models.quantize.ema import masked_mean
+from motionloom.models.distributed import masked_mean
 from motionloom.models.tokenizer.config import Recon
 
 

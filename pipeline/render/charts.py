@@ -1,4 +1,4 @@
-"""Line and bar charts as small inline SVG, drawn without any library so that a report stays one light file.
+"""Line charts, bars, histograms as small inline SVG, without any library, so a report stays one light file.
 
 Colours come from the page's style (`.s0` to `.s7`, `.axis`), so charts follow the light and dark theme. Long
 curves are thinned to the lowest and highest point of each of 200 stretches, which keeps every spike.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -102,6 +102,51 @@ def bar_chart(
         for index, label in enumerate(labels):
             parts.append(_text(x_axis(index + 0.5), HEIGHT - BOTTOM + 17, label[:14], "middle"))
     return _svg(title, parts, None)
+
+
+def histogram(
+    counts: Mapping[str, ArrayLike],
+    edges: tuple[float, float],
+    *,
+    x_label: str = "",
+    y_label: str = "",
+    title: str = "",
+) -> str:
+    """SVG of stacked counts: for each name one count per equal bin [K] of the range `edges`, and a legend."""
+    stacks = {name: np.asarray(values, np.float64).ravel() for name, values in counts.items()}
+    tallest = float(np.sum(list(stacks.values()), axis=0).max(initial=0.0)) if stacks else 0.0
+    if tallest <= 0:
+        return _svg(title, [_text(WIDTH / 2, HEIGHT / 2, "no data yet", "middle")], None)
+    bins = len(next(iter(stacks.values())))
+    x_axis = _Axis(*edges, LEFT, WIDTH - RIGHT, nice=False)
+    y_axis = _Axis(0.0, tallest, HEIGHT - BOTTOM, TOP)
+    parts = _axes(x_axis, y_axis, x_label, y_label, False)
+    step = (edges[1] - edges[0]) / bins
+    below = np.zeros(bins)
+    for index, (name, values) in enumerate(stacks.items()):
+        for bin_ in np.flatnonzero(values).tolist():
+            low, high = edges[0] + bin_ * step, edges[0] + (bin_ + 1) * step
+            left, right = x_axis(low) + 0.5, x_axis(high) - 0.5
+            top, base = y_axis(below[bin_] + values[bin_]), y_axis(below[bin_])
+            tip = f"<title>{escape(f'{name}, {low:.4g} to {high:.4g}: {values[bin_]:g}')}</title>"
+            parts.append(
+                f'<rect class="stack s{index % 8}" x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" '
+                f'height="{base - top:.1f}">{tip}</rect>'
+            )
+        below += values
+    return _svg(title, parts, None) + _legend([Line(name, (), ()) for name in stacks])
+
+
+def ranking(items: Sequence[tuple[str, float]]) -> str:
+    """An ordered list of names with bars and values, as HTML: names stay text that can be read and found."""
+    most = max((value for _, value in items), default=0) or 1
+    rows = "".join(
+        f'<li><span class="name">{escape(name)}</span>'
+        f'<span class="track"><i style="width:{100 * value / most:.1f}%"></i></span>'
+        f'<span class="value">{value:,g}</span></li>'
+        for name, value in items
+    )
+    return f'<ol class="ranking">{rows}</ol>'
 
 
 class _Axis:

@@ -14,7 +14,7 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.charts import Line, bar_chart, line_chart
+from motionloom.pipeline.render.charts import Line, bar_chart, histogram, line_chart, ranking
 from motionloom.pipeline.render.files import write_text
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
@@ -26,6 +26,8 @@ from motionloom.pipeline.render.viewer import (
 )
 
 Value = str | float | int | None
+SHORT = 24
+"""Columns whose cells have no more letters than this are not broken into lines."""
 PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 
 
@@ -45,6 +47,11 @@ class Page:
         self._blocks.append(f'<h2 id="{anchor}">{escape(text)}</h2>')
         return self
 
+    def add_subheading(self, text: str) -> Page:
+        """A heading within a section."""
+        self._blocks.append(f"<h3>{escape(text)}</h3>")
+        return self
+
     def add_text(self, text: str) -> Page:
         """Paragraphs, parted by empty lines."""
         for paragraph in text.split("\n\n"):
@@ -52,31 +59,22 @@ class Page:
                 self._blocks.append(f"<p>{escape(paragraph.strip())}</p>")
         return self
 
+    def add_list(self, lines: Sequence[str]) -> Page:
+        """A list with a point before each line."""
+        self._blocks.append("<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>")
+        return self
+
     def add_table(
         self, columns: Sequence[str], rows: Sequence[Sequence[Value]], caption: str = "", digits: int = 3
     ) -> Page:
         """A table; numbers stand right with `digits` decimals, None is a dash."""
-        for row in rows:
-            if len(row) != len(columns):
-                raise UserError(f"table '{caption}': a row has {len(row)} cells for {len(columns)} columns")
-        numeric = [
-            any(_is_number(row[k]) for row in rows)
-            and all(_is_number(row[k]) or row[k] is None for row in rows)
-            for k in range(len(columns))
-        ]
-        align = [' class="number"' if flag else "" for flag in numeric]
-        head = "".join(f"<th{a}>{escape(name)}</th>" for name, a in zip(columns, align, strict=True))
-        body = "".join(
-            "<tr>"
-            + "".join(f"<td{a}>{_cell(v, digits)}</td>" for v, a in zip(row, align, strict=True))
-            + "</tr>"
-            for row in rows
-        )
-        title = f"<caption>{escape(caption)}</caption>" if caption else ""
-        self._blocks.append(
-            f'<div class="scroll"><table>{title}<thead><tr>{head}</tr></thead>'
-            f"<tbody>{body}</tbody></table></div>"
-        )
+        self._blocks.append(_table(columns, rows, caption, digits))
+        return self
+
+    def add_folded(self, summary: str, columns: Sequence[str], rows: Sequence[Sequence[Value]]) -> Page:
+        """A table that is closed until the reader opens it."""
+        table = _table(columns, rows, "", 3)
+        self._blocks.append(f"<details><summary>{escape(summary)}</summary>{table}</details>")
         return self
 
     def add_facts(self, facts: Mapping[str, Value]) -> Page:
@@ -107,6 +105,22 @@ class Page:
         return self._add_chart(
             bar_chart(values, x_label=x_label, y_label=y_label, labels=labels, title=title), title
         )
+
+    def add_histogram(
+        self,
+        counts: Mapping[str, ArrayLike],
+        edges: tuple[float, float],
+        title: str,
+        x_label: str = "",
+        y_label: str = "clips",
+    ) -> Page:
+        """Stacked counts per bin of a range, one colour a name."""
+        chart = histogram(counts, edges, x_label=x_label, y_label=y_label, title=title)
+        return self._add_chart(chart, title)
+
+    def add_ranking(self, items: Sequence[tuple[str, float]], title: str) -> Page:
+        """Names with bars, in the order given."""
+        return self._add_chart(ranking(items), title)
 
     def add_viewer(self, motions: Sequence[ViewerMotion], note: str = "") -> Page:
         """Motions that play in the page, with their own controls below."""
@@ -160,6 +174,30 @@ class Page:
         else:
             self._blocks.append(f'<div class="plots">{block}</div>')
         return self
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[Value]], caption: str, digits: int) -> str:
+    for row in rows:
+        if len(row) != len(columns):
+            raise UserError(f"table '{caption}': a row has {len(row)} cells for {len(columns)} columns")
+    numeric = [
+        any(_is_number(row[k]) for row in rows) and all(_is_number(row[k]) or row[k] is None for row in rows)
+        for k in range(len(columns))
+    ]
+    short = [all(len(str(row[k])) <= SHORT for row in rows) for k in range(len(columns))]
+    align = [
+        ' class="number"' if number else ' class="short"' if brief else ""
+        for number, brief in zip(numeric, short, strict=True)
+    ]
+    head = "".join(f'<th scope="col"{a}>{escape(name)}</th>' for name, a in zip(columns, align, strict=True))
+    body = "".join(
+        "<tr>" + "".join(f"<td{a}>{_cell(v, digits)}</td>" for v, a in zip(row, align, strict=True)) + "</tr>"
+        for row in rows
+    )
+    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return (
+        f'<div class="scroll"><table>{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    )
 
 
 def _is_number(value: Value) -> bool:

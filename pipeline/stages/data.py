@@ -1,34 +1,59 @@
-"""Stages that bring shards: synthesise them, convert a BVH folder, or take those that exist."""
+"""Stages that bring shards: synthesise them, or take those that exist (`convert.py`: real sources)."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Self
 
-from motionloom.datasets.convert.bvh import BvhConfig, convert_bvh
+from pydantic import Field, model_validator
+
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.check import check
+from motionloom.datasets.shards.reader import manifest_layout, read_manifest, require_layout
+from motionloom.datasets.shards.reading import CacheConfig, Reading
+from motionloom.datasets.shards.store import is_url, open_store
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.files import sha256_file, write_json
-from motionloom.pipeline.sources import REFERENCE, SHARDS
-from motionloom.pipeline.stage import StageConfig, StageContext
+from motionloom.pipeline.files import write_json
+from motionloom.pipeline.sources import READER, REFERENCE, SHARDS, DataPart, Reader, Reference
+from motionloom.pipeline.stage import RUNTIME, StageConfig, StageContext
 
 
 class SynthStageConfig(SynthConfig, StageConfig):
     """Synthetic whole-body shards."""
 
 
-class BvhStageConfig(BvhConfig, StageConfig):
-    """A folder of captioned BVH files."""
+class ShardsStageConfig(Reading, StageConfig):
+    """Shards that exist already, in a folder or on a server, or a mix of several such data sets."""
 
-
-class ShardsStageConfig(StageConfig):
-    """Shards that exist already."""
-
-    path: str
-    """Folder with `manifest.json`."""
+    path: str | None = None
+    """Folder with `manifest.json`, or a URL (`s3://`, `https://`, `http://`)."""
+    mix: list[DataPart] = Field(default_factory=list)
+    """Several data sets and their weights, in place of `path`."""
     verify: bool = True
-    """Check every checksum once, when the stage runs."""
+    """Check folders from end to end, when the stage runs. Shards on a server are checked as they arrive."""
+    # These two change no result, so a finished run is not thrown away for them.
+    mode: Literal["indexed", "streamed"] = Field("indexed", json_schema_extra=RUNTIME)
+    """`indexed` reads clips where they lie; `streamed` has training read whole shards front to back."""
+    cache: CacheConfig = Field(CacheConfig(), json_schema_extra=RUNTIME)
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.path is None) == (not self.mix):
+            raise ValueError("give either path (one data set) or mix (several, each with path and weight)")
+        places = [part.path for part in self.mix]
+        if len(set(places)) != len(places):
+            raise ValueError("mix names a data set twice; add its weights up")
+        return self
+
+    def parts(self) -> list[DataPart]:
+        """The data sets, folders by their absolute path."""
+        parts = self.mix or [DataPart(path=str(self.path), weight=1.0)]
+        return [part.model_copy(update={"path": _place(part.path)}) for part in parts]
+
+    def found_layout(self) -> MotionLayout:
+        """Layout of the shards as they are."""
+        return manifest_layout(read_manifest(open_store(self.parts()[0].path, self.cache))[0])
 
 
 def run_synth(context: StageContext) -> None:
@@ -37,57 +62,67 @@ def run_synth(context: StageContext) -> None:
     if config.seed == 0:
         config = config.model_copy(update={"seed": context.seed})
     manifest = synthesize(config, context.folder / SHARDS, workers=context.hardware.convert_workers)
-    _say(context, manifest)
-
-
-def run_bvh(context: StageContext) -> None:
-    """Convert BVH files."""
-    manifest = convert_bvh(context.config, context.folder / SHARDS, workers=context.hardware.convert_workers)
-    _say(context, manifest)
+    say_shards(context, manifest)
 
 
 def run_shards(context: StageContext) -> None:
     """Point at existing shards, after checking them."""
-    root = Path(context.config.path).expanduser().resolve()
-    manifest = Manifest.load_json(root / "manifest.json")
-    if context.config.verify:
-        problems = check(root)
-        if problems:
-            raise UserError(
-                f"{root}: {len(problems)} problems, first: {problems[0]}; see: motionloom data check"
-            )
-    write_json(context.folder / REFERENCE, {"path": str(root)})
-    _say(context, manifest)
+    config: ShardsStageConfig = context.config
+    layouts = []
+    for part in config.parts():
+        manifest, _ = read_manifest(open_store(part.path, config.cache))
+        layouts.append((part.path, manifest_layout(manifest)))
+        if config.verify and not is_url(part.path):
+            problems = check(Path(part.path))
+            if problems:
+                raise UserError(
+                    f"{part.path}: {len(problems)} problems, first: {problems[0]}; see: motionloom data check"
+                )
+        say_shards(context, manifest, part.path if len(config.parts()) > 1 else "")
+        _warn_of_small_cache(context, config, part.path, manifest)
+    for place, layout in layouts[1:]:
+        require_layout(layout, layouts[0][1], f"{place}, mixed with {layouts[0][0]}")
+    reference = Reference(parts=config.parts(), order=config.order, shards_per_group=config.shards_per_group)
+    write_json(context.folder / REFERENCE, reference.dump())
+    settle_shards(config, context.folder)
 
 
-def bvh_sources(config: BvhStageConfig) -> dict[str, Any]:
-    """Names and sizes of the source files, checksums of the small ones that steer the conversion."""
-    source = Path(config.source).expanduser()
-    if not source.is_dir():
-        raise UserError(f"{source}: no such folder (the BVH source; set it with --set data.source=FOLDER)")
-    files = {
-        p.relative_to(source).as_posix(): p.stat().st_size for p in sorted(source.rglob("*")) if p.is_file()
-    }
-    steering = {}
-    for name in (config.joint_map, config.captions):
-        if name is not None and Path(name).expanduser().is_file():
-            steering[Path(name).name] = sha256_file(Path(name).expanduser())
-    return {"files": files, "steering": steering}
+def settle_shards(config: ShardsStageConfig, folder: Path) -> None:
+    """Write down how the recipe wants the shards read now; done again whenever the recipe runs."""
+    write_json(folder / READER, Reader(mode=config.mode, cache=config.cache).dump())
 
 
 def shards_source(config: ShardsStageConfig) -> dict[str, Any]:
-    """Checksum of the manifest, which holds those of the shards."""
-    path = Path(config.path).expanduser() / "manifest.json"
-    if not path.is_file():
-        raise UserError(f"{path}: no manifest; is this a finished shard folder?")
-    return {"manifest": sha256_file(path)}
+    """Checksums of the manifests, which hold those of the shards."""
+    manifests = [read_manifest(open_store(part.path, config.cache))[1] for part in config.parts()]
+    return {"manifests": manifests}
 
 
-def _say(context: StageContext, manifest: Manifest) -> None:
+def _place(path: str) -> str:
+    """A URL as it is, a folder resolved."""
+    if is_url(path) or path.startswith("file:"):
+        return path
+    return str(Path(path).expanduser().resolve())
+
+
+def _warn_of_small_cache(
+    context: StageContext, config: ShardsStageConfig, place: str, manifest: Manifest
+) -> None:
+    """Random access through a cache that cannot hold the training split fetches its shards over and over."""
+    size = sum(shard.bytes for shard in manifest.shards if shard.split == "train")
+    if is_url(place) and config.order == "global" and 0 < config.cache.limit < size:
+        context.console.print(
+            f"    [yellow]{place}: {size / 1e9:.1f} GB of training shards, the cache holds "
+            f"{config.cache.gigabytes:g}: raise cache.gigabytes, or set order: streamed[/]"
+        )
+
+
+def say_shards(context: StageContext, manifest: Manifest, name: str = "") -> None:
+    """One line about a data set: clips, minutes, layout."""
     clips = sum(s.samples for s in manifest.shards)
     seconds = sum(s.frames for s in manifest.shards) / manifest.fps
     dropped = f", {len(manifest.dropped)} dropped" if manifest.dropped else ""
     context.console.print(
-        f"    {clips} clips, {seconds / 60:.1f} minutes at {manifest.fps:g} fps, layout {manifest.layout} "
-        f"({manifest.family}), {len(manifest.shards)} shards{dropped}"
+        f"    {name and name + ': '}{clips} clips, {seconds / 60:.1f} minutes at {manifest.fps:g} fps, "
+        f"layout {manifest.layout} ({manifest.family}), {len(manifest.shards)} shards{dropped}"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.clips import ClipDataset, in_order
 from motionloom.datasets.text.cache import TextCache
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
@@ -25,6 +26,8 @@ Prior = Literal["tma", "sentence"]
 
 class GptStageConfig(TrainedStageConfig):
     """A GPT over the tokens of one tokenizer."""
+
+    shardable = True
 
     net: GptConfig = GptConfig()
     loss: GptLossConfig = GptLossConfig()
@@ -81,6 +84,8 @@ def run_gpt(context: StageContext) -> None:
             rank,
             world,
             training,
+            # Weights count; the order of shards does not, as the tokens are all in memory.
+            tuple(replace(source, shards=None) for source in dataset.sources()),
         )
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
@@ -103,12 +108,12 @@ def run_gpt(context: StageContext) -> None:
 
 
 def priors(
-    dataset: ShardDataset, text: TextCache, tma: LoadedTma | None, *, face: bool
+    dataset: ClipDataset, text: TextCache, tma: LoadedTma | None, *, face: bool
 ) -> tuple[list[list[int]], Tensor, Tensor]:
     """Captions of each clip as rows of the tables of text [n, E] and sentence embeddings [n, S]."""
     names: dict[str, int] = {}
     captions = []
-    for index in range(len(dataset)):
+    for index in in_order(dataset, "face_texts.json" if face else "texts.json"):
         found = [c.text for c in captions_of(dataset, index, face=face)]
         if not found:
             raise UserError(

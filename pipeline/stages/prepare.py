@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.shards.statistics import compute
-from motionloom.datasets.text.cache import TextCache
-from motionloom.datasets.text.encoder import load_text_encoder
+from motionloom.datasets.text.build import build_text_cache
 from motionloom.pipeline.sources import captions_of, open_split, splits_of
 from motionloom.pipeline.stage import StageConfig, StageContext
 
@@ -37,12 +36,17 @@ def run_text(context: StageContext) -> None:
     """Embed the captions of all splits."""
     captions: set[str] = set()
     for split in splits_of(context.input("data")):
-        dataset: ShardDataset = open_split(context.input("data"), split)
-        for index in range(len(dataset)):
+        dataset = open_split(context.input("data"), split)
+        for index in in_order(dataset, "texts.json", "face_texts.json"):
             captions.update(c.text for c in captions_of(dataset, index, face=False))
             captions.update(c.text for c in captions_of(dataset, index, face=True))
-    encoder = load_text_encoder(context.config.encoder)
-    TextCache.build(context.folder / "cache", captions, encoder, progress=context.console.is_terminal)
+    cache = build_text_cache(
+        context.folder / "cache",
+        captions,
+        context.config.encoder,
+        workers=context.hardware.convert_workers,
+        progress=context.console.is_terminal,
+    )
     context.console.print(
-        f"    {len(captions)} different captions, {encoder.dim}-d embeddings by {encoder.name}"
+        f"    {len(captions)} different captions, {cache.dim}-d embeddings by {cache.encoder}"
     )

@@ -73,8 +73,7 @@ def _motions(bundle: Bundle, truths: list[Truth], generated: list[GeneratedMotio
         again = face
         face_tokens = bundle.faces.get("gpt")
         if truth.face is not None and isinstance(face_tokens, GptFace):
-            rebuilt = reconstruct(face_tokens.tokenizer, bundle.stats, truth.face)
-            again = synthetic_face_controls(rebuilt)
+            again = synthetic_face_controls(reconstruct(face_tokens.tokenizer, bundle.stats, truth.face))
         rebuilt = decode(reconstruct(bundle.tokenizer, bundle.stats, truth.features), layout)
         for label, joints, controls in (
             ("recorded", truth.joints, face),

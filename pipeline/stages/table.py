@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from motionloom.pipeline.stage import StageKind
 from motionloom.pipeline.stages import (
+    convert,
     data,
     diffusion,
     evaluate,
@@ -36,9 +37,19 @@ STAGES: dict[str, StageKind] = {
     kind.name: kind
     for kind in (
         StageKind("synth", "synthetic shards", data.SynthStageConfig, data.run_synth),
-        StageKind("bvh", "shards from BVH", data.BvhStageConfig, data.run_bvh, external=data.bvh_sources),
+        *(
+            StageKind(
+                name, f"shards from {title}", config, convert.run_convert, external=convert.source_facts
+            )
+            for name, (title, config) in convert.CONVERTED.items()
+        ),
         StageKind(
-            "shards", "existing shards", data.ShardsStageConfig, data.run_shards, external=data.shards_source
+            "shards",
+            "existing shards",
+            data.ShardsStageConfig,
+            data.run_shards,
+            external=data.shards_source,
+            settle=data.settle_shards,
         ),
         StageKind("stats", "mean and deviation", prepare.StatsConfig, prepare.run_stats, ("data",)),
         StageKind("text", "caption embeddings", prepare.TextConfig, prepare.run_text, ("data",)),

@@ -51,7 +51,7 @@ def run_tma(context: StageContext) -> None:
         open_stats(context.input("stats")),
         open_text(context.input("text")),
     )
-    dataset = open_split(data, "train")
+    dataset = open_split(data, "train", training=True)
     columns = part_columns(dataset.layout, config.part)
     torch.manual_seed(context.seed)
     net = Tma(config.net, motion_dim=len(columns), text_dim=text.dim)

@@ -60,7 +60,7 @@ def run_tokenizer(context: StageContext) -> None:
     """Train a tokenizer on windows of the training split."""
     config = context.config
     data, stats = context.input("data"), open_stats(context.input("stats"))
-    dataset = open_split(data, "train")
+    dataset = open_split(data, "train", training=True)
     torch.manual_seed(context.seed)
     net = build_tokenizer(config.net, dataset.layout)
     module = TokenizerModule(

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.networks import load_tokenizer
@@ -51,7 +51,7 @@ def run_tokens(context: StageContext) -> None:
 
 def encode_split(
     tokenizer: Tokenizer,
-    dataset: ShardDataset,
+    dataset: ClipDataset,
     stats: FeatureStats,
     batch_frames: int,
     advance: Callable[[int], None] | None = None,
@@ -76,7 +76,7 @@ def encode_split(
 
 
 def padded(
-    tokenizer: Tokenizer, dataset: ShardDataset, stats: FeatureStats, items: NDArray[np.int64]
+    tokenizer: Tokenizer, dataset: ClipDataset, stats: FeatureStats, items: NDArray[np.int64]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Normalised motion [B, T, D] zero-padded, and true lengths [B] (multiples of the group length)."""
     unit, columns = tokenizer.group_frames, tokenizer.columns.numpy()

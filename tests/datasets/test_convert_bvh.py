@@ -14,15 +14,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from motionloom.datasets.convert.bvh import BvhConfig, convert_bvh, plan_bvh
-from motionloom.datasets.convert.splits import hash_split, read_split_files
+from motionloom.datasets.convert.archives import Batch
+from motionloom.datasets.convert.bvh import BvhClips, BvhConfig, convert_bvh, plan_bvh, prepare_bvh
+from motionloom.datasets.convert.conversion import SCAN_FILE, run_conversion
+from motionloom.datasets.convert.splits import hash_split
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.canonical import canonicalize, resample
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, Split, UserError
+from motionloom.datasets.shards.lock import LOCK_FILE
 from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.tasks import Part
+from motionloom.datasets.shards.writer import WORK_FOLDER
 
 NAMES = (
     "bow_active",
@@ -93,7 +98,7 @@ def test_clips_become_samples_with_captions_split_and_licence(clips: Path, tmp_p
     assert reasons(manifest) == {"dataset-1_dash_normal_001.bvh": "0.67 s, shorter than 1 s"}
     assert {s.split: s.samples for s in manifest.shards} == {"train": 3, "val": 1, "test": 2}
     assert str(clips) not in json.dumps(manifest.dump())
-    assert not [p.name for p in (tmp_path / "out").iterdir() if p.name.startswith(".")]
+    assert [p.name for p in (tmp_path / "out").iterdir() if p.name.startswith(".")] == [".scan.json"]
     rows = {row["id"]: row for row in map(json.loads, (clips / "captions.jsonl").read_text().splitlines())}
     splits: tuple[Split, ...] = ("train", "val", "test")
     for split in splits:
@@ -145,11 +150,9 @@ def test_archives_give_the_same_features_as_files(copy: Path, tmp_path: Path) ->
 def test_a_killed_run_resumes_to_the_same_bytes(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from motionloom.datasets.convert import bvh
-
     pack(copy, 3)
     convert(config(copy), tmp_path / "whole")
-    real, calls = bvh._clip_features, []
+    real, calls = BvhClips.features, []
 
     def dies(*args: Any) -> Any:
         calls.append(args)
@@ -157,13 +160,71 @@ def test_a_killed_run_resumes_to_the_same_bytes(
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(bvh, "_clip_features", dies)
+    monkeypatch.setattr(BvhClips, "features", dies)
     with pytest.raises(KeyboardInterrupt):
         convert(config(copy), tmp_path / "out")
-    assert len(list((tmp_path / "out" / ".features").glob("*.json"))) == 2
+    assert len(list((tmp_path / "out" / WORK_FOLDER).glob("*.json"))) == 2
     convert(config(copy), tmp_path / "out")
     assert len(calls) == 5 + 2  # two archives were kept, only the third one's clips are made again
     assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "whole")
+
+
+def test_a_finished_conversion_reads_nothing_again(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pack(copy, 2)
+    first = convert(config(copy), tmp_path / "out")
+    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")}
+
+    def never(*_: Any) -> Any:
+        raise AssertionError("an archive was read again")
+
+    monkeypatch.setattr(Batch, "read", never)
+    assert convert(config(copy), tmp_path / "out") == first
+    assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")} == before
+
+
+def test_a_clip_by_itself_is_the_same_sample(copy: Path, tmp_path: Path) -> None:
+    pack(copy, 2)
+    prepared = prepare_bvh(config(copy))
+    run_conversion(prepared, tmp_path / "out", progress=False)
+    dataset = ShardDataset.open(tmp_path / "out", "val")
+    (clip,) = [item for split, item in prepared.plan.items if split == "val"]
+    sample = prepared.convert(clip)
+    assert not isinstance(sample, list)
+    np.testing.assert_array_equal(sample.motion, dataset.motion(0))
+    assert (sample.meta, sample.texts) == (dataset.meta(0), dataset.texts(0))
+    seconds = prepared.estimated(2).seconds_needed
+    assert seconds is not None and 0 < seconds < 60
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_parts_and_one_last_run_give_the_same_bytes(copy: Path, tmp_path: Path, count: int) -> None:
+    pack(copy, 3)
+    (copy / "broken.bvh").write_text("HIERARCHY\nMOTION\nFrames: 60\nFrame Time: 0.033333\n1 2 3\n")
+    given = config(copy, uncaptioned="keep")
+    whole = convert(given, tmp_path / "whole", clips_per_shard=2)
+    out = tmp_path / "out"
+    with pytest.raises(UserError, match=r"features of \d batches are missing"):
+        run_part(given, out, Part(0, count))
+    for index in reversed(range(count)):
+        made = run_part(given, out, Part(index, count, "features"))
+        assert made.shards == []
+    names = [s.name for index in range(count) for s in run_part(given, out, Part(index, count)).shards]
+    assert sorted(names) == sorted(shard.name for shard in whole.shards)
+    assert not (out / "manifest.json").exists()
+    assert convert(given, out, clips_per_shard=2) == whole
+    assert bytes_of(out) == bytes_of(tmp_path / "whole")
+    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    for step in ("features", "shards"):  # all is there: nothing is made, and the manifest stays
+        run_part(given, out, Part(0, count, step))  # type: ignore[arg-type]
+    (out / LOCK_FILE).unlink()  # parts leave it, the last run takes it away
+    assert {path.name: path.stat().st_mtime_ns for path in out.iterdir()} == before
+
+
+def run_part(given: BvhConfig, out: Path, part: Part) -> Manifest:
+    prepared = prepare_bvh(given, scan=out / SCAN_FILE)
+    return run_conversion(prepared, out, clips_per_shard=2, progress=False, part=part)
 
 
 def test_changed_file_and_changed_option_are_not_reused(copy: Path, tmp_path: Path) -> None:
@@ -238,32 +299,6 @@ def test_splits_come_from_files_then_captions_then_hash(copy: Path, tmp_path: Pa
     assert all(split == hash_split(clip.id) for split, clip in hashed.items)
 
 
-def test_hash_split_is_80_5_15() -> None:
-    counts = Counter(hash_split(f"clip {i}") for i in range(20_000))
-    assert counts["train"] / 20_000 == pytest.approx(0.80, abs=0.01)
-    assert counts["val"] / 20_000 == pytest.approx(0.05, abs=0.005)
-
-
-def test_leaks_and_ids_that_leave_the_folder_are_refused(shared: Path, tmp_path: Path) -> None:
-    broken = shared / "data/broken/splits"
-    shutil.copy(broken / "overlap_train.txt", tmp_path / "train.txt")
-    shutil.copy(broken / "overlap_test.txt", tmp_path / "test.txt")
-    with pytest.raises(UserError, match=r"900002.*leaks"):
-        read_split_files(tmp_path)
-    (tmp_path / "train.txt").unlink()
-    shutil.copy(broken / "traversal_id.txt", tmp_path / "test.txt")
-    with pytest.raises(UserError, match="not a plain relative name"):
-        read_split_files(tmp_path)
-    shutil.copy(broken / "duplicate_ids.txt", tmp_path / "test.txt")
-    splits, notes = read_split_files(tmp_path)
-    assert splits["900001"] == "test" and len(notes) == 1
-    shutil.copy(broken / "crlf_blank.txt", tmp_path / "test.txt")
-    assert len(read_split_files(tmp_path)[0]) == 2
-    (tmp_path / "test.txt").unlink()
-    with pytest.raises(UserError, match=r"no train\.txt"):
-        read_split_files(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -314,7 +349,7 @@ def test_damaged_archive_keeps_what_came_before(copy: Path, tmp_path: Path) -> N
 
 
 def test_wrong_unit_and_wrong_map_are_explained(copy: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"measures .* m with unit 'm'; set the file's unit"):
+    with pytest.raises(UserError, match=r"measures .* is the length unit right\? \(read with unit 'm'"):
         convert(config(copy, unit="m"), tmp_path / "out")
     data = json.loads((copy / "joint_map.json").read_text())
     data["smpl22"][0][2] = "Pelvis"

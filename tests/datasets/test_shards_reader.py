@@ -17,7 +17,7 @@ import pytest
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, ShardInfo, UserError
-from motionloom.datasets.shards import reader
+from motionloom.datasets.shards import access
 from motionloom.datasets.shards.check import check
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.reader import ShardDataset
@@ -64,10 +64,10 @@ def test_every_member_comes_back(made: ModuleType, root: Path) -> None:
 def test_few_shards_stay_open_and_views_survive(
     made: ModuleType, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "OPEN_SHARDS", 2)
+    monkeypatch.setattr(access, "OPEN_SHARDS", 2)
     dataset = ShardDataset.open(root, "train")
     views = [dataset.motion(i) for i in range(36)]
-    assert len(dataset._maps) == 2
+    assert len(dataset._access.maps) == 2
     for i, view in enumerate(views):
         np.testing.assert_array_equal(view, made.clip_motion(int(dataset.ids[i].rpartition("-")[2])))
 

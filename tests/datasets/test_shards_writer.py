@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import hashlib
 import json
 import subprocess
@@ -14,7 +16,9 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.lock import LOCK_FILE, folder_lock
 from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.tasks import Part
 
 
 @pytest.fixture
@@ -207,3 +211,85 @@ def test_a_second_writer_is_refused(made: ModuleType, tmp_path: Path) -> None:
         return made.clip(i)
 
     made.write(tmp_path, count=5, convert=convert)
+
+
+@pytest.mark.parametrize("count", [1, 2, 20])
+def test_parts_in_any_order_and_one_last_run_give_the_same_bytes(
+    made: ModuleType, tmp_path: Path, count: int
+) -> None:
+    convert = made.Convert(drop=(3, 17), bad=(8,))
+    whole = made.write(tmp_path / "whole", convert=convert)
+    out = tmp_path / "out"
+    parts = [made.write(out, convert=convert, part=Part(k, count)) for k in reversed(range(count))]
+    assert sorted(s.name for part in parts for s in part.shards) == sorted(s.name for s in whole.shards)
+    assert sum(len(part.dropped) for part in parts) == 3
+    assert not (out / "manifest.json").exists() and not (out / "index.npz").exists()
+    kept = {path.name: path.stat().st_mtime_ns for path in out.glob("*.tar")}
+    assert made.write(out, convert=convert) == whole
+    assert digests(out) == digests(tmp_path / "whole")
+    assert {name: (out / name).stat().st_mtime_ns for name in kept} == kept
+
+
+def test_the_last_run_makes_what_parts_have_not_and_verifies_the_rest(
+    made: ModuleType, tmp_path: Path
+) -> None:
+    made.write(tmp_path / "whole")
+    out = tmp_path / "out"
+    made.write(out, part=Part(0, 3))
+    made.write(out, part=Part(2, 3))
+    shard = out / "made-train-000002.tar"
+    content = bytearray(shard.read_bytes())
+    content[5000] ^= 1
+    shard.write_bytes(content)
+    made.write(out)
+    assert digests(out) == digests(tmp_path / "whole")
+
+
+def test_parts_work_at_once_and_leave_each_others_files(made: ModuleType, tmp_path: Path) -> None:
+    stranger = tmp_path / ".made-train-000001.tar.0123456789abcdef.tmp"
+
+    def convert(i: int) -> object:
+        stranger.touch()
+        made.write(tmp_path, part=Part(1, 2))  # another part, while this one writes
+        with pytest.raises(UserError, match="another conversion is writing here"):
+            made.write(tmp_path)
+        return made.clip(i)
+
+    made.write(tmp_path, convert=convert, part=Part(0, 2))
+    assert stranger.exists(), "a part must not clean up: the file may be another part's"
+    made.write(tmp_path)
+    assert not stranger.exists() and not (tmp_path / LOCK_FILE).exists()
+
+
+def test_a_part_is_refused_while_a_whole_run_writes(made: ModuleType, tmp_path: Path) -> None:
+    def convert(i: int) -> object:
+        with pytest.raises(UserError, match="another conversion is writing here"):
+            made.write(tmp_path, part=Part(0, 2))
+        return made.clip(i)
+
+    made.write(tmp_path, count=5, convert=convert)
+    with pytest.raises(UserError, match="parts are numbered from 0 to 1"):
+        Part(2, 2)
+
+
+def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path: Path) -> None:
+    for _ in range(3):
+        with folder_lock(tmp_path):
+            assert (tmp_path / LOCK_FILE).exists()
+        assert not (tmp_path / LOCK_FILE).exists()
+    with folder_lock(tmp_path, shared=True):
+        (tmp_path / LOCK_FILE).unlink()
+        with folder_lock(tmp_path, shared=True), pytest.raises(UserError), folder_lock(tmp_path):
+            pass
+
+
+def test_a_file_system_without_locks_is_written_with_a_warning(
+    made: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with pytest.warns(UserWarning, match="this file system has no locks"):
+        made.write(tmp_path, count=5)
+    assert (tmp_path / "manifest.json").exists()

@@ -102,7 +102,7 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "unknown --until": (["run", "humantomato-tiny", "--until", "gtp", "--dry-run"], "did you mean 'gpt'"),
     "unfinished input": (["run", "humantomato-tiny", "--only", "gpt"], "is not finished"),
     "no source folder": (["run", "bvh-body", "--set", "data.source=nowhere"], "nowhere: no such folder"),
-    "no shards": (["run", "humantomato-paper", "--set", "data.path=nowhere"], "nowhere/manifest.json"),
+    "no shards": (["run", "humantomato-paper", "--set", "data.path=nowhere"], "nowhere: no manifest.json"),
     "not a run": (["generate", "nowhere", "a person walks"], "nowhere: not a run folder"),
     "no caption": (["generate", "nowhere"], "give at least one caption"),
     "unknown format": (["generate", "nowhere", "a person walks", "-f", "npz,bhv"], "did you mean 'bvh'"),

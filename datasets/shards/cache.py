@@ -1,0 +1,131 @@
+"""A folder of downloaded files that several processes share, kept below a size limit.
+
+Names hold a checksum of the content (or of the manifest that decides it), so a file is never out of date. One
+process downloads a file while the others that want it wait; it appears by a rename, whole or not at all.
+Locks are the kernel's (`flock`), so a killed process leaves none. The file unused for longest goes first;
+whoever has it mapped keeps its content until letting go.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.reading import CacheConfig
+
+_PART = ".part"
+_LOCKS = ".locks"
+
+
+def default_folder() -> Path:
+    """`motionloom/shards` in the user's cache folder."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "motionloom" / "shards"
+
+
+class FileCache:
+    """Files by name. Nothing is created before the first one is asked for."""
+
+    def __init__(self, config: CacheConfig) -> None:
+        self.folder = Path(config.folder).expanduser() if config.folder else default_folder()
+        self.limit = config.limit
+
+    def find(self, name: str) -> BinaryIO | None:
+        """A cached file, opened and marked as used now; None when it is not there."""
+        path = self.folder / name
+        try:
+            file = path.open("rb")
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read ({error}); delete it") from None
+        os.utime(file.fileno(), ns=(time.time_ns(), time.time_ns()))
+        return file
+
+    def get(self, name: str, size: int, make: Callable[[Path], object]) -> BinaryIO:
+        """The file `name`, opened. `make` writes it to the path it is given when it is not there yet.
+
+        `size` (bytes, 0 if unknown) is made room for. With a limit of 0 (no shards are kept) nothing is
+        ever deleted, as only manifests and indices come here.
+        """
+        if self.limit and size > self.limit:
+            raise UserError(
+                f"{self.folder}: a file of {size} bytes is larger than the cache's limit of {self.limit}; "
+                f"raise its gigabytes"
+            )
+        found = self.find(name)
+        if found is not None:
+            return found
+        path = self.folder / name
+        with self._lock(name):
+            found = self.find(name)
+            if found is not None:
+                return found
+            self._make_room(size)
+            part = path.with_name(f".{name}{_PART}")
+            try:
+                make(part)
+                file = part.open("rb")
+                os.fsync(file.fileno())
+                part.replace(path)
+            finally:
+                part.unlink(missing_ok=True)
+        self._make_room(0, keep=name)
+        return file
+
+    def _make_room(self, size: int, keep: str = "") -> None:
+        """Delete the files unused for longest until `size` more bytes fit, and what killed processes left."""
+        if not self.limit:
+            return
+        files = []
+        used = size
+        with os.scandir(self.folder) as entries:
+            for entry in entries:
+                if not entry.is_file():
+                    continue
+                if entry.name.endswith(_PART):
+                    self._remove_abandoned(entry.name)
+                try:
+                    status = entry.stat()
+                except FileNotFoundError:  # another process was faster
+                    continue
+                used += status.st_size
+                if entry.name != keep and not entry.name.startswith("."):
+                    files.append((status.st_mtime_ns, entry.name, status.st_size))
+        for _, name, length in sorted(files):
+            if used <= self.limit:
+                break
+            (self.folder / name).unlink(missing_ok=True)
+            used -= length
+
+    def _remove_abandoned(self, part: str) -> None:
+        with self._lock(part.removeprefix(".").removesuffix(_PART), wait=False) as mine:
+            if mine:
+                (self.folder / part).unlink(missing_ok=True)
+
+    @contextmanager
+    def _lock(self, name: str, *, wait: bool = True) -> Iterator[bool]:
+        """Hold the lock that `name` shares with a few others; false when it is taken and we do not wait."""
+        path = self.folder / _LOCKS / name[:2]
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise UserError(
+                f"{self.folder}: the cache folder cannot be used ({error}); name another"
+            ) from None
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            except BlockingIOError:
+                yield False
+                return
+            yield True
+        finally:
+            os.close(handle)

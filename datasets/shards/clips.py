@@ -1,0 +1,85 @@
+"""`ClipDataset`: what batches, statistics and stages ask of a data set, be it one folder, a URL or a mix."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Caption, ClipMeta, Split
+from motionloom.datasets.shards.order import Source
+
+
+class ClipDataset(Protocol):
+    """The clips of one split, numbered from 0."""
+
+    where: str
+    """Folder or URL, for messages."""
+    split: Split
+    layout: MotionLayout
+
+    def __len__(self) -> int: ...
+
+    @property
+    def frames(self) -> NDArray[np.int64]:
+        """T of every clip, [n]."""
+        ...
+
+    @property
+    def ids(self) -> list[str]:
+        """Source id of every clip."""
+        ...
+
+    def has(self, member: str) -> NDArray[np.bool_]:
+        """Which clips hold a member such as `texts.json`, [n]."""
+        ...
+
+    def motion(self, i: int) -> NDArray[np.float32]:
+        """Features of clip `i`, [T, D]."""
+        ...
+
+    def meta(self, i: int) -> ClipMeta:
+        """Metadata of clip `i`."""
+        ...
+
+    def texts(self, i: int) -> list[Caption]:
+        """Captions of clip `i`."""
+        ...
+
+    def face_texts(self, i: int) -> list[Caption]:
+        """Captions about the face of clip `i`."""
+        ...
+
+    def audio(self, i: int) -> NDArray[np.float32] | None:
+        """Audio features of clip `i`, [T_audio, 438]."""
+        ...
+
+    def wav(self, i: int) -> tuple[NDArray[np.float32], int] | None:
+        """Sound of clip `i`: (mono samples [S], rate in Hz)."""
+        ...
+
+    def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
+        """Told before a batch is made, so that a remote data set can read it in one go; changes nothing."""
+        ...
+
+    def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
+        """How a batch plan over `clips` (ascending numbers; all when None) is to be ordered and mixed."""
+        ...
+
+    def parts(self) -> Sequence[tuple[ClipDataset, float]]:
+        """(data set, weight) of what it is made of; itself when it is one."""
+        ...
+
+
+def in_order(dataset: ClipDataset, *members: str) -> Iterator[int]:
+    """The numbers of all clips, with `members` of the next ones read ahead."""
+    for start in range(0, len(dataset), _AHEAD):
+        block = range(start, min(start + _AHEAD, len(dataset)))
+        dataset.prefetch(block, members)
+        yield from block
+
+
+_AHEAD = 64

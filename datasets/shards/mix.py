@@ -1,0 +1,125 @@
+"""`MixedDataset`: several data sets of one layout as one, drawn by weight.
+
+Clips are numbered through, data set after data set. How often each data set is drawn is the batch plan's
+affair (`order.mixed_order`): an epoch has as many places as all the data sets together have clips, whatever
+the weights, and each data set gets exactly its share of them. A small data set with a great weight so comes
+several times an epoch (with new windows and captions each time), a large one with a small weight is seen
+once in several epochs. Evaluation does not weigh: it sees every clip of every data set once.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from functools import cached_property
+from itertools import accumulate
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.schema import Caption, ClipMeta, UserError
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.order import Source
+
+
+class MixedDataset:
+    """A `ClipDataset` of others. `parts` are (data set, weight > 0), all of one split."""
+
+    def __init__(self, parts: Sequence[tuple[ClipDataset, float]]) -> None:
+        if not parts:
+            raise UserError("a mix needs at least one data set")
+        self._parts = list(parts)
+        self._datasets = [dataset for dataset, _ in parts]
+        one = self._datasets[0]
+        for other, weight in parts:
+            if not 0 < weight < float("inf"):
+                raise UserError(f"{other.where}: weight {weight} in a mix; weights are positive numbers")
+            have, want = ((d.layout.name, d.layout.family, d.layout.fps) for d in (other, one))
+            if have != want:
+                raise UserError(
+                    f"a mix needs one layout: {one.where} holds {want[0]} ({want[1]}, {want[2]:g} fps), "
+                    f"{other.where} holds {have[0]} ({have[1]}, {have[2]:g} fps); convert one of them again"
+                )
+        self.where = " + ".join(dataset.where for dataset in self._datasets)
+        self.split = one.split
+        self.layout = one.layout
+        self._first = list(accumulate(map(len, self._datasets), initial=0))
+
+    def __len__(self) -> int:
+        return self._first[-1]
+
+    @cached_property
+    def frames(self) -> NDArray[np.int64]:
+        """T of every clip, [n]."""
+        return np.concatenate([dataset.frames for dataset in self._datasets])
+
+    @cached_property
+    def ids(self) -> list[str]:
+        """Source id of every clip, as its own data set has it."""
+        return [source for dataset in self._datasets for source in dataset.ids]
+
+    def has(self, member: str) -> NDArray[np.bool_]:
+        """Which clips hold a member such as `texts.json`, [n]."""
+        return np.concatenate([dataset.has(member) for dataset in self._datasets])
+
+    def motion(self, i: int) -> NDArray[np.float32]:
+        """Features of clip `i`, [T, D]."""
+        dataset, own = self._find(i)
+        return dataset.motion(own)
+
+    def meta(self, i: int) -> ClipMeta:
+        """Metadata of clip `i`."""
+        dataset, own = self._find(i)
+        return dataset.meta(own)
+
+    def texts(self, i: int) -> list[Caption]:
+        """Captions of clip `i`."""
+        dataset, own = self._find(i)
+        return dataset.texts(own)
+
+    def face_texts(self, i: int) -> list[Caption]:
+        """Captions about the face of clip `i`."""
+        dataset, own = self._find(i)
+        return dataset.face_texts(own)
+
+    def audio(self, i: int) -> NDArray[np.float32] | None:
+        """Audio features of clip `i`, [T_audio, 438]."""
+        dataset, own = self._find(i)
+        return dataset.audio(own)
+
+    def wav(self, i: int) -> tuple[NDArray[np.float32], int] | None:
+        """Sound of clip `i`: (mono samples [S], rate in Hz)."""
+        dataset, own = self._find(i)
+        return dataset.wav(own)
+
+    def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
+        """Each data set is told its own clips."""
+        for dataset, begin, end in self._ranges():
+            dataset.prefetch([i - begin for i in clips if begin <= i < end], members)
+
+    def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
+        """One source for each data set that has any of `clips`; the others' weight goes to those."""
+        chosen = np.arange(len(self)) if clips is None else clips
+        sources = []
+        for (dataset, weight), (_, begin, end) in zip(self._parts, self._ranges(), strict=True):
+            first, last = np.searchsorted(chosen, [begin, end]).tolist()
+            if last > first:
+                own = dataset.sources(chosen[first:last] - begin)
+                if len(own) > 1:
+                    raise UserError(f"{dataset.where}: a mix of mixes; list all data sets in one mix")
+                sources.append(replace(own[0], first=first, weight=weight))
+        return tuple(sources)
+
+    def parts(self) -> list[tuple[ClipDataset, float]]:
+        """(data set, weight)."""
+        return self._parts
+
+    def _ranges(self) -> list[tuple[ClipDataset, int, int]]:
+        return list(zip(self._datasets, self._first, self._first[1:], strict=False))
+
+    def _find(self, i: int) -> tuple[ClipDataset, int]:
+        if not 0 <= i < len(self):
+            raise IndexError(f"clip {i} of {len(self)}")
+        part = bisect_right(self._first, i) - 1
+        return self._datasets[part], i - self._first[part]

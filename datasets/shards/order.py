@@ -1,0 +1,84 @@
+"""The order of one epoch's items: all shuffled, shard by shard, or mixed from several data sets.
+
+Every order here is a pure function of its key. The orders differ in what they ask of the storage: a global
+shuffle touches every shard all the time, the streamed order finishes one group of shards before the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.randomness import permutation, words
+
+# Last elements of keys. `BatchPlan` draws its pools by (seed, epoch, n >= 1), so a zero in the third place
+# keeps these apart from them; no key may end in zero (numpy pads keys with zeros).
+_SHARDS, _WITHIN, _MIX = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class Source:
+    """The items `first .. first + count` of a plan: those of one data set."""
+
+    first: int
+    count: int
+    weight: float = 1.0
+    """Share of the batches, relative to the other sources."""
+    shards: NDArray[np.int32] | None = None
+    """Shard of each item, [count], for the streamed order; None for the global one."""
+    group: int = 1
+    """Shards whose items are shuffled together in the streamed order."""
+    name: str = ""
+
+
+def source_order(source: Source, *key: int) -> NDArray[np.int64]:
+    """All items of one source once, [count], by the key."""
+    if source.shards is None:
+        return source.first + permutation(source.count, *key)
+    numbers, shard = np.unique(source.shards, return_inverse=True)
+    place = np.empty(len(numbers), dtype=np.int64)
+    place[permutation(len(numbers), *key, 0, _SHARDS)] = np.arange(len(numbers))
+    draws = words(source.count, *key, 0, _WITHIN)
+    return source.first + np.lexsort((draws, place[shard] // source.group))
+
+
+def mixed_order(
+    sources: Sequence[Source], size: int, seed: int, epoch: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(items [size], turns [size]) of one epoch over several sources.
+
+    Each source gets exactly its share of the `size` places, spread evenly over them, so that every batch
+    holds its share to within a clip or two. A source goes on where it stopped in the epoch before: all its
+    items come once, in an order of their own each time, before any comes again. `turns` counts these rounds.
+    """
+    places, items, turns = [], [], []
+    for number, (source, share) in enumerate(zip(sources, shares(sources, size), strict=True)):
+        drawn = np.arange(epoch * share, (epoch + 1) * share)
+        turn, place = np.divmod(drawn, source.count)
+        for this in range(int(turn[0]), int(turn[-1]) + 1):
+            order = source_order(source, seed, this, 0, _MIX, number + 1)
+            items.append(order[place[turn == this]])
+        turns.append(turn)
+        places.append((np.arange(share) + 0.5) / share)
+    merged = np.argsort(np.concatenate(places), kind="stable")
+    return np.concatenate(items)[merged], np.concatenate(turns)[merged]
+
+
+def shares(sources: Sequence[Source], size: int) -> list[int]:
+    """Places of each source among `size`, by largest remainder; `UserError` when one would get none."""
+    total = sum(source.weight for source in sources)
+    wanted = np.array([source.weight / total * size for source in sources])
+    counts = np.floor(wanted).astype(np.int64)
+    rest = size - int(counts.sum())
+    counts[np.argsort(counts - wanted, kind="stable")[:rest]] += 1
+    for source, count in zip(sources, counts.tolist(), strict=True):
+        if count == 0:
+            raise UserError(
+                f"{source.name}: weight {source.weight:g} of {total:g} is less than one clip of an epoch of "
+                f"{size}; raise the weight or leave the data set out"
+            )
+    return [int(count) for count in counts]

@@ -1,0 +1,294 @@
+"""Where the files of a data set lie: a folder, a web server or an S3 bucket, behind one interface.
+
+Only the schemes of `SCHEMES` are opened, and the check comes before anything else: no `pipe:`, no chained or
+shell URL ever reaches a library. Requests go through fsspec and are repeated by `retry.persist`. Credentials
+come from the environment alone; a URL that carries some is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import re
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol, cast
+from urllib.parse import unquote, urlsplit
+
+from motionloom.datasets.schema import ShardInfo, UserError
+from motionloom.datasets.shards.cache import FileCache
+from motionloom.datasets.shards.index import INDEX_FILE, MANIFEST_FILE
+from motionloom.datasets.shards.reading import CacheConfig
+from motionloom.datasets.shards.retry import MissingFileError, persist
+
+SCHEMES = ("file", "http", "https", "s3")
+CHUNK = 8 * 2**20
+"""Bytes of one range request when a shard is read front to back without a cache."""
+
+_CONNECT_SECONDS, _READ_SECONDS = 15, 60
+
+Piece = tuple[str, int, int]
+"""(file name, first byte, byte behind the last)."""
+
+
+class Store(Protocol):
+    """The files of one data set, by name."""
+
+    place: str
+    """The folder or URL it was opened with."""
+    mappable: bool
+    """Whether `open_shard` gives a file of this machine, which can be memory-mapped."""
+
+    def where(self, name: str) -> str:
+        """Path or URL of a file, for messages."""
+        ...
+
+    def read_manifest(self, digest: str | None = None) -> bytes:
+        """Content of `manifest.json`; with `digest` (sha256, hex) that content or a `UserError`."""
+        ...
+
+    def open_index(self, digest: str) -> BinaryIO:
+        """`index.npz` of the manifest with that sha256, seekable."""
+        ...
+
+    def open_shard(self, shard: ShardInfo) -> BinaryIO:
+        """A whole shard, buffered, from its beginning."""
+        ...
+
+    def read_pieces(self, pieces: Sequence[Piece]) -> list[bytes]:
+        """Pieces of files, each of exactly the length asked for."""
+        ...
+
+
+def is_url(place: Path | str) -> bool:
+    """Whether a place is on a server."""
+    return isinstance(place, str) and _scheme(place) not in (None, "file")
+
+
+def open_store(place: Path | str, cache: CacheConfig | None = None) -> Store:
+    """The store at a folder or URL; `UserError` for a scheme that is not allowed. Reads nothing yet."""
+    scheme = _scheme(place) if isinstance(place, str) else None
+    if scheme is None:
+        return LocalStore(Path(place))
+    if scheme not in SCHEMES:
+        raise UserError(
+            f"{place}: data is read from {', '.join(f'{s}:' for s in SCHEMES)} and folders, not from "
+            f"'{scheme}:' (a folder with such a name: write ./{place})"
+        )
+    url = urlsplit(str(place))
+    if scheme == "file":
+        if url.netloc not in ("", "localhost") or not url.path.startswith("/"):
+            raise UserError(f"{place}: write a file URL as file:///folder")
+        return LocalStore(Path(unquote(url.path)))
+    if url.username is not None or url.password is not None:
+        raise UserError(
+            f"{url.scheme}://…@{url.hostname}: credentials belong in the environment, not in the URL"
+        )
+    if not url.hostname or url.query or url.fragment or ".." in url.path.split("/"):
+        raise UserError(f"{place}: write it as {scheme}://host-or-bucket/folder, without '?', '#' and '..'")
+    return RemoteStore(str(place).rstrip("/"), cache or CacheConfig())
+
+
+def _scheme(place: str) -> str | None:
+    found = re.match(r"([A-Za-z][A-Za-z0-9+.-]*):", place)
+    return found.group(1).lower() if found else None
+
+
+class LocalStore:
+    """A folder of this machine."""
+
+    mappable = True
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.place = str(root)
+
+    def where(self, name: str) -> str:
+        """The path."""
+        return str(self.root / name)
+
+    def read_manifest(self, digest: str | None = None) -> bytes:
+        """See `Store`."""
+        with self._open(MANIFEST_FILE) as file:
+            return _as_before(file.read(), digest, self.where(MANIFEST_FILE))
+
+    def open_index(self, digest: str) -> BinaryIO:
+        """See `Store`."""
+        return self._open(INDEX_FILE)
+
+    def open_shard(self, shard: ShardInfo) -> BinaryIO:
+        """See `Store`."""
+        return self._open(shard.name)
+
+    def read_pieces(self, pieces: Sequence[Piece]) -> list[bytes]:
+        """See `Store`."""
+        found = []
+        for name, start, end in pieces:
+            with self._open(name) as file:
+                file.seek(start)
+                found.append(file.read(end - start))
+            if len(found[-1]) != end - start:
+                raise UserError(f"{self.where(name)}: ends before byte {end}: truncated or changed")
+        return found
+
+    def _open(self, name: str) -> BinaryIO:
+        try:
+            return (self.root / name).open("rb")
+        except FileNotFoundError:
+            raise MissingFileError(f"{self.where(name)}: no such file") from None
+        except OSError as error:
+            raise UserError(f"{self.where(name)}: cannot be read ({error})") from None
+
+
+class RemoteStore:
+    """A URL. Whole shards are kept in a cache, if that has room; manifest and index always are.
+
+    Data sets of one process share connections; another process (forked or spawned) opens its own.
+    """
+
+    def __init__(self, url: str, cache: CacheConfig) -> None:
+        self.place = url
+        self.cache = FileCache(cache)
+        self.mappable = cache.limit > 0
+
+    def where(self, name: str) -> str:
+        """The URL."""
+        return f"{self.place}/{name}"
+
+    def read_manifest(self, digest: str | None = None) -> bytes:
+        """See `Store`."""
+        if digest is not None:
+            found = self.cache.find(f"{digest}.manifest.json")
+            if found is not None:
+                with found:
+                    return found.read()
+        where = self.where(MANIFEST_FILE)
+        raw = _as_before(persist(where, lambda: self._system().cat_file(where)), digest, where)
+        name = f"{hashlib.sha256(raw).hexdigest()}.manifest.json"
+        self.cache.get(name, len(raw), lambda path: path.write_bytes(raw)).close()
+        return raw
+
+    def open_index(self, digest: str) -> BinaryIO:
+        """See `Store`. The manifest holds the shards' checksums, so its own decides the index's content."""
+        return self.cache.get(f"{digest}.index.npz", 0, lambda path: self._download(INDEX_FILE, path))
+
+    def open_shard(self, shard: ShardInfo) -> BinaryIO:
+        """See `Store`. A shard in the cache was checked against the manifest's sha256 when it arrived."""
+        if self.mappable:
+            return self.cache.get(f"{shard.sha256}.tar", shard.bytes, lambda path: self._fetch(shard, path))
+        raw = _RangeFile(self, shard.name, shard.bytes)
+        return cast(BinaryIO, io.BufferedReader(raw, CHUNK))
+
+    def read_pieces(self, pieces: Sequence[Piece]) -> list[bytes]:
+        """See `Store`. All at once; those that failed are then repeated one by one."""
+        if len(pieces) > 1:
+            names, starts, ends = zip(*pieces, strict=True)
+            urls = [self.where(name) for name in names]
+            found = self._system().cat_ranges(urls, list(starts), list(ends), on_error="return")
+        else:
+            found = [None] * len(pieces)
+        out = []
+        for (name, start, end), got in zip(pieces, found, strict=True):
+            whole = isinstance(got, bytes) and len(got) == end - start
+            out.append(cast(bytes, got) if whole else self._piece(self.where(name), start, end))
+        return out
+
+    def _piece(self, url: str, start: int, end: int) -> bytes:
+        def read() -> bytes:
+            found: bytes = self._system().cat_file(url, start=start, end=end)
+            if len(found) > end - start:
+                raise UserError(
+                    f"{url}: the server ignores byte ranges; let the cache keep shards (gigabytes > 0)"
+                )
+            if len(found) < end - start:
+                raise OSError(f"{len(found)} of the {end - start} bytes from {start}: truncated or changed")
+            return found
+
+        return persist(url, read)
+
+    def _download(self, name: str, path: Path) -> None:
+        url = self.where(name)
+        persist(url, lambda: self._system().get_file(url, str(path)))
+
+    def _fetch(self, shard: ShardInfo, path: Path) -> None:
+        url = self.where(shard.name)
+
+        def fetch() -> None:
+            self._system().get_file(url, str(path))
+            size = path.stat().st_size
+            if size != shard.bytes:
+                raise OSError(f"{size} bytes, the manifest says {shard.bytes}: truncated or changed")
+            with path.open("rb") as file:
+                if hashlib.file_digest(cast(Any, file), "sha256").hexdigest() != shard.sha256:
+                    raise OSError("the sha256 is not the manifest's: damaged or changed")
+
+        persist(url, fetch)
+
+    def _system(self) -> Any:
+        """This process's connections."""
+        settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith("AWS_")))
+        return _connect(cast(str, _scheme(self.place)), os.getpid(), settings)
+
+
+@lru_cache(maxsize=4)
+def _connect(scheme: str, pid: int, settings: tuple[tuple[str, str], ...]) -> Any:
+    """An fsspec file system of this process and environment.
+
+    Its own retries are off: `persist` is the only one that repeats.
+    """
+    try:
+        import fsspec  # type: ignore[import-untyped]
+
+        if scheme == "s3":
+            import s3fs  # type: ignore[import-untyped]  # noqa: F401 (its absence is told by name)
+
+            system = fsspec.filesystem(
+                "s3",
+                skip_instance_cache=True,
+                use_listings_cache=False,
+                config_kwargs={
+                    "connect_timeout": _CONNECT_SECONDS,
+                    "read_timeout": _READ_SECONDS,
+                    "retries": {"total_max_attempts": 1},
+                    "max_pool_connections": 32,
+                },
+            )
+            system.retries = 1
+            return system
+        import aiohttp
+
+        timeout = aiohttp.ClientTimeout(total=None, connect=_CONNECT_SECONDS, sock_read=_READ_SECONDS)
+        return fsspec.filesystem("http", skip_instance_cache=True, client_kwargs={"timeout": timeout})
+    except ImportError as error:
+        raise UserError(
+            f"reading from {scheme}: needs {error.name}; pip install 'motionloom[remote]'"
+        ) from None
+
+
+def _as_before(raw: bytes, digest: str | None, where: str) -> bytes:
+    if digest is not None and hashlib.sha256(raw).hexdigest() != digest:
+        raise UserError(f"{where}: changed while the data set was in use; start again")
+    return raw
+
+
+class _RangeFile(io.RawIOBase):
+    """A file on a server, read front to back by range requests."""
+
+    def __init__(self, store: RemoteStore, name: str, size: int) -> None:
+        self._store, self._name, self._size, self._at = store, name, size, 0
+
+    def readable(self) -> bool:
+        """Yes."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """The next bytes."""
+        end = min(self._at + len(buffer), self._size)
+        if end == self._at:
+            return 0
+        data = self._store.read_pieces([(self._name, self._at, end)])[0]
+        buffer[: len(data)] = data
+        self._at = end
+        return len(data)

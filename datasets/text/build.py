@@ -1,0 +1,253 @@
+"""Making a text cache in parts: each computed once, by any process, and kept if the run is killed.
+
+Captions that are not in the cache yet are divided by the first bits of their keys into parts of about 512.
+`parts/NAME.npz` is one finished part; its name is a digest of the encoder and of the captions in it, so a run
+that is started again finds what is done, and a changed caption set never meets a wrong part. A part is
+encoded on one thread, in an order that depends on its captions alone: the bytes of the finished cache do not
+depend on how many processes made it, or on how often it was interrupted.
+
+Parts are ranges of ascending keys, so merging them, with what the cache held before, is one pass that
+streams to disk. The old files stay in place until all new ones are written.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import BinaryIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.files import atomic_file, remove_temporaries, write_json
+from motionloom.datasets.shards.pool import Workers
+from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
+from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
+
+PART = 512
+"""Captions a part, about."""
+
+PARTS_A_WORKER = 4
+"""Fewer are encoded here before another process has loaded the encoder."""
+
+BATCH = 64
+"""Captions encoded together: of one part, and of similar length."""
+
+
+def build_text_cache(
+    folder: Path | str,
+    captions: Iterable[str],
+    encoder_name: str,
+    workers: int = 1,
+    progress: bool = True,
+) -> TextCache:
+    """Encode the captions that `folder` does not hold yet, in `workers` processes of one thread each.
+
+    `encoder_name` as for `load_text_encoder`; another encoder's cache is replaced. The same captions give
+    the same bytes for any number of workers.
+    """
+    return _build(Path(folder), captions, load_text_encoder(encoder_name), encoder_name, workers, progress)
+
+
+def build_with_encoder(
+    folder: Path, captions: Iterable[str], encoder: TextEncoder, progress: bool = True
+) -> TextCache:
+    """The same in this process, with an encoder that is loaded already."""
+    return _build(folder, captions, encoder, "", 1, progress)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Captions of a range of keys, ascending by key, and the file that will hold them."""
+
+    path: Path
+    captions: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _EncodeWith:
+    """Encodes parts with an encoder at hand."""
+
+    encoder: TextEncoder
+
+    def __call__(self, part: _Part) -> None:
+        _encode_part(part, self.encoder)
+
+
+@dataclass(frozen=True)
+class _EncodeByName:
+    """Encodes parts in another process: the encoder is loaded there, once."""
+
+    spec: str
+    expected: str
+
+    def __call__(self, part: _Part) -> None:
+        encoder = _loaded(self.spec)
+        if encoder.name != self.expected:
+            raise UserError(f"text encoder '{self.spec}' changed while captions were encoded; run again")
+        _encode_part(part, encoder)
+
+
+def _build(
+    folder: Path,
+    captions: Iterable[str],
+    encoder: TextEncoder,
+    spec: str,
+    workers: int,
+    progress: bool,
+) -> TextCache:
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = {key_of(text): text for text in captions}
+    if not wanted:
+        raise UserError("no captions to encode: the dataset has none")
+    old = _reusable(folder, encoder)
+    new = sorted(wanted.keys() - (old.keys() if old else set()))
+    if old is not None and not new:
+        return old
+    place = folder / "parts"
+    place.mkdir(exist_ok=True)
+    for left in (folder, place):
+        remove_temporaries(left)
+    parts = _parts(new, wanted, place, encoder.name)
+    missing = [part for part in parts if not _finished(part, encoder.dim)]
+    workers = min(workers, len(missing) // PARTS_A_WORKER)
+    encode = _EncodeByName(spec, encoder.name) if workers > 1 else _EncodeWith(encoder)
+    with Workers(workers) as pool:
+        done = pool.run(encode, missing)
+        for _ in track(done, "encoding captions", total=len(missing), disable=not progress):
+            pass
+    texts = {**(old.captions_by_key() if old else {}), **wanted}
+    _merge(folder, texts, new, parts, old, encoder)
+    shutil.rmtree(place)
+    return TextCache.open(folder)
+
+
+@lru_cache(maxsize=1)
+def _loaded(spec: str) -> TextEncoder:
+    return load_text_encoder(spec)
+
+
+def _reusable(folder: Path, encoder: TextEncoder) -> TextCache | None:
+    """The cache in `folder` when it is whole and of the same encoder."""
+    try:
+        found = TextCache.open(folder)
+    except UserError:
+        return None
+    return found if (found.encoder, found.dim) == (encoder.name, encoder.dim) else None
+
+
+def _parts(keys: Sequence[bytes], texts: dict[bytes, str], place: Path, encoder: str) -> list[_Part]:
+    """Parts of ascending keys, by their first bits: as many bits as make parts of at most PART on average."""
+    bits = max(0, (len(keys) - 1) // PART).bit_length()
+    groups: dict[int, list[bytes]] = {}
+    for key in keys:
+        groups.setdefault(int.from_bytes(key[:4], "big") >> (32 - bits), []).append(key)
+    parts = []
+    for _, members in sorted(groups.items()):
+        name = hashlib.sha256(b"".join([encoder.encode(), b"\0", *members])).hexdigest()
+        parts.append(_Part(place / f"{name}.npz", tuple(texts[key] for key in members)))
+    return parts
+
+
+def _encode_part(part: _Part, encoder: TextEncoder) -> None:
+    """Write `sentence` [n, E], `lengths` [n] and `tokens` [sum, E], in the order of the part's captions.
+
+    Encoded by length, so that little is padded.
+    """
+    order = sorted(range(len(part.captions)), key=lambda i: (len(part.captions[i]), i))
+    sentence = np.empty((len(order), encoder.dim), dtype=np.float32)
+    tokens: list[NDArray[np.float16]] = [np.empty((0, encoder.dim), dtype=np.float16)] * len(order)
+    for start in range(0, len(order), BATCH):
+        rows = order[start : start + BATCH]
+        encoded = encoder.encode([part.captions[i] for i in rows])
+        sentence[rows] = encoded.sentence
+        for i, states, mask in zip(rows, encoded.tokens, encoded.mask, strict=True):
+            tokens[i] = states[mask].astype(np.float16)
+    with atomic_file(part.path) as file:
+        np.savez(
+            file,
+            allow_pickle=False,
+            sentence=sentence,
+            lengths=np.array([len(rows) for rows in tokens], dtype=np.int64),
+            tokens=np.concatenate(tokens),
+        )
+
+
+def _finished(part: _Part, dim: int) -> bool:
+    """Whether the part is on disk and whole; the zip's checksums cover every array."""
+    try:
+        sentence, lengths, tokens = (_load(part, name) for name in ("sentence", "lengths", "tokens"))
+    except Exception:  # zipfile and numpy raise many kinds for a damaged file; it is made again
+        return False
+    return (sentence.shape, lengths.shape, tokens.shape) == (
+        (len(part.captions), dim),
+        (len(part.captions),),
+        (int(lengths.sum()), dim),
+    )
+
+
+def _merge(
+    folder: Path,
+    texts: dict[bytes, str],
+    new: Sequence[bytes],
+    parts: Sequence[_Part],
+    old: TextCache | None,
+    encoder: TextEncoder,
+) -> None:
+    """Stream everything into the five files; they replace the old ones together, `cache.json` last."""
+    keys, fresh = sorted(texts), set(new)
+    # Row in the old cache, or -1: the next of the parts.
+    rows = [-1 if old is None or key in fresh else cast(int, old.row(key)) for key in keys]
+    known = old.lengths() if old else np.empty(0, dtype=np.int64)
+    measured = (int(n) for part in parts for n in _load(part, "lengths"))
+    lengths = [next(measured) if row < 0 else int(known[row]) for row in rows]
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    with ExitStack() as stack:
+        files = {
+            name: stack.enter_context(atomic_file(folder / name))
+            for name in ("keys.npy", "captions.jsonl", "sentence.npy", "offsets.npy", "tokens.npy")
+        }
+        _header(files["sentence.npy"], (len(keys), encoder.dim), np.float32)
+        _header(files["tokens.npy"], (int(offsets[-1]), encoder.dim), np.float16)
+        encoded = _encoded(parts)
+        for key, row in zip(keys, rows, strict=True):
+            sentence, tokens = next(encoded) if row < 0 or old is None else old.entry(row)
+            files["sentence.npy"].write(sentence.tobytes())
+            files["tokens.npy"].write(tokens.tobytes())
+            files["captions.jsonl"].write(json.dumps(texts[key], ensure_ascii=False).encode() + b"\n")
+        packed = np.frombuffer(b"".join(keys), dtype=np.uint8).reshape(len(keys), 32)
+        np.save(files["keys.npy"], packed, allow_pickle=False)
+        np.save(files["offsets.npy"], offsets, allow_pickle=False)
+        (folder / "cache.json").unlink(missing_ok=True)
+    info = CacheInfo(encoder=encoder.name, dim=encoder.dim, count=len(keys))
+    write_json(folder / "cache.json", info.dump())
+
+
+def _encoded(parts: Sequence[_Part]) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float16]]]:
+    """(sentence [E], tokens [S, E]) of every caption of every part, holding one part at a time."""
+    for part in parts:
+        tokens = _load(part, "tokens")
+        ends = np.cumsum(_load(part, "lengths"))
+        for sentence, end, length in zip(
+            _load(part, "sentence"), ends, np.diff(ends, prepend=0), strict=True
+        ):
+            yield sentence, tokens[end - length : end]
+
+
+def _load(part: _Part, name: str) -> NDArray:
+    with np.load(part.path, allow_pickle=False) as arrays:
+        return np.asarray(arrays[name])
+
+
+def _header(file: BinaryIO, shape: tuple[int, ...], dtype: type) -> None:
+    """What `np.save` writes before the values."""
+    description = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, description)

@@ -1,0 +1,170 @@
+"""Audio features against the golden vectors and against librosa's own functions in the published order."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from motionloom.datasets.audio import rhythm, spectrum
+from motionloom.datasets.audio.chroma import chroma, fitting_octaves, normalized
+from motionloom.datasets.audio.features import (
+    AudioSettings,
+    aist_bpm,
+    audio_features,
+    baseline_features,
+    beats,
+)
+from motionloom.datasets.audio.median import running_median
+from motionloom.datasets.schema import UserError
+
+
+def published(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArray[np.float32]:
+    """The 438 columns in the order and with the settings of the published extractor, by librosa alone."""
+    import librosa
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mel = librosa.power_to_db(librosa.feature.melspectrogram(y=samples, sr=rate), ref=np.max)
+        mfcc = librosa.feature.mfcc(S=mel)
+        harmonic, percussive = librosa.effects.hpss(samples)
+        notes = librosa.feature.chroma_cqt(y=harmonic, sr=rate, n_octaves=octaves)
+        onsets = librosa.onset.onset_strength(y=percussive, sr=rate, aggregate=np.median)
+        _, found = librosa.beat.beat_track(onset_envelope=onsets, sr=rate)
+        flags = np.zeros_like(onsets)
+        flags[found] = 1
+        tempogram = librosa.feature.tempogram(onset_envelope=onsets, sr=rate)
+    delta = librosa.feature.delta(mfcc, width=3)
+    parts = [mfcc, delta, notes, onsets[None], flags[None], tempogram]
+    return np.concatenate(parts).T.astype(np.float32)
+
+
+def song(seconds: float, rate: int, seed: int, bpm: float = 110.0) -> NDArray[np.float32]:
+    """Drum noise and decaying notes on the beat, from the first sample to the last."""
+    rng = np.random.default_rng(seed)
+    out = 0.01 * rng.standard_normal(int(seconds * rate))
+    for beat in range(int(seconds * bpm / 60)):
+        start = int(beat * 60 / bpm * rate)
+        time = np.arange(min(len(out) - start, int(0.3 * rate))) / rate
+        note = 55 * 2 ** (rng.integers(0, 36) / 12 + 0.004)
+        out[start : start + len(time)] += 0.3 * np.exp(-20 * time) * rng.standard_normal(len(time))
+        out[start : start + len(time)] += 0.3 * np.exp(-6 * time) * np.sin(2 * np.pi * note * time)
+    return out.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def golden(shared: Path) -> dict[str, NDArray]:
+    with np.load(shared / "golden" / "t5_audio_A.npz", allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays}
+
+
+def test_438_columns_equal_the_golden_ones(golden: dict[str, NDArray]) -> None:
+    samples = golden["syn_wav"].astype(np.float32) / 32768
+    found = audio_features(samples, int(golden["syn_sr"]))
+    want = golden["syn_feat438_60fps"]
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, want, rtol=0, atol=1e-3)
+    np.testing.assert_array_equal(found[:, 53], want[:, 53])
+    slow = audio_features(golden["syn_wav_3840"], 3840, AudioSettings(fps=7.5))
+    np.testing.assert_allclose(slow, golden["syn_feat438_7p5fps"], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(beats(samples, 30720), np.flatnonzero(want[:, 53]) / 60)
+
+
+def test_35_columns_equal_the_golden_ones(golden: dict[str, NDArray]) -> None:
+    samples = golden["syn_wav"].astype(np.float32) / 32768
+    found = baseline_features(samples, 30720, AudioSettings(start_bpm=120))
+    np.testing.assert_allclose(found, golden["syn_feat35_60fps"], rtol=0, atol=1e-3)
+    slow = baseline_features(golden["syn_wav_15360"], 15360, AudioSettings(fps=30))
+    np.testing.assert_allclose(slow, golden["syn_feat35_30fps"], rtol=0, atol=1e-3)
+
+
+def test_sound_of_another_rate_is_resampled(golden: dict[str, NDArray]) -> None:
+    samples = golden["syn_wav"].astype(np.float32) / 32768
+    found = audio_features(samples, 30720, AudioSettings(fps=7.5))
+    np.testing.assert_allclose(found, golden["syn_feat438_7p5fps"], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("fps", "seconds"), [(60.0, 4.03), (30.0, 5.0), (20.0, 12.9), (120.0, 2.0), (7.5, 9.0)]
+)
+def test_equal_to_librosa(fps: float, seconds: float) -> None:
+    settings = AudioSettings(fps=fps)
+    samples = song(seconds, settings.rate, seed=int(fps), bpm=70 + fps)
+    want = published(samples, settings.rate, fitting_octaves(settings.rate))
+    np.testing.assert_allclose(audio_features(samples, settings.rate, settings), want, rtol=0, atol=1e-3)
+
+
+def test_silence_is_equal_to_librosa_and_has_no_notes_or_beats() -> None:
+    silence = np.zeros(30720, dtype=np.float32)
+    found = audio_features(silence, 30720)
+    np.testing.assert_allclose(found, published(silence, 30720, 7), rtol=0, atol=1e-3)
+    assert not found[:, 40:].any() and not len(beats(silence, 30720))
+    quarter = song(4.0, 30720, seed=1)
+    quarter[30720:] = 0
+    after = audio_features(quarter, 30720)[140:]  # the longest filters reach 1.07 s
+    assert not after[:, 40:52].any(), "rounding is not scaled up to notes"
+
+
+def test_memory_blocks_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = song(3.0, 30720, seed=2)
+    want = audio_features(samples, 30720)
+    for block in (1, 7, 40, 1000):
+        monkeypatch.setattr(spectrum, "_BLOCK", block)
+        np.testing.assert_allclose(audio_features(samples, 30720), want, rtol=0, atol=5e-4)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 15, 16, 17, 31, 100])
+def test_running_median_is_exact(rows: int) -> None:
+    values = np.random.default_rng(rows).integers(0, 50, (rows, 37)).astype(np.float32)
+    want = ndimage.median_filter(values, size=(31, 1), mode="reflect")
+    np.testing.assert_array_equal(running_median(values), want)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_beats_and_onsets_equal_librosas(seed: int) -> None:
+    import librosa
+
+    rng = np.random.default_rng(seed)
+    fps = float(rng.choice([7.5, 20, 30, 60]))
+    onsets = np.abs(rng.standard_normal(int(rng.integers(40, 2000)))).astype(np.float32)
+    onsets[:: int(0.5 * fps)] += 3
+    onsets[: len(onsets) // 5] *= seed % 2
+    rate, bpm = int(fps * 512), float(rng.uniform(60, 200))
+    tempo, want = librosa.beat.beat_track(onset_envelope=onsets, sr=rate, start_bpm=bpm, tightness=80)
+    found = rhythm.track_beats(onsets, fps, start_bpm=bpm, tightness=80)
+    np.testing.assert_array_equal(found, want)
+    assert rhythm.tempo(onsets, fps, bpm) == pytest.approx(float(np.squeeze(tempo)))
+    np.testing.assert_array_equal(
+        rhythm.pick_onsets(onsets, fps), librosa.onset.onset_detect(onset_envelope=onsets, sr=rate)
+    )
+
+
+def test_a_tone_is_its_note() -> None:
+    """A check that needs no other implementation: A4 is A, and one octave more changes nothing."""
+    time = np.arange(30720, dtype=np.float32) / 30720
+    for hertz, note in ((440.0, 9), (220.0, 9), (261.63, 0)):
+        tone = np.sin(2 * np.pi * hertz * time).astype(np.float32)
+        rows = normalized(chroma(tone, 30720, 7, 0.0), np.inf)[20:40]
+        assert (rows.argmax(axis=1) == note).all()
+        assert np.sort(rows, axis=1)[:, -3].max() < 0.2
+
+
+def test_mistakes_are_named() -> None:
+    sound = np.zeros(30720, dtype=np.float32)
+    with pytest.raises(UserError, match=r"0\.033 s is too short .* at least 0\.033 s"):
+        audio_features(sound[:1023], 30720)
+    assert audio_features(sound[:1024], 30720).shape == (3, 438)
+    with pytest.raises(UserError, match=r"octaves: 6 do not fit at 7\.5 frames a second; at most 5"):
+        audio_features(sound, 30720, AudioSettings(fps=7.5, octaves=6))
+    with pytest.raises(UserError, match="finite mono"):
+        audio_features(np.full(30720, np.nan, dtype=np.float32), 30720)
+    with pytest.raises(UserError, match="whole number of Hz"):
+        AudioSettings.parse({"fps": 29.97}, "settings")
+    assert (aist_bpm("mBR0"), aist_bpm("mHO5"), aist_bpm("mJB3")) == (80, 135, 110)
+    for name in ("mXX1", "mHO", "mBR²", "mBR12"):
+        with pytest.raises(UserError, match="no AIST music"):
+            aist_bpm(name)
