@@ -102,23 +102,31 @@ def digests(out: Path) -> dict[str, str]:
     }
 
 
-def killed(source: Path, out: Path, kills: int, seed: int, wall: float) -> int:
-    """Start with two workers and kill, `kills` times; how many kills came before the end."""
+def killed(source: Path, out: Path, kills: int, seed: int, total: int) -> int:
+    """Start with two workers and kill, `kills` times; how many kills came before the end.
+
+    A kill comes when a random number of the `total` batches and shards is finished, and up to a second later:
+    moments by the clock would depend on what else the machine does.
+    """
     chance, done = random.Random(seed), 0
-    for _ in range(kills):
+    for moment in sorted(chance.sample(range(total - 2), kills)):
         process = subprocess.Popen(child(source, out, 2), start_new_session=True)
-        moment = chance.uniform(0.3, 0.7) * wall
-        try:
-            process.wait(moment)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-            done += 1
-        shards = len(list(out.glob("*.index.json")))
-        batches = len(list(out.glob(".work/*.json")))
-        print(f"killed after {moment:5.1f} s: {batches} batches, {shards} shards finished", flush=True)
+        while process.poll() is None and sum(finished(out)) < moment:
+            time.sleep(0.01)
+        time.sleep(chance.uniform(0, min(1.0, 0.1 * (total - moment))))
+        done += process.poll() is None
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        batches, shards = finished(out)
+        torn = len(list(out.rglob("*.tmp")))
+        print(f"killed: {batches} batches, {shards} shards finished, {torn} half-written files", flush=True)
     subprocess.run(child(source, out, 2), check=True)
     return done
+
+
+def finished(out: Path) -> tuple[int, int]:
+    """Batches and shards of an unfinished run."""
+    return len(list(out.glob(".work/0*.json"))), len(list(out.glob("*.index.json")))
 
 
 def main() -> None:
@@ -152,7 +160,8 @@ def main() -> None:
     tell("convert, 1 worker", seconds[1], motion)
     tell("convert, 2 workers", seconds[2], motion)
     tell("the same again, finished", again, motion)
-    kills = killed(args.source, broken, args.kills, args.seed, seconds[2][0])
+    total = len(list_batches(args.source, ".bvh")[0]) + finished(one)[1]
+    kills = killed(args.source, broken, args.kills, args.seed, total)
     want = digests(one)
     verdicts = {"2 workers": digests(two) == want, f"killed {kills} times": digests(broken) == want}
     print(json.dumps({"files": len(want), "equal to 1 worker": verdicts}))

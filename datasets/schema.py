@@ -14,7 +14,11 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+
+HANDS, FACE = 1, 2
+"""Bits of what a clip holds beside its body."""
+HELD_ALL = HANDS | FACE
 
 Split = Literal["train", "val", "test"]
 
@@ -114,6 +118,11 @@ class ClipMeta(Config):
     mirror_of: str | None = None
     truth: dict[str, Any] | None = None
     """What a synthetic clip really does (action, direction, side, count, hand, face)."""
+
+    @property
+    def held(self) -> int:
+        """`has_hands` and `has_face` as bits."""
+        return HANDS * self.has_hands | FACE * self.has_face
 
 
 class ShardInfo(Config):

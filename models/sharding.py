@@ -3,20 +3,22 @@
 FSDP2 (`fully_shard`): every transformer block is one unit, gathered when it runs and cut again behind it;
 what is left (embeddings, heads) is the last unit. Gradients are averaged over ranks as DDP averages them, and
 nothing is gathered in fewer bits than it is kept in, so training equals DDP up to the order of sums.
+
+torch's modules for it are imported when they are used; they take a second.
 """
 
 from __future__ import annotations
 
 import copy
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from torch import nn
-from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
-from torch.distributed.device_mesh import DeviceMesh
-from torch.distributed.fsdp import fully_shard
 
 from motionloom.models.distributed import rank
 from motionloom.models.layers.transformer import Block
+
+if TYPE_CHECKING:
+    from torch.distributed.device_mesh import DeviceMesh
 
 M = TypeVar("M", bound=nn.Module)
 
@@ -27,6 +29,8 @@ def sharded(net: M, mesh: DeviceMesh) -> M:
     Every rank must hold the same weights. The copy gathers its weights in `forward` only, so a network that
     is used through other methods cannot be cut this way.
     """
+    from torch.distributed.fsdp import fully_shard
+
     cut = copy.deepcopy(net)
     for part in cut.modules():
         if isinstance(part, Block):
@@ -37,6 +41,8 @@ def sharded(net: M, mesh: DeviceMesh) -> M:
 
 def make_whole(cut: nn.Module, net: nn.Module) -> None:
     """Fill `net` on rank 0 with the weights of its sharded copy; a collective, so every rank calls it."""
+    from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
+
     state = get_model_state_dict(cut, options=StateDictOptions(full_state_dict=True, cpu_offload=True))
     if rank() == 0:
         net.load_state_dict(state)

@@ -45,6 +45,9 @@ class StageModule(L.LightningModule, ABC):
         self.optim_config = optim
         self.seed = seed
         self.max_steps = max_steps
+        self.fused = True
+        """Whether AdamW is one kernel. False for "16-mixed": a fused step also removes the scale of the
+        gradients, and they could not be clipped before it."""
 
     @abstractmethod
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
@@ -81,12 +84,25 @@ class StageModule(L.LightningModule, ABC):
         size = len(batch["length"])
         self.log_dict({f"val/{k}": v for k, v in values.items()}, batch_size=size)
 
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip by the norm of all gradients, those cut over ranks too.
+
+        Lightning's own would refuse a fused optimizer in every mixed precision, bfloat16 included.
+        """
+        if gradient_clip_val:
+            torch.nn.utils.clip_grad_norm_(self.net.parameters(), gradient_clip_val)
+
     def configure_optimizers(self) -> Any:
         """AdamW over the trainable parameters, linear warm-up, then constant or cosine."""
         config = self.optim_config
         params = [p for p in self.net.parameters() if p.requires_grad]
         optimizer = torch.optim.AdamW(
-            params, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay, fused=True
+            params, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay, fused=self.fused
         )
 
         def factor(step: int) -> float:

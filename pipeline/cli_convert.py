@@ -45,6 +45,10 @@ _RUN_OPTIONS: dict[str, tuple[Any, Any]] = {
         ],
         None,
     ),
+    "wait": (
+        Annotated[bool, typer.Option("--wait/--no-wait", help="With --cluster: wait for the jobs to end.")],
+        True,
+    ),
 }
 
 

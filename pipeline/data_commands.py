@@ -37,7 +37,7 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
         console.print(f"… and {len(manifest.dropped) - 20} more, all in {out / 'manifest.json'}")
     console.print(
         f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), "
-        f"{manifest.fps:g} fps, {manifest.licence}"
+        f"{manifest.fps:g} fps, {', '.join(manifest.licences) or manifest.licence}"
     )
 
 
@@ -51,6 +51,7 @@ def convert_command(
     workers: int,
     clips_per_shard: int,
     cluster: list[str] | None,
+    wait: bool,
     console: Console,
 ) -> None:
     """Plan a conversion, run it here, or hand it to SLURM."""
@@ -62,18 +63,19 @@ def convert_command(
         say_plan(conversion.estimated(workers), console)
         return
     if cluster:
-        from motionloom.pipeline.slurm_convert import ClusterConfig, submit_conversion
+        from motionloom.pipeline.slurm_convert import ClusterConfig, submit_conversion, wait_for
 
-        given = ClusterConfig.parse(_pairs(cluster), "--cluster")
-        submit_conversion(
+        submission = submit_conversion(
             kind,
-            config.dump(),
+            config.model_dump(),
             out,
-            cluster=given,
+            cluster=ClusterConfig.from_words(cluster),
             strict=strict,
             clips_per_shard=clips_per_shard,
             console=console,
         )
+        if wait:
+            say_manifest(wait_for(submission, console), out, console)
         return
     conversion = converter.prepare(config, out=out, workers=workers, progress=shown)
     manifest = run_conversion(
@@ -88,17 +90,6 @@ def say_plan(plan: ConversionPlan[Any], console: Console) -> None:
     if subsets is not None:
         console.print(subsets)
     console.print(plan.table())
-
-
-def _pairs(given: list[str]) -> dict[str, str]:
-    """KEY=VALUE options as a mapping."""
-    out = {}
-    for text in given:
-        key, sign, value = text.partition("=")
-        if not sign:
-            raise UserError(f"--cluster {text}: write KEY=VALUE, for instance partition=cpu")
-        out[key.strip()] = value.strip()
-    return out
 
 
 def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: Console) -> int:

@@ -32,11 +32,12 @@ def run_recipe(
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed."""
     loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
+    if dry_run:
+        _say_estimate(loaded, console)  # first: it needs no data, the plan looks at them
     plan = make_plan(loaded, run, select)
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if dry_run:
         console.print(plan_table(loaded, plan))
-        _say_estimate(loaded, console)
         console.print(f"{len(todo)} of {len(plan)} stages would run in {run}")
         return run
     if not todo:

@@ -195,6 +195,7 @@ def fit(
 
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
     """Apply the settings that concern how the network computes."""
+    module.fused = config.precision != "16-mixed"
     for part in module.modules():
         if isinstance(part, Transformer):
             part.checkpointed = config.checkpoint_activations

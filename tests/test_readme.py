@@ -65,9 +65,9 @@ def parsed(words: list[str]) -> dict[str, Any]:
     """Parameters of a `motionloom` command, read by the real command line; raises what a user would see."""
     command: Any = typer.main.get_command(app)
     words = words[1:]
-    while hasattr(command, "commands"):
-        assert words and words[0] in command.commands, f"no command {words[:1]}"
-        command = command.commands[words.pop(0)]
+    while hasattr(command, "list_commands"):
+        assert words and words[0] in command.list_commands(None), f"no command {words[:1]}"
+        command = command.get_command(None, words.pop(0))
     return dict(command.make_context(command.name, words).params) | {"command": command.name}
 
 
@@ -150,7 +150,7 @@ def test_yaml_example_is_a_recipe(block: Block, tmp_path: Path) -> None:
 def test_recipes_are_named_and_named_recipes_exist() -> None:
     shipped = set(shipped_recipes())
     everything = "".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
-    assert set(re.findall(r"\b(?:humantomato|ude|baselines|bvh)-[a-z]+\b", everything)) == shipped
+    assert set(re.findall(r"\b(?:humantomato|ude|baselines|bvh|t2m-gpt)-[a-z]+\b", everything)) == shipped
     readme = DOCUMENTS[0].read_text(encoding="utf-8")
     assert all(f"`{name}`" in readme for name in shipped)
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import FACE, HANDS, HELD_ALL, UserError
 
 Family = Literal["exact", "h3d", "raw"]
 Part = Literal["all", "bodyhand", "body", "hand", "face"]
@@ -133,6 +133,19 @@ class MotionLayout:
             return np.setdiff1d(columns, face)
         hand = self._hand_columns()
         return hand if part == "hand" else np.setdiff1d(columns, np.concatenate([hand, face]))
+
+    @cached_property
+    def held_columns(self) -> NDArray[np.bool_]:
+        """Row b: which columns mean something in a clip that holds the bits b (`ClipMeta.held`), [4, D].
+
+        The body's always do. The others are masked in training: what a file stores there plays no part.
+        """
+        needs = np.zeros(self.dim, dtype=np.uint8)
+        needs[self._hand_columns()] = HANDS
+        if self.has("face"):
+            needs[self.slice("face")] = FACE
+        bits = np.arange(HELD_ALL + 1, dtype=np.uint8)[:, None]
+        return (bits & needs) == needs
 
     def _hand_columns(self) -> NDArray[np.int64]:
         columns = np.arange(self.dim)

@@ -32,10 +32,12 @@ _WINDOW, _CAPTION, _CROP = 1, 2, 3
 
 
 class MotionBatch(TypedDict):
-    """`motion` float32 [B, T, C], normalised, zero behind `length` int64 [B]."""
+    """`motion` float32 [B, T, C], normalised, zero behind `length` int64 [B] and where `held` is false."""
 
     motion: Tensor
     length: Tensor
+    held: Tensor
+    """bool [B, C]: columns of parts (hands, face) that the clip holds. The others must not be learnt from."""
 
 
 class CaptionBatch(MotionBatch):
@@ -56,7 +58,7 @@ class WindowBatches(Dataset[MotionBatch]):
     """Fixed windows for the tokenizers (HumanTOMATO appendix C, T2M-GPT's 64 frames).
 
     `windows_per_clip` windows are cut from each clip read. A clip shorter than `window` is taken whole and
-    padded.
+    padded. A clip that holds none of the columns is never drawn; a column that no clip holds is refused.
     """
 
     def __init__(
@@ -81,28 +83,39 @@ class WindowBatches(Dataset[MotionBatch]):
         self.window = window
         self.windows_per_clip = windows_per_clip
         self.seed, self.rank, self.world = seed, rank, world
-        self.plan = BatchPlan(len(dataset), batch_size // windows_per_clip, seed, sources=dataset.sources())
+        self.clips = self.crops.clips
+        if len(self.clips) == 0 or not self.crops.held[np.unique(dataset.held)].any(axis=0).all():
+            raise UserError(
+                f"{dataset.where}: no clip of split '{dataset.split}' holds hands or a face that the chosen "
+                f"part has columns for; choose another `part` or another data set"
+            )
+        sources = dataset.sources(self.clips)
+        self.plan = BatchPlan(len(self.clips), batch_size // windows_per_clip, seed, sources=sources)
         self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
 
     def __len__(self) -> int:
         return ENDLESS
 
     def __getitem__(self, k: int) -> MotionBatch:
-        turns, clips = self.plan.local(k, self.rank, self.world)
+        turns, items = self.plan.local(k, self.rank, self.world)
+        clips = self.clips[items]
         per_clip = self.windows_per_clip
         frames = self.dataset.frames[clips]
         draws = uniform(self.seed, _WINDOW, turns[:, None], clips[:, None], np.arange(per_clip)[None])
         starts = (draws * (np.maximum(frames - self.window, 0) + 1)[:, None]).astype(np.int64)
         length = np.minimum(frames, self.window)
         motion = np.empty((len(clips) * per_clip, self.window, self.crops.width), dtype=np.float32)
+        held = self.dataset.held[clips]
         self.dataset.prefetch(clips.tolist(), ("motion.npy",))
         for row, clip in enumerate(clips.tolist()):
             source = self.dataset.motion(clip)
             for j in range(per_clip):
-                self.crops.fill(motion[row * per_clip + j], source, int(starts[row, j]), int(length[row]))
+                place = motion[row * per_clip + j]
+                self.crops.fill(place, source, int(starts[row, j]), int(length[row]), int(held[row]))
         return {
             "motion": torch.from_numpy(motion),
             "length": torch.from_numpy(np.repeat(length, per_clip)),
+            "held": torch.from_numpy(self.crops.held[np.repeat(held, per_clip)]),
         }
 
 
@@ -130,12 +143,13 @@ class _CaptionedClips:
         usable = dataset.frames >= min_frames
         if text is not None:
             usable &= dataset.has("face_texts.json" if face else "texts.json")
-        self.clips = np.flatnonzero(usable)
+        self.clips = self.crops.clips[usable[self.crops.clips]]
         if len(self.clips) == 0:
             kind = "face captions" if face else "captions"
+            holding = "" if len(self.crops.clips) == len(dataset) else ", the hands or face that are asked for"
             raise UserError(
-                f"{dataset.where}: no clip of split '{dataset.split}' has {kind} and {min_frames} frames; "
-                f"lower min_frames or convert data with {kind}"
+                f"{dataset.where}: no clip of split '{dataset.split}' has {kind}{holding} and {min_frames} "
+                f"frames; lower min_frames or convert data with {kind}"
             )
 
     def prefetch(self, clips: NDArray[np.int64]) -> None:
@@ -163,12 +177,15 @@ class _CaptionedClips:
         length = np.minimum(whole, self.max_frames)
         begin += (crop * (whole - length + 1)).astype(np.int64)
         motion = np.empty((len(clips), padded_length(length), self.crops.width), dtype=np.float32)
+        held = self.dataset.held[clips]
         for row, clip in enumerate(clips.tolist()):
-            self.crops.fill(motion[row], self.dataset.motion(clip), int(begin[row]), int(length[row]))
+            source = self.dataset.motion(clip)
+            self.crops.fill(motion[row], source, int(begin[row]), int(length[row]), int(held[row]))
         captions = [span[0] for span in spans]
         batch = {
             "motion": torch.from_numpy(motion),
             "length": torch.from_numpy(length),
+            "held": torch.from_numpy(self.crops.held[held]),
             "index": torch.from_numpy(clips.copy()),
             "valid": torch.ones(len(clips), dtype=torch.bool),
             "caption": captions,
@@ -231,7 +248,7 @@ class EvalBatches(Dataset[CaptionBatch]):
     """Every qualifying clip of a split once, in order: first caption, first `max_frames` frames.
 
     `text` None leaves captions out (`caption` is then empty strings, no text tensors, every long enough clip
-    qualifies). Each rank gets the same number of rows; where the clips do not divide, the last batch repeats
+    that holds any of the columns qualifies). Each rank gets the same number of rows; where the clips do not divide, the last batch repeats
     its last clip with `valid` false.
     """
 

@@ -69,9 +69,12 @@ def examine(root: Path, *, progress: bool = False) -> CheckReport:
     table = ClipTable(root, manifest.shards, layout)
     widths: dict[int, str] = {}
     for number, shard in enumerate(track(manifest.shards, "checking shards", disable=not progress)):
+        indexed = _indexed_held(root / shard.name)
         try:
             for row, key, clip in _checked_clips(root / shard.name, shard, layout, findings):
                 where = f"{shard.name}: '{key}'"
+                if row < len(indexed) and indexed[row] != clip.meta.held:
+                    findings.error("index", where, "has_hands or has_face is not what the index says")
                 table.add(number, row, clip.meta, clip.motion)
                 frames += clip.meta.frames
                 for kind, message in clip.oddities:
@@ -151,6 +154,14 @@ def _against_manifest(
             findings.error("audio", where, other)
 
 
+def _indexed_held(path: Path) -> list[int]:
+    """What a shard's index says its clips hold; an unreadable index is reported with the indices."""
+    try:
+        return [clip.held for clip in ShardIndex.load_json(index_path(path)).clips]
+    except (UserError, OSError):
+        return []
+
+
 def _check_index(root: Path, split: Split, shards: list[ShardInfo], findings: Findings) -> None:
     """Whether both indices say what the tars say."""
     before = findings.error_kinds["index"]
@@ -175,7 +186,7 @@ def _sound_indices(root: Path, shards: list[ShardInfo], findings: Findings) -> I
         path = root / shard.name
         try:
             stored = ShardIndex.load_json(index_path(path))
-            entries = clip_entries(path, [clip.id for clip in stored.clips])
+            entries = clip_entries(path, [(clip.id, clip.held) for clip in stored.clips])
         except (UserError, OSError, ValueError) as error:
             findings.error("index", index_path(path).name, f"does not fit its tar: {error}")
             continue

@@ -29,6 +29,11 @@ class ClipDataset(Protocol):
         ...
 
     @property
+    def held(self) -> NDArray[np.uint8]:
+        """What every clip holds beside its body, bits of `ClipMeta.held`, [n]."""
+        ...
+
+    @property
     def ids(self) -> list[str]:
         """Source id of every clip."""
         ...

@@ -4,6 +4,8 @@ A window is subtracted and scaled while it is in the processor's cache, straight
 place in the batch: no intermediate array, no tensor per sample. When all columns are wanted, a window is one
 run of memory and is treated as one long row (mean and scale repeated per frame), which halves the time of
 broadcasting over rows.
+
+Columns of a part that a clip does not hold (hands, face) come out as 0, the mean, whatever the file stores.
 """
 
 from __future__ import annotations
@@ -31,13 +33,23 @@ class Crops:
             raise UserError(f"columns outside layout {dataset.layout.name} (or none of them)")
         self.dataset = dataset
         self.width = len(chosen)
+        self.held = dataset.layout.held_columns[:, chosen]
+        """Row b: which of the columns clips hold that hold the bits b, [4, C]."""
+        self.clips = np.flatnonzero(self.held.any(axis=1)[dataset.held])
+        """Clips that hold any of the columns: the others have nothing to give, [n]."""
+        self._lost = [[place for place, _ in _runs(np.flatnonzero(~row))] for row in self.held]
         self._mean = stats.mean[chosen]
         self._scale = 1.0 / stats.std[chosen]
         self._mean_row, self._scale_row = self._mean, self._scale
         self._runs = _runs(chosen)
 
-    def fill(self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int) -> None:
-        """Normalised frames `start .. start + length` of `clip` into `out` [T >= length, C], then zeros."""
+    def fill(
+        self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int, held: int
+    ) -> None:
+        """Normalised frames `start .. start + length` of `clip` into `out` [T >= length, C], then zeros.
+
+        `held` are the bits of what the clip holds.
+        """
         target = out[:length]
         if self.width == clip.shape[1]:
             row = target.reshape(-1)  # a view: both are contiguous
@@ -48,6 +60,8 @@ class Crops:
             for source, place in self._runs:
                 np.subtract(clip[start : start + length, source], self._mean[place], out=target[:, place])
             np.multiply(target, self._scale, out=target)
+        for place in self._lost[held]:
+            target[:, place] = 0.0
         if length < len(out):
             out[length:] = 0.0
 
@@ -61,6 +75,8 @@ class Crops:
 
 def _runs(columns: NDArray[np.int64]) -> list[tuple[slice, slice]]:
     """(slice of the clip's columns, slice of the batch's columns) for each run of neighbouring columns."""
+    if len(columns) == 0:
+        return []
     breaks = np.flatnonzero(np.diff(columns) != 1) + 1
     edges = [0, *breaks.tolist(), len(columns)]
     return [(slice(int(columns[a]), int(columns[b - 1]) + 1), slice(a, b)) for a, b in pairwise(edges)]

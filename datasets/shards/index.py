@@ -10,6 +10,7 @@ Arrays, n clips of a split and M = `len(MEMBERS)`:
 | `frames`        | int32 [n]     | T |
 | `data`          | int64 [n]     | byte in the tar where the motion values start (after the .npy header) |
 | `itemsize`      | uint8 [n]     | bytes per motion value: 4 or 2 |
+| `held`          | uint8 [n]     | what the clip holds beside its body: 1 hands, 2 face, as in its `meta.json` |
 | `offsets`       | int64 [n, M]  | byte in the tar where each member starts |
 | `sizes`         | uint32 [n, M] | its size; 0 = the clip has no such member |
 | `id_ends`       | int64 [n]     | end of each clip's id in `id_bytes` |
@@ -27,7 +28,7 @@ from typing import BinaryIO, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import Config, Dropped, ShardInfo, Split, UserError
+from motionloom.datasets.schema import HELD_ALL, Config, Dropped, ShardInfo, Split, UserError
 from motionloom.datasets.shards.files import write_with
 from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.tar import TarClip, read_npy_header, scan_tar
@@ -40,6 +41,7 @@ _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "frames": (np.int32, 1),
     "data": (np.int64, 1),
     "itemsize": (np.uint8, 1),
+    "held": (np.uint8, 1),
     "offsets": (np.int64, 2),
     "sizes": (np.uint32, 2),
     "id_ends": (np.int64, 1),
@@ -52,6 +54,8 @@ class ClipEntry(Config):
 
     key: str
     id: str
+    held: int
+    """Bits of `ClipMeta.held`."""
     frames: int
     motion_data: int
     motion_itemsize: int
@@ -77,12 +81,14 @@ def index_path(tar: Path) -> Path:
     return tar.with_name(tar.name.removesuffix(".tar") + ".index.json")
 
 
-def clip_entries(path: Path, ids: list[str], *, clips: list[TarClip] | None = None) -> list[ClipEntry]:
-    """Index rows of a tar as it lies on the disk; `ids` are the clips' source ids, in order."""
+def clip_entries(
+    path: Path, told: list[tuple[str, int]], *, clips: list[TarClip] | None = None
+) -> list[ClipEntry]:
+    """Index rows of a tar as it lies on the disk; `told` are the clips' (source id, held), in order."""
     clips = scan_tar(path) if clips is None else clips
     entries = []
     with path.open("rb") as file:
-        for clip, source in zip(clips, ids, strict=True):
+        for clip, (source, held) in zip(clips, told, strict=True):
             start, size = clip.members["motion.npy"]
             file.seek(start)
             header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'")
@@ -94,6 +100,7 @@ def clip_entries(path: Path, ids: list[str], *, clips: list[TarClip] | None = No
                 ClipEntry(
                     key=clip.key,
                     id=source,
+                    held=held,
                     frames=header.shape[0],
                     motion_data=start + header.data,
                     motion_itemsize=header.dtype.itemsize,
@@ -110,6 +117,7 @@ class SplitIndex:
     frames: NDArray[np.int32]
     data: NDArray[np.int64]
     itemsize: NDArray[np.uint8]
+    held: NDArray[np.uint8]
     offsets: NDArray[np.int64]
     sizes: NDArray[np.uint32]
     id_ends: NDArray[np.int64]
@@ -140,6 +148,7 @@ class SplitIndex:
                 "frames": [entry.frames for entry in shard.clips],
                 "data": [entry.motion_data for entry in shard.clips],
                 "itemsize": [entry.motion_itemsize for entry in shard.clips],
+                "held": [entry.held for entry in shard.clips],
                 "offsets": places[..., 0],
                 "sizes": places[..., 1],
                 "id_ends": ends,
@@ -198,6 +207,8 @@ def _index_problem(index: SplitIndex, shards: list[ShardInfo]) -> str | None:
         values = getattr(index, name)
         if values.dtype != kind or values.ndim != rank or (name != "id_bytes" and len(values) != count):
             return f"array '{name}' is {values.dtype} {list(values.shape)}, the manifest has {count} clips"
+    if (index.held > HELD_ALL).any():
+        return f"array 'held' has values above {HELD_ALL}"
     if index.offsets.shape[1] != len(MEMBERS) or index.sizes.shape[1] != len(MEMBERS):
         return f"offsets are not for {len(MEMBERS)} members"
     if count == 0:

@@ -55,6 +55,11 @@ class MixedDataset:
         return np.concatenate([dataset.frames for dataset in self._datasets])
 
     @cached_property
+    def held(self) -> NDArray[np.uint8]:
+        """What every clip holds beside its body, bits of `ClipMeta.held`, [n]."""
+        return np.concatenate([dataset.held for dataset in self._datasets])
+
+    @cached_property
     def ids(self) -> list[str]:
         """Source id of every clip, as its own data set has it."""
         return [source for dataset in self._datasets for source in dataset.ids]

@@ -134,6 +134,11 @@ class ShardDataset:
         """T of every clip, [n]."""
         return self._index.frames.astype(np.int64)
 
+    @property
+    def held(self) -> NDArray[np.uint8]:
+        """What every clip holds beside its body, bits of `ClipMeta.held`, [n]."""
+        return self._index.held
+
     @cached_property
     def ids(self) -> list[str]:
         """Source id of every clip."""

@@ -1,5 +1,8 @@
 """`FeatureStats`: per-column mean and standard deviation, computed in one pass.
 
+A column counts the clips that hold it: what a clip without hands or face stores there plays no part. A column
+that no clip holds gets mean 0 and standard deviation 1.
+
 `Moments` holds (count, mean, sum of squared deviations) and merges by Chan's formula, so clips, shards and
 workers may be combined in any grouping. Statistics come from the training split only; whoever calls `compute`
 decides that by the dataset it passes.
@@ -34,31 +37,34 @@ Values = TypeVar("Values", NDArray[np.float32], Tensor)
 
 @dataclass(frozen=True)
 class Moments:
-    """Streaming mean and variance of rows, float64. `mean` and `m2` are [D]."""
+    """Streaming mean and variance of rows, float64, all [D]; `count` is of rows that hold the column."""
 
-    count: float
+    count: NDArray[np.float64]
     mean: NDArray[np.float64]
     m2: NDArray[np.float64]
 
     @staticmethod
     def none(width: int) -> Moments:
         """No rows yet."""
-        return Moments(0, np.zeros(width), np.zeros(width))
+        return Moments(np.zeros(width), np.zeros(width), np.zeros(width))
 
     @staticmethod
-    def of(rows: NDArray[np.floating]) -> Moments:
-        """Of one array [T, D]."""
+    def of(rows: NDArray[np.floating], held: NDArray[np.bool_] | None = None) -> Moments:
+        """Of one array [T, D]; `held` [D] says which columns count (all when None)."""
         mean = rows.mean(axis=0, dtype=np.float64)
-        return Moments(len(rows), mean, np.square(rows - mean).sum(axis=0))
+        m2 = np.square(rows - mean).sum(axis=0)
+        count = np.full(len(mean), float(len(rows)))
+        if held is None or held.all():
+            return Moments(count, mean, m2)
+        return Moments(*(np.where(held, values, 0.0) for values in (count, mean, m2)))
 
     def merge(self, other: Moments) -> Moments:
         """Of both together."""
         count = self.count + other.count
-        if count == 0:
-            return self
+        rows = np.where(count > 0, count, 1.0)
         delta = other.mean - self.mean
-        mean = self.mean + delta * (other.count / count)
-        m2 = self.m2 + other.m2 + np.square(delta) * (self.count * other.count / count)
+        mean = self.mean + delta * (other.count / rows)
+        m2 = self.m2 + other.m2 + np.square(delta) * (self.count * other.count / rows)
         return Moments(count, mean, m2)
 
     def counted(self, times: float) -> Moments:
@@ -67,8 +73,8 @@ class Moments:
 
     @property
     def std(self) -> NDArray[np.float64]:
-        """Population standard deviation, [D]."""
-        return np.sqrt(self.m2 / (self.count or 1))
+        """Population standard deviation, [D]; 0 of a column without rows."""
+        return np.sqrt(self.m2 / np.where(self.count > 0, self.count, 1.0))
 
 
 @dataclass(frozen=True)
@@ -176,7 +182,7 @@ def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -
         own = Moments.none(layout.dim)
         clips = in_order(part, "motion.npy")
         for i in track(clips, "feature statistics", total=len(part), disable=not progress):
-            own = own.merge(Moments.of(part.motion(i)))
+            own = own.merge(Moments.of(part.motion(i), layout.held_columns[part.held[i]]))
         times = weight / total * len(dataset) / len(part)
         moments = moments.merge(own.counted(times) if len(parts) > 1 else own)
     return from_moments(moments, layout, group=group)
@@ -184,11 +190,21 @@ def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -
 
 def from_moments(moments: Moments, layout: MotionLayout, *, group: bool = False) -> FeatureStats:
     """Finish moments (merged from wherever) into statistics."""
-    if moments.count == 0:
+    frames = round(moments.count.max())
+    if frames == 0:
         raise UserError("no frames to compute feature statistics from: the training split is empty")
-    std = moments.std
+    std, counted = moments.std, moments.count > 0
     if group:
         for name, _ in layout.fields:
-            std[layout.slice(name)] = std[layout.slice(name)].mean()
-    std = np.maximum(std, STD_FLOOR)
-    return FeatureStats(moments.mean.astype(np.float32), std.astype(np.float32), layout, round(moments.count))
+            field = counted & _columns_of(layout, name)
+            if field.any():
+                std[field] = std[field].mean()
+    std = np.where(counted, np.maximum(std, STD_FLOOR), 1.0)
+    return FeatureStats(moments.mean.astype(np.float32), std.astype(np.float32), layout, frames)
+
+
+def _columns_of(layout: MotionLayout, name: str) -> NDArray[np.bool_]:
+    """Mask [D] of one field."""
+    mask = np.zeros(layout.dim, dtype=np.bool_)
+    mask[layout.slice(name)] = True
+    return mask

@@ -96,7 +96,7 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
     """Write one shard and its index."""
     from webdataset.writer import TarWriter  # imports torch: two seconds that kept shards do not pay
 
-    ids: list[str] = []
+    told: list[tuple[str, int]] = []
     dropped: list[Dropped] = []
     with atomic_file(task.path) as file:
         hashing = HashingFile(file)
@@ -106,11 +106,11 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
                 if isinstance(samples, Dropped):
                     dropped.append(samples)
                     continue
-                for source, members in samples:
-                    tar.write({"__key__": f"{task.number:06d}-{len(ids):06d}", **members})
-                    ids.append(source)
+                for source, held, members in samples:
+                    tar.write({"__key__": f"{task.number:06d}-{len(told):06d}", **members})
+                    told.append((source, held))
     info = None
-    entries = clip_entries(task.path, ids)
+    entries = clip_entries(task.path, told)
     if entries:
         info = ShardInfo(
             name=task.path.name,
@@ -129,14 +129,15 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
 
 def _convert_item(
     task: ShardTask[T], convert: Convert[T], label: str, item: T
-) -> list[tuple[str, dict[str, bytes]]] | Dropped:
-    """(clip id, encoded members) of each sample of one item, or why there are none."""
+) -> list[tuple[str, int, dict[str, bytes]]] | Dropped:
+    """(clip id, held, encoded members) of each sample of one item, or why there are none."""
     try:
         made = convert(item)
         samples = made if isinstance(made, list) else [made]
         return [
             (
                 sample.meta.id,
+                sample.meta.held,
                 encode_sample(sample, split=task.split, layout=task.layout, motion_type=task.motion_type),
             )
             for sample in samples

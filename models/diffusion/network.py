@@ -59,7 +59,9 @@ class MotionDiffusion(nn.Module):
             mask: bool [B, T], True = real frame.
             told: bool [B], False hides the text.
         """
-        condition = self.text(text) * told[:, None] + self.time(_waves(step, self.config.dim))
+        condition = self.text(text) * told[:, None] + self.time(
+            _waves(step, self.config.dim).to(self.text.weight.dtype)
+        )
         frames = self.enter(noisy)
         x = torch.cat([condition[:, None].to(frames.dtype), frames], dim=1)
         x = x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype)

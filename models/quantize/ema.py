@@ -148,9 +148,7 @@ class EmaQuantizer(nn.Module):
         self._is_initialised = True
 
     @torch.no_grad()
-    def _update(
-        self, rows: Tensor, mask: Tensor, codes: Tensor, counts: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _update(self, rows: Tensor, mask: Tensor, codes: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
         """EMA step and Code Reset from the global batch; returns its counts [K] and the number of resets."""
         sums = cluster_sums(rows, codes, self.config.num_codes)  # padded rows are zero
         fresh = self._draw(rows, mask)

@@ -65,7 +65,7 @@ class MotionDecoder(nn.Module):
 
     def forward(self, z: Tensor, mask: Tensor) -> Tensor:
         """z [B, Z], mask bool [B, L] -> [B, L, D], zero where masked."""
-        head = self.latent(z)[:, None]
+        head = self.latent(z.to(self.latent.weight.dtype))[:, None]
         frames = sinusoid(mask.shape[1], head.shape[2], z.device).to(head.dtype).expand(len(z), -1, -1)
         visible = torch.cat([mask.new_ones(len(mask), 1), mask], dim=1)
         x = self.stack(torch.cat([head, frames], dim=1), visible)[:, 1:]

@@ -30,6 +30,8 @@ class ShardsStageConfig(Reading, StageConfig):
     """Folder with `manifest.json`, or a URL (`s3://`, `https://`, `http://`)."""
     mix: list[DataPart] = Field(default_factory=list)
     """Several data sets and their weights, in place of `path`."""
+    layout: str | None = None
+    """Refuse shards of another layout. Dry runs go by it while the shards are not there yet."""
     verify: bool = True
     """Check folders from end to end, when the stage runs. Shards on a server are checked as they arrive."""
     # These two change no result, so a finished run is not thrown away for them.
@@ -52,7 +54,9 @@ class ShardsStageConfig(Reading, StageConfig):
         return [part.model_copy(update={"path": _place(part.path)}) for part in parts]
 
     def found_layout(self) -> MotionLayout:
-        """Layout of the shards as they are."""
+        """Layout of the shards as they are, or, while there are none, as they are meant to be."""
+        if self.layout is not None:
+            return MotionLayout.named(self.layout)
         return manifest_layout(read_manifest(open_store(self.parts()[0].path, self.cache))[0])
 
 
@@ -72,6 +76,11 @@ def run_shards(context: StageContext) -> None:
     for part in config.parts():
         manifest, _ = read_manifest(open_store(part.path, config.cache))
         layouts.append((part.path, manifest_layout(manifest)))
+        if config.layout is not None and manifest.layout != config.layout:
+            raise UserError(
+                f"{part.path}: layout {manifest.layout}, but stage {context.name} wants {config.layout}; "
+                f"convert to that layout, or leave `layout` out"
+            )
         if config.verify and not is_url(part.path):
             problems = check(Path(part.path))
             if problems:

@@ -53,7 +53,7 @@ def test_moments_merge_in_any_grouping(sizes: list[int], seed: int, offset: floa
     for part in reversed(parts):
         right = Moments.of(part).merge(right)
     rows = np.concatenate([*parts, np.zeros((0, 3))])
-    assert left.count == right.count == len(rows)
+    assert (left.count == len(rows)).all() and (right.count == len(rows)).all()
     if len(rows):
         for moments in (left, right):
             np.testing.assert_allclose(moments.mean, rows.mean(axis=0), rtol=1e-10)

@@ -4,7 +4,7 @@ Two gloo processes with half of each batch each, under DDP as the pipeline sets 
 with the whole batch: the loss of every step, the last gradients and the weights and codebooks agree to 1e-5.
 Ranks hold different numbers of real frames and tokens.
 
-The networks are float64. In float32 the order of a sum changes the last bit, and AdamW divides a gradient by
+The networks that learn are float64. In float32 the order of a sum changes the last bit, and AdamW divides a gradient by
 its own size: where the true gradient is zero (the bias of attention keys, which a softmax cancels) it turns
 that bit into a step of the learning rate. Codebooks, losses and code assignment stay float32, as in training.
 Nothing is drawn: there is no dropout, and the networks that sample latents or codes run in evaluation mode.
@@ -87,12 +87,12 @@ def gpt() -> tuple[StageModule, Batches]:
     book = build_tokenizer(H2VQConfig(width=8, depth=1, code_dim=8, num_codes=9), LAYOUT)
     for quantizer in book.codebooks().values():
         quantizer.codebook.normal_()  # spread out, so that the alignment has something to gain
-    aligned = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), LAYOUT.dim, TEXT).double()
+    aligned = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), LAYOUT.dim, TEXT)
     config = GptConfig(layers=2, dim=16, heads=2, ff=32, block_size=20)
     net = InterleavedGPT(config, book.streams, book.pattern, text_dim=16)
     module = GptModule(
         net, OPTIM, seed=0, max_steps=STEPS, loss=GptLossConfig(align_weight=1.0),
-        tokenizer=book.double(), tma=aligned,
+        tokenizer=book, tma=aligned,
     )  # fmt: skip
 
     def batch(step: int) -> dict[str, Tensor]:
@@ -132,8 +132,10 @@ class Undrawn(DiffusionModule):
             torch.randint = lambda low, high, size, **_: part(  # type: ignore[assignment]
                 randint(low, high, (whole,), generator=generator)
             )
-            torch.randn_like = lambda x: part(  # type: ignore[assignment]
-                torch.randn(whole, *x.shape[1:], generator=generator, dtype=x.dtype)
+            torch.randn_like = (
+                lambda x: part(  # type: ignore[assignment]
+                    torch.randn(whole, *x.shape[1:], generator=generator, dtype=x.dtype)
+                )
             )
             return super().losses(batch)
         finally:

@@ -19,9 +19,10 @@ Call = Callable[..., Any]
 
 def commands(group: Any, *path: str) -> list[tuple[str, ...]]:
     """Every command of the program as its words."""
-    if not hasattr(group, "commands"):
+    if not hasattr(group, "list_commands"):
         return [path]
-    return [found for name, child in group.commands.items() for found in commands(child, *path, name)]
+    names = group.list_commands(None)
+    return [found for name in names for found in commands(group.get_command(None, name), *path, name)]
 
 
 COMMANDS = commands(typer.main.get_command(app))
@@ -40,7 +41,13 @@ def test_the_commands_are_these() -> None:
         "report",
         "export",
         "data synth",
+        "data convert humanml3d",
+        "data convert motionx",
+        "data convert aistpp",
+        "data convert amass",
         "data convert bvh",
+        "data report",
+        "retrieval",
         "data check",
         "data stats",
     }
@@ -112,7 +119,7 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "check nothing": (["data", "check", "nowhere"], "nowhere: no such folder"),
     "stats of nothing": (["data", "stats", "nowhere"], "nowhere/manifest.json: no such file"),
     "convert nothing": (
-        ["data", "convert", "bvh", "nowhere", "out", "--joint-map", "map.json"],
+        ["data", "convert", "bvh", "nowhere", "out", "--joint-map", "map.json", "--licence", "CC0"],
         "map.json: cannot read the joint map",
     ),
     "synth of a wrong layout": (["data", "synth", "out", "--layout", "body13"], "layout"),
