@@ -53,7 +53,7 @@ def sum_over_ranks(x: Tensor) -> Tensor:
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean of `values` where `mask` is True, as this rank's share: the mean over ranks is that of all elements.
+    """Mean of `values` where `mask` is True; over several ranks a share, whose mean over ranks is that mean.
 
     Ranks hold different numbers of real frames or tokens, so each divides by the mean number per rank, not by
     its own. 0 where there are none.

@@ -140,8 +140,10 @@ def gather(root: Path, *, progress: bool = False) -> tuple[DataFacts, dict[str, 
                 candidates.append((split, clip))
                 described.append(_describe(motion, layout))
                 if split == measured_split:
-                    moments = moments.merge(Moments.of(motion))
-                    low, high = np.minimum(low, motion.min(axis=0)), np.maximum(high, motion.max(axis=0))
+                    held = layout.held_columns[dataset.held[clip]]
+                    moments = moments.merge(Moments.of(motion, held))
+                    low[held] = np.minimum(low, motion.min(axis=0))[held]
+                    high[held] = np.maximum(high, motion.max(axis=0))[held]
                 bar.advance(task)
         task = bar.add_task("outliers", total=len(chosen[measured_split]))
         outliers = _outliers(opened[measured_split], chosen[measured_split], moments, bar, task)
@@ -157,8 +159,8 @@ def gather(root: Path, *, progress: bool = False) -> tuple[DataFacts, dict[str, 
         measured_split=measured_split,
         measured=len(chosen[measured_split]),
         moments=moments,
-        low=low.astype(np.float32),
-        high=high.astype(np.float32),
+        low=np.where(moments.count > 0, low, 0.0).astype(np.float32),
+        high=np.where(moments.count > 0, high, 0.0).astype(np.float32),
         outliers=outliers,
         candidates=candidates,
         described=np.asarray(described, dtype=np.float32),
@@ -279,6 +281,7 @@ def _outliers(
     for clip in clips:
         motion = dataset.motion(clip)
         away = np.abs(motion - moments.mean) / std
+        away[:, ~dataset.layout.held_columns[dataset.held[clip]]] = 0.0
         frame, column = np.unravel_index(int(away.argmax()), away.shape)
         most = float(away[frame, column])
         found = Outlier(most, clip, int(frame), int(column), float(motion[frame, column]))

@@ -210,7 +210,7 @@ def _features(page: Page, facts: DataFacts, opened: dict[str, ShardDataset]) -> 
     layout, mean, std = facts.layout, facts.moments.mean, facts.moments.std
     page.add_heading("Features")
     page.add_text(
-        f"Of {facts.moments.count:,} frames of {facts.measured:,} clips of the {facts.measured_split} split, "
+        f"Of {int(facts.moments.count.max()):,} frames of {facts.measured:,} clips of the {facts.measured_split} split, "
         f"in the units of the layout: metres, radians, per frame where they are velocities. "
         f"{_JOINTS[layout.num_joints]}"
     )

@@ -56,7 +56,7 @@ class ClusterConfig(Config):
     time_minutes: int = Field(default=120, ge=1)
     """Time limit of a task."""
     memory_gb: float = Field(default=4.0, gt=0)
-    """Memory of a task; about 1 GB a process is needed."""
+    """Memory of a task; a process needs about half a GB (BVH; longer clips need more)."""
     account: str | None = None
     """Account to charge."""
     qos: str | None = None

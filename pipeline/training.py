@@ -41,7 +41,7 @@ class TrainConfig(Config):
     batch_size: int = Field(256, ge=1)
     """Global batch, over all processes and accumulated parts."""
     accumulate: int = Field(1, ge=1)
-    """Parts the batch of a step is cut into, so that less memory is needed; the gradient is the mean of theirs.
+    """Parts the batch of a step is cut into, to need less memory; the gradient is the mean of theirs.
 
     Equal to the whole batch where a loss is a mean over samples and the parts hold equally many real frames
     or tokens. Two things cannot be: a contrastive loss sees the negatives of its own part only, and a learnt

@@ -10,6 +10,7 @@ from torch import Tensor
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.distributed import masked_mean
 from motionloom.models.layers.transformer import length_mask
+from motionloom.models.masks import held_values
 from motionloom.models.stage_module import OptimConfig, StageModule
 
 
@@ -23,7 +24,7 @@ class DiffusionModule(StageModule):
         self.noiser = net.config.schedule.noiser()
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Loss of {"motion" [B, T, D], "length" [B], "sentence" [B, E]}.
+        """Loss of {"motion" [B, T, D], "length" [B], "sentence" [B, E], "held" bool [B, D] (optional: all)}.
 
         Time steps and noise are drawn anew each call; evaluation tells every caption.
         """
@@ -38,4 +39,4 @@ class DiffusionModule(StageModule):
         found = self.net(noisy, step, text, mask, told)
         target = motion if schedule.predicts == "sample" else noise
         error = (found - target.float()).square()
-        return {"loss": masked_mean(error, mask)}
+        return {"loss": masked_mean(error, held_values(mask, batch.get("held")))}

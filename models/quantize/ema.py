@@ -141,8 +141,10 @@ class EmaQuantizer(nn.Module):
     @torch.no_grad()
     def _initialise(self, rows: Tensor, mask: Tensor) -> None:
         drawn = sum_over_ranks(self._draw(rows, mask))
-        self.codebook.copy_(drawn)
-        self.ema_sum.copy_(drawn * self.config.reset_below)
+        # Of a batch without vectors nothing is drawn; Code Reset then replaces the random codes one by one.
+        some = sum_over_ranks(mask.any().float()) > 0
+        self.codebook.copy_(torch.where(some, drawn, self.codebook))
+        self.ema_sum.copy_(self.codebook * self.config.reset_below)
         self.ema_count.fill_(self.config.reset_below)
         self.initialised.fill_(True)
         self._is_initialised = True
@@ -157,9 +159,11 @@ class EmaQuantizer(nn.Module):
             dim = self.config.dim
             sums, fresh, counts = packed[:, :dim], packed[:, dim:-1], packed[:, -1]
         floor = self.config.reset_below
+        # A batch without vectors (no clip of it has hands) teaches nothing: everything stays as it is.
+        rate = torch.where(counts.sum() > 0, 1 - self.config.decay, 0.0)
         # lerp: decay * floor + (1 - decay) * floor may round below the floor and reset a code in steady use
-        self.ema_count.lerp_(counts, 1 - self.config.decay)
-        self.ema_sum.lerp_(sums, 1 - self.config.decay)
+        self.ema_count.lerp_(counts, rate)
+        self.ema_sum.lerp_(sums, rate)
         reset = self.ema_count < floor
         self.ema_count.masked_fill_(reset, floor)
         self.ema_sum.copy_(torch.where(reset[:, None], fresh * floor, self.ema_sum))

@@ -1,6 +1,7 @@
 """The terms of TMA's loss as functions of tensors (HumanTOMATO appendix D.1, B.5.1).
 
-L = L_rec + 1e-5 KL + 1e-5 L_E + 0.1 L_NCE. Every function returns a scalar float32.
+L = L_rec + 1e-5 KL + 1e-5 L_E + 0.1 L_NCE. Every function computes and returns float32, under
+autocast and of half inputs too.
 
 Distributed: each function returns a value whose *mean over ranks* is the loss of the concatenated batch, so
 DDP's gradient averaging reproduces one process with the whole batch. Rows per rank must be equal; numbers of
@@ -17,13 +18,14 @@ from motionloom.models.distributed import gather_rows, gather_rows_with_grad, ma
 
 
 def reconstruction_loss(pred: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """SmoothL1 over the real frames: pred and target [B, T, D], mask bool [B, T]."""
+    """SmoothL1 where `mask` is true: pred and target [B, T, D], mask bool [B, T] or [B, T, D]."""
     error = F.smooth_l1_loss(pred.float(), target.float(), reduction="none")
     return masked_mean(error, mask)
 
 
 def kl_divergence(mu_q: Tensor, logvar_q: Tensor, mu_p: Tensor, logvar_p: Tensor) -> Tensor:
     """KL(q || p) of diagonal Gaussians [B, Z], mean over batch *and* dimensions (TMR's reduction)."""
+    mu_q, logvar_q, mu_p, logvar_p = (x.float() for x in (mu_q, logvar_q, mu_p, logvar_p))
     ratio = logvar_q - logvar_p
     terms = ratio.exp() + (mu_q - mu_p).square() * (-logvar_p).exp() - 1 - ratio
     return 0.5 * terms.mean()
@@ -39,7 +41,7 @@ def kl_four(text: tuple[Tensor, Tensor], motion: tuple[Tensor, Tensor]) -> Tenso
 
 def latent_loss(text: Tensor, motion: Tensor) -> Tensor:
     """L_E: SmoothL1 between the two latents [B, Z]."""
-    return F.smooth_l1_loss(text, motion)
+    return F.smooth_l1_loss(text.float(), motion.float())
 
 
 def false_negatives(sentence: Tensor, threshold: float) -> Tensor:

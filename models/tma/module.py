@@ -10,6 +10,7 @@ from torch import Tensor
 
 from motionloom.datasets.schema import Config
 from motionloom.models.layers.transformer import length_mask
+from motionloom.models.masks import held_values
 from motionloom.models.stage_module import OptimConfig, StageModule
 from motionloom.models.tma.losses import info_nce, kl_four, latent_loss, reconstruction_loss
 from motionloom.models.tma.network import Tma
@@ -46,8 +47,9 @@ class TmaModule(StageModule):
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D], "length" [B], "text_tokens" [B, S, E], "text_mask",
-        "sentence" [B, E].
+        "sentence" [B, E], "held" bool [B, D] (optional: all).
 
+        Columns of a part that a clip does not hold are 0, the mean, for the encoder and not reconstructed.
         Latents are sampled in training and are the means in evaluation. InfoNCE contrasts the means, as the
         published HumanTOMATO code does (TMR contrasts samples): retrieval uses the means too.
         """
@@ -57,7 +59,7 @@ class TmaModule(StageModule):
         moved = net.encode_motion(motion, length)
         z_text, z_motion = self._latent(*text), self._latent(*moved)
         target, frames = net.strided(motion, length)
-        mask = length_mask(frames, target.shape[1])
+        mask = held_values(length_mask(frames, target.shape[1]), batch.get("held"))
         size = motion.shape[1]
         rec_text = reconstruction_loss(net.decode(z_text, length, size), target, mask)
         rec_motion = reconstruction_loss(net.decode(z_motion, length, size), target, mask)

@@ -3,6 +3,9 @@
 A tokenizer consumes exactly the layout columns it models, already normalised; `select` picks them out of full
 frames. Four frames are one group: `length` is rounded up to whole groups, so the last group of a clip may
 hold padded (zero) frames, and a padded batch gives what each clip gives alone.
+
+Columns that a clip does not hold (`held` bool [B, dim]; hands, face) are read as 0, the mean. A stream of
+tokens that belongs to such a part alone does not learn from the clip, and its vectors are 0 in the decoder.
 """
 
 from __future__ import annotations
@@ -104,32 +107,54 @@ class Tokenizer(nn.Module, ABC):
         """The quantizer of each stream."""
 
     @abstractmethod
-    def _quantize(self, x: Tensor, valid: Tensor | None, *, update: bool) -> Latents:
-        """Encode and quantize x [B, T, dim]; `valid` [B] counts frames in whole groups."""
+    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
+        """Encode and quantize x [B, T, dim]; `valid` [B] counts frames in whole groups.
+
+        `lost`, bool [B] per stream, is true of clips that do not hold the stream's part (`_lost`).
+        """
 
     @abstractmethod
     def _join(self, vectors: dict[str, Tensor]) -> Tensor:
         """Code vectors per stream [B, T / 4 * per_group, d] -> the decoder's input."""
 
-    def forward(self, x: Tensor, length: Tensor | None = None) -> TokenizerOutput:
-        """Reconstruct x [B, T, dim]; `length` [B] = valid frames. Updates the codebooks in training mode."""
+    def _lost(self, held: Tensor | None) -> dict[str, Tensor]:
+        """Bool [B] for each stream that belongs to a part which clips may lack: true where it is lacking."""
+        return {}
+
+    def forward(self, x: Tensor, length: Tensor | None = None, held: Tensor | None = None) -> TokenizerOutput:
+        """Reconstruct x [B, T, dim]; `length` [B] = valid frames. Updates the codebooks in training mode.
+
+        `held` [B, dim]: false where a clip does not hold a column; None = all are held.
+        """
         valid = self._valid(x, length)
-        latents = self._quantize(x, valid, update=True)
+        latents = self._quantize(_cleared(x, held), valid, self._lost(held), update=True)
         recon = self.decoder(latents.joined, valid)
         return TokenizerOutput(recon, latents.penalty, latents.codes, latents.metrics)
 
     @torch.no_grad()
-    def encode(self, x: Tensor, length: Tensor | None = None) -> dict[str, Tensor]:
+    def encode(
+        self, x: Tensor, length: Tensor | None = None, held: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """Tokens of x [B, T, dim], per stream int64 [B, T / 4 * per_group]. Never updates a codebook.
 
-        Of a clip of `length` frames the first ceil(length / 4) * per_group tokens mean something.
+        Of a clip of `length` frames the first ceil(length / 4) * per_group tokens mean something; all are
+        valid codes, also those of a part that the clip does not hold.
         """
-        return self._quantize(x, self._valid(x, length), update=False).codes
+        return self._quantize(_cleared(x, held), self._valid(x, length), self._lost(held), update=False).codes
 
-    def decode(self, codes: dict[str, Tensor], length: Tensor | None = None) -> Tensor:
-        """Motion [B, T, dim] of tokens; `length` [B] in frames where clips of a batch differ."""
+    def decode(
+        self, codes: dict[str, Tensor], length: Tensor | None = None, held: Tensor | None = None
+    ) -> Tensor:
+        """Motion [B, T, dim] of tokens; `length` [B] in frames where clips of a batch differ.
+
+        With the `held` that `encode` was given, the body comes out as in training, which knows of no hands
+        there; the columns that are not held mean nothing.
+        """
         books = self.codebooks()
-        return self._decode({s.name: books[s.name].vectors(codes[s.name]) for s in self.streams}, length)
+        vectors = {s.name: books[s.name].vectors(codes[s.name]) for s in self.streams}
+        for name, lost in self._lost(held).items():
+            vectors[name] = without(vectors[name], lost)
+        return self._decode(vectors, length)
 
     def decode_soft(self, weights: dict[str, Tensor], length: Tensor | None = None) -> Tensor:
         """`decode` for weights over the codes [B, L, K], differentiable in them; one-hot gives `decode`."""
@@ -172,11 +197,25 @@ def _whole_groups(length: Tensor | None) -> Tensor | None:
     return (length + GROUP_FRAMES - 1) // GROUP_FRAMES * GROUP_FRAMES
 
 
-def token_mask(valid: Tensor | None, tokens: int, stride: int) -> Tensor | None:
-    """True where a token is real, [B, tokens]; `valid` [B] in frames, one token per `stride` frames."""
+def _cleared(x: Tensor, held: Tensor | None) -> Tensor:
+    """Zero in the columns that are not held."""
+    return x if held is None else x.masked_fill(~held[:, None], 0.0)
+
+
+def without(vectors: Tensor, lost: Tensor | None) -> Tensor:
+    """Vectors [B, L, d], zero for the clips that lack their part (`lost` bool [B])."""
+    return vectors if lost is None else vectors.masked_fill(lost[:, None, None], 0.0)
+
+
+def token_mask(valid: Tensor | None, tokens: int, stride: int, lost: Tensor | None = None) -> Tensor | None:
+    """True where a token is real, [B, tokens]; `valid` [B] in frames, one token per `stride` frames.
+
+    No token is real of a clip that lacks the stream's part (`lost` bool [B]).
+    """
     if valid is None:
-        return None
-    return torch.arange(tokens, device=valid.device) * stride < valid[:, None]
+        return None if lost is None else (~lost)[:, None].expand(-1, tokens)
+    real = torch.arange(tokens, device=valid.device) * stride < valid[:, None]
+    return real if lost is None else real & ~lost[:, None]
 
 
 def stream_metrics(metrics: dict[str, Tensor], stream: str) -> dict[str, Tensor]:

@@ -4,6 +4,8 @@ Hands are quantized first, at a quarter of the frame rate; the body at half of i
 z_hat_B = Q_B(Conv1d(Concat(Transform(z_hat_H), z_B))). The paper leaves open: Transform = nearest x2
 up-sampling and a linear projection; the fusing Conv1d has kernel 3; the decoder reads both latents at the
 body rate and doubles it once.
+
+A clip without hands gives the hand codebook nothing to learn; its hand latents are 0 wherever they are read.
 """
 
 from __future__ import annotations
@@ -17,7 +19,14 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
 from motionloom.models.quantize.base import Codebook
 from motionloom.models.quantize.ema import EmaQuantizer
-from motionloom.models.tokenizer.base import Latents, Stream, Tokenizer, stream_metrics, token_mask
+from motionloom.models.tokenizer.base import (
+    Latents,
+    Stream,
+    Tokenizer,
+    stream_metrics,
+    token_mask,
+    without,
+)
 from motionloom.models.tokenizer.config import H2VQConfig
 
 
@@ -58,11 +67,16 @@ class H2VQ(Tokenizer):
         """The quantizer of each stream."""
         return {"body": self.body_quantizer, "hand": self.hand_quantizer}
 
-    def _quantize(self, x: Tensor, valid: Tensor | None, *, update: bool) -> Latents:
+    def _lost(self, held: Tensor | None) -> dict[str, Tensor]:
+        return {} if held is None else {"hand": ~held[:, self.hand_columns].all(1)}
+
+    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
+        no_hands = lost.get("hand")
         z_hand = self.hand_encoder(x[..., self.hand_columns], valid)
-        hand = self.hand_quantizer(z_hand, token_mask(valid, z_hand.shape[1], 4), update=update)
+        hand = self.hand_quantizer(z_hand, token_mask(valid, z_hand.shape[1], 4, no_hands), update=update)
+        hand_vectors = without(hand.quantized, no_hands)
         z_body = self.body_encoder(x[..., self.body_columns], valid)
-        hint = self.transform(hand.quantized).repeat_interleave(2, dim=1)
+        hint = self.transform(hand_vectors).repeat_interleave(2, dim=1)
         mask = token_mask(valid, z_body.shape[1], 2)
         both = torch.cat([hint, z_body], dim=-1)
         if mask is not None:
@@ -70,7 +84,7 @@ class H2VQ(Tokenizer):
         fused = self.fuse(both.transpose(1, 2)).transpose(1, 2)
         body = self.body_quantizer(fused, mask, update=update)
         return Latents(
-            self._join({"body": body.quantized, "hand": hand.quantized}),
+            self._join({"body": body.quantized, "hand": hand_vectors}),
             body.penalty + hand.penalty,
             {"body": body.codes, "hand": hand.codes},
             stream_metrics(body.metrics, "body") | stream_metrics(hand.metrics, "hand"),

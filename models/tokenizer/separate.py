@@ -15,7 +15,14 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
 from motionloom.models.quantize.base import Codebook
 from motionloom.models.quantize.ema import EmaQuantizer
-from motionloom.models.tokenizer.base import Latents, Stream, Tokenizer, stream_metrics, token_mask
+from motionloom.models.tokenizer.base import (
+    Latents,
+    Stream,
+    Tokenizer,
+    stream_metrics,
+    token_mask,
+    without,
+)
 from motionloom.models.tokenizer.config import SeparateConfig
 
 _HALVINGS = {"body": 1, "hand": 2}
@@ -23,6 +30,8 @@ _HALVINGS = {"body": 1, "hand": 2}
 
 class SeparateVQ(Tokenizer):
     """Streams "body" and "hand" that share nothing."""
+
+    hand_columns: Tensor
 
     def __init__(self, config: SeparateConfig, layout: MotionLayout) -> None:
         if not layout.has_part("hand"):
@@ -64,15 +73,19 @@ class SeparateVQ(Tokenizer):
         assert isinstance(book, EmaQuantizer)
         return book
 
-    def _quantize(self, x: Tensor, valid: Tensor | None, *, update: bool) -> Latents:
+    def _lost(self, held: Tensor | None) -> dict[str, Tensor]:
+        return {} if held is None else {"hand": ~held[:, self.hand_columns].all(1)}
+
+    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
         vectors: dict[str, Tensor] = {}
         codes: dict[str, Tensor] = {}
         metrics: dict[str, Tensor] = {}
         penalty = x.new_zeros((), dtype=torch.float32)
         for name, halvings in _HALVINGS.items():
             z = self.encoders[name](x[..., getattr(self, f"{name}_columns")], valid)
-            out = self._book(name)(z, token_mask(valid, z.shape[1], 2**halvings), update=update)
-            vectors[name], codes[name] = out.quantized, out.codes
+            missing = lost.get(name)
+            out = self._book(name)(z, token_mask(valid, z.shape[1], 2**halvings, missing), update=update)
+            vectors[name], codes[name] = without(out.quantized, missing), out.codes
             metrics |= stream_metrics(out.metrics, name)
             penalty = penalty + out.penalty
         return Latents(self._join(vectors), penalty, codes, metrics)

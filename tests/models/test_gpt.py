@@ -84,6 +84,19 @@ def test_batch_of_mixed_lengths_equals_one_at_a_time(gpt: InterleavedGPT) -> Non
 
 
 @torch.no_grad()
+def test_cached_batch_of_mixed_lengths_equals_each_alone_uncached(gpt: InterleavedGPT) -> None:
+    seq, text = sequences([1, 5, 3]), torch.randn(3, 6)
+    x = torch.cat([gpt.embed_text(text), gpt.embed(seq.tokens[:, :-1], seq.kinds[:, :-1])], dim=1)
+    cache = gpt.stack.cache(x.shape[1])
+    hidden = torch.cat([gpt.hidden(piece, cache) for piece in x.split(1, dim=1)], dim=1)
+    cached = gpt.logits(hidden, seq.kinds, gpt.legal(seq.tokens, seq.kinds))
+    for row in range(3):
+        n = int(seq.length[row])
+        alone = gpt(seq.tokens[row : row + 1, :n], seq.kinds[row : row + 1, :n], text[row : row + 1])
+        torch.testing.assert_close(cached[row, :n], alone[0], rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
 def test_causal_and_conditional(gpt: InterleavedGPT) -> None:
     seq, text = sequences([4]), torch.randn(1, 6)
     full = gpt(seq.tokens, seq.kinds, text)

@@ -75,9 +75,12 @@ def test_free_lengths_keep_the_grammar(gpt: InterleavedGPT) -> None:
 
 
 def test_requested_lengths_are_kept(gpt: InterleavedGPT) -> None:
-    groups = torch.tensor([1, 9, 4, 9, 2])
-    out = generate(gpt, torch.randn(5, 6), groups=groups, seed=1)
+    groups, text, seeds = torch.tensor([1, 9, 4, 9, 2]), torch.randn(5, 6), sample_seeds(1, 5)
+    out = generate(gpt, text, groups=groups, seed=1)
     assert torch.equal(out.groups, groups)
+    for row in range(5):
+        mine = slice(row, row + 1)
+        assert rows_equal(generate(gpt, text[mine], groups=groups[mine], seed=seeds[mine]), 0, out, row)
     for wrong in ([0, 1, 1, 1, 1], [1, 1, 1, 1, 10]):
         with pytest.raises(UserError, match="1 to 9 groups"):
             generate(gpt, torch.randn(5, 6), groups=torch.tensor(wrong))

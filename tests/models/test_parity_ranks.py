@@ -4,9 +4,10 @@ Two gloo processes with half of each batch each, under DDP as the pipeline sets 
 with the whole batch: the loss of every step, the last gradients and the weights and codebooks agree to 1e-5.
 Ranks hold different numbers of real frames and tokens.
 
-The networks that learn are float64. In float32 the order of a sum changes the last bit, and AdamW divides a gradient by
-its own size: where the true gradient is zero (the bias of attention keys, which a softmax cancels) it turns
-that bit into a step of the learning rate. Codebooks, losses and code assignment stay float32, as in training.
+The networks that learn are float64. In float32 the order of a sum changes the last bit, and AdamW divides a
+gradient by its own size: where the true gradient is zero (the bias of attention keys, which a softmax
+cancels) it turns that bit into a step of the learning rate. Codebooks, losses and code assignment stay
+float32, as in training.
 Nothing is drawn: there is no dropout, and the networks that sample latents or codes run in evaluation mode.
 
 The processes run this file as a script.

@@ -1,4 +1,4 @@
-"""FSDP for the GPT: two gloo processes that share the weights train what two that each hold all of them train.
+"""FSDP for the GPT: two gloo processes that share the weights train what two with all of them train.
 
 Both go through `fit`, with everything on that can differ: dropout, dropped text, alignment with Gumbel draws,
 clipping of the gradient, validation, checkpoints. The processes run this file as a script.
