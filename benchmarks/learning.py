@@ -92,7 +92,7 @@ def similarities(run: Path) -> list[tuple[str, str, float, float]]:
 def generation(
     run: Path, truths: list[Truth], hold_out: list[dict[str, Any]], repeats: int
 ) -> dict[str, Any]:
-    """Share of right attributes of generated motions: of held-out combinations, and of the other test clips."""
+    """Share of right attributes of generated motions, of held-out combinations and of other test clips."""
     bundle = Bundle.open(run)
     rows: dict[str, dict[str, list[bool]]] = {"held out": defaultdict(list), "other": defaultdict(list)}
     for repeat in range(repeats):

@@ -109,17 +109,25 @@ def _parameter(name: str, annotation: Any, default: Any = inspect.Parameter.empt
 
 def _option(key: str, field: FieldInfo) -> inspect.Parameter:
     """A command line option for one field: its type, default and docstring."""
-    kind = _simple(field.annotation)
-    info = typer.Option(f"--{key.replace('_', '-')}", help=" ".join((field.description or "").split()))
-    if kind is bool:
-        flag = f"--{key.replace('_', '-')}/--no-{key.replace('_', '-')}"
-        info = typer.Option(flag, help=" ".join((field.description or "").split()))
+    kind, name = _simple(field.annotation), key.replace("_", "-")
+    text = " ".join((field.description or "").split())
+    choices = _choices(field.annotation)
+    if choices:
+        text = f"{text} One of: {', '.join(choices)}."
+    info = typer.Option(f"--{name}/--no-{name}" if kind is bool else f"--{name}", help=text)
     if field.is_required():
         return _parameter(key, Annotated[kind, info])
     default = field.get_default(call_default_factory=True)
     if typing.get_origin(kind) is list:
         kind, default = kind | None, list(default) or None
     return _parameter(key, Annotated[kind, info], default)
+
+
+def _choices(annotation: Any) -> list[str]:
+    """The words of a field that takes one of several."""
+    if typing.get_origin(annotation) is Literal:
+        return [str(value) for value in typing.get_args(annotation)]
+    return [word for part in typing.get_args(annotation) for word in _choices(part)]
 
 
 def _simple(annotation: Any) -> Any:

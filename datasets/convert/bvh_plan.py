@@ -31,7 +31,7 @@ class BvhConfig(ConvertConfig):
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""
     joint_map: Path
-    """JSON file that says which joints of the files stand for ours (docs/data.md)."""
+    """JSON file that says which joints of the files stand for ours (docs/sources.md)."""
     captions: Path | None = None
     """JSON lines: id, file, captions, split. Without it clips have no captions."""
     splits: Path | None = None

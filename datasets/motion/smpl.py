@@ -41,7 +41,7 @@ _MODEL_BYTES = 2**29
 _PICKLE = (
     "is a pickle, which can run code and is never opened here; where chumpy and scipy are installed, save "
     "the model once with numpy.savez(J_regressor=..., v_template=..., shapedirs=..., kintree_table=...) as "
-    "plain arrays (docs/data.md has the lines)"
+    "plain arrays (docs/sources.md has the lines)"
 )
 
 
