@@ -12,6 +12,7 @@ from torch import Tensor
 
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.schema import HANDS, HELD_ALL
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.datasets.synth.measure import agrees
@@ -61,7 +62,7 @@ def reconstruction_figures(
     """Errors in millimetres of the tokenizer, of the mean pose and of the nearest training clip.
 
     `mpjpe_*` compares poses (root and heading aligned), `global_*` compares positions in the world, the path
-    included.
+    included. Of a clip without hands the body's joints alone count, and nothing in `mpjpe_hand`.
     """
     layout = truths_layout(tokenizer)
     body = stats.mean[tokenizer.layout.part("bodyhand")].astype(np.float32)
@@ -69,24 +70,29 @@ def reconstruction_figures(
     rows: dict[str, list[float]] = {}
     for truth in truths:
         real = local_joints(truth.features, layout)
-        found = reconstruct(tokenizer, stats, truth.features)
+        found = reconstruct(tokenizer, stats, truth.features, truth.held)
         constant = np.broadcast_to(body, truth.features.shape)
-        other = nearest.features(truth.features)
+        other = nearest.features(truth.features, truth.held)
+        joints = slice(None) if truth.held & HANDS else slice(BODY_JOINTS)
         frames = len(truth.features)
-        rebuilt, target = torch.from_numpy(decode(found, layout)), torch.from_numpy(truth.joints)
+        rebuilt, target = _joints(found, layout, joints), torch.from_numpy(truth.joints)[:, joints]
         values = {"pa_mpjpe": pa_mpjpe(rebuilt, target)}
         if frames > 2:
             values["accel"] = accel(rebuilt, target)
         for suffix, features in (("", found), ("_mean_pose", constant), ("_nearest_train_clip", other)):
-            pose, place = (
-                torch.from_numpy(local_joints(features, layout)),
-                torch.from_numpy(decode(features, layout)),
-            )
-            values |= {f"{k}{suffix}": v for k, v in pose_errors(pose, torch.from_numpy(real)).items()}
+            pose, place = torch.from_numpy(local_joints(features, layout)), _joints(features, layout, joints)
+            errors = pose_errors(pose[:, joints], torch.from_numpy(real)[:, joints])
+            if layout.num_joints > BODY_JOINTS:
+                errors.setdefault("mpjpe_body", errors["mpjpe"])
+            values |= {f"{k}{suffix}": v for k, v in errors.items()}
             values[f"global_mpjpe{suffix}"] = mpjpe(place, target, root=None)
         for name, value in values.items():
             rows.setdefault(name, []).append(float(value.mean()))
     return {name: float(np.mean(values)) for name, values in rows.items()}
+
+
+def _joints(features: NDArray[np.float32], layout: MotionLayout, chosen: slice) -> Tensor:
+    return torch.from_numpy(decode(features, layout))[:, chosen]
 
 
 def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
@@ -111,23 +117,35 @@ def truths_layout(tokenizer: Tokenizer) -> MotionLayout:
 
 
 class NearestClip:
-    """The training clip whose poses, stretched to the same length, come nearest."""
+    """The training clip whose poses, stretched to the same length, come nearest.
+
+    Hands are compared where both clips have them. A motion with hands finds none without, if there are any.
+    """
 
     def __init__(self, train: ClipDataset) -> None:
         self.train = train
         self.columns = train.layout.part("bodyhand")
         layout = joint_layout(train.layout)
         self.positions = layout.slice("positions")
+        self.body = np.arange(3 * (layout.num_joints - 1)) < 3 * (BODY_JOINTS - 1)
         keys = [self._key(np.asarray(train.motion(i))[:, self.columns]) for i in range(len(train))]
         self.keys = np.stack(keys)
-        self.norms = np.square(self.keys).sum(1)
+        self.without_hands = (train.held & HANDS) == 0
 
     def _key(self, features: NDArray[np.float32]) -> NDArray[np.float64]:
-        return stretch(features[:, self.positions], KEY_FRAMES).ravel()
+        """Positions [KEY_FRAMES, 3 (N - 1)]."""
+        return stretch(features[:, self.positions], KEY_FRAMES)
 
-    def features(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Features [T, D] of that clip, stretched to T frames (velocities scaled with time)."""
-        distance = self.norms - 2 * self.keys @ self._key(features)
+    def features(self, features: NDArray[np.float32], held: int = HELD_ALL) -> NDArray[np.float32]:
+        """Features [T, D] of that clip, stretched to T frames (velocities scaled with time).
+
+        `held` says what `features` hold.
+        """
+        hands = bool(held & HANDS) and not self.without_hands.all()
+        chosen = slice(None) if hands else self.body
+        distance = np.square(self.keys[:, :, chosen] - self._key(features)[:, chosen]).sum((1, 2))
+        if hands:
+            distance[self.without_hands] = np.inf
         found = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
         out = stretch(found, len(features))
         layout = joint_layout(self.train.layout)
@@ -147,16 +165,24 @@ def stretch(values: NDArray[np.float32], frames: int) -> NDArray[np.float64]:
 
 
 def embed_motions(
-    tma: LoadedTma, stats: FeatureStats, motions: Sequence[NDArray[np.float32]], batch: int = 64
+    tma: LoadedTma,
+    stats: FeatureStats,
+    motions: Sequence[NDArray[np.float32]],
+    held: Sequence[int] | None = None,
+    batch: int = 64,
 ) -> Tensor:
-    """TMA latents [n, 256] of body-hand features; longer motions are cut at the model's length."""
+    """TMA latents [n, 256] of body-hand features; longer motions are cut at the model's length.
+
+    `held` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
+    """
     columns = tma.layout.part(tma.part)
     mean, std = stats.mean[columns], stats.std[columns]
     order = np.argsort([len(m) for m in motions], kind="stable")
+    masks = tma.layout.held_columns[:, columns][[HELD_ALL] * len(motions) if held is None else held]
     out: dict[int, Tensor] = {}
     for start in range(0, len(order), batch):
         rows = order[start : start + batch].tolist()
-        cut = [(motions[i][: tma.max_frames] - mean) / std for i in rows]
+        cut = [np.where(masks[i], (motions[i][: tma.max_frames] - mean) / std, 0.0) for i in rows]
         length = torch.tensor([len(m) for m in cut])
         motion = torch.zeros(len(cut), int(length.max()), len(columns))
         for row, values in enumerate(cut):

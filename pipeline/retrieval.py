@@ -57,7 +57,7 @@ def retrieve(run: Path, *, split: str | None = None, seed: int = 0) -> list[Prot
         )
     captions = [t.caption for t in truths]
     text = tma.embed_captions(captions, cache)
-    motion = embed_motions(tma, stats, [t.features for t in truths])
+    motion = embed_motions(tma, stats, [t.features for t in truths], [t.held for t in truths])
     sentence = torch.as_tensor(cache.sentence(captions))
     rows = [
         _result("A", "whole split", recall(text, motion)),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.features import decode, face_of
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import FACE, HELD_ALL
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.models.tokenizer.base import Tokenizer
@@ -17,7 +18,10 @@ from motionloom.models.tokenizer.base import Tokenizer
 
 @dataclass(frozen=True)
 class Truth:
-    """A clip of the data set: features of the body-hand part, joints, expression, captions."""
+    """A clip of the data set: features of the body-hand part, joints, expression, captions.
+
+    `face` is None where the clip holds none; `held` are the bits of `ClipMeta.held`.
+    """
 
     id: str
     features: NDArray[np.float32]
@@ -26,6 +30,7 @@ class Truth:
     caption: str
     face_caption: str
     truth: dict | None
+    held: int = HELD_ALL
 
 
 def joint_layout(layout: MotionLayout) -> MotionLayout:
@@ -44,26 +49,33 @@ def truth_of(dataset: ClipDataset, index: int, max_frames: int | None = None) ->
     body = motion[:, layout.part("bodyhand")]
     texts, faces = dataset.texts(index), dataset.face_texts(index)
     caption = texts[0].text if texts else ""
+    held = int(dataset.held[index])
     return Truth(
         id=dataset.ids[index],
         features=body,
         joints=decode(body, joint_layout(layout)),
-        face=face_of(motion, layout) if layout.has("face") else None,
+        face=face_of(motion, layout) if layout.has("face") and held & FACE else None,
         caption=caption,
         face_caption=faces[0].text if faces else caption,
         truth=dataset.meta(index).truth,
+        held=held,
     )
 
 
 @torch.no_grad()
 def reconstruct(
-    tokenizer: Tokenizer, stats: FeatureStats, features: NDArray[np.float32]
+    tokenizer: Tokenizer, stats: FeatureStats, features: NDArray[np.float32], held: int = HELD_ALL
 ) -> NDArray[np.float32]:
-    """Through the tokenizer and back, in the features' own units [T, D]; T a multiple of four."""
+    """Through the tokenizer and back, in the features' own units [T, D]; T a multiple of four.
+
+    `held` says what the clip holds; of what it does not hold, nothing is read and the mean comes back.
+    """
     columns = tokenizer.columns.numpy()
     mean, std = stats.mean[columns], stats.std[columns]
     motion = torch.from_numpy(((features - mean) / std).astype(np.float32))[None]
-    out = tokenizer.decode(tokenizer.encode(motion))[0].numpy()
+    mask = torch.from_numpy(tokenizer.layout.held_columns[held, columns])[None]
+    out = tokenizer.decode(tokenizer.encode(motion, held=mask), held=mask)
+    out = out.masked_fill(~mask[:, None], 0.0)[0].numpy()
     return np.asarray(out * std + mean, dtype=np.float32)
 
 

@@ -2,6 +2,9 @@
 
 One `tokens-SPLIT.safetensors` per split: for each stream the codes of all clips end to end, and where each
 clip begins, counted in groups of four frames. Written once by the `tokens` stage, never re-encoded by a GPT.
+
+A clip that lacks a part which the tokenizer models (hands, face) has codes, but those say what was never
+recorded: such clips are marked, and `whole_clips` leaves them out of GPT training.
 """
 
 from __future__ import annotations
@@ -35,6 +38,8 @@ class TokenStore:
     codes: Codes
     starts: NDArray[np.int64]
     per_group: Mapping[str, int]
+    whole: NDArray[np.bool_]
+    """Clips that hold all the columns the tokenizer models, [n]."""
 
     @property
     def groups(self) -> NDArray[np.int64]:
@@ -47,6 +52,16 @@ class TokenStore:
         end = int(self.starts[index + 1]) if count is None else begin + count
         return {name: flat[begin * n : end * n] for (name, flat), n in self._streams()}
 
+    def whole_clips(self) -> TokenStore:
+        """The store of the clips in `whole` alone, in order."""
+        if self.whole.all():
+            return self
+        codes = {}
+        for (name, flat), n in self._streams():
+            codes[name] = flat[torch.from_numpy(np.repeat(self.whole, self.groups * n))]
+        starts = np.concatenate([[0], np.cumsum(self.groups[self.whole])]).astype(np.int64)
+        return TokenStore(codes, starts, self.per_group, self.whole[self.whole])
+
     def _streams(self) -> list[tuple[tuple[str, Tensor], int]]:
         return [((name, flat), self.per_group[name]) for name, flat in self.codes.items()]
 
@@ -54,6 +69,7 @@ class TokenStore:
         """Write the store."""
         tensors = {f"codes.{name}": flat.to(torch.int32) for name, flat in self.codes.items()}
         tensors["starts"] = torch.from_numpy(self.starts)
+        tensors["whole"] = torch.from_numpy(self.whole)
         with atomic(path) as temporary:
             temporary.write_bytes(save(tensors))
 
@@ -66,7 +82,9 @@ class TokenStore:
         codes = {k.removeprefix("codes."): v.long() for k, v in tensors.items() if k.startswith("codes.")}
         if set(codes) != set(per_group):
             raise UserError(f"{path}: holds streams {sorted(codes)}, the tokenizer has {sorted(per_group)}")
-        return TokenStore(codes, tensors["starts"].numpy(), per_group)
+        if "whole" not in tensors:
+            raise UserError(f"{path}: written by an older version; run the tokens stage again")
+        return TokenStore(codes, tensors["starts"].numpy(), per_group, tensors["whole"].numpy())
 
 
 @dataclass(frozen=True)

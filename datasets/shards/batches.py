@@ -146,7 +146,9 @@ class _CaptionedClips:
         self.clips = self.crops.clips[usable[self.crops.clips]]
         if len(self.clips) == 0:
             kind = "face captions" if face else "captions"
-            holding = "" if len(self.crops.clips) == len(dataset) else ", the hands or face that are asked for"
+            holding = (
+                "" if len(self.crops.clips) == len(dataset) else ", the hands or face that are asked for"
+            )
             raise UserError(
                 f"{dataset.where}: no clip of split '{dataset.split}' has {kind}{holding} and {min_frames} "
                 f"frames; lower min_frames or convert data with {kind}"

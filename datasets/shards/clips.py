@@ -79,10 +79,11 @@ class ClipDataset(Protocol):
         ...
 
 
-def in_order(dataset: ClipDataset, *members: str) -> Iterator[int]:
-    """The numbers of all clips, with `members` of the next ones read ahead."""
-    for start in range(0, len(dataset), _AHEAD):
-        block = range(start, min(start + _AHEAD, len(dataset)))
+def in_order(dataset: ClipDataset, *members: str, clips: Sequence[int] | None = None) -> Iterator[int]:
+    """The numbers of all clips (or `clips`), with `members` of the next ones read ahead."""
+    clips = range(len(dataset)) if clips is None else clips
+    for start in range(0, len(clips), _AHEAD):
+        block = clips[start : start + _AHEAD]
         dataset.prefetch(block, members)
         yield from block
 

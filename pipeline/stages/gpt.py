@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -68,11 +70,17 @@ def run_gpt(context: StageContext) -> None:
             context.input("tokens") / f"tokens-{split}.safetensors",
             {s.name: s.per_group for s in tokenizer.streams},
         )
+        clips = np.flatnonzero(store.whole)
+        if len(clips) == 0:
+            raise UserError(
+                f"stage {context.name}: no clip of split '{split}' holds all that the tokenizer models (hands, "
+                f"face): train a tokenizer of another `part`, or take other data"
+            )
         captions, prior, sentences = priors(
-            dataset, text, tma if config.prior == "tma" else None, face=config.face
+            dataset, clips, text, tma if config.prior == "tma" else None, face=config.face
         )
         return TokenBatches(
-            store,
+            store.whole_clips(),
             captions,
             prior,
             sentences,
@@ -85,7 +93,7 @@ def run_gpt(context: StageContext) -> None:
             world,
             training,
             # Weights count; the order of shards does not, as the tokens are all in memory.
-            tuple(replace(source, shards=None) for source in dataset.sources()),
+            tuple(replace(source, shards=None) for source in dataset.sources(clips)),
         )
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
@@ -108,12 +116,12 @@ def run_gpt(context: StageContext) -> None:
 
 
 def priors(
-    dataset: ClipDataset, text: TextCache, tma: LoadedTma | None, *, face: bool
+    dataset: ClipDataset, clips: NDArray[np.int64], text: TextCache, tma: LoadedTma | None, *, face: bool
 ) -> tuple[list[list[int]], Tensor, Tensor]:
-    """Captions of each clip as rows of the tables of text [n, E] and sentence embeddings [n, S]."""
+    """Captions of each of `clips` as rows of the tables of text [n, E] and sentence embeddings [n, S]."""
     names: dict[str, int] = {}
     captions = []
-    for index in in_order(dataset, "face_texts.json" if face else "texts.json"):
+    for index in in_order(dataset, "face_texts.json" if face else "texts.json", clips=clips.tolist()):
         found = [c.text for c in captions_of(dataset, index, face=face)]
         if not found:
             raise UserError(

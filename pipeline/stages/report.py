@@ -74,7 +74,7 @@ def _motions(bundle: Bundle, truths: list[Truth], generated: list[GeneratedMotio
         face_tokens = bundle.faces.get("gpt")
         if truth.face is not None and isinstance(face_tokens, GptFace):
             again = synthetic_face_controls(reconstruct(face_tokens.tokenizer, bundle.stats, truth.face))
-        rebuilt = decode(reconstruct(bundle.tokenizer, bundle.stats, truth.features), layout)
+        rebuilt = decode(reconstruct(bundle.tokenizer, bundle.stats, truth.features, truth.held), layout)
         for label, joints, controls in (
             ("recorded", truth.joints, face),
             ("reconstruction", rebuilt, again),
@@ -128,7 +128,7 @@ def _codebooks(page: Page, context: StageContext, bundle: Bundle) -> None:
     tokens = context.inputs["gpt"].parent / _tokens_stage(context.inputs["gpt"])
     path = tokens / "tokens-train.safetensors"
     streams = bundle.tokenizer.streams
-    store = TokenStore.load(path, {s.name: s.per_group for s in streams})
+    store = TokenStore.load(path, {s.name: s.per_group for s in streams}).whole_clips()
     page.add_heading("Codebooks")
     for stream in streams:
         uses = np.bincount(store.codes[stream.name].numpy(), minlength=stream.num_codes)

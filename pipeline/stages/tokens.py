@@ -42,11 +42,16 @@ def run_tokens(context: StageContext) -> None:
                 partial(progress.advance, task),
             )
         store.save(context.folder / f"tokens-{split}.safetensors")
+        whole = store.whole_clips()
         used = ", ".join(
-            f"{s.name} {len(torch.unique(store.codes[s.name]))}/{s.num_codes} codes"
+            f"{s.name} {len(torch.unique(whole.codes[s.name]))}/{s.num_codes} codes"
             for s in tokenizer.streams
         )
-        context.console.print(f"    {split}: {len(dataset)} clips, {int(store.starts[-1])} groups; {used}")
+        lacking = len(dataset) - len(whole.groups)
+        note = f"; {lacking} clips lack hands or a face: no GPT learns their tokens" if lacking else ""
+        context.console.print(
+            f"    {split}: {len(dataset)} clips, {int(store.starts[-1])} groups; {used}{note}"
+        )
 
 
 def encode_split(
@@ -61,24 +66,28 @@ def encode_split(
     groups = np.maximum(np.asarray(dataset.frames) // unit, 1)
     starts = np.concatenate([[0], np.cumsum(groups)]).astype(np.int64)
     per_group = {s.name: s.per_group for s in tokenizer.streams}
+    held = dataset.layout.held_columns[:, tokenizer.columns.numpy()]
     flat = {name: torch.zeros(int(starts[-1]) * n, dtype=torch.int64) for name, n in per_group.items()}
     for items in _by_length(groups, batch_frames // unit):
         motion, length = padded(tokenizer, dataset, stats, items)
         with torch.no_grad():
-            codes = tokenizer.encode(motion, length)
+            codes = tokenizer.encode(motion, length, torch.from_numpy(held[dataset.held[items]]))
         for row, item in enumerate(items.tolist()):
             for name, n in per_group.items():
                 begin, count = int(starts[item]) * n, int(groups[item]) * n
                 flat[name][begin : begin + count] = codes[name][row, :count]
         if advance is not None:
             advance(len(items))
-    return TokenStore(flat, starts, per_group)
+    return TokenStore(flat, starts, per_group, held.all(axis=1)[dataset.held])
 
 
 def padded(
     tokenizer: Tokenizer, dataset: ClipDataset, stats: FeatureStats, items: NDArray[np.int64]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Normalised motion [B, T, D] zero-padded, and true lengths [B] (multiples of the group length)."""
+    """Normalised motion [B, T, D] zero-padded, and true lengths [B] (multiples of the group length).
+
+    Columns that a clip does not hold are as stored: the tokenizer is told which ones.
+    """
     unit, columns = tokenizer.group_frames, tokenizer.columns.numpy()
     lengths = [max(int(dataset.frames[i]) // unit, 1) * unit for i in items]
     motion = torch.zeros(len(items), max(lengths), len(columns))
