@@ -21,7 +21,6 @@ from rich.console import Console
 from rich.table import Table
 
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.estimate import bits_per_second
 from motionloom.pipeline.evaluation import reconstruction_figures
 from motionloom.pipeline.networks import load_tokenizer
 from motionloom.pipeline.run import run_recipe
@@ -75,7 +74,7 @@ def measure(run: Path, clips: int) -> dict[str, float]:
     figures = reconstruction_figures(
         net, open_stats(run / "stages/stats"), open_split(run / "stages/data", "train"), truths
     )
-    figures["bits"] = bits_per_second(net)
+    figures["bits"] = net.bits_per_second
     kept.write_text(json.dumps(figures))
     return figures
 

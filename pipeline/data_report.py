@@ -208,9 +208,10 @@ def _counts(page: Page, counts: Counter[int], title: str, x_label: str, y_label:
 
 def _features(page: Page, facts: DataFacts, opened: dict[str, ShardDataset]) -> None:
     layout, mean, std = facts.layout, facts.moments.mean, facts.moments.std
+    frames = int(facts.moments.count.max())
     page.add_heading("Features")
     page.add_text(
-        f"Of {int(facts.moments.count.max()):,} frames of {facts.measured:,} clips of the {facts.measured_split} split, "
+        f"Of {frames:,} frames of {facts.measured:,} clips of the {facts.measured_split} split, "
         f"in the units of the layout: metres, radians, per frame where they are velocities. "
         f"{_JOINTS[layout.num_joints]}"
     )

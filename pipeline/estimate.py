@@ -7,7 +7,6 @@ for the backward pass; workspaces of kernels and the allocator's rounding come o
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +24,6 @@ from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.stage_module import StageModule
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma
-from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.pipeline.recipe import Recipe, Stage
@@ -101,12 +99,6 @@ def data_layout(recipe: Recipe) -> MotionLayout:
     return MotionLayout.named(name, fps=fps or 30.0)
 
 
-def bits_per_second(net: Tokenizer) -> float:
-    """Bits that a tokenizer's codes carry for one second of motion, so that tokenizers compare fairly."""
-    groups = net.layout.fps / net.group_frames
-    return groups * sum(s.per_group * math.log2(s.num_codes) for s in net.streams)
-
-
 def _fake(
     recipe: Recipe, stage: Stage, layout: MotionLayout, batch: int
 ) -> tuple[StageModule, dict[str, Any], str]:
@@ -131,7 +123,7 @@ def _fake(
         "length": torch.full((batch,), config.window),
     }
     per_group = " + ".join(f"{s.per_group} {s.name}" for s in net.streams)
-    return module, inputs, f"{per_group} per 4 frames, {bits_per_second(net):.0f} bit/s"
+    return module, inputs, f"{per_group} per 4 frames, {net.bits_per_second:.0f} bit/s"
 
 
 def _fake_gpt(

@@ -127,25 +127,28 @@ class NearestClip:
         self.columns = train.layout.part("bodyhand")
         layout = joint_layout(train.layout)
         self.positions = layout.slice("positions")
-        self.body = np.arange(3 * (layout.num_joints - 1)) < 3 * (BODY_JOINTS - 1)
         keys = [self._key(np.asarray(train.motion(i))[:, self.columns]) for i in range(len(train))]
-        self.keys = np.stack(keys)
-        self.without_hands = (train.held & HANDS) == 0
+        self.keys = [np.stack(part) for part in zip(*keys, strict=True)]
+        self.norms = [np.square(part).sum(1) for part in self.keys]
+        self.with_hands = (train.held & HANDS) > 0
 
-    def _key(self, features: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Positions [KEY_FRAMES, 3 (N - 1)]."""
-        return stretch(features[:, self.positions], KEY_FRAMES)
+    def _key(self, features: NDArray[np.float32]) -> list[NDArray[np.float64]]:
+        """Positions of the body's joints and of the hands', each flat."""
+        key = stretch(features[:, self.positions], KEY_FRAMES)
+        return [part.ravel() for part in np.split(key, [3 * (BODY_JOINTS - 1)], axis=1)]
 
     def features(self, features: NDArray[np.float32], held: int = HELD_ALL) -> NDArray[np.float32]:
         """Features [T, D] of that clip, stretched to T frames (velocities scaled with time).
 
         `held` says what `features` hold.
         """
-        hands = bool(held & HANDS) and not self.without_hands.all()
-        chosen = slice(None) if hands else self.body
-        distance = np.square(self.keys[:, :, chosen] - self._key(features)[:, chosen]).sum((1, 2))
-        if hands:
-            distance[self.without_hands] = np.inf
+        body, hands = (
+            norms - 2 * keys @ key
+            for norms, keys, key in zip(self.norms, self.keys, self._key(features), strict=True)
+        )
+        distance = body
+        if held & HANDS and self.with_hands.any():
+            distance = np.where(self.with_hands, body + hands, np.inf)
         found = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
         out = stretch(found, len(features))
         layout = joint_layout(self.train.layout)

@@ -250,8 +250,8 @@ class EvalBatches(Dataset[CaptionBatch]):
     """Every qualifying clip of a split once, in order: first caption, first `max_frames` frames.
 
     `text` None leaves captions out (`caption` is then empty strings, no text tensors, every long enough clip
-    that holds any of the columns qualifies). Each rank gets the same number of rows; where the clips do not divide, the last batch repeats
-    its last clip with `valid` false.
+    that holds any of the columns qualifies). Each rank gets the same number of rows; where the clips do not
+    divide, the last batch repeats its last clip with `valid` false.
     """
 
     def __init__(

@@ -10,7 +10,7 @@ Arrays, n clips of a split and M = `len(MEMBERS)`:
 | `frames`        | int32 [n]     | T |
 | `data`          | int64 [n]     | byte in the tar where the motion values start (after the .npy header) |
 | `itemsize`      | uint8 [n]     | bytes per motion value: 4 or 2 |
-| `held`          | uint8 [n]     | what the clip holds beside its body: 1 hands, 2 face, as in its `meta.json` |
+| `held`          | uint8 [n]     | what the clip holds beside its body, by its `meta.json`: 1 hands, 2 face |
 | `offsets`       | int64 [n, M]  | byte in the tar where each member starts |
 | `sizes`         | uint32 [n, M] | its size; 0 = the clip has no such member |
 | `id_ends`       | int64 [n]     | end of each clip's id in `id_bytes` |

@@ -7,6 +7,7 @@ as a turn.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,14 +120,19 @@ def tempo(signals: Signals) -> float:
 
 
 def rise_time(signal: Array, fps: float) -> float:
-    """Seconds of the first rise of a signal [T] from rest to its top, by its 10 % and 90 % crossings."""
+    """Seconds of the first rise of a signal [T] from rest to its top, by its 10 % and 90 % crossings.
+
+    Infinite for a signal that never rises (a generated motion may do nothing); never less than a frame.
+    """
     low, high = float(signal[0]), float(signal.max())
-    share = (signal - low) / max(high - low, 1e-6)
+    if high - low < 1e-6:
+        return math.inf
+    share = (signal - low) / (high - low)
     end = _crossing(share, 0.9, 0)
     below = np.flatnonzero(share[: int(end) + 1] < 0.1)
     start = _crossing(share, 0.1, int(below[-1]) if len(below) else 0)
     # A minimum-jerk ease spends half of its time between these two.
-    return (end - start) / fps / 0.5
+    return max(end - start, 1.0) / fps / 0.5
 
 
 def _crossing(share: Array, level: float, first: int) -> float:

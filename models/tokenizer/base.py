@@ -10,6 +10,7 @@ tokens that belongs to such a part alone does not learn from the clip, and its v
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import NamedTuple, Self
 
@@ -97,6 +98,12 @@ class Tokenizer(nn.Module, ABC):
     def dim(self) -> int:
         """Number of columns modelled."""
         return len(self.columns)
+
+    @property
+    def bits_per_second(self) -> float:
+        """Bits that the codes of one second of motion carry, so that tokenizers compare fairly."""
+        groups = self.layout.fps / GROUP_FRAMES
+        return groups * sum(s.per_group * math.log2(s.num_codes) for s in self.streams)
 
     def select(self, x: Tensor) -> Tensor:
         """The columns this tokenizer models, [..., D of the layout] -> [..., dim]."""

@@ -49,6 +49,7 @@ def run_evaluate(context: StageContext) -> None:
     truths = [truth_of(dataset, i) for i in sorted(spread(dataset, config.clips))]
     truths = [t for t in truths if len(t.features) >= bundle.tokenizer.group_frames]
     figures: dict[str, Any] = {"split": split, "clips": len(truths)}
+    figures["bits_per_second"] = bundle.tokenizer.bits_per_second
     figures["reconstruction_mm"] = reconstruction_figures(
         bundle.tokenizer, bundle.stats, open_split(data, "train"), truths
     )
@@ -147,7 +148,8 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
     r = figures["reconstruction_mm"]
     out.append(
         (
-            f"Reconstruction on {figures['clips']} {figures['split']} clips, mm (lower is better)",
+            f"Reconstruction on {figures['clips']} {figures['split']} clips, mm (lower is better); "
+            f"codes of {figures['bits_per_second']:.0f} bit/s",
             ["", "pose", "body", "fingers from the wrist", "in the world", "PA-MPJPE", "ACCEL"],
             [
                 [

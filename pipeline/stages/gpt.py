@@ -73,8 +73,8 @@ def run_gpt(context: StageContext) -> None:
         clips = np.flatnonzero(store.whole)
         if len(clips) == 0:
             raise UserError(
-                f"stage {context.name}: no clip of split '{split}' holds all that the tokenizer models (hands, "
-                f"face): train a tokenizer of another `part`, or take other data"
+                f"stage {context.name}: no clip of split '{split}' holds all that the tokenizer models "
+                f"(hands, face): train a tokenizer of another `part`, or take other data"
             )
         captions, prior, sentences = priors(
             dataset, clips, text, tma if config.prior == "tma" else None, face=config.face

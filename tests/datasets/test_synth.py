@@ -24,7 +24,7 @@ from motionloom.datasets.synth.generate import (
     truth_of,
 )
 from motionloom.datasets.synth.measure import agrees, measure
-from motionloom.datasets.synth.truth import ACTIONS
+from motionloom.datasets.synth.truth import ACTIONS, draw
 
 FPS = 30.0
 CONFIG = SynthConfig(seed=2024, music=True)
@@ -294,3 +294,17 @@ def test_shards_are_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
     index = int(meta.id.rsplit("-", 1)[1])
     np.testing.assert_array_equal(dataset.motion(0), make_sample(index, config).motion)
     assert meta.truth == make_clip(index, config).truth
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+@pytest.mark.parametrize("kind", ["still", "jump cut", "collapsed"])
+def test_judging_a_motion_that_does_nothing(action: str, kind: str) -> None:
+    """Generated motions may stand still, jump between two frames or fold into a point; judging goes on."""
+    joints = np.repeat(Skeleton.named("smplx52").rest_joints[None], 60, axis=0) + [0.0, 0.95, 0.0]
+    if kind == "jump cut":
+        joints[30:, :, 1] -= 0.4
+    elif kind == "collapsed":
+        joints *= 0
+    claimed = draw(action, np.random.default_rng(0)).record(hands=True, face=False)
+    found = agrees(claimed, joints, None, 20.0)
+    assert "action" in found and all(isinstance(value, bool) for value in found.values())

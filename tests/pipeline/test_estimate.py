@@ -8,7 +8,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from motionloom.pipeline.estimate import bits_per_second, estimate
+from motionloom.pipeline.estimate import estimate
 from motionloom.pipeline.recipe import load_recipe
 from motionloom.pipeline.run import run_recipe
 
@@ -82,7 +82,7 @@ def test_bits_of_a_tokenizer() -> None:
     from motionloom.models.tokenizer.config import RvqConfig
 
     net = build_tokenizer(RvqConfig(width=8, code_dim=8, num_codes=16), MotionLayout.named("body133", fps=20))
-    assert bits_per_second(net) == 5 * 2 * 4
+    assert net.bits_per_second == 5 * 2 * 4
 
 
 def test_dry_run_tells(paper: Path, tmp_path: Path) -> None:

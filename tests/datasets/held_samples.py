@@ -1,0 +1,49 @@
+"""A data set of which some clips lack hands, some a face; what is stored there is garbage of a chosen kind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import FACE, HANDS, Caption, ClipMeta, Split
+from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.shards.writer import write_dataset
+
+LAYOUT = MotionLayout.named("wholebody363")
+COUNT = 24
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Clip i holds the bits `held[i % len(held)]`; `garbage` fills the rest."""
+
+    held: tuple[int, ...] = (3, 1, 2, 0, 3)
+    garbage: float = 0.0
+
+    def __call__(self, i: int) -> Sample:
+        rng = np.random.default_rng(i)
+        motion = rng.standard_normal((16 + i, LAYOUT.dim)) * np.linspace(0.5, 2, LAYOUT.dim) + 0.1 * (i % 3)
+        bits = self.held[i % len(self.held)]
+        lost = ~LAYOUT.held_columns[bits]
+        junk = np.random.default_rng(1000 + i).standard_normal((len(motion), int(lost.sum())))
+        motion[:, lost] = self.garbage * (1 + junk)
+        meta = ClipMeta(
+            id=f"clip{i}", source="made", split="train", layout=LAYOUT.name, family=LAYOUT.family,
+            fps=LAYOUT.fps, skeleton=LAYOUT.skeleton_name, frames=len(motion), licence="CC0",
+            has_hands=bool(bits & HANDS), has_face=bool(bits & FACE),
+        )  # fmt: skip
+        texts = [Caption(text=f"a person {i}"), Caption(text="walks")]
+        faces = [Caption(text="happy")]
+        return Sample(meta, motion.astype(np.float32), texts=texts, face_texts=faces)
+
+
+def write(out: Path, garbage: float = 0.0, held: tuple[int, ...] = (3, 1, 2, 0, 3)) -> Path:
+    items: list[tuple[Split, int]] = [("test" if i % 4 == 3 else "train", i) for i in range(COUNT)]
+    write_dataset(
+        out, items, Convert(held, garbage), name="held", layout=LAYOUT, licence="CC0", converter="test",
+        converter_version=1, options={}, clips_per_shard=5, progress=False,
+    )  # fmt: skip
+    return out
