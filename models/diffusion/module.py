@@ -10,7 +10,6 @@ from torch import Tensor
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.distributed import masked_mean
 from motionloom.models.layers.transformer import length_mask
-from motionloom.models.masks import held_values
 from motionloom.models.stage_module import OptimConfig, StageModule
 
 
@@ -39,4 +38,4 @@ class DiffusionModule(StageModule):
         found = self.net(noisy, step, text, mask, told)
         target = motion if schedule.predicts == "sample" else noise
         error = (found - target.float()).square()
-        return {"loss": masked_mean(error, held_values(mask, batch.get("held")))}
+        return {"loss": masked_mean(error, mask, batch.get("held"))}

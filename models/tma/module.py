@@ -10,7 +10,6 @@ from torch import Tensor
 
 from motionloom.datasets.schema import Config
 from motionloom.models.layers.transformer import length_mask
-from motionloom.models.masks import held_values
 from motionloom.models.stage_module import OptimConfig, StageModule
 from motionloom.models.tma.losses import info_nce, kl_four, latent_loss, reconstruction_loss
 from motionloom.models.tma.network import Tma
@@ -59,10 +58,10 @@ class TmaModule(StageModule):
         moved = net.encode_motion(motion, length)
         z_text, z_motion = self._latent(*text), self._latent(*moved)
         target, frames = net.strided(motion, length)
-        mask = held_values(length_mask(frames, target.shape[1]), batch.get("held"))
+        mask, held = length_mask(frames, target.shape[1]), batch.get("held")
         size = motion.shape[1]
-        rec_text = reconstruction_loss(net.decode(z_text, length, size), target, mask)
-        rec_motion = reconstruction_loss(net.decode(z_motion, length, size), target, mask)
+        rec_text = reconstruction_loss(net.decode(z_text, length, size), target, mask, held)
+        rec_motion = reconstruction_loss(net.decode(z_motion, length, size), target, mask, held)
         kl = kl_four(text, moved)
         latent = latent_loss(z_text, z_motion)
         contrastive = info_nce(

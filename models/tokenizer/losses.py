@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from motionloom.models.distributed import masked_mean
-from motionloom.models.masks import held_values
 from motionloom.models.tokenizer.config import Recon
 
 
@@ -30,7 +29,7 @@ def reconstruction_loss(
         return error.mean()
     position = torch.arange(error.shape[1], device=error.device)
     end = position.new_full((len(error),), len(position)) if length is None else length
-    return masked_mean(error, held_values(position < end[:, None], held))
+    return masked_mean(error, position < end[:, None], held)
 
 
 def velocity_loss(

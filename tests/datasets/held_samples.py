@@ -1,4 +1,4 @@
-"""A data set of which some clips lack hands, some a face; what is stored there is garbage of a chosen kind."""
+"""A data set of which some clips lack hands, some a face; garbage of a chosen size is stored there."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def test_tokens_of_clips_that_lack_a_part(data: Data, part: str, bit: int, tmp_p
     stores = [encode_split(net, dataset, stats, 256) for dataset, stats in data]
     dataset, store = data[0][0], stores[0]
     for name, codes in store.codes.items():
-        assert torch.equal(codes, stores[1].codes[name]) and 0 <= codes.min() and codes.max() < 8
+        assert torch.equal(codes, stores[1].codes[name]) and codes.min() >= 0 and codes.max() < 8
     np.testing.assert_array_equal(store.whole, (dataset.held & bit) > 0)
     store.save(tmp_path / "tokens.safetensors")
     loaded = TokenStore.load(tmp_path / "tokens.safetensors", store.per_group)
