@@ -74,8 +74,8 @@ def reconstruct(
     mean, std = stats.mean[columns], stats.std[columns]
     motion = torch.from_numpy(((features - mean) / std).astype(np.float32))[None]
     mask = torch.from_numpy(tokenizer.layout.held_columns[held, columns])[None]
-    out = tokenizer.decode(tokenizer.encode(motion, held=mask), held=mask)
-    out = out.masked_fill(~mask[:, None], 0.0)[0].numpy()
+    rebuilt = tokenizer.decode(tokenizer.encode(motion, held=mask), held=mask)
+    out = rebuilt.masked_fill(~mask[:, None], 0.0)[0].numpy()
     return np.asarray(out * std + mean, dtype=np.float32)
 
 

@@ -6,8 +6,8 @@ Choices:
   compared.
 - Layout `h3d263` at 20 fps keeps the vectors bit for bit. Made again from new_joints/ they are not the same:
   one more frame is lost, and the published code starts every clip with a forced heading that decoding has
-  already turned into motion (docs/sources.md tells how much). That way keeps each clip's own bone lengths, which
-  are HumanML3D's uniform ones.
+  already turned into motion (docs/sources.md tells how much). That way keeps each clip's own bone lengths,
+  which are HumanML3D's uniform ones.
 - `body133` (family `exact`) is made from the joints, or from the decoded vectors.
 - Segment captions stay captions with start and end; the loaders cut the frames. A mirrored clip `M<id>` tells
   whose image it is and stays in the split of its original.

@@ -145,7 +145,8 @@ class MotionLayout:
         if self.has("face"):
             needs[self.slice("face")] = FACE
         bits = np.arange(HELD_ALL + 1, dtype=np.uint8)[:, None]
-        return (bits & needs) == needs
+        held: NDArray[np.bool_] = (bits & needs) == needs
+        return held
 
     def _hand_columns(self) -> NDArray[np.int64]:
         columns = np.arange(self.dim)

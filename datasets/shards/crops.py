@@ -35,7 +35,8 @@ class Crops:
         self.width = len(chosen)
         self.held = dataset.layout.held_columns[:, chosen]
         """Row b: which of the columns clips hold that hold the bits b, [4, C]."""
-        self.clips = np.flatnonzero(self.held.any(axis=1)[dataset.held])
+        some = np.asarray(self.held.any(axis=1))
+        self.clips = np.flatnonzero(some[dataset.held])
         """Clips that hold any of the columns: the others have nothing to give, [n]."""
         self._lost = [[place for place, _ in _runs(np.flatnonzero(~row))] for row in self.held]
         self._mean = stats.mean[chosen]

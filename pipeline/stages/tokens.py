@@ -78,7 +78,8 @@ def encode_split(
                 flat[name][begin : begin + count] = codes[name][row, :count]
         if advance is not None:
             advance(len(items))
-    return TokenStore(flat, starts, per_group, held.all(axis=1)[dataset.held])
+    whole = np.asarray(held.all(axis=1))
+    return TokenStore(flat, starts, per_group, whole[dataset.held])
 
 
 def padded(

@@ -300,7 +300,8 @@ def test_shards_are_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["still", "jump cut", "collapsed"])
 def test_judging_a_motion_that_does_nothing(action: str, kind: str) -> None:
     """Generated motions may stand still, jump between two frames or fold into a point; judging goes on."""
-    joints = np.repeat(Skeleton.named("smplx52").rest_joints[None], 60, axis=0) + [0.0, 0.95, 0.0]
+    joints = np.repeat(Skeleton.named("smplx52").rest_joints[None], 60, axis=0)
+    joints[..., 1] += 0.95
     if kind == "jump cut":
         joints[30:, :, 1] -= 0.4
     elif kind == "collapsed":
