@@ -9,8 +9,6 @@ import pytest
 from motionloom.pipeline.bundle import PARTS, part_folders
 from motionloom.pipeline.recipe import load_recipe, shipped_recipes
 
-FACE = {"face_tokenizer", "face_gpt"}
-
 
 @pytest.mark.parametrize("name", sorted(shipped_recipes()))
 def test_finished_parts_are_found(name: str, tmp_path: Path) -> None:
@@ -20,8 +18,8 @@ def test_finished_parts_are_found(name: str, tmp_path: Path) -> None:
         (tmp_path / "stages" / stage.name).mkdir(parents=True)
         (tmp_path / "stages" / stage.name / "artifact.json").write_text("{}")
     found = part_folders(tmp_path)
-    expected = set(PARTS) - (set() if "face_gpt" in {s.name for s in recipe.stages} else FACE)
-    assert set(found) == expected
+    assert set(found) == set(PARTS) & {stage.name for stage in recipe.stages}
+    assert {"stats", "tokenizer", "gpt"} <= set(found)
     assert all(folder == tmp_path / "stages" / role for role, folder in found.items())
 
 
