@@ -29,7 +29,7 @@ demo: $(STAMP)
 	@$(BIN)/motionloom run $(RECIPE) $(DEMO_ARGS)
 
 test: $(STAMP)
-	$(BIN)/python -P -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -P -m pytest -n auto --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)
 
 # mypy reads the folders as the namespace package `motionloom`, so it gets a folder of that name that links to them.
 lint: $(STAMP)
