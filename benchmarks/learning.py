@@ -1,14 +1,15 @@
-"""The learning proofs on a finished (or half finished) run of `humantomato-learning`, from its test split.
+"""The learning proofs on a run of `humantomato-learning`, from its test split; as many as it is ready for.
 
     motionloom run humantomato-learning
-    python benchmarks/learning.py runs/humantomato-learning [--without RUN ...]
+    python benchmarks/learning.py runs/humantomato-learning
 
-- Retrieval among 32 clips that all do something different (no two have the same truth), both ways.
+- Retrieval among 32 clips that all do something different (no two have the same truth), both ways, with the
+  filter of negatives and without.
 - What the captions of opposite motions look like to TMA and to the frozen sentence encoder.
-- Motions generated for held-out combinations of known words, measured on their joints.
+- Motions generated for held-out combinations of known words, measured on their joints: by the paper's GPT,
+  by one that reads the sentence embedding and by one without the alignment loss.
 
-`--without` names further runs to put beside, for instance one trained without the filter of negatives
-(`--set tma.loss.threshold=1.0`).
+Writes `learning.json` and `learning.png` into the run's folder.
 """
 
 from __future__ import annotations
@@ -16,23 +17,30 @@ from __future__ import annotations
 import argparse
 import json
 from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.motion.features import decode
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.datasets.synth.measure import agrees
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.models.metrics.retrieval import recall
-from motionloom.pipeline.bundle import Bundle, text_encoder_of
+from motionloom.pipeline.bundle import Bundle, part_folders, text_encoder_of
 from motionloom.pipeline.evaluation import embed_motions
 from motionloom.pipeline.networks import LoadedTma
-from motionloom.pipeline.samples import Truth, truth_of
+from motionloom.pipeline.samples import Truth, joint_layout, reconstruct, truth_of
+from motionloom.pipeline.sampling import SamplingConfig
 from motionloom.pipeline.sources import open_split, open_text
+
+matplotlib.use("Agg")
 
 PAIRS = (
     ("a person walks in a clockwise circle", "a person walks in a counter-clockwise circle"),
@@ -42,6 +50,21 @@ PAIRS = (
     ("a person jumps up once", "a person jumps up three times"),
 )
 SIZE = 32
+TMAS = {"tma": "TMA", "tma_unfiltered": "without the filter"}
+GPTS = {
+    "gpt": "TMA prior, alignment loss",
+    "gpt_sentence": "sentence prior, alignment loss",
+    "gpt_unaligned": "TMA prior alone",
+}
+
+Shares = dict[str, dict[str, float]]
+"""Held out or not -> attribute -> share of right ones."""
+Judged = tuple[NDArray[Any], NDArray[Any] | None]
+"""Joints [T, N, 3] and expression [T, 50], or None."""
+
+
+def finished(run: Path, stage: str) -> bool:
+    return (run / "stages" / stage / "artifact.json").is_file()
 
 
 def test_truths(run: Path) -> list[Truth]:
@@ -55,10 +78,10 @@ def told(truth: Truth) -> str:
     return json.dumps(record, sort_keys=True)
 
 
-def retrieval(run: Path, truths: list[Truth], draws: int) -> dict[str, float]:
+def retrieval(run: Path, stage: str, truths: list[Truth], draws: int) -> dict[str, float]:
     """Mean recall over draws of 32 clips with different truths."""
     stages = run / "stages"
-    tma, cache = LoadedTma.load(stages / "tma"), open_text(stages / "text")
+    tma, cache = LoadedTma.load(stages / stage), open_text(stages / "text")
     stats = FeatureStats.load(stages / "stats/stats.safetensors")
     text = tma.embed_captions([t.caption for t in truths], cache)
     motion = embed_motions(tma, stats, [t.features for t in truths])
@@ -89,23 +112,66 @@ def similarities(run: Path) -> list[tuple[str, str, float, float]]:
     return rows
 
 
-def generation(
-    run: Path, truths: list[Truth], hold_out: list[dict[str, Any]], repeats: int
-) -> dict[str, Any]:
-    """Share of right attributes of generated motions, of held-out combinations and of other test clips."""
-    bundle = Bundle.open(run)
+def judge(
+    truths: list[Truth], motions: Iterable[Judged], fps: float, hold_out: list[dict[str, Any]]
+) -> Shares:
+    """Shares of right attributes; "every" is their mean, "whole" the share of clips that get all right."""
     rows: dict[str, dict[str, list[bool]]] = {"held out": defaultdict(list), "other": defaultdict(list)}
-    for repeat in range(repeats):
-        motions = bundle.generate(
-            [t.caption for t in truths], face_captions=[t.face_caption for t in truths], seed=repeat
-        )
-        for truth, made in zip(truths, motions, strict=True):
-            record = truth.truth or {}
-            apart = any(all(record.get(k) == v for k, v in c.items()) for c in hold_out)
-            kind = rows["held out" if apart else "other"]
-            for name, right in agrees(record, made.joints, made.face, made.layout.fps).items():
-                kind[name].append(right)
+    for truth, (joints, face) in zip(truths, motions, strict=True):
+        record = truth.truth or {}
+        apart = any(all(record.get(k) == v for k, v in c.items()) for c in hold_out)
+        kind = rows["held out" if apart else "other"]
+        right = agrees(record, joints, face, fps)
+        for name, value in right.items():
+            kind[name].append(value)
+            kind["every"].append(value)
+        kind["whole"].append(all(right.values()))
     return {kind: {name: float(np.mean(v)) for name, v in found.items()} for kind, found in rows.items()}
+
+
+def generation(
+    run: Path, truths: list[Truth], hold_out: list[dict[str, Any]], sampling: SamplingConfig
+) -> dict[str, Shares]:
+    """Shares of a guess, of the tokenizer's reconstructions and of every GPT of the run."""
+    parts = part_folders(run)
+    encoder = text_encoder_of(parts["text"])
+    captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
+    bundle = Bundle.from_parts(parts, encoder)
+    fps, joints = bundle.layout.fps, joint_layout(bundle.layout)
+    order = np.random.default_rng(0).permutation(len(truths))
+    guess = ((truths[k].joints, truths[k].face) for k in order)
+    rebuilt = (reconstruct(bundle.tokenizer, bundle.stats, t.features, t.held) for t in truths)
+    out = {
+        "another clip's motion": judge(truths, guess, fps, hold_out),
+        "reconstruction": judge(truths, ((decode(x, joints), None) for x in rebuilt), fps, hold_out),
+    }
+    for name, title in GPTS.items():
+        if finished(run, name):
+            bundle = Bundle.from_parts({**parts, "gpt": run / "stages" / name}, encoder)
+            made = bundle.generate(captions, face_captions=faces, sampling=sampling)
+            out[title] = judge(truths, ((m.joints, m.face) for m in made), fps, hold_out)
+    return out
+
+
+def draw(shares: dict[str, Shares], path: Path) -> None:
+    """Bars of every attribute on the held-out combinations, one colour a row of the table."""
+    import matplotlib.pyplot as plt
+
+    names = sorted({name for row in shares.values() for name in row["held out"]})
+    figure, axes = plt.subplots(figsize=(11, 3.6), layout="constrained")
+    for k, (title, row) in enumerate(shares.items()):
+        at = np.arange(len(names)) + 0.16 * (k - len(shares) / 2)
+        axes.bar(at, [100 * row["held out"].get(name, np.nan) for name in names], 0.15, label=title)
+    axes.axhline(90, color="grey", lw=0.8, ls=":")
+    axes.set_xticks(range(len(names)), names)
+    axes.set_ylabel("right, %")
+    axes.set_title("held-out combinations of words")
+    axes.legend(ncols=3, fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
+def percent(row: dict[str, float], names: Iterable[str]) -> list[str]:
+    return [f"{100 * row[name]:.1f} %" if name in row else "" for name in names]
 
 
 def main() -> None:
@@ -113,32 +179,38 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path)
-    parser.add_argument("--without", type=Path, nargs="*", default=[])
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--draws", type=int, default=200, help="draws of 32 different clips")
+    parser.add_argument("--temperature", type=float, default=1.0)
+    parser.add_argument("--top-p", type=float, default=0.95)
     args = parser.parse_args()
-    console, truths = Console(), test_truths(args.run)
-    table = Table("run", "text to motion R@1", "R@3", "motion to text R@1", "R@3")
-    for run in (args.run, *args.without):
-        found = retrieval(run, truths, args.draws)
-        keys = ("t2m/R@1", "t2m/R@3", "m2t/R@1", "m2t/R@3")
-        table.add_row(run.name, *(f"{100 * found[key]:.1f} %" for key in keys))
+    run, console, truths = args.run, Console(), test_truths(args.run)
+    found: dict[str, Any] = {"clips": len(truths), "retrieval": {}}
+    keys = ("t2m/R@1", "t2m/R@3", "m2t/R@1", "m2t/R@3")
+    table = Table("model", "text to motion R@1", "R@3", "motion to text R@1", "R@3")
+    for stage, title in TMAS.items():
+        if finished(run, stage):
+            found["retrieval"][title] = row = retrieval(run, stage, truths, args.draws)
+            table.add_row(title, *percent(row, keys))
     table.title = f"retrieval among {SIZE} different motions, {len(truths)} test clips; a guess: 3.1 %, 9.4 %"
     console.print(table)
     table = Table("caption", "caption", "sentence encoder", "TMA", title="cosine of opposite captions")
-    for one, other, sentence, aligned in similarities(args.run):
+    found["opposites"] = similarities(run)
+    for one, other, sentence, aligned in found["opposites"]:
         table.add_row(one, other, f"{sentence:.2f}", f"{aligned:.2f}")
     console.print(table)
-    if (args.run / "stages/gpt/artifact.json").is_file():
-        recipe = json.loads((args.run / "stages/data/artifact.json").read_text())
-        shares = generation(args.run, truths, recipe["config"]["hold_out"], args.repeats)
-        names = sorted({*shares["held out"], *shares["other"]})
-        table = Table("attribute", *shares, title="generated motions that do what the caption says")
-        for name in names:
-            table.add_row(
-                name, *(f"{100 * shares[k][name]:.0f} %" if name in shares[k] else "" for k in shares)
-            )
-        console.print(table)
+    if finished(run, "gpt"):
+        hold_out = json.loads((run / "stages/data/artifact.json").read_text())["config"]["hold_out"]
+        sampling = SamplingConfig(temperature=args.temperature, top_p=args.top_p)
+        found["generation"] = shares = generation(run, truths, hold_out, sampling)
+        for kind in ("held out", "other"):
+            names = sorted({name for row in shares.values() for name in row[kind]})
+            table = Table("motion", *names, title=f"motions that do what the caption says: {kind}")
+            for title, row in shares.items():
+                table.add_row(title, *percent(row[kind], names))
+            console.print(table)
+        draw(shares, run / "learning.png")
+    (run / "learning.json").write_text(json.dumps(found, indent=1))
+    console.print(f"{run / 'learning.json'}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Tokenizers at an equal training budget: H2VQ, RVQ, VQ, body and hands apart, FSQ (Tables 3 and 7).
 
-    python benchmarks/reconstruction_order.py WORK [--shards FOLDER] [--seeds 3] [--steps 600]
+    python benchmarks/reconstruction_order.py WORK [--shards FOLDER] [--seeds 3] [--steps 1600]
 
 Every tokenizer is trained by the same recipe on the same windows with the same widths, one run a seed, and
 measured on the test split: MPJPE in mm of all joints and of the body from the root, of the fingers from their
@@ -29,31 +29,38 @@ from motionloom.pipeline.sources import open_split, open_stats
 
 matplotlib.use("Agg")
 
-CODES = {"num_codes": 256, "reset_below": 0.2}
+CODES = {"num_codes": 512, "reset_below": 0.05}
 NETS: dict[str, tuple[str, dict]] = {
     "VQ": ("vq", CODES),
     "RVQ, 2 levels": ("rvq", {**CODES, "levels": 2}),
     "RVQ, 3 levels": ("rvq", {**CODES, "levels": 3}),
     "apart": ("separate", CODES),
     "H2VQ": ("h2vq", CODES),
-    "FSQ": ("fsq", {"steps": [8, 6, 5]}),
+    "FSQ": ("fsq", {"steps": [8, 8, 8]}),
 }
 """Title -> stage kind and what differs. RVQ with three levels spends exactly H2VQ's bits."""
 
-COMMON = {"width": 96, "depth": 2, "code_dim": 96, "recon": "smooth_l1", "velocity_weight": 0.5}
+COMMON = {
+    "width": 96,
+    "depth": 2,
+    "code_dim": 96,
+    "recon": "smooth_l1",
+    "velocity_weight": 0.5,
+    "bone_weight": 0.3,
+}
 COLUMNS = {"mpjpe": "all", "mpjpe_body": "body", "mpjpe_hand": "fingers", "global_mpjpe": "world"}
 
 
 def recipe(work: Path, kind: str, net: dict, seed: int, args: argparse.Namespace) -> Path:
     """The recipe file of one run; data, statistics and windows are the same for all."""
-    train = {"steps": args.steps, "batch_size": 64, "checkpoint_every": 100, "validate_every": 0}
+    train = {"steps": args.steps, "batch_size": 16, "checkpoint_every": 200, "validate_every": 0}
     stages = {
         "data": {"kind": "shards", "path": str(args.shards.resolve()), "verify": False},
         "stats": {"kind": "stats"},
         "tokenizer": {
             "kind": kind,
             "net": {**COMMON, **net},
-            "optim": {"lr": 4.0e-4, "warmup_steps": 30, "schedule": "cosine"},
+            "optim": {"lr": 2.0e-3, "warmup_steps": 30, "schedule": "cosine"},
             "train": train,
         },
     }
@@ -118,8 +125,9 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--shards", type=Path, help="whole-body shards; default: synthetic clips")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--made", type=int, default=1000, help="synthetic clips to make")
+    parser.add_argument("--steps", type=int, default=1600)
+    parser.add_argument("--nets", nargs="*", choices=list(NETS), default=list(NETS))
+    parser.add_argument("--made", type=int, default=2000, help="synthetic clips to make")
     parser.add_argument("--clips", type=int, default=100, help="test clips at most")
     args = parser.parse_args()
     if args.shards is None:
@@ -129,7 +137,8 @@ def main() -> None:
     console = Console()
     results: dict[str, list[dict[str, float]]] = {}
     for seed in range(args.seeds):
-        for title, (kind, net) in NETS.items():
+        for title in args.nets:
+            kind, net = NETS[title]
             run = args.work / f"{title.replace(' ', '-').replace(',', '')}-{seed}"
             run_recipe(recipe(run, kind, net, seed, args), run, console=console)
             results.setdefault(title, []).append(measure(run, args.clips))

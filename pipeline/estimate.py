@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from rich.table import Table
 from torch import Tensor
@@ -117,7 +118,8 @@ def _fake(
         denoiser = MotionDiffusion(config.net, dim, width)
         return DiffusionModule(denoiser, config.optim, seed=0, max_steps=1), inputs, ""
     net = build_tokenizer(config.net, layout)
-    module = TokenizerModule(net, config.optim, seed=0, max_steps=1, **config.net.loss_terms())
+    std = np.ones(layout.dim)
+    module = TokenizerModule(net, config.optim, seed=0, max_steps=1, std=std, **config.net.loss_terms())
     inputs = {
         "motion": torch.empty(batch, config.window, net.dim),
         "length": torch.full((batch,), config.window),

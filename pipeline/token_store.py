@@ -111,6 +111,8 @@ class TokenBatches(Dataset[dict[str, Any]]):
     training: bool = True
     sources: tuple[Source, ...] = ()
     """Data sets and their weights, when several are mixed."""
+    latents: Tensor | None = None
+    """TMA's embeddings of the same captions [n, Z], for an alignment loss where `prior` is something else."""
 
     @cached_property
     def _plan(self) -> BatchPlan:
@@ -133,12 +135,14 @@ class TokenBatches(Dataset[dict[str, Any]]):
             rows.append(self.captions[item][choice])
             sequences.append(self._sequence(item, rng))
         batch = pad_sequences(sequences)
+        latents = {} if self.latents is None else {"tma_text": self.latents[rows]}
         return {
             "tokens": batch.tokens,
             "kinds": batch.kinds,
             "length": batch.length,
             "text": self.prior[rows],
             "sentence": self.sentences[rows],
+            **latents,
         }
 
     def _sequence(self, item: int, rng: np.random.Generator) -> TokenSequence:

@@ -91,6 +91,7 @@ class Tokenizer(nn.Module, ABC):
         self.layout = layout
         self.streams = streams
         self.pattern = pattern
+        self.part: Part = part
         self.is_frozen = False
         self.register_buffer("columns", torch.from_numpy(layout.part(part)))
 

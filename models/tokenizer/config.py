@@ -20,6 +20,7 @@ class LossTerms(TypedDict):
     alpha: float
     recon: Recon
     velocity_weight: float
+    bone_weight: float
 
 
 class BaseTokenizerConfig(Config):
@@ -34,6 +35,8 @@ class BaseTokenizerConfig(Config):
     recon: Recon = "l2"
     velocity_weight: float = Field(default=0.0, ge=0)
     """Weight of the same reconstruction error between frame-to-frame differences."""
+    bone_weight: float = Field(default=0.0, ge=0)
+    """Weight of the error of the bones' directions [ours], without which fingers are learnt last."""
 
     def commitment(self) -> float:
         """Weight of the quantizers' penalty; 0 for quantizers without one."""
@@ -45,6 +48,7 @@ class BaseTokenizerConfig(Config):
             "alpha": self.commitment(),
             "recon": self.recon,
             "velocity_weight": self.velocity_weight,
+            "bone_weight": self.bone_weight,
         }
 
 

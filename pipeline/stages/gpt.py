@@ -8,12 +8,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from torch.utils.data import Dataset
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, in_order
-from motionloom.datasets.text.cache import TextCache
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
@@ -76,9 +74,10 @@ def run_gpt(context: StageContext) -> None:
                 f"stage {context.name}: no clip of split '{split}' holds all that the tokenizer models "
                 f"(hands, face): train a tokenizer of another `part`, or take other data"
             )
-        captions, prior, sentences = priors(
-            dataset, clips, text, tma if config.prior == "tma" else None, face=config.face
-        )
+        captions, known = captions_by_row(dataset, clips, face=config.face)
+        sentences = torch.as_tensor(text.sentence(known))
+        latents = tma.embed_captions(known, text) if tma is not None else None
+        prior = latents if config.prior == "tma" and latents is not None else sentences
         return TokenBatches(
             store.whole_clips(),
             captions,
@@ -94,6 +93,7 @@ def run_gpt(context: StageContext) -> None:
             training,
             # Weights count; the order of shards does not, as the tokens are all in memory.
             tuple(replace(source, shards=None) for source in dataset.sources(clips)),
+            latents=latents if align and config.prior != "tma" else None,
         )
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
@@ -115,10 +115,10 @@ def run_gpt(context: StageContext) -> None:
         save_model(context.folder, net, facts)
 
 
-def priors(
-    dataset: ClipDataset, clips: NDArray[np.int64], text: TextCache, tma: LoadedTma | None, *, face: bool
-) -> tuple[list[list[int]], Tensor, Tensor]:
-    """Captions of each of `clips` as rows of the tables of text [n, E] and sentence embeddings [n, S]."""
+def captions_by_row(
+    dataset: ClipDataset, clips: NDArray[np.int64], *, face: bool
+) -> tuple[list[list[int]], list[str]]:
+    """For each of `clips` the rows of its captions in the list of all of them, and that list."""
     names: dict[str, int] = {}
     captions = []
     for index in in_order(dataset, "face_texts.json" if face else "texts.json", clips=clips.tolist()):
@@ -128,6 +128,4 @@ def priors(
                 f"clip {dataset.ids[index]}: no {'face ' if face else ''}caption to train a GPT on"
             )
         captions.append([names.setdefault(caption, len(names)) for caption in found])
-    ordered = list(names)
-    sentences = torch.as_tensor(text.sentence(ordered))
-    return captions, tma.embed_captions(ordered, text) if tma else sentences, sentences
+    return captions, list(names)

@@ -64,7 +64,12 @@ def run_tokenizer(context: StageContext) -> None:
     torch.manual_seed(context.seed)
     net = build_tokenizer(config.net, dataset.layout)
     module = TokenizerModule(
-        net, config.optim, seed=context.seed, max_steps=config.train.steps, **config.net.loss_terms()
+        net,
+        config.optim,
+        seed=context.seed,
+        max_steps=config.train.steps,
+        std=stats.std,
+        **config.net.loss_terms(),
     )
     columns = net.columns.numpy()
 

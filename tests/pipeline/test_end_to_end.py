@@ -248,6 +248,18 @@ def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..
     assert "Figures on held-out clips" in page.read_text()
 
 
+def test_alignment_works_with_the_sentence_prior_too(
+    copy: Path, small_run: Any, call: Callable[..., Any]
+) -> None:
+    change = ("--set", "gpt.prior=sentence", "--until", "gpt")
+    done = call("run", small_run.recipe, "--out", copy, *change)
+    assert done.code == 0, done.out
+    log = [json.loads(line) for line in (copy / "stages/gpt/metrics.jsonl").read_text().splitlines()]
+    assert all(row["val/align"] > 0 for row in log if "val/align" in row) and log
+    assert any("val/align" in row for row in log)
+    assert call("run", small_run.recipe, "--out", copy, "--until", "gpt").code == 0
+
+
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine to drive")
 def test_the_page_plays_in_a_browser(small_run: Any) -> None:
