@@ -25,7 +25,7 @@ from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate, sample_seeds
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.artifact import Artifact
-from motionloom.pipeline.faces import FaceGenerator, FaceKind, choose, expression, load_faces
+from motionloom.pipeline.faces import FaceGenerator, FaceKind, FaceRequest, choose, expression, load_faces
 from motionloom.pipeline.model_store import LayoutFacts
 from motionloom.pipeline.networks import LoadedTma, load_gpt, load_tokenizer
 from motionloom.pipeline.sampling import SamplingConfig
@@ -166,7 +166,7 @@ class Bundle:
             prior = self._tma_text(encoded) if self.tma is not None else None
             # The face takes the body's length, so that both share one time line.
             frames = [len(motion) for motion in body]
-            made = face.make(encoded, prior, frames, seeds[1], sampling)
+            made = face.make(FaceRequest(encoded, prior, frames, seeds[1], sampling))
             expressions = [expression(values, self.layout, self.stats) for values in made]
         out = []
         for row, caption in enumerate(captions):

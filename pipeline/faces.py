@@ -32,18 +32,25 @@ from motionloom.pipeline.sampling import SamplingConfig
 FaceKind = Literal["gpt", "vae", "diffusion"]
 
 
+@dataclass(frozen=True)
+class FaceRequest:
+    """What a generator is asked for: one expression for each text."""
+
+    text: EncodedText
+    prior: torch.Tensor | None
+    """TMA's embedding of the texts [n, E], where there is one."""
+    frames: Sequence[int]
+    """Length of each expression, the body's."""
+    seeds: Sequence[int]
+    """One for each expression."""
+    sampling: SamplingConfig
+
+
 class FaceGenerator(Protocol):
     """Text to normalised expression."""
 
-    def make(
-        self,
-        text: EncodedText,
-        prior: torch.Tensor | None,
-        frames: Sequence[int],
-        seeds: Sequence[int],
-        sampling: SamplingConfig,
-    ) -> list[torch.Tensor]:
-        """Expressions [T, 50] of encoded texts; `prior` [n, E] is TMA's embedding, where there is one."""
+    def make(self, request: FaceRequest) -> list[torch.Tensor]:
+        """Normalised expressions [T, 50], in the order of the texts."""
 
 
 @dataclass(frozen=True)
@@ -55,25 +62,19 @@ class GptFace:
     prior: str
 
     @torch.no_grad()
-    def make(
-        self,
-        text: EncodedText,
-        prior: torch.Tensor | None,
-        frames: Sequence[int],
-        seeds: Sequence[int],
-        sampling: SamplingConfig,
-    ) -> list[torch.Tensor]:
+    def make(self, request: FaceRequest) -> list[torch.Tensor]:
         """See `FaceGenerator`; lengths are whole groups of four frames."""
-        given = torch.as_tensor(text.sentence) if self.prior == "sentence" else prior
+        sampling = request.sampling
+        given = torch.as_tensor(request.text.sentence) if self.prior == "sentence" else request.prior
         if given is None:
             raise UserError("this face GPT needs the TMA text encoder, and no tma part is here")
-        groups = torch.tensor([-(-count // GROUP_FRAMES) for count in frames])
+        groups = torch.tensor([-(-count // GROUP_FRAMES) for count in request.frames])
         codes = generate(
             self.gpt, given, groups=groups, temperature=sampling.temperature, top_k=sampling.top_k or None,
-            top_p=sampling.top_p, cfg_scale=sampling.cfg_scale, seed=list(seeds),
+            top_p=sampling.top_p, cfg_scale=sampling.cfg_scale, seed=list(request.seeds),
         ).codes  # fmt: skip
         out = []
-        for row, count in enumerate(frames):
+        for row, count in enumerate(request.frames):
             single = {
                 s.name: codes[s.name][row : row + 1, : int(groups[row]) * s.per_group]
                 for s in self.tokenizer.streams
@@ -89,20 +90,14 @@ class VaeFace:
     net: LoadedTma
 
     @torch.no_grad()
-    def make(
-        self,
-        text: EncodedText,
-        prior: torch.Tensor | None,
-        frames: Sequence[int],
-        seeds: Sequence[int],
-        sampling: SamplingConfig,
-    ) -> list[torch.Tensor]:
+    def make(self, request: FaceRequest) -> list[torch.Tensor]:
         """See `FaceGenerator`. The latent is drawn from the text's Gaussian; temperature scales its width."""
+        text, frames, seeds = request.text, request.frames, request.seeds
         mu, logvar = self.net.net.encode_text(torch.as_tensor(text.tokens), torch.as_tensor(text.mask))
         noise = torch.stack(
             [torch.randn(mu.shape[1], generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         )
-        z = mu + sampling.temperature * (0.5 * logvar).exp() * noise
+        z = mu + request.sampling.temperature * (0.5 * logvar).exp() * noise
         made = self.net.net.decode(z, torch.tensor(frames), max(frames))
         return [made[row, :count] for row, count in enumerate(frames)]
 
@@ -113,18 +108,12 @@ class DiffusionFace:
 
     net: MotionDiffusion
 
-    def make(
-        self,
-        text: EncodedText,
-        prior: torch.Tensor | None,
-        frames: Sequence[int],
-        seeds: Sequence[int],
-        sampling: SamplingConfig,
-    ) -> list[torch.Tensor]:
+    def make(self, request: FaceRequest) -> list[torch.Tensor]:
         """See `FaceGenerator`."""
+        sampling = request.sampling
         return sample_motions(
-            self.net, torch.as_tensor(text.sentence), frames, seeds=seeds, sampler=sampling.sampler,
-            steps=sampling.denoising_steps, guidance=sampling.cfg_scale,
+            self.net, torch.as_tensor(request.text.sentence), request.frames, seeds=request.seeds,
+            sampler=sampling.sampler, steps=sampling.denoising_steps, guidance=sampling.cfg_scale,
         )  # fmt: skip
 
 

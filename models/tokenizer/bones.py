@@ -59,12 +59,13 @@ class Bones(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """[..., D] -> [..., bones, 3]."""
         features = features.float()
-        joints = features[..., self.positions].unflatten(-1, (-1, 3)) * self.scale
+        joints = features[..., self.positions].reshape(*features.shape[:-1], -1, 3) * self.scale
         # Positions are relative to the root but in height, which counts from the floor.
         root = torch.zeros_like(joints[..., :1, :])
         root[..., 0, 1] = features[..., self.height] * self.height_scale
         ends = torch.cat([root, joints], dim=-2)
-        return (joints - ends[..., self.parents, :]) / self.lengths
+        vectors: Tensor = joints - ends[..., self.parents, :]
+        return vectors / self.lengths
 
     def held(self, held: Tensor) -> Tensor:
         """Bool [B, D] -> bool [B, bones]: both ends are held, for a part's columns are held together."""

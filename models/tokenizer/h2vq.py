@@ -10,50 +10,29 @@ A clip without hands gives the hand codebook nothing to learn; its hand latents 
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
 from motionloom.models.quantize.base import Codebook
 from motionloom.models.quantize.ema import EmaQuantizer
-from motionloom.models.tokenizer.base import (
-    Latents,
-    Stream,
-    Tokenizer,
-    stream_metrics,
-    token_mask,
-    without,
-)
+from motionloom.models.tokenizer.base import Latents, stream_metrics, token_mask, without
+from motionloom.models.tokenizer.body_hand import BodyHandTokenizer
 from motionloom.models.tokenizer.config import H2VQConfig
 
 
-class H2VQ(Tokenizer):
+class H2VQ(BodyHandTokenizer):
     """Two body tokens and one hand token per four frames."""
 
-    body_columns: Tensor
-    hand_columns: Tensor
-
     def __init__(self, config: H2VQConfig, layout: MotionLayout) -> None:
-        if not layout.has_part("hand"):
-            raise UserError(
-                f"layout {layout.name} has no hand columns; use kind 'vq' or 'rvq' with part 'body'"
-            )
-        streams = (Stream("body", config.num_codes, 2), Stream("hand", config.num_codes, 1))
-        super().__init__(config, layout, config.part, streams, ("body", "body", "hand"))
-        columns = layout.part(config.part)
-        body, hand = (np.searchsorted(columns, layout.part(part)) for part in ("body", "hand"))
-        self.register_buffer("body_columns", torch.from_numpy(body))
-        self.register_buffer("hand_columns", torch.from_numpy(hand))
-
+        super().__init__(config, layout)
         width, depth, growth, d = config.width, config.depth, config.dilation_growth, config.code_dim
         self.hand_encoder = ConvEncoder(
-            len(hand), d, width=width, halvings=2, depth=depth, dilation_growth=growth
+            len(self.hand_columns), d, width=width, halvings=2, depth=depth, dilation_growth=growth
         )
         self.body_encoder = ConvEncoder(
-            len(body), d, width=width, halvings=1, depth=depth, dilation_growth=growth
+            len(self.body_columns), d, width=width, halvings=1, depth=depth, dilation_growth=growth
         )
         self.hand_quantizer = EmaQuantizer(config.quantizer(), salt=0)
         self.transform = nn.Linear(d, d)
@@ -66,9 +45,6 @@ class H2VQ(Tokenizer):
     def codebooks(self) -> dict[str, Codebook]:
         """The quantizer of each stream."""
         return {"body": self.body_quantizer, "hand": self.hand_quantizer}
-
-    def _lost(self, held: Tensor | None) -> dict[str, Tensor]:
-        return {} if held is None else {"hand": ~held[:, self.hand_columns].all(1)}
 
     def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
         no_hands = lost.get("hand")
@@ -89,6 +65,3 @@ class H2VQ(Tokenizer):
             {"body": body.codes, "hand": hand.codes},
             stream_metrics(body.metrics, "body") | stream_metrics(hand.metrics, "hand"),
         )
-
-    def _join(self, vectors: dict[str, Tensor]) -> Tensor:
-        return torch.cat([vectors["body"], vectors["hand"].repeat_interleave(2, dim=1)], dim=-1)

@@ -6,45 +6,27 @@ but the body's codes do not know the hands' and neither decoder sees the other p
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
 from motionloom.models.quantize.base import Codebook
 from motionloom.models.quantize.ema import EmaQuantizer
-from motionloom.models.tokenizer.base import (
-    Latents,
-    Stream,
-    Tokenizer,
-    stream_metrics,
-    token_mask,
-    without,
-)
+from motionloom.models.tokenizer.base import Latents, stream_metrics, token_mask, without
+from motionloom.models.tokenizer.body_hand import BodyHandTokenizer
 from motionloom.models.tokenizer.config import SeparateConfig
 
 _HALVINGS = {"body": 1, "hand": 2}
 
 
-class SeparateVQ(Tokenizer):
+class SeparateVQ(BodyHandTokenizer):
     """Streams "body" and "hand" that share nothing."""
 
-    hand_columns: Tensor
-
     def __init__(self, config: SeparateConfig, layout: MotionLayout) -> None:
-        if not layout.has_part("hand"):
-            raise UserError(
-                f"layout {layout.name} has no hand columns; use kind 'vq' or 'rvq' with part 'body'"
-            )
-        streams = (Stream("body", config.num_codes, 2), Stream("hand", config.num_codes, 1))
-        super().__init__(config, layout, config.part, streams, ("body", "body", "hand"))
-        whole = layout.part(config.part)
-        columns = {name: np.searchsorted(whole, layout.part(name)) for name in ("body", "hand")}
+        super().__init__(config, layout)
+        columns = {"body": self.body_columns, "hand": self.hand_columns}
         width, depth, growth, d = config.width, config.depth, config.dilation_growth, config.code_dim
-        for name, where in columns.items():
-            self.register_buffer(f"{name}_columns", torch.from_numpy(where))
         self.encoders = nn.ModuleDict(
             {
                 name: ConvEncoder(
@@ -73,9 +55,6 @@ class SeparateVQ(Tokenizer):
         assert isinstance(book, EmaQuantizer)
         return book
 
-    def _lost(self, held: Tensor | None) -> dict[str, Tensor]:
-        return {} if held is None else {"hand": ~held[:, self.hand_columns].all(1)}
-
     def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
         vectors: dict[str, Tensor] = {}
         codes: dict[str, Tensor] = {}
@@ -90,21 +69,18 @@ class SeparateVQ(Tokenizer):
             penalty = penalty + out.penalty
         return Latents(self._join(vectors), penalty, codes, metrics)
 
-    def _join(self, vectors: dict[str, Tensor]) -> Tensor:
-        return torch.cat([vectors["body"], vectors["hand"].repeat_interleave(2, dim=1)], dim=-1)
-
 
 class _ApartDecoder(nn.Module):
     """Each part's latents through its own decoder, into its own columns."""
 
     order: Tensor
 
-    def __init__(self, decoders: dict[str, ConvDecoder], columns: dict[str, np.ndarray], dim: int) -> None:
+    def __init__(self, decoders: dict[str, ConvDecoder], columns: dict[str, Tensor], dim: int) -> None:
         super().__init__()
         self.decoders = nn.ModuleDict(decoders)
         self.dim = dim
-        where = np.concatenate([columns[name] for name in decoders])
-        self.register_buffer("order", torch.from_numpy(np.argsort(where)))
+        where = torch.cat([columns[name] for name in decoders])
+        self.register_buffer("order", torch.argsort(where))
 
     def forward(self, joined: Tensor, valid: Tensor | None) -> Tensor:
         """Joined latents [B, T / 2, 2 d], valid frames [B] or None -> [B, T, D]."""

@@ -5,7 +5,7 @@ A new stage is a network file, a LightningModule file, a line here and a recipe 
 
 from __future__ import annotations
 
-from motionloom.pipeline.stage import StageKind
+from motionloom.pipeline.stage import StageConfig, StageKind
 from motionloom.pipeline.stages import (
     convert,
     data,
@@ -33,6 +33,11 @@ _ALL_MODELS = (
     "face_diffusion?",
 )
 
+
+def _tokenizer(name: str, summary: str, config: type[StageConfig]) -> StageKind:
+    return StageKind(name, summary, config, tokenizer.run_tokenizer, ("data", "stats"), trains=True)
+
+
 STAGES: dict[str, StageKind] = {
     kind.name: kind
     for kind in (
@@ -53,46 +58,11 @@ STAGES: dict[str, StageKind] = {
         ),
         StageKind("stats", "mean and deviation", prepare.StatsConfig, prepare.run_stats, ("data",)),
         StageKind("text", "caption embeddings", prepare.TextConfig, prepare.run_text, ("data",)),
-        StageKind(
-            "h2vq",
-            "H2VQ tokenizer",
-            tokenizer.H2VQStageConfig,
-            tokenizer.run_tokenizer,
-            ("data", "stats"),
-            trains=True,
-        ),
-        StageKind(
-            "vq",
-            "VQ tokenizer",
-            tokenizer.VqStageConfig,
-            tokenizer.run_tokenizer,
-            ("data", "stats"),
-            trains=True,
-        ),
-        StageKind(
-            "rvq",
-            "RVQ tokenizer",
-            tokenizer.RvqStageConfig,
-            tokenizer.run_tokenizer,
-            ("data", "stats"),
-            trains=True,
-        ),
-        StageKind(
-            "separate",
-            "body and hands apart",
-            tokenizer.SeparateStageConfig,
-            tokenizer.run_tokenizer,
-            ("data", "stats"),
-            trains=True,
-        ),
-        StageKind(
-            "fsq",
-            "FSQ tokenizer",
-            tokenizer.FsqStageConfig,
-            tokenizer.run_tokenizer,
-            ("data", "stats"),
-            trains=True,
-        ),
+        _tokenizer("h2vq", "H2VQ tokenizer", tokenizer.H2VQStageConfig),
+        _tokenizer("vq", "VQ tokenizer", tokenizer.VqStageConfig),
+        _tokenizer("rvq", "RVQ tokenizer", tokenizer.RvqStageConfig),
+        _tokenizer("separate", "body and hands apart", tokenizer.SeparateStageConfig),
+        _tokenizer("fsq", "FSQ tokenizer", tokenizer.FsqStageConfig),
         StageKind(
             "tma",
             "text-motion alignment",

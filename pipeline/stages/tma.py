@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch.utils.data import Dataset
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
@@ -34,6 +34,12 @@ class TmaStageConfig(TrainedStageConfig):
     part: Literal["bodyhand", "face"] = "bodyhand"
     """What is aligned; `face` takes the face captions. Without InfoNCE (`loss.contrastive: 0`) it is TEMOS,
     or, of the face, the paper's facial cVAE (B.5.1)."""
+
+    @model_validator(mode="after")
+    def _faces_have_every_frame(self) -> TmaStageConfig:
+        if self.part == "face" and self.net.frame_stride != 1:
+            raise ValueError("a face is generated frame by frame: net.frame_stride must be 1 with part: face")
+        return self
 
 
 def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:

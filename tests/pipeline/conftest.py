@@ -1,13 +1,17 @@
-"""Shared by the pipeline tests: a procedural walker to draw, the command line, and one finished small run."""
+"""Shared by the pipeline tests: a procedural walker to draw, the command line, a browser, one small run."""
 
 from __future__ import annotations
 
+import importlib
 import os
+import shutil
 import subprocess
 import sysconfig
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -170,6 +174,51 @@ def start() -> Callable[..., subprocess.Popen[str]]:
         )
 
     return go
+
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+BROWSER_ARGUMENTS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A headless Chromium; skips where there is none."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine to drive")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER_ARGUMENTS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="session")
+def until() -> Callable[..., None]:
+    """`until(page, expression)`: wait for JavaScript, from outside: the page's own policy forbids `eval`."""
+
+    def go(page: Any, expression: str, seconds: float = 15.0) -> None:
+        end = time.monotonic() + seconds
+        while not page.evaluate(expression):
+            assert time.monotonic() < end, f"never true: {expression}"
+            page.wait_for_timeout(20)
+
+    return go
+
+
+@pytest.fixture(scope="module")
+def borrow() -> Iterator[Callable[[str], ModuleType]]:
+    """`borrow("loopback")`: a helper module of the tests of `datasets`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[1] / "datasets"))
+        yield importlib.import_module
 
 
 @dataclass(frozen=True)

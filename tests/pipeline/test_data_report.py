@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -24,7 +23,6 @@ from motionloom.pipeline.data_clips import choose, joints_of, watch
 from motionloom.pipeline.data_facts import gather
 from motionloom.pipeline.data_report import write_data_report
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 NASTY = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=1'><b>bold</b> & \"q\""
 CONFIG = SynthConfig(clips=40, min_seconds=2.0, max_seconds=5.0)
 
@@ -228,32 +226,9 @@ def test_commands(
 # ---- in a browser
 
 
-def until(page: Any, expression: str, seconds: float = 15.0) -> None:
-    """Wait for a JavaScript condition; from outside, because the page's own policy forbids `eval`."""
-    end = time.monotonic() + seconds
-    while not page.evaluate(expression):
-        assert time.monotonic() < end, f"never true: {expression}"
-        page.wait_for_timeout(20)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on this machine to drive")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(
-            executable_path=CHROMIUM,
-            args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"],
-        )
-        yield chromium
-        chromium.close()
-
-
 @pytest.mark.browser
 @pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 400)])
-def test_it_plays_and_stays_quiet(browser: Any, page: Path, scheme: str, width: int) -> None:
+def test_it_plays_and_stays_quiet(browser: Any, until: Any, page: Path, scheme: str, width: int) -> None:
     trouble: list[str] = []
     sheet = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
     sheet.on("console", lambda m: trouble.append(m.text) if m.type in ("error", "warning") else None)

@@ -22,7 +22,6 @@ from motionloom.pipeline.pretrained import MotionModel
 
 pytestmark = pytest.mark.slow
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 STAGES = [
     "data",
     "stats",
@@ -261,25 +260,18 @@ def test_alignment_works_with_the_sentence_prior_too(
 
 
 @pytest.mark.browser
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine to drive")
-def test_the_page_plays_in_a_browser(small_run: Any) -> None:
-    from playwright.sync_api import sync_playwright
-
+def test_the_page_plays_in_a_browser(browser: Any, until: Callable[..., None], small_run: Any) -> None:
     trouble: list[str] = []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        page = browser.new_page()
-        page.on("console", lambda m: trouble.append(m.text) if m.type in ("error", "warning") else None)
-        page.on("pageerror", lambda error: trouble.append(str(error)))
-        page.goto((small_run.folder / "stages/report/report.html").as_uri())
-        end = time.monotonic() + 30
-        while not page.evaluate("window.__viewer && window.__viewer.draws > 0"):
-            assert time.monotonic() < end, "the viewer never drew"
-            page.wait_for_timeout(50)
-        frames = set()
-        while len(frames) < 5:
-            frames.add(page.evaluate("window.__viewer.frame"))
-            assert time.monotonic() < end, "the frames do not advance"
-            page.wait_for_timeout(50)
-        browser.close()
+    page = browser.new_page()
+    page.on("console", lambda m: trouble.append(m.text) if m.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: trouble.append(str(error)))
+    page.goto((small_run.folder / "stages/report/report.html").as_uri())
+    end = time.monotonic() + 30
+    until(page, "window.__viewer && window.__viewer.draws > 0", 30)
+    frames = set()
+    while len(frames) < 5:
+        frames.add(page.evaluate("window.__viewer.frame"))
+        assert time.monotonic() < end, "the frames do not advance"
+        page.wait_for_timeout(50)
+    page.close()
     assert not trouble

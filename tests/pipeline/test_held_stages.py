@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -26,12 +26,8 @@ Data = list[tuple[ShardDataset, FeatureStats]]
 
 
 @pytest.fixture(scope="module")
-def made() -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[1] / "datasets"))
-        import held_samples
-
-        yield held_samples
+def made(borrow: Callable[[str], ModuleType]) -> ModuleType:
+    return borrow("held_samples")
 
 
 @pytest.fixture(scope="module")

@@ -69,6 +69,11 @@ def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> N
         ("[1, 2]", "mapping"),
         ("a: [", "not valid YAML"),
         ("extends: recipe\nname: x", "circle"),
+        (
+            "name: x\nstages: {data: {kind: synth}, stats: {kind: stats}, text: {kind: text}, "
+            "face_vae: {kind: tma, part: face, net: {frame_stride: 2}}}",
+            "frame_stride must be 1",
+        ),
     ],
 )
 def test_wrong_recipes_are_refused(text: str, says: str, tmp_path: Path) -> None:

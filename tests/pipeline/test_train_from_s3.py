@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -27,12 +27,8 @@ STEPS = 16
 
 
 @pytest.fixture(scope="module")
-def loopback() -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[1] / "datasets"))
-        import loopback
-
-        yield loopback
+def loopback(borrow: Callable[[str], ModuleType]) -> ModuleType:
+    return borrow("loopback")
 
 
 @pytest.fixture(scope="module")

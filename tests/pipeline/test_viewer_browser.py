@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import shutil
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,44 +15,14 @@ from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-ARGUMENTS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 PARENTS = Skeleton.named("smplx52").parents
 NASTY = "</script><img src=x onerror='window.hacked=1'><b>bold</b> & \"q\""
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine to drive"),
-]
-
-
-def until(page: Any, expression: str, seconds: float = 15.0) -> None:
-    """Wait for a JavaScript condition; from outside, because the page's own policy forbids `eval`."""
-    end = time.monotonic() + seconds
-    while not page.evaluate(expression):
-        assert time.monotonic() < end, f"never true: {expression}"
-        page.wait_for_timeout(20)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield chromium
-        chromium.close()
+pytestmark = pytest.mark.browser
 
 
 @pytest.fixture
-def visit(browser: Any) -> Iterator[Callable[..., Any]]:
+def visit(browser: Any, until: Callable[..., None]) -> Iterator[Callable[..., Any]]:
     """Opens a file and fails the test if the page ever complains or asks for anything."""
     trouble: list[str] = []
     pages = []
@@ -136,7 +104,7 @@ def still(page: Any, frame: int = 0) -> None:
     page.evaluate(f"() => {{ __viewer.play(false); __viewer.setFrame({frame}); }}")
 
 
-def test_plays_by_itself_and_pauses(visit: Any, single: Path) -> None:
+def test_plays_by_itself_and_pauses(visit: Any, until: Any, single: Path) -> None:
     page = visit(single)
     first = page.evaluate("__viewer.frame")
     until(page, f"Math.abs(__viewer.frame - {first}) >= 5")
@@ -227,7 +195,7 @@ def test_drag_wheel_and_reset_change_the_view(visit: Any, single: Path) -> None:
     assert changed(before, pixels(page)) < 0.002
 
 
-def test_scrub_bar_and_buttons(visit: Any, single: Path) -> None:
+def test_scrub_bar_and_buttons(visit: Any, until: Any, single: Path) -> None:
     page = visit(single)
     bar = page.get_by_label("Time")
     box = bar.bounding_box()
@@ -270,7 +238,7 @@ def test_without_follow_the_whole_way_is_in_view(visit: Any, single: Path) -> No
     assert abs(boxes[0] - boxes[1]) > 20
 
 
-def test_rows_share_one_clock_and_short_ones_hold_or_loop(visit: Any, rows: Path) -> None:
+def test_rows_share_one_clock_and_short_ones_hold_or_loop(visit: Any, until: Any, rows: Path) -> None:
     page = visit(rows, width=1280, height=1000)
     assert page.locator("canvas").count() == 6
     assert page.locator(".mlv-label").all_text_contents() == ["truth", "reconstruction", "generated"] * 2
@@ -312,7 +280,7 @@ def test_dark_and_light(visit: Any, single: Path) -> None:
     assert changed(pixels(light), pixels(dark)) < 0.002
 
 
-def test_reduced_motion_starts_still_but_plays_on_request(visit: Any, single: Path) -> None:
+def test_reduced_motion_starts_still_but_plays_on_request(visit: Any, until: Any, single: Path) -> None:
     page = visit(single, reduced_motion="reduce")
     assert page.evaluate("[__viewer.playing, __viewer.frame]") == [False, 0]
     page.get_by_role("button", name="Play").click()
@@ -329,7 +297,7 @@ def test_unknown_skeletons_and_single_poses_draw(visit: Any, tmp_path: Path) -> 
     assert right - left > 50 and bottom >= top
 
 
-def test_report_page_with_two_viewers_and_charts(visit: Any, tmp_path: Path, walk: Any) -> None:
+def test_report_page_with_two_viewers_and_charts(visit: Any, until: Any, tmp_path: Path, walk: Any) -> None:
     motions = [
         ViewerMotion(walk(30), 20, PARENTS, label, "walks", "walks") for label in ("truth", "generated")
     ]
