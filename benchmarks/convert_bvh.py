@@ -26,7 +26,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from motionloom.datasets.convert.archives import list_batches
-from motionloom.datasets.convert.bvh import BvhConfig, convert_bvh
+from motionloom.datasets.convert.bvh import BvhConfig, prepare_bvh
+from motionloom.datasets.convert.conversion import SCAN_FILE, run_conversion
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.schema import Manifest
 
@@ -140,7 +141,9 @@ def main() -> None:
     parser.add_argument("--convert", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.convert:
-        convert_bvh(config_of(args.source), args.work, workers=args.convert, progress=False)
+        config, workers = config_of(args.source), args.convert
+        prepared = prepare_bvh(config, workers=workers, scan=args.work / SCAN_FILE)
+        run_conversion(prepared, args.work, workers=workers, progress=False)
         return
     args.work.mkdir(parents=True, exist_ok=True)
     one, two, broken = (args.work / name for name in ("one", "two", "killed"))

@@ -7,7 +7,7 @@
   filter of negatives and without.
 - What the captions of opposite motions look like to TMA and to the frozen sentence encoder.
 - Motions generated for held-out combinations of known words, measured on their joints: by the paper's GPT,
-  by one that reads the sentence embedding and by one without the alignment loss.
+  by one that reads the sentence embedding and by one without the alignment loss. Faces by each generator.
 
 Writes `learning.json` and `learning.png` into the run's folder.
 """
@@ -30,11 +30,14 @@ from rich.table import Table
 
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.shards.statistics import FeatureStats
+from motionloom.datasets.synth.face import read
 from motionloom.datasets.synth.measure import agrees
 from motionloom.datasets.text.encoder import load_text_encoder
+from motionloom.models.gpt.sampling import sample_seeds
 from motionloom.models.metrics.retrieval import recall
 from motionloom.pipeline.bundle import Bundle, part_folders, text_encoder_of
 from motionloom.pipeline.evaluation import embed_motions
+from motionloom.pipeline.faces import FaceRequest, expression
 from motionloom.pipeline.networks import LoadedTma
 from motionloom.pipeline.samples import Truth, joint_layout, reconstruct, truth_of
 from motionloom.pipeline.sampling import SamplingConfig
@@ -153,6 +156,29 @@ def generation(
     return out
 
 
+def facial(run: Path, truths: list[Truth]) -> dict[str, float]:
+    """Share of expressions that show what the caption says, for each generator (Table 4 in miniature)."""
+    parts = part_folders(run)
+    bundle = Bundle.from_parts(parts, text_encoder_of(parts["text"]))
+    shown = [t for t in truths if t.face is not None and (t.truth or {}).get("face")]
+    request = FaceRequest(
+        bundle.text_encoder.encode([t.face_caption for t in shown]),
+        None,
+        [len(t.features) for t in shown],
+        sample_seeds(0, len(shown)),
+        SamplingConfig(),
+    )
+    wanted = [(t.truth or {})["face"] for t in shown]
+    order = np.random.default_rng(0).permutation(len(shown))
+    out = {
+        "another clip's face": float(np.mean([wanted[k] == w for k, w in zip(order, wanted, strict=True)]))
+    }
+    for kind, generator in bundle.faces.items():
+        made = [expression(values, bundle.layout, bundle.stats) for values in generator.make(request)]
+        out[kind] = float(np.mean([read(face) == w for face, w in zip(made, wanted, strict=True)]))
+    return out
+
+
 def draw(shares: dict[str, Shares], path: Path) -> None:
     """Bars of every attribute on the held-out combinations, one colour a row of the table."""
     import matplotlib.pyplot as plt
@@ -209,6 +235,12 @@ def main() -> None:
                 table.add_row(title, *percent(row[kind], names))
             console.print(table)
         draw(shares, run / "learning.png")
+    if finished(run, "face_gpt"):
+        found["face"] = facial(run, truths)
+        table = Table("generator", "right", title="faces that show what their caption says")
+        for title, share in found["face"].items():
+            table.add_row(title, f"{100 * share:.1f} %")
+        console.print(table)
     (run / "learning.json").write_text(json.dumps(found, indent=1))
     console.print(f"{run / 'learning.json'}")
 

@@ -22,7 +22,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import ClipMeta, Split
+from motionloom.datasets.schema import Split
 from motionloom.datasets.shards.batches import WindowBatches
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
@@ -41,10 +41,7 @@ class Noise:
         rng = np.random.default_rng(i)
         frames = int(rng.integers(WINDOW, 197))
         motion = rng.standard_normal((frames, LAYOUT.dim), dtype=np.float32)
-        meta = ClipMeta(
-            id=str(i), source="noise", split="train", layout=LAYOUT.name, family=LAYOUT.family,
-            fps=LAYOUT.fps, skeleton=LAYOUT.skeleton_name, frames=frames, licence="CC0",
-        )  # fmt: skip
+        meta = LAYOUT.clip_meta(str(i), source="noise", split="train", frames=frames, licence="CC0")
         return Sample(meta, motion)
 
 

@@ -4,7 +4,8 @@
 
 Every tokenizer is trained by the same recipe on the same windows with the same widths, one run a seed, and
 measured on the test split: MPJPE in mm of all joints and of the body from the root, of the fingers from their
-wrists, and the world positions with the path. Killed and started again it goes on where it was.
+wrists, and the world positions with the path. Shards without hands leave out tokenizers of body and hands.
+Killed and started again it goes on where it was.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.evaluation import reconstruction_figures
 from motionloom.pipeline.networks import load_tokenizer
@@ -49,6 +51,10 @@ COMMON = {
     "bone_weight": 0.3,
 }
 COLUMNS = {"mpjpe": "all", "mpjpe_body": "body", "mpjpe_hand": "fingers", "global_mpjpe": "world"}
+
+
+HANDED = ("h2vq", "separate")
+"""Stage kinds that need hands."""
 
 
 def recipe(work: Path, kind: str, net: dict, seed: int, args: argparse.Namespace) -> Path:
@@ -91,17 +97,21 @@ def show(results: dict[str, list[dict[str, float]]], console: Console) -> None:
         "tokenizer", "bit/s", *COLUMNS.values(), title="test clips, mm, mean ± deviation over seeds"
     )
     for title, rows in results.items():
-        cells = [_spread([row[key] for row in rows]) for key in COLUMNS]
+        cells = [_spread([row[key] for row in rows if key in row]) for key in COLUMNS]
         table.add_row(title, f"{rows[0]['bits']:.0f}", *cells)
     first = next(iter(results.values()))[0]
     for name, suffix in (("nearest training clip", "_nearest_train_clip"), ("mean pose", "_mean_pose")):
-        table.add_row(name, "", *(f"{first[f'{key}{suffix}']:.1f}" for key in COLUMNS))
+        table.add_row(
+            name, "", *(_spread([first[k + suffix]] if k + suffix in first else []) for k in COLUMNS)
+        )
     console.print(table)
 
 
 def _spread(values: Sequence[float]) -> str:
-    deviation = np.std(values, ddof=1) if len(values) > 1 else 0.0
-    return f"{np.mean(values):.1f} ± {deviation:.1f}"
+    if not values:
+        return ""
+    deviation = f" ± {np.std(values, ddof=1):.1f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.1f}{deviation}"
 
 
 def draw(results: dict[str, list[dict[str, float]]], path: Path) -> None:
@@ -111,7 +121,8 @@ def draw(results: dict[str, list[dict[str, float]]], path: Path) -> None:
     figure, panels = plt.subplots(1, len(COLUMNS), figsize=(12, 3), sharey=True, layout="constrained")
     for panel, (key, title) in zip(panels, COLUMNS.items(), strict=True):
         for row, (_name, figures) in enumerate(results.items()):
-            panel.plot([f[key] for f in figures], [row] * len(figures), "o", alpha=0.7, color="C0")
+            values = [f[key] for f in figures if key in f]
+            panel.plot(values, [row] * len(values), "o", alpha=0.7, color="C0")
         panel.set_title(f"{title}, mm")
         panel.set_yticks(range(len(results)), list(results))
         panel.grid(axis="x", alpha=0.3)
@@ -135,10 +146,14 @@ def main() -> None:
         fields = {"clips": args.made, "fps": 20, "min_seconds": 2.0, "max_seconds": 5.0, "seed": 7}
         synthesize(SynthConfig.parse(fields, "synthetic clips"), args.shards, workers=2)
     console = Console()
+    handed = ShardDataset.open(args.shards, "train").layout.has_part("hand")
     results: dict[str, list[dict[str, float]]] = {}
     for seed in range(args.seeds):
         for title in args.nets:
             kind, net = NETS[title]
+            if not handed and kind in HANDED:
+                continue
+            net = net if handed else {**net, "part": "body"}
             run = args.work / f"{title.replace(' ', '-').replace(',', '')}-{seed}"
             run_recipe(recipe(run, kind, net, seed, args), run, console=console)
             results.setdefault(title, []).append(measure(run, args.clips))

@@ -102,7 +102,10 @@ class Caption(Config):
 
 
 class ClipMeta(Config):
-    """`meta.json` of one sample: where a clip comes from and what its features mean."""
+    """`meta.json` of one sample: where a clip comes from and what its features mean.
+
+    `MotionLayout.clip_meta` makes one and fills in what the layout knows.
+    """
 
     id: str
     source: str

@@ -38,12 +38,12 @@ from motionloom.datasets.convert.aistpp_plan import (
     plan_aistpp,
 )
 from motionloom.datasets.convert.conversion import Conversion, digest
-from motionloom.datasets.convert.features import features_of, require_human
+from motionloom.datasets.convert.features import body_of, features_of, require_human
 from motionloom.datasets.convert.files import inside
 from motionloom.datasets.motion.canonical import canonicalize, facing, resample, resample_quaternions
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
-from motionloom.datasets.schema import Caption, ClipMeta, UserError
+from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.sample import Sample
 
 __all__ = ["AistppConfig", "canonical_smpl75", "convert_clip", "plan_aistpp", "prepare_aistpp"]
@@ -70,29 +70,25 @@ _KEPT_PIECES = 64
 
 def prepare_aistpp(config: AistppConfig, *, workers: int = 1, progress: bool = False) -> Conversion[AistClip]:
     """Look at the whole source; everything is told, nothing is converted yet."""
-    body, settings = _body(config), audio_settings(config)
+    body, settings = body_of(config.body_model, "smpl22"), audio_settings(config)
     plan = plan_aistpp(config, progress=progress)
     told = []
     for _, clip in plan.items:
         size = (config.source / clip.label()).stat().st_size
         sound = (config.sound_folder / clip.sound).stat().st_size if clip.sound else 0
         told.append([clip.id, clip.split, clip.used, size, clip.sound, sound])
-    options = config.dump()
-    for local in ("source", "splits", "ignore_list", "music_folder"):
-        options.pop(local)
+    options = config.options("splits", "ignore_list", "music_folder")
     options |= {"body_model": body.statement, "source_sha256": digest(told)}
     options["audio_version"] = VERSION if settings else None
     return Conversion(
+        config=config,
         plan=plan,
         convert=partial(convert_clip, config, body),
         describe=AistClip.label,
-        layout=config.motion_layout(),
-        name=config.name,
         licence=config.licence or (MUSIC_LICENCE if config.stores_music else MOTION_LICENCE),
         converter=CONVERTER,
         version=CONVERTER_VERSION,
         options=options,
-        motion_type=config.motion_type,
         audio=settings.dump() if settings else None,
     )
 
@@ -122,14 +118,10 @@ def convert_clip(config: AistppConfig, body: BodyModel, clip: AistClip) -> Sampl
     features, wav = None, None
     if clip.sound is not None:
         features, wav = music_of_clip(config, clip.sound, len(motion))
-    meta = ClipMeta(
-        id=clip.id,
+    meta = layout.clip_meta(
+        clip.id,
         source=label,
         split=clip.split,
-        layout=layout.name,
-        family=layout.family,
-        fps=layout.fps,
-        skeleton=layout.skeleton_name,
         frames=len(motion),
         licence=clip.licence,
         has_hands=False,
@@ -201,12 +193,6 @@ def piece_of_music(
         if shared is not None:
             shared.setflags(write=False)  # every clip of the piece gets the same array
     return features, kept
-
-
-def _body(config: AistppConfig) -> BodyModel:
-    if config.body_model is None:
-        return BodyModel.neutral("smpl22")
-    return BodyModel.load(config.body_model, "smpl22")
 
 
 def _genre_caption(sequence: str) -> Caption:

@@ -19,7 +19,7 @@ from rich.progress import track
 from motionloom.datasets.audio.sound import sound_seconds
 from motionloom.datasets.convert.aist_pickle import read_aist_motion
 from motionloom.datasets.convert.aistpp_lists import SequenceLists, read_lists
-from motionloom.datasets.convert.base import ConversionPlan, Subset
+from motionloom.datasets.convert.base import ConversionPlan, Subset, frames_by_split
 from motionloom.datasets.convert.conversion import ConvertConfig, count_licences, drop, limited
 from motionloom.datasets.convert.features import frames_after
 from motionloom.datasets.convert.files import inside
@@ -176,9 +176,7 @@ def plan_aistpp(config: AistppConfig, *, progress: bool = False) -> ConversionPl
         cut += found.used < found.frames
         items.append((found.split, found))
     notes = [*lists.notes, *_notes(config, music, items, cut)]
-    if config.limit is not None and len(items) > config.limit:
-        notes.append(f"limited to {config.limit} of {len(items)} clips")
-        items = limited(items, AistClip.label, config.limit)
+    items = limited(items, AistClip.label, config.limit, notes)
 
     present = {name.removesuffix(".pkl") for name in names}
     missing = {
@@ -186,13 +184,10 @@ def plan_aistpp(config: AistppConfig, *, progress: bool = False) -> ConversionPl
         for sequence, split in lists.splits.items()
         if sequence not in present and sequence not in lists.ignored
     }
-    frames: dict[Split, int] = dict.fromkeys(SPLITS, 0)
-    for split, clip in items:
-        frames[split] += frames_after(clip.used, FPS, layout)
     return ConversionPlan(
         name=f"{config.source.name} -> {config.name}",
         items=items,
-        frames=frames,
+        frames=frames_by_split((split, frames_after(clip.used, FPS, layout)) for split, clip in items),
         found=len(names),
         missing=[
             Dropped(source=f"{MOTIONS}/{sequence}.pkl", reason=f"listed in split '{split}', but not here")

@@ -14,6 +14,7 @@ Z up becomes Y up. Jaw, eyes, soft tissue (`dmpls`) and markers are not used.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -26,7 +27,6 @@ from motionloom.datasets.convert.smpl_npz import read_motion
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.motion.smpl import BodyModel, SkeletonName, smpl_joints
-from motionloom.datasets.schema import ClipMeta
 from motionloom.datasets.shards.sample import Sample
 
 __all__ = ["AmassConfig", "prepare_amass"]
@@ -37,19 +37,18 @@ CONVERTER_VERSION = 1
 FINGERS_MOVE = 1e-3
 """Radians. Fingers that turn less than this over a clip were not captured, but set to one pose."""
 
-_PATHS = ("source", "captions", "splits", "humanml_index", "humanml_texts")
+_PATHS = ("captions", "splits", "humanml_index", "humanml_texts")
 _MODEL_PATHS = {
     "neutral": "body_model",
     "female": "body_model_female",
     "male": "body_model_male",
 }
-"""Options that hold local paths."""
+"""Options that hold local paths, beside the source."""
 
 
 def prepare_amass(config: AmassConfig, *, workers: int = 1, progress: bool = False) -> Conversion[AmassClip]:
     """Plan the conversion of a folder of AMASS clips."""
-    layout = config.motion_layout()
-    skeleton = cast("SkeletonName", layout.skeleton_name)
+    skeleton = cast("SkeletonName", config.motion_layout().skeleton_name)
     paths = {gender: getattr(config, option) for gender, option in _MODEL_PATHS.items()}
     bodies = {gender: BodyModel.load(path, skeleton) for gender, path in paths.items() if path is not None}
     kinds = {gender: str(body.statement["kind"]) for gender, body in bodies.items()}
@@ -61,20 +60,17 @@ def prepare_amass(config: AmassConfig, *, workers: int = 1, progress: bool = Fal
         [clip.label(), clip.file.size, clip.first, clip.last, [caption.dump() for caption in clip.texts]]
         for _, clip in plan.items
     ]
-    options = {key: value for key, value in config.dump().items() if key not in _PATHS}
-    options = {key: value for key, value in options.items() if key not in _MODEL_PATHS.values()}
+    options = config.options(*_PATHS, *_MODEL_PATHS.values())
     options |= {"humanml_index": config.humanml_index is not None, "bodies": statements}
     return Conversion(
+        config=config,
         plan=plan,
-        convert=ClipMaker(config, layout, bodies),
+        convert=ClipMaker(config, bodies),
         describe=AmassClip.label,
-        layout=layout,
-        name=config.name,
         licence=config.licence or LICENCE,
         converter=CONVERTER,
         version=CONVERTER_VERSION,
         options=options | {"source_sha256": digest(told)},
-        motion_type=config.motion_type,
     )
 
 
@@ -83,9 +79,13 @@ class ClipMaker:
     """Everything a worker needs to make samples."""
 
     config: AmassConfig
-    layout: MotionLayout
     bodies: dict[str, BodyModel]
     """By gender; `neutral` serves the genders that are not there."""
+
+    @cached_property
+    def layout(self) -> MotionLayout:
+        """The layout of the samples."""
+        return self.config.motion_layout()
 
     def __call__(self, clip: AmassClip) -> Sample:
         """One sample; `UserError` when the motion cannot be used."""
@@ -104,14 +104,10 @@ class ClipMaker:
             joints = mirror(joints, self.layout.skeleton)
         features = features_of(joints, clip.fps / step, self.layout, same_bones=self.config.retarget)
         turned = np.ptp(motion.rotations[:, BODY_JOINTS:], axis=0)
-        meta = ClipMeta(
-            id=clip.id,
+        meta = self.layout.clip_meta(
+            clip.id,
             source=clip.file.label,
             split=clip.split,
-            layout=self.layout.name,
-            family=self.layout.family,
-            fps=self.layout.fps,
-            skeleton=self.layout.skeleton_name,
             frames=len(features),
             licence=self.config.licence or LICENCE,
             has_hands=bool(turned.size) and float(turned.max()) > FINGERS_MOVE,

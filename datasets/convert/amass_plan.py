@@ -19,7 +19,7 @@ from motionloom.datasets.convert.amass_source import (
     list_files,
     read_headers,
 )
-from motionloom.datasets.convert.base import ConversionPlan, Subset
+from motionloom.datasets.convert.base import ConversionPlan, Subset, frames_by_split
 from motionloom.datasets.convert.captions import CaptionTable, read_captions
 from motionloom.datasets.convert.conversion import count_licences, limited
 from motionloom.datasets.convert.features import frames_after
@@ -33,7 +33,6 @@ from motionloom.datasets.convert.splits import (
 )
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
-from motionloom.datasets.shards.index import SPLITS
 
 _NOTED_LINES = 50
 """Wrong caption lines that are noted one by one."""
@@ -108,16 +107,13 @@ def plan_amass(
             plan.dropped.append(Dropped(source=clip.label(), reason=reason))
         else:
             plan.items.append((clip.split, clip))
-    if config.limit is not None and len(plan.items) > config.limit:
-        plan.notes.append(f"limited to {config.limit} of {len(plan.items)} clips")
-    items = limited(plan.items, AmassClip.label, config.limit)
-    frames: dict[Split, int] = dict.fromkeys(SPLITS, 0)
-    for split, clip in items:
-        frames[split] += frames_after(clip.last - clip.first, clip.fps, layout)
+    items = limited(plan.items, AmassClip.label, config.limit, plan.notes)
     return ConversionPlan(
         name=f"{config.source.name} -> {config.name}",
         items=items,
-        frames=frames,
+        frames=frames_by_split(
+            (split, frames_after(clip.last - clip.first, clip.fps, layout)) for split, clip in items
+        ),
         found=len(files),
         missing=plan.missing,
         uncaptioned=plan.uncaptioned,

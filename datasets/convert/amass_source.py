@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from pydantic import Field, model_validator
-from rich.progress import Progress
 
 from motionloom.datasets.convert.conversion import ConvertConfig, drop
-from motionloom.datasets.convert.files import inside
+from motionloom.datasets.convert.files import inside, read_in_threads
 from motionloom.datasets.convert.smpl_npz import MotionHeader, read_motion_header
 from motionloom.datasets.convert.splits import check_id
 from motionloom.datasets.motion.layout import MotionLayout
@@ -139,15 +137,12 @@ def read_headers(
     """The files that can be read, with what they state, and the others."""
     out: list[tuple[AmassFile, MotionHeader]] = []
     broken: list[Dropped] = []
-    with Progress(disable=not progress) as bar, ThreadPoolExecutor(max(workers, 1)) as pool:
-        shown = bar.add_task("reading the source", total=len(files))
-        # Threads are enough: opening many files waits for the disk.
-        for file, header in zip(files, pool.map(_read, files), strict=True):
-            if isinstance(header, UserError):
-                broken.append(drop(file.label, header))
-            else:
-                out.append((file, header))
-            bar.advance(shown)
+    headers = read_in_threads(_read, files, workers=workers, progress=progress)
+    for file, header in zip(files, headers, strict=True):
+        if isinstance(header, UserError):
+            broken.append(drop(file.label, header))
+        else:
+            out.append((file, header))
     return out, broken
 
 

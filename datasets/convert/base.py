@@ -6,7 +6,7 @@ and why, so nothing is skipped silently (`convert ... --plan` prints it and stop
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -106,6 +106,14 @@ class ConversionPlan(Generic[T]):
         bad = [*self.broken, *self.missing]
         if bad:
             raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")
+
+
+def frames_by_split(counts: Iterable[tuple[Split, int]]) -> dict[Split, int]:
+    """Frames a split, from (split, frames) of every clip."""
+    frames: dict[Split, int] = dict.fromkeys(SPLITS, 0)
+    for split, count in counts:
+        frames[split] += count
+    return frames
 
 
 def _duration(seconds: float) -> str:

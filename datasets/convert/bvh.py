@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +22,17 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.convert.archives import Batch
 from motionloom.datasets.convert.bvh_plan import SUFFIX, BvhClip, BvhConfig, plan_bvh
-from motionloom.datasets.convert.conversion import SCAN_FILE, Conversion, digest, drop, run_conversion
+from motionloom.datasets.convert.conversion import Conversion, digest, drop
 from motionloom.datasets.convert.feature_store import store_batch, stored_batch, stored_features
 from motionloom.datasets.convert.features import features_of
 from motionloom.datasets.convert.first_step import FirstStep
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.schema import ClipMeta, Dropped, Manifest, UserError
+from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.sample import Sample
 
-__all__ = ["BvhConfig", "convert_bvh", "plan_bvh", "prepare_bvh"]
+__all__ = ["BvhConfig", "plan_bvh", "prepare_bvh"]
 
 CONVERTER = "bvh"
 CONVERTER_VERSION = 2
@@ -48,53 +49,21 @@ def prepare_bvh(
     for _, clip in plan.items:
         groups.setdefault(clip.number, []).append(clip)
     batches = [
-        BvhBatch(clips, group[0].batch, number, tuple(clip.label for clip in group), digest(options))
+        BvhBatch(clips, group[0].batch, number, tuple(clip.label() for clip in group), digest(options))
         for number, group in sorted(groups.items())
     ]
     positions = {batch.number: position for position, batch in enumerate(batches)}
     return Conversion(
+        config=config,
         plan=plan,
         convert=clips,
-        describe=_label,
-        layout=clips.layout,
-        name=config.name,
+        describe=BvhClip.label,
         licence=config.licence,
         converter=CONVERTER,
         version=CONVERTER_VERSION,
         options=options,
-        motion_type=config.motion_type,
         first=FirstStep(batches, lambda clip: positions[clip.number], clips.take),
     )
-
-
-def convert_bvh(
-    config: BvhConfig,
-    out: Path,
-    *,
-    workers: int = 1,
-    progress: bool = True,
-    strict: bool = False,
-    seed: int = 0,
-    clips_per_shard: int = 256,
-) -> Manifest:
-    """Convert the source into shards under `out`; clips left out are in the manifest with their reasons.
-
-    `strict` stops when a clip is missing or cannot be read, or an archive is damaged. Same input and options
-    give the same bytes for any `workers`.
-    """
-    return run_conversion(
-        prepare_bvh(config, workers=workers, progress=progress, scan=out / SCAN_FILE),
-        out,
-        workers=workers,
-        strict=strict,
-        seed=seed,
-        clips_per_shard=clips_per_shard,
-        progress=progress,
-    )
-
-
-def _label(clip: BvhClip) -> str:
-    return clip.label
 
 
 @dataclass(frozen=True)
@@ -102,25 +71,29 @@ class BvhClips:
     """Makes samples of clips: all that every clip of a conversion has in common."""
 
     config: BvhConfig
-    layout: MotionLayout
     joint_map: JointMap
 
     @staticmethod
     def of(config: BvhConfig) -> BvhClips:
         """Read the joint map."""
-        layout = config.motion_layout()
-        return BvhClips(config, layout, JointMap.load(config.joint_map, target=layout.skeleton_name))
+        target = config.motion_layout().skeleton_name
+        return BvhClips(config, JointMap.load(config.joint_map, target=target))
+
+    @cached_property
+    def layout(self) -> MotionLayout:
+        """The layout of the samples."""
+        return self.config.motion_layout()
 
     def __call__(self, clip: BvhClip) -> Sample:
         """One clip by itself. An archive is read up to the clip: for many clips, make the batch."""
         for file in clip.batch.read(SUFFIX):
             if file.path == clip.found.path:
-                return self._sample(clip, self.features(clip.label, file.data))
-        raise UserError(f"{clip.label}: no longer in the source")
+                return self._sample(clip, self.features(clip.label(), file.data))
+        raise UserError(f"{clip.label()}: no longer in the source")
 
     def take(self, clip: BvhClip, folder: Path) -> Sample:
         """One clip from the files of the first step."""
-        return self._sample(clip, stored_features(_path(folder, clip.number), clip.label))
+        return self._sample(clip, stored_features(_path(folder, clip.number), clip.label()))
 
     def features(self, label: str, data: bytes) -> NDArray[np.float32]:
         """Features [T', D] of one file; `label` names it in errors."""
@@ -136,14 +109,10 @@ class BvhClips:
 
     def _sample(self, clip: BvhClip, motion: NDArray[np.float32]) -> Sample:
         layout = self.layout
-        meta = ClipMeta(
-            id=clip.id,
-            source=clip.label,
+        meta = layout.clip_meta(
+            clip.id,
+            source=clip.label(),
             split=clip.split,
-            layout=layout.name,
-            family=layout.family,
-            fps=layout.fps,
-            skeleton=layout.skeleton_name,
             frames=len(motion),
             licence=self.config.licence,
             has_hands=layout.num_joints > BODY_JOINTS,

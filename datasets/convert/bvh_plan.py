@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from motionloom.datasets.convert.archives import Batch, list_batches
-from motionloom.datasets.convert.base import ConversionPlan
+from motionloom.datasets.convert.base import ConversionPlan, frames_by_split
 from motionloom.datasets.convert.captions import CaptionTable, read_captions
 from motionloom.datasets.convert.conversion import ConvertConfig, count_licences, drop, limited
 from motionloom.datasets.convert.features import frames_after
@@ -20,7 +20,6 @@ from motionloom.datasets.motion.joint_map import Unit, Up
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
 from motionloom.datasets.shards.files import sha256_of
-from motionloom.datasets.shards.index import SPLITS
 
 SUFFIX = ".bvh"
 
@@ -62,10 +61,9 @@ class BvhConfig(ConvertConfig):
             raise UserError(f"layout {self.layout} cannot be made from joints; use body133 or h3d263")
         return layout
 
-    def options(self) -> dict[str, Any]:
+    def options(self, *local: str) -> dict[str, Any]:
         """What the output depends on, for the manifest: files by name and digest instead of local paths."""
-        given = self.dump()
-        given.pop("source")
+        given = super().options(*local)
         for key in ("joint_map", "captions"):
             path: Path | None = getattr(self, key)
             given[key] = {"file": path.name, "sha256": sha256_of(path)} if path else None
@@ -85,9 +83,8 @@ class BvhClip:
     split: Split
     texts: tuple[Caption, ...]
 
-    @property
     def label(self) -> str:
-        """Names the clip in reports."""
+        """Name of the clip in reports."""
         return self.found.label
 
 
@@ -159,20 +156,17 @@ def _decide(
         items.append((split, BvhClip(batches[number], number, clip, clip_id, split, texts)))
     if other_rate:
         notes.append(f"{other_rate} captions state another frame rate than their file; the file's counts")
-    if config.limit is not None and len(items) > config.limit:
-        notes.append(f"limited to {config.limit} of {len(items)} clips")
-        items = limited(items, lambda clip: clip.id, config.limit)
+    items = limited(items, lambda clip: clip.id, config.limit, notes)
     layout = config.motion_layout()
-    frames: dict[Split, int] = dict.fromkeys(SPLITS, 0)
-    for split, planned in items:
-        rate = config.source_fps or planned.found.fps
-        frames[split] += frames_after(planned.found.frames, rate, layout)
     wanted = {clip_id: row.file or clip_id for clip_id, row in table.rows.items()}
     wanted |= {clip_id: clip_id for clip_id in listed if clip_id not in wanted}
     return ConversionPlan(
         name=f"{config.source.name} -> {config.name}",
         items=items,
-        frames=frames,
+        frames=frames_by_split(
+            (split, frames_after(planned.found.frames, config.source_fps or planned.found.fps, layout))
+            for split, planned in items
+        ),
         found=len(found),
         missing=[
             Dropped(source=name, reason=f"clip '{clip_id}' is listed, but its file is not in the source")

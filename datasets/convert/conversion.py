@@ -68,6 +68,10 @@ class ConvertConfig(Config):
         """The layout of the written shards."""
         return MotionLayout.named(self.layout, fps=self.fps)
 
+    def options(self, *local: str) -> dict[str, Any]:
+        """What the output depends on, for the manifest: without `source` and other `local` paths."""
+        return {key: value for key, value in self.dump().items() if key not in ("source", *local)}
+
     def licence_problem(self, licence: str) -> str:
         """Why a clip under `licence` is left out; empty when it may come."""
         if not self.allow_licence or licence in self.allow_licence:
@@ -87,18 +91,16 @@ class ConvertConfig(Config):
 class Conversion(Generic[T]):
     """What to write. `convert` and the items must be picklable; `convert` may raise `DropClip(reason)`."""
 
+    config: ConvertConfig
     plan: ConversionPlan[T]
     convert: Callable[[T], Sample | list[Sample]]
     describe: Callable[[T], str]
     """Name of an item in reports. A changed file must change it: name and size will do."""
-    layout: MotionLayout
-    name: str
     licence: str
     converter: str
     version: int
     options: dict[str, Any]
     """What the output depends on, as plain JSON; never a local path."""
-    motion_type: MotionType = "float32"
     audio: dict[str, Any] | None = None
     first: FirstStep[T] | None = None
     """For sources where clips cannot be read one by one; `convert` must then give the same samples."""
@@ -106,7 +108,7 @@ class Conversion(Generic[T]):
     def estimated(self, workers: int) -> ConversionPlan[T]:
         """The plan with disk and time: bytes by the frame counts, time by converting a few clips."""
         plan = self.plan
-        width = self.layout.dim * (2 if self.motion_type == "float16" else 4)
+        width = self.config.motion_layout().dim * (2 if self.config.motion_type == "float16" else 4)
         needed = sum(plan.frames.values()) * width + len(plan.items) * 4096
         each = self._trial()
         seconds = None if each is None else each * len(plan.items) / workers
@@ -154,7 +156,7 @@ def run_conversion(
     shard. With `part`, only that part is made, without a manifest (the one returned tells of the part); the
     run without one then finds the shards of all parts, makes what is missing and writes index and manifest.
     """
-    plan = conversion.plan
+    config, plan = conversion.config, conversion.plan
     if strict:
         plan.require_whole()
     folder, first = out / WORK_FOLDER, conversion.first
@@ -171,8 +173,8 @@ def run_conversion(
         out,
         plan.items,
         conversion.convert if first is None else Take(first.take, folder),
-        name=conversion.name,
-        layout=conversion.layout,
+        name=config.name,
+        layout=config.motion_layout(),
         licence=conversion.licence,
         converter=conversion.converter,
         converter_version=conversion.version,
@@ -183,7 +185,7 @@ def run_conversion(
         strict=strict,
         progress=progress,
         describe=conversion.describe,
-        motion_type=conversion.motion_type,
+        motion_type=config.motion_type,
         dropped=plan.left_out(),
         licences=plan.licences,
         audio=conversion.audio,
@@ -194,11 +196,16 @@ def run_conversion(
 
 
 def limited(
-    items: Sequence[tuple[Split, T]], key: Callable[[T], str], limit: int | None
+    items: Sequence[tuple[Split, T]],
+    key: Callable[[T], str],
+    limit: int | None,
+    notes: list[str] | None = None,
 ) -> list[tuple[Split, T]]:
-    """At most `limit` items, chosen by a hash of their key, in the old order."""
+    """At most `limit` items, chosen by a hash of their key, in the old order; `notes` tell of a choice."""
     if limit is None or len(items) <= limit:
         return list(items)
+    if notes is not None:
+        notes.append(f"limited to {limit} of {len(items)} clips")
     kept = set(sorted((digest(key(item)) for _, item in items))[:limit])
     return [item for item in items if digest(key(item[1])) in kept]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.motion.canonical import canonicalize, resample, retarget
 from motionloom.datasets.motion.features import encode
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.smpl import BodyModel, SkeletonName
 from motionloom.datasets.schema import UserError
 
 FIGURE_METRES = (0.5, 4.0)
@@ -17,6 +19,11 @@ FIGURE_METRES = (0.5, 4.0)
 
 MAX_SPEED = 40.0
 """Metres a second. The fastest hand of a person stays below 30; video fits that explode do not."""
+
+
+def body_of(model: Path | None, skeleton: SkeletonName) -> BodyModel:
+    """The user's body model, or the neutral skeleton of the package where none is given."""
+    return BodyModel.neutral(skeleton) if model is None else BodyModel.load(model, skeleton)
 
 
 def features_of(

@@ -1,11 +1,19 @@
-"""Files of a source by their names in it: text, and paths that can never leave the folder."""
+"""Files of a source: text, paths that can never leave the folder, and reading many of them at a time."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TypeVar
+
+from rich.progress import Progress
 
 from motionloom.datasets.convert.splits import check_id
 from motionloom.datasets.schema import UserError
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 MAX_TEXT_BYTES = 64 << 20
 """A text file beyond this is refused unread; the longest split list of a release has a few MB."""
@@ -60,3 +68,18 @@ def inside(root: Path, relative: str, name: str | None = None) -> Path:
     if not safe:
         raise UserError(f"{name}: a link that leaves {root.name}/; copy the file in its place")
     return path
+
+
+def read_in_threads(
+    read: Callable[[T], R], items: Sequence[T], *, workers: int, progress: bool, before: int = 0
+) -> Iterator[R]:
+    """What `read` makes of every item, in their order; the bar counts `before` items as done already.
+
+    Threads are enough: opening many files waits for the disk, unpacking and hashing run outside the
+    interpreter's lock.
+    """
+    with Progress(disable=not progress) as bar, ThreadPoolExecutor(max(workers, 1)) as pool:
+        shown = bar.add_task("reading the source", total=before + len(items), completed=before)
+        for made in pool.map(read, items):
+            yield made
+            bar.advance(shown)

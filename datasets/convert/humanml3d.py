@@ -37,7 +37,7 @@ from motionloom.datasets.motion.canonical import resample
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import ClipMeta, UserError
+from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 
 __all__ = ["HumanMl3dConfig", "convert_clip", "plan_humanml3d", "prepare_humanml3d"]
@@ -58,19 +58,15 @@ def prepare_humanml3d(
     for _, clip in plan.items:
         sizes = [(config.source / file).stat().st_size for file in clip.files]
         told.append([clip.id, clip.files, sizes, [caption.dump() for caption in clip.texts]])
-    options = config.dump()
-    options.pop("source")
     return Conversion(
+        config=config,
         plan=plan,
         convert=partial(convert_clip, config),
         describe=HumanMl3dClip.label,
-        layout=config.motion_layout(),
-        name=config.name,
         licence=config.licence or LICENCE,
         converter=CONVERTER,
         version=CONVERTER_VERSION,
-        options=options | {"source_sha256": digest(told)},
-        motion_type=config.motion_type,
+        options=config.options() | {"source_sha256": digest(told)},
     )
 
 
@@ -89,14 +85,10 @@ def convert_clip(config: HumanMl3dConfig, clip: HumanMl3dClip) -> Sample:
     else:
         bones = None if config.retarget else own_bones(joints, layout)
         motion = encode_h3d(resample(joints, FPS, layout.fps), layout, bones)
-    meta = ClipMeta(
-        id=clip.id,
+    meta = layout.clip_meta(
+        clip.id,
         source=clip.label(),
         split=clip.split,
-        layout=layout.name,
-        family=layout.family,
-        fps=layout.fps,
-        skeleton=layout.skeleton_name,
         frames=len(motion),
         licence=clip.licence,
         has_hands=False,

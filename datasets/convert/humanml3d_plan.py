@@ -9,24 +9,22 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
-from rich.progress import Progress
 
 from motionloom.datasets.convert.arrays import check_array_header
-from motionloom.datasets.convert.base import ConversionPlan, Subset
+from motionloom.datasets.convert.base import ConversionPlan, Subset, frames_by_split
 from motionloom.datasets.convert.conversion import ConvertConfig, count_licences, drop, limited
 from motionloom.datasets.convert.features import frames_after
-from motionloom.datasets.convert.files import inside
+from motionloom.datasets.convert.files import inside, read_in_threads
 from motionloom.datasets.convert.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.splits import (
     check_id,
-    hash_split,
+    hash_splits,
     keep_mirrors_together,
     original_of,
     read_split_files,
@@ -126,14 +124,9 @@ def plan_humanml3d(
     present, strange = _list_motion(config)
     texts = _list_texts(config)
     splits, notes = _read_splits(config, sorted(present))
-    scanned: dict[str, _Scanned] = {}
-    with Progress(disable=not progress) as bar, ThreadPoolExecutor(max(workers, 1)) as pool:
-        shown = bar.add_task("reading the source", total=len(present))
-        ids = sorted(present)
-        # Threads are enough: opening many small files waits for the disk.
-        for clip_id, found in zip(ids, pool.map(partial(_scan, config, texts, present), ids), strict=True):
-            scanned[clip_id] = found
-            bar.advance(shown)
+    ids = sorted(present)
+    scan = partial(_scan, config, texts, present)
+    scanned = dict(zip(ids, read_in_threads(scan, ids, workers=workers, progress=progress), strict=True))
 
     licence = config.licence or LICENCE
     items: list[tuple[Split, HumanMl3dClip]] = []
@@ -150,20 +143,14 @@ def plan_humanml3d(
     strays = len(texts.ids.keys() - present.keys())
     if strays:
         notes.append(f"{strays} caption files in {texts.folder}/ belong to no motion file here")
-    if config.limit is not None and len(items) > config.limit:
-        notes.append(f"limited to {config.limit} of {len(items)} clips")
-        items = limited(items, HumanMl3dClip.label, config.limit)
+    items = limited(items, HumanMl3dClip.label, config.limit, notes)
 
     missing = {clip_id: split for clip_id, split in splits.items() if clip_id not in present}
     wanted = "/ or ".join(config.folders)
-    frames: dict[Split, int] = dict.fromkeys(SPLITS, 0)
-    for split, clip in items:
-        kept = config.keeps_vectors and clip.files[0].startswith(VECS)
-        frames[split] += clip.frames if kept else frames_after(clip.frames, FPS, layout)
     return ConversionPlan(
         name=f"{config.source.name} -> {config.name}",
         items=items,
-        frames=frames,
+        frames=frames_by_split((split, _frames_made(config, clip, layout)) for split, clip in items),
         found=len(present),
         missing=[
             Dropped(source=clip_id, reason=f"listed in {split}.txt, but not in {wanted}/")
@@ -177,6 +164,13 @@ def plan_humanml3d(
         subsets=_subsets(present, splits, missing, items),
         licences=count_licences([clip.licence for _, clip in items]),
     )
+
+
+def _frames_made(config: HumanMl3dConfig, clip: HumanMl3dClip, layout: MotionLayout) -> int:
+    """Frames in the shards: vectors that are kept lose none."""
+    if config.keeps_vectors and clip.files[0].startswith(VECS):
+        return clip.frames
+    return frames_after(clip.frames, FPS, layout)
 
 
 def _problem(config: HumanMl3dConfig, found: _Scanned, licence: str) -> str:
@@ -232,8 +226,7 @@ def _list_texts(config: HumanMl3dConfig) -> _Texts:
 def _read_splits(config: HumanMl3dConfig, ids: list[str]) -> tuple[dict[str, Split], list[str]]:
     """Split of every id, by the split files, else by hash of the id that a clip has unmirrored."""
     if not any((config.source / f"{split}.txt").is_file() for split in SPLITS):
-        note = "no train.txt, val.txt or test.txt: split 80/5/15 by hash of the id"
-        return {clip_id: hash_split(original_of(clip_id) or clip_id) for clip_id in ids}, [note]
+        return hash_splits(ids)
     splits, notes = read_split_files(config.source)
     keep_mirrors_together(splits, original_of, config.source)
     return splits, notes

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.convert.arrays import load_array
 from motionloom.datasets.convert.conversion import Conversion, digest
-from motionloom.datasets.convert.features import features_of, require_human
+from motionloom.datasets.convert.features import body_of, features_of, require_human
 from motionloom.datasets.convert.motionx_parameters import (
     BETAS,
     EXPRESSION,
@@ -50,7 +50,7 @@ from motionloom.datasets.convert.motionx_text import read_frame_texts
 from motionloom.datasets.convert.splits import original_of
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
-from motionloom.datasets.schema import Caption, ClipMeta, UserError
+from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.sample import Sample
 
 __all__ = ["MotionXConfig", "convert_clip", "plan_motionx", "prepare_motionx", "read_parameters"]
@@ -63,37 +63,27 @@ def prepare_motionx(
     config: MotionXConfig, *, workers: int = 1, progress: bool = False
 ) -> Conversion[MotionXClip]:
     """Look at the whole source; everything is told, nothing is converted yet."""
-    layout = config.motion_layout()
-    # A wrong body model should fail before the long part.
-    body = (
-        BodyModel.load(config.body_model, config.skeleton)
-        if config.body_model
-        else BodyModel.neutral(config.skeleton)
-    )
+    body = body_of(config.body_model, config.skeleton)  # a wrong one should fail before the long part
     plan = plan_motionx(config, workers=workers, progress=progress)
     told = []
     for _, clip in plan.items:
         sizes = [(config.source / file).stat().st_size for file in clip.files]
         texts = [caption.dump() for caption in (*clip.texts, *clip.face_texts)]
         told.append([clip.id, clip.files, sizes, clip.licence, texts])
-    options = config.dump()
-    del options["source"]
     return Conversion(
+        config=config,
         plan=plan,
         convert=partial(convert_clip, config, body),
         describe=MotionXClip.label,
-        layout=layout,
-        name=config.name,
         licence=config.licence or (next(iter(plan.licences)) if len(plan.licences) == 1 else LICENCE),
         converter=CONVERTER,
         version=CONVERTER_VERSION,
-        options=options
+        options=config.options()
         | {
             "splits": bool(config.splits),
             "body_model": body.statement,
             "source_sha256": digest(told),
         },
-        motion_type=config.motion_type,
     )
 
 
@@ -109,14 +99,10 @@ def convert_clip(config: MotionXConfig, body: BodyModel, clip: MotionXClip) -> S
     else:
         face = values[:, EXPRESSION] if layout.has("face") and has_face else None
         motion = features_of(joints, FPS, layout, face=face, same_bones=config.retarget)
-    meta = ClipMeta(
-        id=clip.id,
+    meta = layout.clip_meta(
+        clip.id,
         source=clip.label(),
         split=clip.split,
-        layout=layout.name,
-        family=layout.family,
-        fps=layout.fps,
-        skeleton=layout.skeleton_name,
         frames=len(motion),
         licence=clip.licence,
         has_hands=layout.num_joints > BODY_JOINTS and bool(values[:, HANDS].any()),

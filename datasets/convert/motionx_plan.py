@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from rich.progress import Progress
-
 from motionloom.datasets.convert.arrays import check_array_header, load_array
-from motionloom.datasets.convert.base import ConversionPlan, Subset
+from motionloom.datasets.convert.base import ConversionPlan, Subset, frames_by_split
 from motionloom.datasets.convert.conversion import ConvertConfig, count_licences, digest, drop, limited
 from motionloom.datasets.convert.features import frames_after
+from motionloom.datasets.convert.files import read_in_threads
 from motionloom.datasets.convert.motionx_files import (
     OFFICIAL,
     MotionXFiles,
@@ -30,7 +28,7 @@ from motionloom.datasets.convert.motionx_files import (
 from motionloom.datasets.convert.motionx_parameters import FACE_WIDTH, RAW, aist_scale
 from motionloom.datasets.convert.motionx_text import HUMANML, read_motionx_captions, read_sentences
 from motionloom.datasets.convert.splits import (
-    hash_split,
+    hash_splits,
     keep_mirrors_together,
     original_of,
     read_split_files,
@@ -161,13 +159,8 @@ def plan_motionx(
         present = sorted({subset_of(clip_id) for clip_id in motion})
         raise UserError(f"{config.source}: none of {config.subsets} in it, but {', '.join(present)}")
     splits, split_files, notes = _read_splits(config, files, ids)
-    with Progress(disable=not progress) as bar, ThreadPoolExecutor(max(workers, 1)) as pool:
-        shown = bar.add_task("reading the source", total=len(ids))
-        scanned: list[_Scanned] = []
-        # Threads are enough: opening many small files waits for the disk.
-        for found in pool.map(partial(_scan, config.source, files), ids):
-            scanned.append(found)
-            bar.advance(shown)
+    scan = partial(_scan, config.source, files)
+    scanned = list(read_in_threads(scan, ids, workers=workers, progress=progress))
 
     items: list[tuple[Split, MotionXClip]] = []
     dropped = list(files.repeated)
@@ -194,19 +187,14 @@ def plan_motionx(
             frame_texts,
         )  # fmt: skip
         items.append((split, clip))
-    if config.limit is not None and len(items) > config.limit:
-        notes.append(f"limited to {config.limit} of {len(items)} clips")
-        items = limited(items, MotionXClip.label, config.limit)
+    items = limited(items, MotionXClip.label, config.limit, notes)
     missing = [clip_id for clip_id in splits if clip_id not in motion]
-    frames: dict[Split, int] = dict.fromkeys(SPLITS, 0)
-    for split, clip in items:
-        frames[split] += frames_after(clip.frames, FPS, layout)
     unwanted = len(motion) - len(ids)
     texts_alone = [clip_id for clip_id in files.by_kind["captions"] if clip_id not in motion]
     return ConversionPlan(
         name=f"{config.source.name} -> {config.name}",
         items=items,
-        frames=frames,
+        frames=frames_by_split((split, frames_after(clip.frames, FPS, layout)) for split, clip in items),
         found=len(ids) + len(files.repeated),
         missing=[
             Dropped(source=clip_id, reason=f"listed in {splits[clip_id]}.txt, but its motion is not here")
@@ -246,8 +234,8 @@ def _read_splits(
         folder = config.source / found[0] if found else None
         told = f"splits: {found[0] or '.'}/" if found else ""
     if folder is None:
-        note = "no train.txt, val.txt or test.txt: split 80/5/15 by hash of the id"
-        return {clip_id: hash_split(original_of(clip_id) or clip_id) for clip_id in ids}, set(), [note]
+        hashed, notes = hash_splits(ids)
+        return hashed, set(), notes
     listed, notes = read_split_files(folder)
     keep_mirrors_together(listed, original_of, folder)
     splits: dict[str, Split] = {}

@@ -10,15 +10,13 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from rich.progress import Progress
-
 from motionloom.datasets.convert.archives import Batch
 from motionloom.datasets.convert.conversion import digest, drop
+from motionloom.datasets.convert.files import read_in_threads
 from motionloom.datasets.schema import Config, Dropped, UserError
 from motionloom.datasets.shards.files import write_json
 
@@ -74,20 +72,17 @@ def scan_batches(
     todo = [batch for key, batch in zip(keys, batches, strict=True) if key not in kept]
     made: list[BatchScan] = []
     saved, changed = time.monotonic(), bool(todo) or len(kept) < len(known)
-    with Progress(disable=not progress) as bar, ThreadPoolExecutor(max(workers, 1)) as pool:
-        shown = bar.add_task("reading the source", total=len(batches), completed=len(kept))
-        missing = [key for key in keys if key not in kept]
-        # Threads are enough: unpacking and hashing run outside the interpreter's lock.
-        for key, (found, certain) in zip(
-            missing, pool.map(partial(_scan, suffix, header), todo), strict=True
-        ):
-            made.append(found)
-            if certain:
-                kept[key] = found
-            bar.advance(shown)
-            if time.monotonic() - saved > _SAVE_SECONDS:
-                _save(keep, kept)
-                saved = time.monotonic()
+    missing = [key for key in keys if key not in kept]
+    scans = read_in_threads(
+        partial(_scan, suffix, header), todo, workers=workers, progress=progress, before=len(kept)
+    )
+    for key, (found, certain) in zip(missing, scans, strict=True):
+        made.append(found)
+        if certain:
+            kept[key] = found
+        if time.monotonic() - saved > _SAVE_SECONDS:
+            _save(keep, kept)
+            saved = time.monotonic()
     if changed:
         _save(keep, kept)
     new = iter(made)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from motionloom.datasets.schema import Split, UserError
@@ -22,6 +22,12 @@ def hash_split(clip_id: str) -> Split:
     if share < TRAIN_SHARE:
         return "train"
     return "val" if share < TRAIN_SHARE + VAL_SHARE else "test"
+
+
+def hash_splits(ids: Iterable[str]) -> tuple[dict[str, Split], list[str]]:
+    """What stands for `read_split_files` in a source without any: mirrored clips go with their originals."""
+    note = "no train.txt, val.txt or test.txt: split 80/5/15 by hash of the id"
+    return {clip_id: hash_split(original_of(clip_id) or clip_id) for clip_id in ids}, [note]
 
 
 def check_id(clip_id: str, where: str) -> str:

@@ -17,13 +17,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import FACE, HANDS, HELD_ALL, UserError
+from motionloom.datasets.schema import FACE, HANDS, HELD_ALL, ClipMeta, Split, UserError
 
 Family = Literal["exact", "h3d", "raw"]
 Part = Literal["all", "bodyhand", "body", "hand", "face"]
@@ -88,6 +88,36 @@ class MotionLayout:
         skeleton, usual_fps, usual_family, fields = _KNOWN[name]
         layout = MotionLayout(name, skeleton, usual_fps, usual_family, fields)
         return replace(layout, fps=fps or layout.fps, family=family or layout.family)
+
+    def clip_meta(
+        self,
+        clip_id: str,
+        *,
+        source: str,
+        split: Split,
+        frames: int,
+        licence: str,
+        has_hands: bool = True,
+        has_face: bool = True,
+        mirror_of: str | None = None,
+        truth: dict[str, Any] | None = None,
+    ) -> ClipMeta:
+        """`meta.json` of a clip in this layout: what the layout says is filled in here, once."""
+        return ClipMeta(
+            id=clip_id,
+            source=source,
+            split=split,
+            layout=self.name,
+            family=self.family,
+            fps=self.fps,
+            skeleton=self.skeleton_name,
+            frames=frames,
+            licence=licence,
+            has_hands=has_hands,
+            has_face=has_face,
+            mirror_of=mirror_of,
+            truth=truth,
+        )
 
     @cached_property
     def skeleton(self) -> Skeleton:

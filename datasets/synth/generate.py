@@ -19,7 +19,7 @@ from pydantic import Field, field_validator, model_validator
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features import encode
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, Config, Manifest, Split
+from motionloom.datasets.schema import Caption, Config, Manifest, Split
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth import arms, legs, locomotion
@@ -180,14 +180,10 @@ def make_sample(index: int, config: SynthConfig) -> Sample:
     clip = make_clip(index, config)
     has_face = layout.has("face")
     motion = encode(clip.joints, layout, face=clip.face if has_face else None)
-    meta = ClipMeta(
-        id=f"synth-{config.seed}-{index:06d}",
+    meta = layout.clip_meta(
+        f"synth-{config.seed}-{index:06d}",
         source=f"synthetic seed {config.seed} clip {index}",
         split=split_of(index, config),
-        layout=layout.name,
-        family=layout.family,
-        fps=layout.fps,
-        skeleton=layout.skeleton_name,
         frames=len(motion),
         licence=LICENCE,
         has_hands=layout.num_joints > BODY_JOINTS,

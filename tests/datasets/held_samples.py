@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import FACE, HANDS, Caption, ClipMeta, Split
+from motionloom.datasets.schema import FACE, HANDS, Caption, Split
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 
@@ -30,9 +30,8 @@ class Convert:
         lost = ~LAYOUT.held_columns[bits]
         junk = np.random.default_rng(1000 + i).standard_normal((len(motion), int(lost.sum())))
         motion[:, lost] = self.garbage * (1 + junk)
-        meta = ClipMeta(
-            id=f"clip{i}", source="made", split="train", layout=LAYOUT.name, family=LAYOUT.family,
-            fps=LAYOUT.fps, skeleton=LAYOUT.skeleton_name, frames=len(motion), licence="CC0",
+        meta = LAYOUT.clip_meta(
+            f"clip{i}", source="made", split="train", frames=len(motion), licence="CC0",
             has_hands=bool(bits & HANDS), has_face=bool(bits & FACE),
         )  # fmt: skip
         texts = [Caption(text=f"a person {i}"), Caption(text="walks")]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, Manifest, Split
+from motionloom.datasets.schema import Caption, Manifest, Split
 from motionloom.datasets.shards.sample import DropClip, Sample
 from motionloom.datasets.shards.writer import write_dataset
 
@@ -29,17 +29,7 @@ def clip_motion(i: int) -> np.ndarray:
 
 def clip(i: int, split: Split = "train") -> Sample:
     motion = clip_motion(i)
-    meta = ClipMeta(
-        id=f"clip-ä-{i}",
-        source="made",
-        split=split,
-        layout=LAYOUT.name,
-        family=LAYOUT.family,
-        fps=LAYOUT.fps,
-        skeleton=LAYOUT.skeleton_name,
-        frames=len(motion),
-        licence="CC0",
-    )
+    meta = LAYOUT.clip_meta(f"clip-ä-{i}", source="made", split=split, frames=len(motion), licence="CC0")
     texts = [Caption(text=f"person {i} walks"), Caption(text=f"person {i} turns", start=0.25, end=0.75)]
     return Sample(
         meta,

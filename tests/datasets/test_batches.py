@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -34,15 +33,6 @@ class WordLengths:
             tokens[i, : len(row)] = np.array([len(word) for word in row])[:, None]
             mask[i, : len(row)] = True
         return EncodedText(np.full((len(words), 4), 0.5, dtype=np.float32), tokens, mask)
-
-
-@pytest.fixture(scope="module")
-def made() -> ModuleType:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent))
-        import shard_samples
-
-        return shard_samples
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -16,28 +15,6 @@ from motionloom.datasets.shards import retry
 from motionloom.datasets.shards.cache import FileCache
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.reading import CacheConfig, Reading
-
-
-@pytest.fixture(scope="module")
-def helpers() -> Iterator[tuple[ModuleType, ModuleType]]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent))
-        import loopback
-        import shard_samples
-
-        yield shard_samples, loopback
-
-
-@pytest.fixture(scope="module")
-def loopback(helpers: tuple[ModuleType, ModuleType]) -> ModuleType:
-    return helpers[1]
-
-
-@pytest.fixture(scope="module")
-def root(helpers: tuple[ModuleType, ModuleType], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("data")
-    helpers[0].write(root)
-    return root
 
 
 def content(number: int) -> tuple[str, bytes]:

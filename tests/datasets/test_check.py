@@ -17,7 +17,7 @@ from motionloom.datasets.check_file import FileRules, check_file, check_folder
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features import encode
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
+from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards.check import CheckReport, check, examine
 from motionloom.datasets.shards.duplicates import ClipTable, _runs
 from motionloom.datasets.shards.findings import LISTED, Findings
@@ -59,9 +59,8 @@ class Made:
 
 
 def convert(made: Made) -> Sample:
-    meta = ClipMeta(
-        id=made.id, source="made", split=made.split, layout=LAYOUT.name, family=LAYOUT.family,
-        fps=LAYOUT.fps, skeleton=LAYOUT.skeleton_name, frames=len(made.motion), licence=made.licence,
+    meta = LAYOUT.clip_meta(
+        made.id, source="made", split=made.split, frames=len(made.motion), licence=made.licence,
         mirror_of=made.mirror_of,
     )  # fmt: skip
     return Sample(meta, made.motion, texts=list(made.texts), **made.more)

@@ -24,14 +24,6 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 
 
-@pytest.fixture
-def amass(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    import amass_clips
-
-    return amass_clips
-
-
 @pytest.mark.parametrize("fps", [60.0, 100.0, 120.0, 150.0, 250.0, 59.94])
 def test_every_frame_rate_gives_the_same_motion(amass: ModuleType, fps: float, tmp_path: Path) -> None:
     amass.save(tmp_path / "in/KIT/3/walk_poses.npz", **amass.walk(fps))

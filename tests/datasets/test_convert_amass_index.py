@@ -19,14 +19,6 @@ from motionloom.datasets.schema import UserError
 
 
 @pytest.fixture
-def amass(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    import amass_clips
-
-    return amass_clips
-
-
-@pytest.fixture
 def humanml(amass: ModuleType, tmp_path: Path) -> Path:
     """An AMASS tree with an index and texts of HumanML3D's form."""
     source = tmp_path / "amass"

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.convert.archives import Batch
-from motionloom.datasets.convert.bvh import BvhClips, BvhConfig, convert_bvh, plan_bvh, prepare_bvh
+from motionloom.datasets.convert.bvh import BvhClips, BvhConfig, plan_bvh, prepare_bvh
 from motionloom.datasets.convert.conversion import SCAN_FILE, run_conversion
 from motionloom.datasets.convert.splits import hash_split
 from motionloom.datasets.motion.bvh import read_bvh
@@ -75,8 +75,9 @@ def config(folder: Path, **changes: Any) -> BvhConfig:
     return BvhConfig(**(given | changes))
 
 
-def convert(given: BvhConfig, out: Path, **options: Any) -> Manifest:
-    return convert_bvh(given, out, progress=False, **options)
+def convert(given: BvhConfig, out: Path, *, workers: int = 1, **options: Any) -> Manifest:
+    prepared = prepare_bvh(given, workers=workers, scan=out / SCAN_FILE)
+    return run_conversion(prepared, out, workers=workers, progress=False, **options)
 
 
 def bytes_of(folder: Path) -> dict[str, str]:

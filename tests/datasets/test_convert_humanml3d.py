@@ -38,12 +38,6 @@ def fixture(shared: Path) -> Path:
     return shared / "data/layouts/humanml3d"
 
 
-@pytest.fixture
-def copy(fixture: Path, tmp_path: Path) -> Path:
-    """The fixture, free to change."""
-    return Path(shutil.copytree(fixture, tmp_path / "source", copy_function=shutil.copyfile))
-
-
 def convert(source: Path, out: Path, *, workers: int = 1, strict: bool = False, **options: Any) -> Manifest:
     conversion = prepare_humanml3d(HumanMl3dConfig(source=source, **options), workers=workers)
     return run_conversion(conversion, out, workers=workers, strict=strict, progress=False, clips_per_shard=2)

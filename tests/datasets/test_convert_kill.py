@@ -14,7 +14,8 @@ from pathlib import Path
 SCRIPT = """
 import hashlib, json, os, random, signal, sys, time
 from pathlib import Path
-from motionloom.datasets.convert.bvh import BvhConfig, convert_bvh
+from motionloom.datasets.convert.bvh import BvhConfig, prepare_bvh
+from motionloom.datasets.convert.conversion import SCAN_FILE, run_conversion
 from motionloom.datasets.shards.tasks import write_shard
 import webdataset.writer
 
@@ -23,7 +24,7 @@ def convert(out):
     if not pid:
         try:
             os.setsid()
-            convert_bvh(config, out, progress=False, clips_per_shard=8)
+            run_conversion(prepare_bvh(config, scan=out / SCAN_FILE), out, progress=False, clips_per_shard=8)
         except BaseException:
             import traceback
             traceback.print_exc()

@@ -12,11 +12,25 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from motionx_clips import (
+    BOW,
+    CHAT,
+    DANCE,
+    FACES,
+    HUMANML,
+    MIRRORED,
+    MOTION,
+    MUG,
+    TEXTS,
+    TURN,
+    WAVE,
+    config,
+    planned,
+)
 from numpy.typing import NDArray
 
 from motionloom.datasets.convert.conversion import run_conversion
 from motionloom.datasets.convert.motionx import (
-    MotionXConfig,
     convert_clip,
     parameters_to_joints,
     prepare_motionx,
@@ -28,7 +42,7 @@ from motionloom.datasets.convert.motionx_parameters import (
     scale_aist,
     with_face,
 )
-from motionloom.datasets.convert.motionx_plan import MotionXClip, plan_motionx
+from motionloom.datasets.convert.motionx_plan import plan_motionx
 from motionloom.datasets.motion.canonical import facing, mirror
 from motionloom.datasets.motion.features import decode, face_of
 from motionloom.datasets.motion.layout import MotionLayout
@@ -37,35 +51,10 @@ from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.check import check
 from motionloom.datasets.shards.sample import Sample
 
-WAVE = "idea400/subset_0001/bandai_wave_right_hand_clip_1"
-TURN = "idea400/subset_0001/bandai_Walking_And_Turn_Left_clip_2"
-BOW = "perform/subset_0000/bandai_bow_happily"
-MUG = "GRAB/s1/synthetic_mug_toast_1"
-CHAT = "EgoBody/recording_20990101_S01_S01_01/body_idx_0/synthetic_stand_casual_chat_clip1"
-DANCE = "aist/subset_0004/synthetic_Dance_Krump_Stomp_clip_3"
-HUMANML, MIRRORED = "humanml/900001", "humanml/M900001"
-MOTION = "motion_data/smplx_322"
-TEXTS = "texts/semantic_labels"
-FACES = "face_motion_data/smplx_322"
-
 
 @pytest.fixture
 def fixture(shared: Path) -> Path:
     return shared / "data/layouts/motionx"
-
-
-@pytest.fixture
-def copy(fixture: Path, tmp_path: Path) -> Path:
-    """The fixture, free to change."""
-    return Path(shutil.copytree(fixture, tmp_path / "source"))
-
-
-def config(folder: Path, **changes: Any) -> MotionXConfig:
-    return MotionXConfig(source=folder, **changes)
-
-
-def planned(folder: Path, **changes: Any) -> dict[str, MotionXClip]:
-    return {clip.id: clip for _, clip in plan_motionx(config(folder, **changes)).items}
 
 
 def sample(folder: Path, clip_id: str, **changes: Any) -> Sample:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -20,15 +19,6 @@ from motionloom.datasets.shards.mix import MixedDataset
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.reading import CacheConfig, Reading
 from motionloom.datasets.shards.statistics import compute
-
-
-@pytest.fixture(scope="module")
-def made() -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent))
-        import shard_samples
-
-        yield shard_samples
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +48,8 @@ def test_values_come_back_within_the_bound_from_half_the_bytes(roots: tuple[Path
 
 
 def test_every_reader_gives_the_same_values(
-    roots: tuple[Path, Path], made: ModuleType, tmp_path: Path
+    roots: tuple[Path, Path], loopback: ModuleType, tmp_path: Path
 ) -> None:
-    import loopback
-
     whole, half = (ShardDataset.open(root, "train") for root in roots)
     stats = compute(half)
     np.testing.assert_allclose(stats.mean, compute(whole).mean, atol=1e-4)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from text_samples import OneToken
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import FACE, HANDS, UserError
@@ -22,30 +22,16 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.reading import Reading
 from motionloom.datasets.shards.statistics import STD_FLOOR, FeatureStats, Moments, compute, from_moments
 from motionloom.datasets.text.cache import TextCache
-from motionloom.datasets.text.encoder import EncodedText
 
 GARBAGE = (0.0, 30.0)
 
 
-class Constant:
-    """A text encoder that says the same of everything."""
-
-    name = "constant"
-    dim = 4
-
-    def encode(self, captions: Sequence[str]) -> EncodedText:
-        n = len(captions)
-        tokens, mask = np.ones((n, 1, 4), dtype=np.float32), np.ones((n, 1), dtype=bool)
-        return EncodedText(np.full((n, 4), 0.5, dtype=np.float32), tokens, mask)
-
-
 @pytest.fixture(scope="module")
-def made() -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent))
-        import held_samples
+def made() -> ModuleType:
+    """Clips of which some lack hands or a face."""
+    import held_samples
 
-        yield held_samples
+    return held_samples
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +43,7 @@ def roots(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> list[Pa
 @pytest.fixture(scope="module")
 def text(roots: list[Path], tmp_path_factory: pytest.TempPathFactory) -> TextCache:
     captions = {c.text for d in openings(roots[0], "mixed") for i in range(len(d)) for c in d.texts(i)}
-    return TextCache.build(tmp_path_factory.mktemp("text"), [*captions, "happy"], Constant(), progress=False)
+    return TextCache.build(tmp_path_factory.mktemp("text"), [*captions, "happy"], OneToken(), progress=False)
 
 
 def openings(root: Path, *kinds: str) -> list[ClipDataset]:

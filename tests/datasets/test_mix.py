@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -13,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from text_samples import OneToken
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
@@ -24,15 +24,6 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.reading import Reading
 from motionloom.datasets.shards.statistics import FeatureStats, compute
 from motionloom.datasets.text.cache import TextCache
-
-
-@pytest.fixture(scope="module")
-def made() -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent))
-        import shard_samples
-
-        yield shard_samples
 
 
 @pytest.fixture(scope="module")
@@ -165,20 +156,9 @@ def test_a_clip_drawn_again_gives_another_window(mix: MixedDataset) -> None:
     assert several and all(not torch.equal(rows[0], rows[1]) for rows in several)
 
 
-def test_caption_batches_draw_only_from_data_sets_with_captions(
-    mix: MixedDataset, tmp_path: Path, made: ModuleType
-) -> None:
-    from motionloom.datasets.text.encoder import EncodedText
-
-    class Ones:
-        name, dim = "ones", 2
-
-        def encode(self, captions: list[str]) -> EncodedText:
-            ones = np.ones((len(captions), 1, 2), dtype=np.float32)
-            return EncodedText(ones[:, 0] / 2**0.5, ones, np.ones((len(captions), 1), dtype=bool))
-
+def test_caption_batches_draw_only_from_data_sets_with_captions(mix: MixedDataset, tmp_path: Path) -> None:
     captions = [c.text for i in range(len(mix)) for c in mix.texts(i)]
-    text = TextCache.build(tmp_path, captions, Ones(), progress=False)
+    text = TextCache.build(tmp_path, captions, OneToken(), progress=False)
     batches = CaptionBatches(mix, compute(mix), text, batch_size=8, max_frames=40, min_frames=30, seed=2)
     usable = set(np.flatnonzero(mix.frames >= 30).tolist())
     seen = Counter(int(i >= 60) for k in range(8) for i in batches[k]["index"].tolist())

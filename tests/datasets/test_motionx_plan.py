@@ -4,45 +4,34 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from motionx_clips import (
+    ALL,
+    BOW,
+    CHAT,
+    DANCE,
+    HUMANML,
+    MIRRORED,
+    MOTION,
+    MUG,
+    TEXTS,
+    TURN,
+    WAVE,
+    config,
+    planned,
+)
 
 from motionloom.datasets.convert.motionx import prepare_motionx
 from motionloom.datasets.convert.motionx_files import find_files
-from motionloom.datasets.convert.motionx_plan import MotionXClip, MotionXConfig, plan_motionx
+from motionloom.datasets.convert.motionx_plan import plan_motionx
 from motionloom.datasets.schema import UserError
-
-WAVE = "idea400/subset_0001/bandai_wave_right_hand_clip_1"
-TURN = "idea400/subset_0001/bandai_Walking_And_Turn_Left_clip_2"
-BOW = "perform/subset_0000/bandai_bow_happily"
-MUG = "GRAB/s1/synthetic_mug_toast_1"
-CHAT = "EgoBody/recording_20990101_S01_S01_01/body_idx_0/synthetic_stand_casual_chat_clip1"
-DANCE = "aist/subset_0004/synthetic_Dance_Krump_Stomp_clip_3"
-HUMANML, MIRRORED = "humanml/900001", "humanml/M900001"
-ALL = {WAVE, TURN, BOW, MUG, CHAT, DANCE, HUMANML, MIRRORED}
-MOTION = "motion_data/smplx_322"
-TEXTS = "texts/semantic_labels"
 
 
 @pytest.fixture
 def fixture(shared: Path) -> Path:
     return shared / "data/layouts/motionx"
-
-
-@pytest.fixture
-def copy(fixture: Path, tmp_path: Path) -> Path:
-    """The fixture, free to change."""
-    return Path(shutil.copytree(fixture, tmp_path / "source"))
-
-
-def config(folder: Path, **changes: Any) -> MotionXConfig:
-    return MotionXConfig(source=folder, **changes)
-
-
-def planned(folder: Path, **changes: Any) -> dict[str, MotionXClip]:
-    return {clip.id: clip for _, clip in plan_motionx(config(folder, **changes)).items}
 
 
 def test_plan_tells_subsets_and_frames(fixture: Path) -> None:

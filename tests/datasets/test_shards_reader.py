@@ -26,14 +26,6 @@ from motionloom.datasets.shards.tar import scan_tar
 
 
 @pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    import shard_samples
-
-    return shard_samples
-
-
-@pytest.fixture
 def root(made: ModuleType, tmp_path: Path) -> Path:
     made.write(tmp_path / "data")
     return tmp_path / "data"

@@ -21,14 +21,6 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.tasks import Part
 
 
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    import shard_samples
-
-    return shard_samples
-
-
 def digests(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
 

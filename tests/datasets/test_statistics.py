@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -19,18 +18,7 @@ from motionloom.datasets.shards.statistics import STD_FLOOR, FeatureStats, Momen
 
 
 @pytest.fixture(scope="module")
-def made() -> ModuleType:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent))
-        import shard_samples
-
-        return shard_samples
-
-
-@pytest.fixture(scope="module")
-def train(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> ShardDataset:
-    root = tmp_path_factory.mktemp("data")
-    made.write(root)
+def train(root: Path) -> ShardDataset:
     return ShardDataset.open(root, "train")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import sys
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import ModuleType
@@ -20,28 +19,6 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.reading import CacheConfig, Reading
 from motionloom.datasets.shards.statistics import compute
 from motionloom.datasets.shards.store import LocalStore, open_store
-
-
-@pytest.fixture(scope="module")
-def helpers() -> Iterator[tuple[ModuleType, ModuleType]]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent))
-        import loopback
-        import shard_samples
-
-        yield shard_samples, loopback
-
-
-@pytest.fixture(scope="module")
-def loopback(helpers: tuple[ModuleType, ModuleType]) -> ModuleType:
-    return helpers[1]
-
-
-@pytest.fixture(scope="module")
-def root(helpers: tuple[ModuleType, ModuleType], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("data")
-    helpers[0].write(root)
-    return root
 
 
 @pytest.fixture(autouse=True)

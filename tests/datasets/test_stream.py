@@ -6,7 +6,7 @@ import io
 import pickle
 import tarfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from text_samples import OneToken
 
 from motionloom.datasets.schema import ShardInfo, UserError
 from motionloom.datasets.shards.batches import CaptionBatches, WindowBatches
@@ -25,25 +26,8 @@ from motionloom.datasets.shards.statistics import FeatureStats, compute
 from motionloom.datasets.shards.store import LocalStore
 from motionloom.datasets.shards.stream import read_shard
 from motionloom.datasets.text.cache import TextCache
-from motionloom.datasets.text.encoder import EncodedText
 
 GROUP = 2
-
-
-@pytest.fixture(scope="module")
-def made() -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent))
-        import shard_samples
-
-        yield shard_samples
-
-
-@pytest.fixture(scope="module")
-def loopback(made: ModuleType) -> ModuleType:
-    import loopback
-
-    return loopback
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +40,6 @@ def root(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def stats(root: Path) -> FeatureStats:
     return compute(ShardDataset.open(root, "train"))
-
-
-class OneToken:
-    name, dim = "one-token", 4
-
-    def encode(self, captions: Sequence[str]) -> EncodedText:
-        ones = np.ones((len(captions), 1, 4), dtype=np.float32)
-        return EncodedText(ones[:, 0] / 2, ones, np.ones((len(captions), 1), dtype=bool))
 
 
 @pytest.fixture(scope="module")

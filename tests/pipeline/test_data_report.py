@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, Dropped, UserError
+from motionloom.datasets.schema import Caption, Dropped, UserError
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
@@ -165,10 +165,9 @@ def test_raw_layouts_stand_on_the_neutral_skeleton(name: str) -> None:
 def raw_sample(index: int, layout: MotionLayout) -> Sample:
     rng = np.random.default_rng(index)
     motion = 0.1 * np.cumsum(rng.standard_normal((40 + index, layout.dim)), axis=0).astype(np.float32) / 8
-    meta = ClipMeta(
-        id=f"raw-{index}", source="made", split="train", layout=layout.name, family=layout.family,
-        fps=layout.fps, skeleton=layout.skeleton_name, frames=len(motion), licence="", has_hands=False,
-    )  # fmt: skip
+    meta = layout.clip_meta(
+        f"raw-{index}", source="made", split="train", frames=len(motion), licence="", has_hands=False
+    )
     return Sample(meta, motion)
 
 
