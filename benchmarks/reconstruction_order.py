@@ -48,7 +48,8 @@ COMMON = {
     "code_dim": 96,
     "recon": "smooth_l1",
     "velocity_weight": 0.5,
-    "bone_weight": 0.3,
+    "root_gain": 5.0,
+    "finger_gain": 2.0,
 }
 COLUMNS = {"mpjpe": "all", "mpjpe_body": "body", "mpjpe_hand": "fingers", "global_mpjpe": "world"}
 
@@ -153,7 +154,7 @@ def main() -> None:
             kind, net = NETS[title]
             if not handed and kind in HANDED:
                 continue
-            net = net if handed else {**net, "part": "body"}
+            net = net if handed else {**net, "part": "body", "finger_gain": 0.0}
             run = args.work / f"{title.replace(' ', '-').replace(',', '')}-{seed}"
             run_recipe(recipe(run, kind, net, seed, args), run, console=console)
             results.setdefault(title, []).append(measure(run, args.clips))

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from rich.table import Table
 from torch import Tensor
@@ -118,8 +117,7 @@ def _fake(
         denoiser = MotionDiffusion(config.net, dim, width)
         return DiffusionModule(denoiser, config.optim, seed=0, max_steps=1), inputs, ""
     net = build_tokenizer(config.net, layout)
-    std = np.ones(layout.dim)
-    module = TokenizerModule(net, config.optim, seed=0, max_steps=1, std=std, **config.net.loss_terms())
+    module = TokenizerModule(net, config.optim, seed=0, max_steps=1, **config.net.loss_terms())
     inputs = {
         "motion": torch.empty(batch, config.window, net.dim),
         "length": torch.full((batch,), config.window),

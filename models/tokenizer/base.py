@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.quantize.base import Codebook
+from motionloom.models.tokenizer.basis import Basis
 from motionloom.models.tokenizer.config import BaseTokenizerConfig
 
 GROUP_FRAMES = 4
@@ -91,9 +92,10 @@ class Tokenizer(nn.Module, ABC):
         self.layout = layout
         self.streams = streams
         self.pattern = pattern
-        self.part: Part = part
         self.is_frozen = False
-        self.register_buffer("columns", torch.from_numpy(layout.part(part)))
+        columns = layout.part(part)
+        self.register_buffer("columns", torch.from_numpy(columns))
+        self.basis = Basis(layout, columns, root_gain=config.root_gain, finger_gain=config.finger_gain)
 
     @property
     def dim(self) -> int:
@@ -135,8 +137,8 @@ class Tokenizer(nn.Module, ABC):
         `held` [B, dim]: false where a clip does not hold a column; None = all are held.
         """
         valid = self._valid(x, length)
-        latents = self._quantize(_cleared(x, held), valid, self._lost(held), update=True)
-        recon = self.decoder(latents.joined, valid)
+        latents = self._quantize(self._seen(x, held), valid, self._lost(held), update=True)
+        recon = self.basis.leave(self.decoder(latents.joined, valid))
         return TokenizerOutput(recon, latents.penalty, latents.codes, latents.metrics)
 
     @torch.no_grad()
@@ -148,7 +150,8 @@ class Tokenizer(nn.Module, ABC):
         Of a clip of `length` frames the first ceil(length / 4) * per_group tokens mean something; all are
         valid codes, also those of a part that the clip does not hold.
         """
-        return self._quantize(_cleared(x, held), self._valid(x, length), self._lost(held), update=False).codes
+        valid = self._valid(x, length)
+        return self._quantize(self._seen(x, held), valid, self._lost(held), update=False).codes
 
     def decode(
         self, codes: dict[str, Tensor], length: Tensor | None = None, held: Tensor | None = None
@@ -184,8 +187,12 @@ class Tokenizer(nn.Module, ABC):
         return super().train(mode and not self.is_frozen)
 
     def _decode(self, vectors: dict[str, Tensor], length: Tensor | None) -> Tensor:
-        motion: Tensor = self.decoder(self._join(vectors), _whole_groups(length))
-        return motion
+        return self.basis.leave(self.decoder(self._join(vectors), _whole_groups(length)))
+
+    def _seen(self, x: Tensor, held: Tensor | None) -> Tensor:
+        """What the encoders read: zero in the columns that are not held."""
+        seen = self.basis.enter(x)
+        return seen if held is None else seen.masked_fill(~held[:, None], 0.0)
 
     def _valid(self, x: Tensor, length: Tensor | None) -> Tensor | None:
         if x.shape[-1] != self.dim:
@@ -203,11 +210,6 @@ def _whole_groups(length: Tensor | None) -> Tensor | None:
     if length is None:
         return None
     return (length + GROUP_FRAMES - 1) // GROUP_FRAMES * GROUP_FRAMES
-
-
-def _cleared(x: Tensor, held: Tensor | None) -> Tensor:
-    """Zero in the columns that are not held."""
-    return x if held is None else x.masked_fill(~held[:, None], 0.0)
 
 
 def without(vectors: Tensor, lost: Tensor | None) -> Tensor:

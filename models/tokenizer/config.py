@@ -20,7 +20,6 @@ class LossTerms(TypedDict):
     alpha: float
     recon: Recon
     velocity_weight: float
-    bone_weight: float
 
 
 class BaseTokenizerConfig(Config):
@@ -35,8 +34,10 @@ class BaseTokenizerConfig(Config):
     recon: Recon = "l2"
     velocity_weight: float = Field(default=0.0, ge=0)
     """Weight of the same reconstruction error between frame-to-frame differences."""
-    bone_weight: float = Field(default=0.0, ge=0)
-    """Weight of the error of the bones' directions [ours], without which fingers are learnt last."""
+    root_gain: float = Field(default=1.0, gt=0)
+    """How much more the root's columns count than others [ours]; see `basis.py`."""
+    finger_gain: float = Field(default=0.0, ge=0)
+    """Above 0, fingers count by how they bend, in bone lengths times this [ours]; see `basis.py`."""
 
     def commitment(self) -> float:
         """Weight of the quantizers' penalty; 0 for quantizers without one."""
@@ -48,7 +49,6 @@ class BaseTokenizerConfig(Config):
             "alpha": self.commitment(),
             "recon": self.recon,
             "velocity_weight": self.velocity_weight,
-            "bone_weight": self.bone_weight,
         }
 
 

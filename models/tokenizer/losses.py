@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from motionloom.models.distributed import masked_mean
-from motionloom.models.tokenizer.bones import Bones
 from motionloom.models.tokenizer.config import Recon
 
 
@@ -41,20 +40,6 @@ def velocity_loss(
     return reconstruction_loss(recon.float().diff(dim=1), target.float().diff(dim=1), shorter, kind, held)
 
 
-def bone_loss(
-    recon: Tensor,
-    target: Tensor,
-    length: Tensor | None,
-    kind: Recon,
-    bones: Bones,
-    held: Tensor | None = None,
-) -> Tensor:
-    """`reconstruction_loss` of the bone vectors of [B, T, D], in units of the bones' lengths."""
-    there = None if held is None else bones.held(held).repeat_interleave(3, dim=1)
-    rebuilt, wanted = bones(recon).flatten(-2), bones(target).flatten(-2)
-    return reconstruction_loss(rebuilt, wanted, length, kind, there)
-
-
 def tokenizer_loss(
     recon_motion: Tensor,
     target: Tensor,
@@ -64,12 +49,10 @@ def tokenizer_loss(
     alpha: float,
     recon: Recon,
     velocity_weight: float,
-    bone_weight: float = 0.0,
-    bones: Bones | None = None,
     held: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """`loss` = recon + velocity_weight * velocity + bone_weight * bones + alpha * penalty, and its terms
-    `recon`, `commit` (and `velocity`, `bones`).
+    """`loss` = recon + velocity_weight * velocity + alpha * penalty, and its terms `recon`, `commit` (and
+    `velocity`).
 
     Args:
         recon_motion: [B, T, D] from the decoder.
@@ -79,8 +62,6 @@ def tokenizer_loss(
         alpha: Weight of the penalty.
         recon: Kind of error.
         velocity_weight: Weight of the velocity term; 0 leaves it out.
-        bone_weight: Weight of the bone term [ours]; 0 leaves it out.
-        bones: Bone vectors of the columns; needed where they have a weight.
         held: bool [B, D], false in columns that a clip does not hold: they do not count. None = all.
     """
     terms = {"recon": reconstruction_loss(recon_motion, target, length, recon, held), "commit": penalty}
@@ -88,8 +69,4 @@ def tokenizer_loss(
     if velocity_weight > 0:
         terms["velocity"] = velocity_loss(recon_motion, target, length, recon, held)
         loss = loss + velocity_weight * terms["velocity"]
-    if bone_weight > 0:
-        assert bones is not None, "a bone_weight needs the bones"
-        terms["bones"] = bone_loss(recon_motion, target, length, recon, bones, held)
-        loss = loss + bone_weight * terms["bones"]
     return {"loss": loss, **terms}

@@ -63,15 +63,11 @@ def run_tokenizer(context: StageContext) -> None:
     dataset = open_split(data, "train", training=True)
     torch.manual_seed(context.seed)
     net = build_tokenizer(config.net, dataset.layout)
-    module = TokenizerModule(
-        net,
-        config.optim,
-        seed=context.seed,
-        max_steps=config.train.steps,
-        std=stats.std,
-        **config.net.loss_terms(),
-    )
     columns = net.columns.numpy()
+    net.basis.learn(stats.std[columns])
+    module = TokenizerModule(
+        net, config.optim, seed=context.seed, max_steps=config.train.steps, **config.net.loss_terms()
+    )
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
         return WindowBatches(

@@ -43,7 +43,7 @@ def captioned(dim: int) -> dict[str, Any]:
 
 def tokenizer(kind: str) -> tuple[StageModule, dict[str, Any]]:
     config = {
-        "h2vq": H2VQConfig(**BOOK),
+        "h2vq": H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0),
         "rvq": RvqConfig(**BOOK),
         "separate": SeparateConfig(**BOOK),
         "fsq": FsqConfig(**SMALL, steps=(4, 4)),
@@ -63,7 +63,7 @@ def diffusion() -> tuple[StageModule, dict[str, Any]]:
 
 
 def gpt() -> tuple[StageModule, dict[str, Any]]:
-    book = build_tokenizer(H2VQConfig(**BOOK), LAYOUT)
+    book = build_tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0), LAYOUT)
     align = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), 313, 12)
     config = GptConfig(layers=1, dim=16, heads=2, ff=16, block_size=20, pkeep=0.8)
     net = InterleavedGPT(config, book.streams, book.pattern, 16)

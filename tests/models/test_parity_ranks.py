@@ -22,6 +22,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
@@ -63,6 +64,7 @@ def motion(step: int, dim: int) -> dict[str, Tensor]:
 
 def tokenizer(config: AnyTokenizerConfig) -> tuple[StageModule, Batches]:
     net = build_tokenizer(config, LAYOUT)
+    net.basis.learn(np.full(net.dim, 0.02))  # independent noise in every column bends fingers wildly
     module = TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms())
     return module, lambda step: motion(step, net.dim)
 
@@ -144,7 +146,7 @@ class Undrawn(DiffusionModule):
 
 
 CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
-    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK)),
+    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
     "rvq": lambda: tokenizer(RvqConfig(**BOOK)),
     "fsq": lambda: tokenizer(FsqConfig(**SMALL, steps=(5, 4))),
     "tma": tma,

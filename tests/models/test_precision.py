@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import lightning as L
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -54,6 +55,7 @@ def captioned(dim: int) -> dict[str, Tensor]:
 
 def tokenizer(config: AnyTokenizerConfig) -> Case:
     net = build_tokenizer(config, LAYOUT)
+    net.basis.learn(np.full(net.dim, 0.02))  # independent noise in every column bends fingers wildly
     return TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms()), captioned(net.dim)
 
 
@@ -68,7 +70,7 @@ def diffusion() -> Case:
 
 
 def gpt() -> Case:
-    book = build_tokenizer(H2VQConfig(**BOOK), LAYOUT)
+    book = build_tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0), LAYOUT)
     align = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), 313, 12)
     config = GptConfig(layers=1, dim=16, heads=2, ff=16, block_size=20, dropout=0, attention_dropout=0)
     net = InterleavedGPT(config, book.streams, book.pattern, 16)
@@ -81,7 +83,7 @@ def gpt() -> Case:
 
 
 CASES: dict[str, Callable[[], Case]] = {
-    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK)),
+    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
     "rvq": lambda: tokenizer(RvqConfig(**BOOK)),
     "fsq": lambda: tokenizer(FsqConfig(**SMALL, steps=(5, 4))),
     "tma": tma,

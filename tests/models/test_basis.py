@@ -1,0 +1,117 @@
+"""The coordinates of the tokenizers: fingers as bones, the root louder, and back again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.models.stage_module import OptimConfig
+from motionloom.models.tokenizer.basis import Basis
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig, TokenizerConfig
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.pipeline.evaluation import local_joints
+
+LAYOUT = MotionLayout.named("wholebody363")
+RNG = np.random.default_rng(0)
+STD = RNG.uniform(0.1, 2.0, LAYOUT.dim).astype(np.float32)
+
+
+def basis_of(part: Part = "bodyhand", root_gain: float = 5.0, finger_gain: float = 2.0) -> Basis:
+    columns = LAYOUT.part(part)
+    basis = Basis(LAYOUT, columns, root_gain=root_gain, finger_gain=finger_gain)
+    basis.learn(STD[columns])
+    return basis
+
+
+@pytest.mark.parametrize("part", ["bodyhand", "all"])
+def test_out_is_the_inverse_of_in(part: Part) -> None:
+    basis = basis_of(part)
+    x = torch.from_numpy(RNG.standard_normal((2, 7, len(LAYOUT.part(part))))).float()
+    torch.testing.assert_close(basis.leave(basis.enter(x)), x, rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(basis.enter(basis.leave(x)), x, rtol=1e-5, atol=1e-4)
+
+
+def test_fingers_are_bones_and_the_rest_stays() -> None:
+    columns, basis = LAYOUT.part("bodyhand"), basis_of()
+    x = RNG.standard_normal((2, 5, len(columns))).astype(np.float32)
+    seen = basis.enter(torch.from_numpy(x)).numpy()
+    whole, skeleton = MotionLayout.named("wholebody313"), LAYOUT.skeleton
+    joints = local_joints(x * STD[columns], whole)
+    velocities = (x * STD[columns])[..., whole.slice("velocities")].reshape(2, 5, 52, 3)
+    speeds = STD[columns][whole.slice("velocities")].reshape(52, 3)
+    first, moving = whole.slice("positions").start, whole.slice("velocities").start
+    for joint in range(22, 52):
+        parent = skeleton.parents[joint]
+        at = slice(first + 3 * (joint - 1), first + 3 * joint)
+        length = np.linalg.norm(skeleton.offsets[joint])
+        want = 2 * (joints[..., joint, :] - joints[..., parent, :]) / length
+        np.testing.assert_allclose(seen[..., at], want, rtol=1e-4, atol=1e-3)
+        at = slice(moving + 3 * joint, moving + 3 * joint + 3)
+        want = (velocities[..., joint, :] - velocities[..., parent, :]) / speeds[joint]
+        np.testing.assert_allclose(seen[..., at], want, rtol=1e-4, atol=1e-3)
+    body = np.searchsorted(columns, LAYOUT.part("body"))
+    np.testing.assert_allclose(seen[..., body[:4]], 5 * x[..., body[:4]])
+    np.testing.assert_array_equal(seen[..., body[4:]], x[..., body[4:]])
+
+
+def test_moving_an_arm_leaves_its_fingers() -> None:
+    basis, x = basis_of(), torch.zeros(1, 1, 313)
+    moved = x.clone()
+    first = MotionLayout.named("wholebody313").slice("positions").start
+    for joint in [20, *range(22, 37)]:  # the left wrist and its fingers
+        column = first + 3 * (joint - 1)
+        moved[..., column] = 0.05 / float(STD[column])
+    changed = (basis.enter(moved) - basis.enter(x)).abs() > 1e-5
+    assert changed[0, 0].nonzero()[:, 0].tolist() == [first + 3 * 19]
+
+
+def test_without_gains_nothing_changes_and_nothing_is_saved() -> None:
+    basis, x = basis_of(root_gain=1.0, finger_gain=0.0), torch.randn(1, 4, 313)
+    assert torch.equal(basis.enter(x), x) and torch.equal(basis.leave(x), x) and not basis.state_dict()
+
+
+SIZES = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8, "reset_below": 0.1}
+
+
+@pytest.mark.parametrize("config", [H2VQConfig, RvqConfig])
+def test_a_tokenizer_with_gains_gives_the_papers_features(config: type[H2VQConfig | RvqConfig]) -> None:
+    torch.manual_seed(0)
+    settings: TokenizerConfig = config(**SIZES, root_gain=5.0, finger_gain=2.0)  # type: ignore[arg-type]
+    net = build_tokenizer(settings, LAYOUT)
+    net.basis.learn(STD[LAYOUT.part("bodyhand")])
+    x, length = torch.randn(2, 16, 313), torch.tensor([16, 8])
+    x[1, 8:] = 0
+    codes = net.eval().encode(x, length)
+    out = net(x, length)
+    torch.testing.assert_close(net.decode(codes, length), out.recon, rtol=1e-4, atol=1e-4)
+    assert not out.recon[1, 8:].any(), "padding stays zero"
+    again = build_tokenizer(settings, LAYOUT)
+    again.load_state_dict(net.state_dict())
+    torch.testing.assert_close(again.eval().decode(codes, length), out.recon, rtol=1e-4, atol=1e-4)
+
+
+def test_the_loss_is_of_what_is_seen() -> None:
+    torch.manual_seed(0)
+    config = H2VQConfig.model_validate({**SIZES, "root_gain": 3.0, "finger_gain": 2.0})
+    net = build_tokenizer(config, LAYOUT)
+    net.basis.learn(STD[LAYOUT.part("bodyhand")])
+    module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms()).eval()
+    x = torch.randn(2, 8, 313)
+    held = torch.from_numpy(LAYOUT.held_columns[[3, 0]])[:, LAYOUT.part("bodyhand")]
+    batch = {"motion": x, "length": torch.tensor([8, 8]), "held": held}
+    values = module.losses(batch)
+    error = (net.basis.enter(net(x, held=held).recon) - net.basis.enter(x)).square()
+    want = error[held[:, None].expand_as(error)].mean()
+    torch.testing.assert_close(values["recon"], want)
+    garbage = {**batch, "motion": torch.where(held[:, None], x, 7.0)}
+    torch.testing.assert_close(module.losses(garbage), values, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("part", ["body", "hand", "face"])
+def test_fingers_alone_are_refused(part: Part) -> None:
+    with pytest.raises(UserError, match="finger_gain"):
+        basis_of(part)
