@@ -37,7 +37,7 @@ from motionloom.models.gpt.sampling import sample_seeds
 from motionloom.models.metrics.retrieval import recall
 from motionloom.pipeline.bundle import Bundle, part_folders, text_encoder_of
 from motionloom.pipeline.evaluation import embed_motions
-from motionloom.pipeline.faces import FaceRequest, expression
+from motionloom.pipeline.faces import FaceRequest, expression, load_faces
 from motionloom.pipeline.networks import LoadedTma
 from motionloom.pipeline.samples import Truth, joint_layout, reconstruct, truth_of
 from motionloom.pipeline.sampling import SamplingConfig
@@ -159,10 +159,11 @@ def generation(
 def facial(run: Path, truths: list[Truth]) -> dict[str, float]:
     """Share of expressions that show what the caption says, for each generator (Table 4 in miniature)."""
     parts = part_folders(run)
-    bundle = Bundle.from_parts(parts, text_encoder_of(parts["text"]))
+    encoder = load_text_encoder(text_encoder_of(parts["text"]))
+    stats = FeatureStats.load(parts["stats"] / "stats.safetensors")
     shown = [t for t in truths if t.face is not None and (t.truth or {}).get("face")]
     request = FaceRequest(
-        bundle.text_encoder.encode([t.face_caption for t in shown]),
+        encoder.encode([t.face_caption for t in shown]),
         None,
         [len(t.features) for t in shown],
         sample_seeds(0, len(shown)),
@@ -173,8 +174,8 @@ def facial(run: Path, truths: list[Truth]) -> dict[str, float]:
     out = {
         "another clip's face": float(np.mean([wanted[k] == w for k, w in zip(order, wanted, strict=True)]))
     }
-    for kind, generator in bundle.faces.items():
-        made = [expression(values, bundle.layout, bundle.stats) for values in generator.make(request)]
+    for kind, generator in load_faces(parts).items():
+        made = [expression(values, stats.layout, stats) for values in generator.make(request)]
         out[kind] = float(np.mean([read(face) == w for face, w in zip(made, wanted, strict=True)]))
     return out
 

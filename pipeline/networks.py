@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from pydantic import TypeAdapter
 from torch import Tensor
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
@@ -16,7 +15,7 @@ from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import TokenizerConfig
+from motionloom.models.tokenizer.config import parse_tokenizer
 from motionloom.pipeline.model_store import load_facts, load_weights
 
 
@@ -29,7 +28,7 @@ def freeze(net: torch.nn.Module) -> None:
 def load_tokenizer(folder: Path) -> Tokenizer:
     """A trained tokenizer."""
     facts = load_facts(folder)
-    config = TypeAdapter(TokenizerConfig).validate_python(facts.config)
+    config = parse_tokenizer(facts.config, f"{folder / 'model.json'}: config")
     net = build_tokenizer(config, facts.layout.layout())
     load_weights(folder, net)
     return net.freeze()

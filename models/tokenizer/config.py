@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, TypedDict
+from typing import Any, Literal, TypedDict
 
 from pydantic import Field, field_validator
 
 from motionloom.datasets.motion.layout import Part
-from motionloom.datasets.schema import Config
+from motionloom.datasets.schema import Config, UserError
 from motionloom.models.quantize.ema import QuantizerConfig
 
 Recon = Literal["l2", "smooth_l1"]
@@ -118,5 +118,18 @@ class FsqConfig(BaseTokenizerConfig):
 
 
 AnyTokenizerConfig = H2VQConfig | VqConfig | RvqConfig | SeparateConfig | FsqConfig
-TokenizerConfig = Annotated[AnyTokenizerConfig, Field(discriminator="kind")]
-"""Any tokenizer, told apart by `kind`."""
+_KINDS: dict[str, type[AnyTokenizerConfig]] = {
+    "h2vq": H2VQConfig,
+    "vq": VqConfig,
+    "rvq": RvqConfig,
+    "separate": SeparateConfig,
+    "fsq": FsqConfig,
+}
+
+
+def parse_tokenizer(data: dict[str, Any], where: str) -> AnyTokenizerConfig:
+    """The config of any tokenizer, told apart by `kind`; a `UserError` names `where` and the key."""
+    kind = str(data.get("kind"))
+    if kind not in _KINDS:
+        raise UserError(f"{where}: no tokenizer of kind '{kind}'; known: {', '.join(_KINDS)}")
+    return _KINDS[kind].parse(data, where)

@@ -11,7 +11,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.stage_module import OptimConfig
 from motionloom.models.tokenizer.basis import Basis
 from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig, TokenizerConfig
+from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.pipeline.evaluation import local_joints
 
@@ -80,7 +80,7 @@ SIZES = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8, "reset_below": 0
 @pytest.mark.parametrize("config", [H2VQConfig, RvqConfig])
 def test_a_tokenizer_with_gains_gives_the_papers_features(config: type[H2VQConfig | RvqConfig]) -> None:
     torch.manual_seed(0)
-    settings: TokenizerConfig = config(**SIZES, root_gain=5.0, finger_gain=2.0)  # type: ignore[arg-type]
+    settings = config.model_validate({**SIZES, "root_gain": 5.0, "finger_gain": 2.0})
     net = build_tokenizer(settings, LAYOUT)
     net.basis.learn(STD[LAYOUT.part("bodyhand")])
     x, length = torch.randn(2, 16, 313), torch.tensor([16, 8])

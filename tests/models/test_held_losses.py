@@ -17,11 +17,11 @@ from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import (
+    AnyTokenizerConfig,
     FsqConfig,
     H2VQConfig,
     RvqConfig,
     SeparateConfig,
-    TokenizerConfig,
     VqConfig,
 )
 from motionloom.models.tokenizer.module import TokenizerModule
@@ -29,7 +29,7 @@ from motionloom.models.tokenizer.module import TokenizerModule
 LAYOUT = MotionLayout.named("wholebody363")
 SMALL: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "velocity_weight": 0.5}
 BOOK: dict[str, Any] = {**SMALL, "num_codes": 8, "reset_below": 0.1}
-CONFIGS: dict[str, TokenizerConfig] = {
+CONFIGS: dict[str, AnyTokenizerConfig] = {
     "h2vq": H2VQConfig(**BOOK),
     "separate": SeparateConfig(**BOOK),
     "vq all": VqConfig(**BOOK, part="all"),
@@ -40,7 +40,7 @@ HELD = [3, 1, 2, 0]
 LENGTH = torch.tensor([16, 12, 16, 9])
 
 
-def module_of(config: TokenizerConfig) -> TokenizerModule:
+def module_of(config: AnyTokenizerConfig) -> TokenizerModule:
     torch.manual_seed(0)
     net = build_tokenizer(config, LAYOUT)
     return TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms())

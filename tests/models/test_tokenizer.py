@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from pydantic import TypeAdapter
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -19,8 +18,8 @@ from motionloom.models.tokenizer.config import (
     H2VQConfig,
     RvqConfig,
     SeparateConfig,
-    TokenizerConfig,
     VqConfig,
+    parse_tokenizer,
 )
 from motionloom.models.tokenizer.h2vq import H2VQ
 
@@ -233,12 +232,14 @@ def test_mistakes_are_named() -> None:
 
 
 def test_config_kinds_and_defaults() -> None:
-    adapter: TypeAdapter[TokenizerConfig] = TypeAdapter(TokenizerConfig)
-    face = adapter.validate_python({"kind": "rvq", "part": "face"})
+    face = parse_tokenizer({"kind": "rvq", "part": "face"}, "here")
     assert isinstance(face, RvqConfig)
     assert (face.levels, face.num_codes, face.code_dim, face.width, face.depth) == (2, 512, 512, 512, 3)
     assert (face.alpha, face.decay, face.recon, face.velocity_weight) == (0.02, 0.99, "l2", 0.0)
-    assert isinstance(adapter.validate_python({"kind": "vq", "num_codes": 4096}), VqConfig)
-    assert isinstance(adapter.validate_python({"kind": "h2vq"}), H2VQConfig)
-    with pytest.raises(ValueError, match="levels"):
-        adapter.validate_python({"kind": "vq", "levels": 2})
+    assert isinstance(parse_tokenizer({"kind": "vq", "num_codes": 4096}, "here"), VqConfig)
+    assert isinstance(parse_tokenizer({"kind": "h2vq"}, "here"), H2VQConfig)
+    assert (face.root_gain, face.finger_gain) == (1.0, 0.0)
+    with pytest.raises(UserError, match="here: unknown key 'levels'"):
+        parse_tokenizer({"kind": "vq", "levels": 2}, "here")
+    with pytest.raises(UserError, match="no tokenizer of kind 'vqvae'; known: h2vq, vq"):
+        parse_tokenizer({"kind": "vqvae"}, "here")
