@@ -7,6 +7,15 @@ from pathlib import Path
 
 import pytest
 
+# Two processes that fill one cache of numba's at once, as librosa's functions do in a fresh environment, can
+# mix their files and then crash (numba issue 10128): each test process has its own.
+os.environ["NUMBA_CACHE_DIR"] = str(
+    Path(__file__).resolve().parents[1]
+    / ".pytest_cache"
+    / "numba"
+    / os.environ.get("PYTEST_XDIST_WORKER", "one")
+)
+
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
