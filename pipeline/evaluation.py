@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from motionloom.datasets.motion.features import decode
-from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
 from motionloom.datasets.schema import HANDS, HELD_ALL
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.statistics import FeatureStats
@@ -25,8 +25,6 @@ from motionloom.pipeline.samples import Truth, joint_layout, reconstruct
 KEY_FRAMES = 16
 """Moments of a clip that the nearest-clip search compares."""
 
-
-WRISTS = (20, 21)
 LEFT_FINGERS, RIGHT_FINGERS = range(22, 37), range(37, 52)
 """Joints of `smplx52`."""
 

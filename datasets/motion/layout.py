@@ -29,6 +29,7 @@ Family = Literal["exact", "h3d", "raw"]
 Part = Literal["all", "bodyhand", "body", "hand", "face"]
 
 BODY_JOINTS = 22
+WRISTS = (20, 21)
 FACE_DIMS = 50
 
 

@@ -40,6 +40,10 @@ class TokenizerOutput(NamedTuple):
 
     recon: Tensor
     """[B, T, dim]; zero after the last valid group."""
+    read: Tensor
+    """[B, T, dim] in the coordinates of `Basis`: what the encoders read, 0 in columns that are not held."""
+    written: Tensor
+    """[B, T, dim] in the same: what the decoder wrote, to be compared with `read`."""
     penalty: Tensor
     """Commitment, summed over codebooks; scalar."""
     codes: dict[str, Tensor]
@@ -137,9 +141,11 @@ class Tokenizer(nn.Module, ABC):
         `held` [B, dim]: false where a clip does not hold a column; None = all are held.
         """
         valid = self._valid(x, length)
-        latents = self._quantize(self._seen(x, held), valid, self._lost(held), update=True)
-        recon = self.basis.leave(self.decoder(latents.joined, valid))
-        return TokenizerOutput(recon, latents.penalty, latents.codes, latents.metrics)
+        read = self._read(x, held)
+        latents = self._quantize(read, valid, self._lost(held), update=True)
+        written = self.decoder(latents.joined, valid)
+        recon = self.basis.leave(written)
+        return TokenizerOutput(recon, read, written, latents.penalty, latents.codes, latents.metrics)
 
     @torch.no_grad()
     def encode(
@@ -151,7 +157,7 @@ class Tokenizer(nn.Module, ABC):
         valid codes, also those of a part that the clip does not hold.
         """
         valid = self._valid(x, length)
-        return self._quantize(self._seen(x, held), valid, self._lost(held), update=False).codes
+        return self._quantize(self._read(x, held), valid, self._lost(held), update=False).codes
 
     def decode(
         self, codes: dict[str, Tensor], length: Tensor | None = None, held: Tensor | None = None
@@ -189,10 +195,10 @@ class Tokenizer(nn.Module, ABC):
     def _decode(self, vectors: dict[str, Tensor], length: Tensor | None) -> Tensor:
         return self.basis.leave(self.decoder(self._join(vectors), _whole_groups(length)))
 
-    def _seen(self, x: Tensor, held: Tensor | None) -> Tensor:
+    def _read(self, x: Tensor, held: Tensor | None) -> Tensor:
         """What the encoders read: zero in the columns that are not held."""
-        seen = self.basis.enter(x)
-        return seen if held is None else seen.masked_fill(~held[:, None], 0.0)
+        read = self.basis.enter(x)
+        return read if held is None else read.masked_fill(~held[:, None], 0.0)
 
     def _valid(self, x: Tensor, length: Tensor | None) -> Tensor | None:
         if x.shape[-1] != self.dim:

@@ -20,10 +20,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
 from motionloom.datasets.schema import UserError
 
-WRISTS = (20, 21)
 FINGERS = (2, 5, 3)
 """Hands, fingers of a hand, joints of a finger from the wrist outwards: the order of `smplx52`."""
 
@@ -51,7 +50,7 @@ class Basis(nn.Module):
         root = np.arange(layout.slice("positions").start) if layout.has("positions") else columns[:0]
         gain = np.where(np.isin(columns, root), root_gain, 1.0)
         self.register_buffer("gain", torch.as_tensor(gain, dtype=torch.float32), persistent=False)
-        self.bends = finger_gain > 0
+        self.louder, self.bends = root_gain != 1, finger_gain > 0
         if not self.bends:
             return
         fingers = [_columns(layout, field, range(BODY_JOINTS, 52)) for field in ("positions", "velocities")]
@@ -75,7 +74,7 @@ class Basis(nn.Module):
 
     def enter(self, x: Tensor) -> Tensor:
         """Features [..., D] -> coordinates [..., D]."""
-        seen = x * self.gain.to(x.dtype)
+        seen = x * self.gain.to(x.dtype) if self.louder else x
         if not self.bends:
             return seen
         for field in range(2):
@@ -86,7 +85,7 @@ class Basis(nn.Module):
 
     def leave(self, seen: Tensor) -> Tensor:
         """The inverse of `enter`."""
-        x = seen / self.gain.to(seen.dtype)
+        x = seen / self.gain.to(seen.dtype) if self.louder else seen
         if not self.bends:
             return x
         for field in range(2):

@@ -41,10 +41,9 @@ class TokenizerModule(StageModule):
         """
         motion, length, held = batch["motion"], batch["length"], batch.get("held")
         out: TokenizerOutput = self.net(motion, length, held)
-        basis = self.net.basis
         terms = tokenizer_loss(
-            basis.enter(out.recon),
-            basis.enter(motion),
+            out.written,
+            out.read,
             out.penalty,
             length,
             alpha=self.alpha,
