@@ -43,14 +43,15 @@ def run_gpt(context: StageContext) -> None:
     config: GptStageConfig = context.config
     tokenizer = load_tokenizer(context.input("tokenizer"))
     tma_folder = context.optional("tma")
-    if (config.prior == "tma" or config.loss.align_weight > 0) and tma_folder is None:
+    align = config.loss.align_weight > 0
+    needed = config.prior == "tma" or align
+    if needed and tma_folder is None:
         raise UserError(f"stage {context.name}: prior 'tma' and align_weight > 0 need a tma stage before it")
-    tma = LoadedTma.load(tma_folder) if tma_folder is not None else None
+    tma = LoadedTma.load(tma_folder) if needed and tma_folder is not None else None
     text = open_text(context.input("text"))
     text_dim = tma.net.config.latent if config.prior == "tma" and tma else text.dim
     torch.manual_seed(context.seed)
     net = InterleavedGPT(config.net, tokenizer.streams, tokenizer.pattern, text_dim)
-    align = tma is not None and config.loss.align_weight > 0
     module = GptModule(
         net,
         config.optim,
