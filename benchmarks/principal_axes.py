@@ -51,7 +51,7 @@ def main() -> None:
     table = Table("features", "components", "hand shapes", "actions", "pose, mm", "fingers, mm")
     for title, (root, finger) in GAINS.items():
         basis = Basis(train.layout, columns, root_gain=root, finger_gain=finger)
-        basis.learn(std)
+        basis.learn(mean, std)
         sample = np.concatenate([seen(basis, x, mean, std) for x in frames])
         center = sample.mean(0)
         axes = np.linalg.svd(sample - center, full_matrices=False)[2]

@@ -144,7 +144,7 @@ class Tokenizer(nn.Module, ABC):
         read = self._read(x, held)
         latents = self._quantize(read, valid, self._lost(held), update=True)
         written = self.decoder(latents.joined, valid)
-        recon = self.basis.leave(written)
+        recon = self._leave(written, valid)
         return TokenizerOutput(recon, read, written, latents.penalty, latents.codes, latents.metrics)
 
     @torch.no_grad()
@@ -193,7 +193,14 @@ class Tokenizer(nn.Module, ABC):
         return super().train(mode and not self.is_frozen)
 
     def _decode(self, vectors: dict[str, Tensor], length: Tensor | None) -> Tensor:
-        return self.basis.leave(self.decoder(self._join(vectors), _whole_groups(length)))
+        valid = _whole_groups(length)
+        return self._leave(self.decoder(self._join(vectors), valid), valid)
+
+    def _leave(self, written: Tensor, valid: Tensor | None) -> Tensor:
+        """The decoder's coordinates as features, exactly zero after the last valid group."""
+        features = self.basis.leave(written)
+        mask = token_mask(valid, features.shape[1], 1)
+        return features if mask is None else features.masked_fill(~mask[..., None], 0.0)
 
     def _read(self, x: Tensor, held: Tensor | None) -> Tensor:
         """What the encoders read: zero in the columns that are not held."""

@@ -5,12 +5,14 @@ people see at once are small there:
 
 - Where the path leads: 4 of 313 columns, whose errors add up along a clip. `root_gain` multiplies them, as
   the public HumanML3D code does (its `feat_bias` is 5).
-- What a hand does: finger positions are relative to the root, so nearly all their spread is the arm's. With a
-  `finger_gain` they are read as bones, each from its parent joint, in units of the bone's length / gain, and
-  their velocities likewise relative to the parent's.
+- What a hand does: finger positions are relative to the root, so nearly all their spread is where the arm is
+  and how the wrist is turned. With a `finger_gain` they are read as bones in units of the bone's length /
+  gain: the knuckles from their wrist, which say how the hand is turned, and the bones behind them in the
+  palm's own frame, where a fist is the same numbers wherever the hand points. Velocities are read relative
+  to the parent joint's.
 
-Both are linear and are undone on the way out: a tokenizer takes and gives the paper's features, and without
-gains it is the paper's.
+Both are undone on the way out: a tokenizer takes and gives the paper's features, and without gains it is the
+paper's. Zero is the mean in both.
 """
 
 from __future__ import annotations
@@ -19,12 +21,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
 from motionloom.datasets.schema import UserError
 
 FINGERS = (2, 5, 3)
 """Hands, fingers of a hand, joints of a finger from the wrist outwards: the order of `smplx52`."""
+INDEX, MIDDLE, PINKY = 0, 1, 2
 
 
 class Basis(nn.Module):
@@ -38,6 +42,7 @@ class Basis(nn.Module):
     """
 
     gain: Tensor
+    mean: Tensor
     std: Tensor
     fingers: Tensor
     wrists: Tensor
@@ -64,12 +69,24 @@ class Basis(nn.Module):
             where = np.searchsorted(columns, np.stack(value))
             self.register_buffer(name, torch.as_tensor(where), persistent=False)
         self.register_buffer("unit", torch.as_tensor(unit, dtype=torch.float32), persistent=False)
+        self.register_buffer("mean", torch.zeros(len(columns)))
         self.register_buffer("std", torch.ones(len(columns)))
 
+    @property
+    def knuckles(self) -> Tensor:
+        """Columns of the knuckles' positions, which say how a hand is turned; needs a `finger_gain`."""
+        return self.fingers[0].reshape(*FINGERS, 3)[:, :, 0].flatten()
+
+    @property
+    def bent(self) -> Tensor:
+        """Columns of the bones behind them, which say what the hand does; needs a `finger_gain`."""
+        return self.fingers[0].reshape(*FINGERS, 3)[:, :, 1:].flatten()
+
     @torch.no_grad()
-    def learn(self, std: NDArray[np.floating]) -> None:
-        """What the features were divided by, [D of the modelled columns]; saved with the weights."""
+    def learn(self, mean: NDArray[np.floating], std: NDArray[np.floating]) -> None:
+        """How the features were normalised, each [D of the modelled columns]; saved with the weights."""
         if self.bends:
+            self.mean.copy_(torch.as_tensor(mean, dtype=torch.float32))
             self.std.copy_(torch.as_tensor(std, dtype=torch.float32))
 
     def enter(self, x: Tensor) -> Tensor:
@@ -77,10 +94,11 @@ class Basis(nn.Module):
         seen = x * self.gain.to(x.dtype) if self.louder else x
         if not self.bends:
             return seen
-        for field in range(2):
-            joints, base, unit = self._chains(x, field)
-            bones = joints - torch.cat([base, joints[..., :-1, :]], dim=-2)
-            seen = seen.index_copy(-1, self.fingers[field], (bones / unit).flatten(-4).to(x.dtype))
+        bones = (self._bent(x) - self._bent(torch.zeros_like(self.mean))) / self.unit
+        joints, wrists = self._moving(x)
+        moving = _bones(joints, wrists) / self._spread()
+        for columns, values in zip(self.fingers, (bones, moving), strict=True):
+            seen = seen.index_copy(-1, columns, values.flatten(-4).to(x.dtype))
         return seen
 
     def leave(self, seen: Tensor) -> Tensor:
@@ -88,21 +106,57 @@ class Basis(nn.Module):
         x = seen / self.gain.to(seen.dtype) if self.louder else seen
         if not self.bends:
             return x
-        for field in range(2):
-            bones, base, unit = self._chains(x, field)
-            bones = seen[..., self.fingers[field]].to(bones.dtype).reshape(bones.shape) * unit
-            joints = (base + bones.cumsum(-2)).flatten(-4) / self.std[self.fingers[field]]
-            x = x.index_copy(-1, self.fingers[field], joints.to(x.dtype))
+        joints, wrists = self._standing(x)
+        at, moving = (seen[..., columns].to(joints.dtype).reshape(joints.shape) for columns in self.fingers)
+        bent = at * self.unit + self._bent(torch.zeros_like(self.mean))
+        knuckles = bent[..., :1, :]
+        bones = torch.cat([knuckles, bent[..., 1:, :] @ _palm(knuckles)], dim=-2)
+        positions = (wrists + bones.cumsum(-2)).flatten(-4) - self.mean[self.fingers[0]]
+        velocities = (self._moving(x)[1] + (moving * self._spread()).cumsum(-2)).flatten(-4)
+        for columns, values in zip(self.fingers, (positions, velocities), strict=True):
+            x = x.index_copy(-1, columns, (values / self.std[columns]).to(x.dtype))
         return x
 
-    def _chains(self, x: Tensor, field: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Of positions (0) or velocities (1), m: joints [..., 2, 5, 3, 3], wrists [..., 2, 5, 1, 3], unit."""
-        fingers, wrists = self.fingers[field], self.wrists[field]
-        wide = x.to(torch.promote_types(x.dtype, torch.float32))
-        spread = self.std[fingers].reshape(*FINGERS, 3)
-        joints = wide[..., fingers].reshape(*x.shape[:-1], *FINGERS, 3) * spread
-        base = (wide[..., wrists] * self.std[wrists]).reshape(*x.shape[:-1], 2, 1, 1, 3)
-        return joints, base.expand(*x.shape[:-1], 2, 5, 1, 3), self.unit if field == 0 else spread
+    def _bent(self, x: Tensor) -> Tensor:
+        """Bones [..., 2, 5, 3, 3] in m: knuckles from the wrist, the others in the palm's frame."""
+        bones = _bones(*self._standing(x))
+        knuckles = bones[..., :1, :]
+        return torch.cat([knuckles, bones[..., 1:, :] @ _palm(knuckles).transpose(-1, -2)], dim=-2)
+
+    def _standing(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions in m of finger joints [..., 2, 5, 3, 3] and wrists [..., 2, 1, 1, 3]."""
+        x = x.to(torch.promote_types(x.dtype, torch.float32)) * self.std + self.mean
+        return self._joints(x, 0)
+
+    def _moving(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Their velocities in m per frame, less the mean."""
+        return self._joints(x.to(torch.promote_types(x.dtype, torch.float32)) * self.std, 1)
+
+    def _joints(self, x: Tensor, field: int) -> tuple[Tensor, Tensor]:
+        joints = x[..., self.fingers[field]].reshape(*x.shape[:-1], *FINGERS, 3)
+        return joints, x[..., self.wrists[field]].reshape(*x.shape[:-1], 2, 1, 1, 3)
+
+    def _spread(self) -> Tensor:
+        """What velocities are divided by, [2, 5, 3, 3]."""
+        return self.std[self.fingers[1]].reshape(*FINGERS, 3)
+
+
+def _bones(joints: Tensor, wrists: Tensor) -> Tensor:
+    """Joints [..., 2, 5, 3, 3] from their parents, the first of a finger from the wrist [..., 2, 1, 1, 3]."""
+    first = wrists.expand(*joints.shape[:-2], 1, 3)
+    return joints - torch.cat([first, joints[..., :-1, :]], dim=-2)
+
+
+def _palm(knuckles: Tensor) -> Tensor:
+    """Axes of the palm as rows, [..., 2, 1, 3, 3], from its knuckles [..., 2, 5, 1, 3].
+
+    Along the middle finger, across towards the index finger, and out of the hand's back or its palm.
+    Knuckles do not move against each other, so three of them say how the hand is turned.
+    """
+    along = normalize(knuckles[..., MIDDLE, :, :], dim=-1)
+    across = knuckles[..., INDEX, :, :] - knuckles[..., PINKY, :, :]
+    across = normalize(across - (across * along).sum(-1, keepdim=True) * along, dim=-1)
+    return torch.stack([along, across, torch.linalg.cross(along, across)], dim=-2)
 
 
 def _columns(layout: MotionLayout, field: str, joints: range | tuple[int, ...]) -> NDArray[np.int64]:

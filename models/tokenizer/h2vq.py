@@ -5,6 +5,9 @@ z_hat_B = Q_B(Conv1d(Concat(Transform(z_hat_H), z_B))). The paper leaves open: T
 up-sampling and a linear projection; the fusing Conv1d has kernel 3; the decoder reads both latents at the
 body rate and doubles it once.
 
+With a `finger_gain` (`basis.py`) the hand codes read how fingers bend and nothing else; how the hand is
+turned is left to the body codes, which read the knuckles [ours].
+
 A clip without hands gives the hand codebook nothing to learn; its hand latents are 0 wherever they are read.
 """
 
@@ -25,14 +28,22 @@ from motionloom.models.tokenizer.config import H2VQConfig
 class H2VQ(BodyHandTokenizer):
     """Two body tokens and one hand token per four frames."""
 
+    hand_read: Tensor
+    body_read: Tensor
+
     def __init__(self, config: H2VQConfig, layout: MotionLayout) -> None:
         super().__init__(config, layout)
         width, depth, growth, d = config.width, config.depth, config.dilation_growth, config.code_dim
+        hand, body = self.hand_columns, self.body_columns
+        if self.basis.bends:
+            hand, body = self.basis.bent, torch.cat([body, self.basis.knuckles])
+        self.register_buffer("hand_read", hand, persistent=False)
+        self.register_buffer("body_read", body, persistent=False)
         self.hand_encoder = ConvEncoder(
-            len(self.hand_columns), d, width=width, halvings=2, depth=depth, dilation_growth=growth
+            len(hand), d, width=width, halvings=2, depth=depth, dilation_growth=growth
         )
         self.body_encoder = ConvEncoder(
-            len(self.body_columns), d, width=width, halvings=1, depth=depth, dilation_growth=growth
+            len(body), d, width=width, halvings=1, depth=depth, dilation_growth=growth
         )
         self.hand_quantizer = EmaQuantizer(config.quantizer(), salt=0)
         self.transform = nn.Linear(d, d)
@@ -48,10 +59,10 @@ class H2VQ(BodyHandTokenizer):
 
     def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
         no_hands = lost.get("hand")
-        z_hand = self.hand_encoder(x[..., self.hand_columns], valid)
+        z_hand = self.hand_encoder(x[..., self.hand_read], valid)
         hand = self.hand_quantizer(z_hand, token_mask(valid, z_hand.shape[1], 4, no_hands), update=update)
         hand_vectors = without(hand.quantized, no_hands)
-        z_body = self.body_encoder(x[..., self.body_columns], valid)
+        z_body = self.body_encoder(x[..., self.body_read], valid)
         hint = self.transform(hand_vectors).repeat_interleave(2, dim=1)
         mask = token_mask(valid, z_body.shape[1], 2)
         both = torch.cat([hint, z_body], dim=-1)

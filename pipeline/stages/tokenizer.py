@@ -64,7 +64,7 @@ def run_tokenizer(context: StageContext) -> None:
     torch.manual_seed(context.seed)
     net = build_tokenizer(config.net, dataset.layout)
     columns = net.columns.numpy()
-    net.basis.learn(stats.std[columns])
+    net.basis.learn(stats.mean[columns], stats.std[columns])
     module = TokenizerModule(
         net, config.optim, seed=context.seed, max_steps=config.train.steps, **config.net.loss_terms()
     )

@@ -64,7 +64,9 @@ def motion(step: int, dim: int) -> dict[str, Tensor]:
 
 def tokenizer(config: AnyTokenizerConfig) -> tuple[StageModule, Batches]:
     net = build_tokenizer(config, LAYOUT)
-    net.basis.learn(np.full(net.dim, 0.02))  # independent noise in every column bends fingers wildly
+    net.basis.learn(
+        np.zeros(net.dim), np.full(net.dim, 0.02)
+    )  # independent noise in every column bends fingers wildly
     module = TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms())
     return module, lambda step: motion(step, net.dim)
 

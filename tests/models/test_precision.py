@@ -55,7 +55,9 @@ def captioned(dim: int) -> dict[str, Tensor]:
 
 def tokenizer(config: AnyTokenizerConfig) -> Case:
     net = build_tokenizer(config, LAYOUT)
-    net.basis.learn(np.full(net.dim, 0.02))  # independent noise in every column bends fingers wildly
+    net.basis.learn(
+        np.zeros(net.dim), np.full(net.dim, 0.02)
+    )  # independent noise in every column bends fingers wildly
     return TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms()), captioned(net.dim)
 
 
