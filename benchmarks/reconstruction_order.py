@@ -31,7 +31,7 @@ from motionloom.pipeline.sources import open_split, open_stats
 
 matplotlib.use("Agg")
 
-CODES = {"num_codes": 512, "reset_below": 0.05}
+CODES = {"num_codes": 512, "decay": 0.9, "reset_below": 0.05}
 NETS: dict[str, tuple[str, dict]] = {
     "VQ": ("vq", CODES),
     "RVQ, 2 levels": ("rvq", {**CODES, "levels": 2}),
@@ -49,7 +49,7 @@ COMMON = {
     "recon": "smooth_l1",
     "velocity_weight": 0.5,
     "root_gain": 5.0,
-    "finger_gain": 2.0,
+    "finger_gain": 4.0,
 }
 COLUMNS = {"mpjpe": "all", "mpjpe_body": "body", "mpjpe_hand": "fingers", "global_mpjpe": "world"}
 
