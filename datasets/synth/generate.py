@@ -30,7 +30,7 @@ from motionloom.datasets.synth.hands import shape_hand
 from motionloom.datasets.synth.maths import Array
 from motionloom.datasets.synth.music import SAMPLE_RATE, render
 from motionloom.datasets.synth.pose import Track
-from motionloom.datasets.synth.truth import ACTIONS, Span, Truth, draw
+from motionloom.datasets.synth.truth import ACTIONS, HANDS, Span, Truth, draw
 
 CONVERTER_VERSION = 1
 LICENCE = "CC0-1.0"
@@ -65,6 +65,8 @@ class SynthConfig(Config):
     """None = the layout's usual frame rate (30 for whole body, 20 for body only)."""
     actions: list[str] | None = None
     """None = all; otherwise names of `truth.ACTIONS`."""
+    hand_shapes: list[str] | None = None
+    """What hands that are free do besides being relaxed. None = all; otherwise names of `truth.HANDS`."""
     min_seconds: float = Field(2.0, ge=1.0)
     max_seconds: float = Field(6.0, le=60.0)
     val_fraction: float = Field(0.05, ge=0, lt=1)
@@ -85,6 +87,14 @@ class SynthConfig(Config):
         if wrong or actions == []:
             raise ValueError(f"no action {', '.join(wrong) or 'given'}; known: {', '.join(ACTIONS)}")
         return actions
+
+    @field_validator("hand_shapes")
+    @classmethod
+    def _shapes(cls, shapes: list[str] | None) -> list[str] | None:
+        wrong = sorted(set(shapes or []) - set(HANDS[1:]))
+        if wrong or shapes == []:
+            raise ValueError(f"no hand shape {', '.join(wrong) or 'given'}; known: {', '.join(HANDS[1:])}")
+        return shapes
 
     @field_validator("hold_out")
     @classmethod
@@ -159,7 +169,8 @@ def truth_of(index: int, config: SynthConfig) -> Truth:
     actions = config.actions or list(ACTIONS)
     block, place = divmod(index, len(actions))
     order = np.random.default_rng([config.seed, block, 101]).permutation(len(actions))
-    return draw(actions[int(order[place])], np.random.default_rng([config.seed, index, 0]))
+    rng = np.random.default_rng([config.seed, index, 0])
+    return draw(actions[int(order[place])], rng, config.hand_shapes or HANDS[1:])
 
 
 def split_of(index: int, config: SynthConfig) -> Split:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -74,8 +75,8 @@ class Span:
         return float(rng.uniform(low, high))
 
 
-def draw(action: str, rng: np.random.Generator) -> Truth:
-    """Truth of one clip of `action`."""
+def draw(action: str, rng: np.random.Generator, hand_shapes: Sequence[str] = HANDS[1:]) -> Truth:
+    """Truth of one clip of `action`; hands that are free take one of `hand_shapes` now and then."""
     direction: str | None = None
     side: str | None = None
     speed: str | None = None
@@ -112,7 +113,7 @@ def draw(action: str, rng: np.random.Generator) -> Truth:
     if action == "squat" and count is not None:
         # As many as fit into five seconds without changing the pace.
         count = min(count, {"slowly": 1, None: 2, "quickly": 3}[speed])
-    left, right = _hands(action, side, rng)
+    left, right = _hands(action, side, rng, hand_shapes)
     return Truth(action, direction, side, count, speed, left, right, str(rng.choice(FACES)), bpm, style)
 
 
@@ -120,9 +121,9 @@ def _one(rng: np.random.Generator, options: tuple[Any, ...]) -> Any:
     return options[int(rng.integers(len(options)))]
 
 
-def _hands(action: str, side: str | None, rng: np.random.Generator) -> tuple[str, str]:
+def _hands(action: str, side: str | None, rng: np.random.Generator, free: Sequence[str]) -> tuple[str, str]:
     """A shape for each hand; a punch needs a fist, a clap and a wave need open hands."""
-    shapes = [str(rng.choice(HANDS[1:])) if rng.random() < 0.4 else "relaxed" for _ in range(2)]
+    shapes = [str(rng.choice(free)) if rng.random() < 0.4 else "relaxed" for _ in range(2)]
     if rng.random() < 0.12:
         shapes[1] = shapes[0]
     for index, name in enumerate(SIDES):

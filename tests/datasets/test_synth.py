@@ -24,7 +24,7 @@ from motionloom.datasets.synth.generate import (
     truth_of,
 )
 from motionloom.datasets.synth.measure import agrees, measure
-from motionloom.datasets.synth.truth import ACTIONS, draw
+from motionloom.datasets.synth.truth import ACTIONS, HANDS, draw
 
 FPS = 30.0
 CONFIG = SynthConfig(seed=2024, music=True)
@@ -309,3 +309,18 @@ def test_judging_a_motion_that_does_nothing(action: str, kind: str) -> None:
     claimed = draw(action, np.random.default_rng(0)).record(hands=True, face=False)
     found = agrees(claimed, joints, None, 20.0)
     assert "action" in found and all(isinstance(value, bool) for value in found.values())
+
+
+def test_hand_shapes_can_be_fewer() -> None:
+    config = SynthConfig(clips=300, hand_shapes=["fist", "point"], actions=["walk", "clap", "punch", "wave"])
+    shapes = {truth_of(index, config).hand(side) for index in range(300) for side in (0, 1)}
+    assert shapes == {"relaxed", "fist", "point", "spread"}, "a wave spreads its hand, whatever is asked"
+    free = {truth_of(index, config) for index in range(300)}
+    assert {t.left_hand for t in free if t.action == "walk"} == {"relaxed", "fist", "point"}
+    everything = SynthConfig(clips=300, hand_shapes=list(HANDS[1:]))
+    assert [truth_of(i, everything) for i in range(50)] == [truth_of(i, SynthConfig()) for i in range(50)]
+
+
+def test_a_hand_shape_that_is_not_known_is_refused() -> None:
+    with pytest.raises(ValueError, match="no hand shape claw; known: fist, point"):
+        SynthConfig(hand_shapes=["claw"])
