@@ -232,9 +232,9 @@ def main() -> None:
         found["generation"] = shares = generation(run, some, hold_out, sampling)
         for kind in ("held out", "other"):
             names = sorted({name for row in shares.values() for name in row[kind]})
-            table = Table("motion", *names, title=f"motions that do what the caption says: {kind}")
-            for title, row in shares.items():
-                table.add_row(title, *percent(row[kind], names))
+            table = Table("right", *shares, title=f"motions that do what the caption says: {kind}")
+            for name in names:
+                table.add_row(name, *(cell for row in shares.values() for cell in percent(row[kind], [name])))
             console.print(table)
         draw(shares, run / "learning.png")
     if finished(run, "face_gpt"):
