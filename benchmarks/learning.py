@@ -213,6 +213,8 @@ def main() -> None:
     parser.add_argument("--top-p", type=float, default=0.95)
     parser.add_argument("--cfg", type=float, default=1.0, help="classifier-free guidance of body and hands")
     args = parser.parse_args()
+    if not finished(args.run, "tma"):
+        raise SystemExit(f"{args.run}: the proofs start with a trained TMA; run the stage `tma` first")
     run, console, truths = args.run, Console(), test_truths(args.run)
     found: dict[str, Any] = {"clips": len(truths), "retrieval": retrieval(run, "tma", truths, args.draws)}
     keys = ("t2m/R@1", "t2m/R@3", "m2t/R@1", "m2t/R@3")
@@ -229,6 +231,7 @@ def main() -> None:
         hold_out = json.loads((run / "stages/data/artifact.json").read_text())["config"]["hold_out"]
         sampling = SamplingConfig(temperature=args.temperature, top_p=args.top_p, cfg_scale=args.cfg)
         some = [truths[k] for k in np.random.default_rng(0).permutation(len(truths))[: args.clips]]
+        found["generated"], found["sampling"] = len(some), sampling.dump()
         found["generation"] = shares = generation(run, some, hold_out, sampling)
         for kind in ("held out", "other"):
             names = sorted({name for row in shares.values() for name in row[kind]})

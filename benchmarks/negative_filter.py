@@ -23,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from motionloom.pipeline.run import run_recipe
+from motionloom.pipeline.samples import Truth
 
 THRESHOLDS = {"tma_85": 0.85, "tma_95": 0.95, "tma_none": 1.0}
 """Stage -> cosine above which two captions are not negatives; 1 keeps all negatives."""
@@ -62,11 +63,11 @@ def recipe(folder: Path, shards: Path, seed: int, steps: int) -> Path:
     return path
 
 
-def measure(run: Path, stage: str, draws: int) -> dict[str, float]:
+def measure(run: Path, stage: str, truths: list[Truth], draws: int) -> dict[str, float]:
     """Recalls of one TMA and the mean cosine of opposite captions, kept beside it."""
     kept = run / f"{stage}.json"
     if not kept.is_file():
-        figures = retrieval(run, stage, test_truths(run), draws)
+        figures = retrieval(run, stage, truths, draws)
         figures["opposites"] = float(np.mean([row[3] for row in similarities(run, stage)]))
         kept.write_text(json.dumps(figures))
     return dict(json.loads(kept.read_text()))
@@ -86,8 +87,9 @@ def main() -> None:
     for seed in range(args.seeds):
         folder = args.work / str(seed)
         run_recipe(recipe(folder, args.run / "stages/data/shards", seed, args.steps), folder, console=console)
+        truths = test_truths(folder)
         for stage in THRESHOLDS:
-            results[stage].append(measure(folder, stage, args.draws))
+            results[stage].append(measure(folder, stage, truths, args.draws))
     table = Table("filter above", *COLUMNS.values(), "cosine of opposites")
     for stage, rows in results.items():
         cells = [_spread([row[key] for row in rows]) for key in (*COLUMNS, "opposites")]
@@ -97,7 +99,8 @@ def main() -> None:
 
 
 def _spread(values: list[float]) -> str:
-    return f"{np.mean(values):.3f} ± {np.std(values, ddof=1) if len(values) > 1 else 0:.3f}"
+    deviation = f" ± {np.std(values, ddof=1):.3f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.3f}{deviation}"
 
 
 if __name__ == "__main__":

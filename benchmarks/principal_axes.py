@@ -26,7 +26,7 @@ from motionloom.pipeline.evaluation import local_joints, pose_errors
 from motionloom.pipeline.samples import joint_layout, truth_of
 from motionloom.pipeline.sources import open_split, open_stats
 
-GAINS = {"the paper's features": (1.0, 0.0), "fingers as bones": (5.0, 4.0)}
+GAINS = {"the paper's features": (1.0, 0.0), "fingers in the palm's frame": (5.0, 4.0)}
 
 
 def seen(basis: Basis, features: NDArray[np.float32], mean: NDArray, std: NDArray) -> NDArray[np.float32]:

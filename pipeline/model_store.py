@@ -60,4 +60,8 @@ def load_weights(folder: Path, net: torch.nn.Module) -> None:
     try:
         net.load_state_dict(load_file(path))
     except (FileNotFoundError, SafetensorError, RuntimeError) as error:
-        raise UserError(f"{path}: cannot load these weights ({str(error).splitlines()[0]})") from None
+        why = " ".join(str(error).split())[:300]
+        raise UserError(
+            f"{path}: cannot load these weights; were they made by another version? Run the stage that made "
+            f"them again ({why})"
+        ) from None

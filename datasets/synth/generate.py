@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features import encode
@@ -80,21 +80,14 @@ class SynthConfig(Config):
     hold_out: list[dict[str, Any]] = Field(default_factory=list)
     """Combinations of truth values kept for testing, for example `[{"action": "kick", "side": "left"}]`."""
 
-    @field_validator("actions")
+    @field_validator("actions", "hand_shapes")
     @classmethod
-    def _known(cls, actions: list[str] | None) -> list[str] | None:
-        wrong = sorted(set(actions or []) - set(ACTIONS))
-        if wrong or actions == []:
-            raise ValueError(f"no action {', '.join(wrong) or 'given'}; known: {', '.join(ACTIONS)}")
-        return actions
-
-    @field_validator("hand_shapes")
-    @classmethod
-    def _shapes(cls, shapes: list[str] | None) -> list[str] | None:
-        wrong = sorted(set(shapes or []) - set(HANDS[1:]))
-        if wrong or shapes == []:
-            raise ValueError(f"no hand shape {', '.join(wrong) or 'given'}; known: {', '.join(HANDS[1:])}")
-        return shapes
+    def _known(cls, names: list[str] | None, info: ValidationInfo) -> list[str] | None:
+        known, what = (ACTIONS, "action") if info.field_name == "actions" else (HANDS[1:], "hand shape")
+        wrong = sorted(set(names or []) - set(known))
+        if wrong or names == []:
+            raise ValueError(f"no {what} {', '.join(wrong) or 'given'}; known: {', '.join(known)}")
+        return names
 
     @field_validator("hold_out")
     @classmethod

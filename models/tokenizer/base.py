@@ -38,12 +38,11 @@ class Stream(NamedTuple):
 class TokenizerOutput(NamedTuple):
     """What `Tokenizer.forward` returns."""
 
-    recon: Tensor
-    """[B, T, dim]; zero after the last valid group."""
     read: Tensor
     """[B, T, dim] in the coordinates of `Basis`: what the encoders read, 0 in columns that are not held."""
     written: Tensor
-    """[B, T, dim] in the same: what the decoder wrote, to be compared with `read`."""
+    """[B, T, dim] in the same: what the decoder wrote, to be compared with `read`; `features` makes motion
+    of it."""
     penalty: Tensor
     """Commitment, summed over codebooks; scalar."""
     codes: dict[str, Tensor]
@@ -136,7 +135,7 @@ class Tokenizer(nn.Module, ABC):
         return {}
 
     def forward(self, x: Tensor, length: Tensor | None = None, held: Tensor | None = None) -> TokenizerOutput:
-        """Reconstruct x [B, T, dim]; `length` [B] = valid frames. Updates the codebooks in training mode.
+        """Read, quantize and write x [B, T, dim]; `length` [B] = valid frames. Training updates codebooks.
 
         `held` [B, dim]: false where a clip does not hold a column; None = all are held.
         """
@@ -144,8 +143,7 @@ class Tokenizer(nn.Module, ABC):
         read = self._read(x, held)
         latents = self._quantize(read, valid, self._lost(held), update=True)
         written = self.decoder(latents.joined, valid)
-        recon = self._leave(written, valid)
-        return TokenizerOutput(recon, read, written, latents.penalty, latents.codes, latents.metrics)
+        return TokenizerOutput(read, written, latents.penalty, latents.codes, latents.metrics)
 
     @torch.no_grad()
     def encode(
@@ -179,6 +177,12 @@ class Tokenizer(nn.Module, ABC):
         vectors = {s.name: weights[s.name] @ books[s.name].codebook.to(weights[s.name]) for s in self.streams}
         return self._decode(vectors, length)
 
+    def features(self, written: Tensor, length: Tensor | None = None) -> Tensor:
+        """Motion [B, T, dim] of the decoder's coordinates, exactly zero after the last valid group."""
+        motion = self.basis.leave(written)
+        mask = token_mask(_whole_groups(length), motion.shape[1], 1)
+        return motion if mask is None else motion.masked_fill(~mask[..., None], 0.0)
+
     def freeze(self) -> Self:
         """Evaluation for good: no gradients, no codebook updates, whatever `.train()` a parent calls."""
         self.eval()
@@ -193,14 +197,7 @@ class Tokenizer(nn.Module, ABC):
         return super().train(mode and not self.is_frozen)
 
     def _decode(self, vectors: dict[str, Tensor], length: Tensor | None) -> Tensor:
-        valid = _whole_groups(length)
-        return self._leave(self.decoder(self._join(vectors), valid), valid)
-
-    def _leave(self, written: Tensor, valid: Tensor | None) -> Tensor:
-        """The decoder's coordinates as features, exactly zero after the last valid group."""
-        features = self.basis.leave(written)
-        mask = token_mask(valid, features.shape[1], 1)
-        return features if mask is None else features.masked_fill(~mask[..., None], 0.0)
+        return self.features(self.decoder(self._join(vectors), _whole_groups(length)), length)
 
     def _read(self, x: Tensor, held: Tensor | None) -> Tensor:
         """What the encoders read: zero in the columns that are not held."""

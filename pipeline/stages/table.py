@@ -35,7 +35,9 @@ _ALL_MODELS = (
 
 
 def _tokenizer(name: str, summary: str, config: type[StageConfig]) -> StageKind:
-    return StageKind(name, summary, config, tokenizer.run_tokenizer, ("data", "stats"), trains=True)
+    # Version 2: fingers in the palm's frame (`finger_gain`).
+    run, inputs = tokenizer.run_tokenizer, ("data", "stats")
+    return StageKind(name, summary, config, run, inputs, version=2, trains=True)
 
 
 STAGES: dict[str, StageKind] = {

@@ -60,7 +60,7 @@ def test_columns_streams_and_shapes(tokenizer: Tokenizer) -> None:
     assert torch.equal(x, full[..., LAYOUT.part(part)])
     assert tokenizer.group_frames == 4
     out = tokenizer(x)
-    assert out.recon.shape == x.shape
+    assert tokenizer.features(out.written).shape == x.shape
     assert set(out.codes) == {s.name for s in tokenizer.streams} == set(tokenizer.pattern)
     for stream in tokenizer.streams:
         assert tokenizer.pattern.count(stream.name) == stream.per_group
@@ -96,14 +96,14 @@ def test_padded_batch_equals_each_clip_alone(tokenizer: Tokenizer) -> None:
     x = torch.randn(4, 24, tokenizer.dim)
     x[torch.arange(24) >= length[:, None]] = 5.0  # garbage, not zeros: the mask alone must do it
     out = tokenizer(x, length)
-    decoded = tokenizer.decode(out.codes, length)
+    recon, decoded = tokenizer.features(out.written, length), tokenizer.decode(out.codes, length)
     penalties = []
     for i, n in enumerate(length.tolist()):
         alone = tokenizer(x[i : i + 1, :n])
         penalties.append(alone.penalty)
-        torch.testing.assert_close(out.recon[i, :n], alone.recon[0], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(recon[i, :n], tokenizer.features(alone.written)[0], rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(decoded[i, :n], tokenizer.decode(alone.codes)[0], rtol=1e-4, atol=1e-5)
-        assert (out.recon[i, n:] == 0).all()
+        assert (recon[i, n:] == 0).all()
         for stream in tokenizer.streams:
             assert torch.equal(
                 masked_tokens(out.codes[stream.name], stream, length)[i], alone.codes[stream.name][0]
@@ -130,7 +130,7 @@ def test_length_is_rounded_up_to_whole_groups(tokenizer: Tokenizer) -> None:
     tokenizer.eval()
     x = functional.pad(torch.randn(1, 10, tokenizer.dim), (0, 0, 0, 6))
     a, b = tokenizer(x, torch.tensor([10])), tokenizer(x[:, :12])
-    torch.testing.assert_close(a.recon[:, :12], b.recon, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(a.written[:, :12], b.written, rtol=1e-4, atol=1e-5)
 
 
 def test_decode_of_encode_is_the_eval_forward(tokenizer: Tokenizer) -> None:
@@ -142,7 +142,7 @@ def test_decode_of_encode_is_the_eval_forward(tokenizer: Tokenizer) -> None:
     out = tokenizer.eval()(x)
     for name, value in codes.items():
         assert torch.equal(value, out.codes[name])
-    torch.testing.assert_close(tokenizer.decode(codes), out.recon, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(tokenizer.decode(codes), tokenizer.features(out.written), rtol=1e-4, atol=1e-5)
 
 
 def test_decode_soft(tokenizer: Tokenizer) -> None:
@@ -163,7 +163,7 @@ def test_decode_soft(tokenizer: Tokenizer) -> None:
 def test_gradients_reach_every_parameter(tokenizer: Tokenizer) -> None:
     x = torch.randn(4, 16, tokenizer.dim)
     out = tokenizer(x)
-    ((out.recon - x).square().mean() + 0.02 * out.penalty).backward()
+    ((out.written - out.read).square().mean() + 0.02 * out.penalty).backward()
     for name, parameter in tokenizer.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.abs().sum() > 0, name
