@@ -38,7 +38,7 @@ from motionloom.pipeline.bundle import Bundle, part_folders, text_encoder_of
 from motionloom.pipeline.evaluation import embed_motions
 from motionloom.pipeline.faces import FaceRequest, expression, load_faces
 from motionloom.pipeline.networks import LoadedTma
-from motionloom.pipeline.samples import Truth, joint_layout, reconstruct, truth_of
+from motionloom.pipeline.samples import Truth, joint_layout, reconstruct_truth, truth_of
 from motionloom.pipeline.sampling import SamplingConfig
 from motionloom.pipeline.sources import open_split, open_text
 
@@ -144,7 +144,7 @@ def generation(
     fps, joints = bundle.layout.fps, joint_layout(bundle.layout)
     order = np.random.default_rng(0).permutation(len(truths))
     guess = ((truths[k].joints, truths[k].face) for k in order)
-    rebuilt = (reconstruct(bundle.tokenizer, bundle.stats, t.features, t.held) for t in truths)
+    rebuilt = (reconstruct_truth(bundle.tokenizer, bundle.stats, t) for t in truths)
     out = {
         "another clip's motion": judge(truths, guess, fps, hold_out),
         "reconstruction": judge(truths, ((decode(x, joints), None) for x in rebuilt), fps, hold_out),

@@ -25,8 +25,8 @@ from rich.table import Table
 from motionloom.pipeline.run import run_recipe
 from motionloom.pipeline.samples import Truth
 
-THRESHOLDS = {"tma_85": 0.85, "tma_95": 0.95, "tma_none": 1.0}
-"""Stage -> cosine above which two captions are not negatives; 1 keeps all negatives."""
+THRESHOLDS = {"tma_85": 0.85, "tma_95": 0.95, "tma_none": None}
+"""Stage -> cosine above which two captions are not negatives; None keeps all negatives."""
 COLUMNS = {
     "t2m/R@1": "text to motion R@1",
     "t2m/R@3": "R@3",

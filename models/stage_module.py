@@ -1,8 +1,8 @@
 """Base of the stages' LightningModules: one seeded step, one optimizer, plain scalar logs.
 
-Every random draw of a training step (dropout, latents, code resets, Gumbel noise) comes from a generator
-state that is a pure function of (seed, step, rank), so a run that was killed and resumed repeats the
-undisturbed run bit for bit.
+Every random draw of a training step (dropout, latents, Gumbel noise) comes from a generator state that is a
+pure function of (seed, step, rank), so a run that was killed and resumed repeats the undisturbed run bit for
+bit. Codebooks draw by themselves, the same on every rank (`quantize/draws.py`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from motionloom.models.distributed import alone
 from motionloom.models.sharding import sharded
 
 LOG_EVERY = 10
-"""Steps between logged figures; averaging them over ranks costs a collective each."""
+"""Steps that a row of the log averages; averaging over ranks costs a collective each."""
 
 
 class OptimConfig(Config):
@@ -45,6 +45,8 @@ class StageModule(L.LightningModule, ABC):
         self.optim_config = optim
         self.seed = seed
         self.max_steps = max_steps
+        self._since: Tensor | None = None
+        self._count = 0
         self.fused = True
         """Whether AdamW is one kernel. False for "16-mixed": a fused step also removes the scale of the
         gradients, and they could not be clipped before it."""
@@ -59,7 +61,12 @@ class StageModule(L.LightningModule, ABC):
             self.net = sharded(self.net, self.device_mesh["data_parallel"])
 
     def compile_losses(self) -> None:
-        """Compile networks and losses as one graph; seeding and logging stay outside. A break is an error."""
+        """Compile networks and losses as one graph; seeding and logging stay outside. A break is an error.
+
+        Graphs of stages that ran before in this process are dropped: the number that one function may have
+        is limited, and all tokenizers share theirs.
+        """
+        torch.compiler.reset()
         self.losses = torch.compile(self.losses, fullgraph=True)  # type: ignore[method-assign]
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
@@ -68,10 +75,23 @@ class StageModule(L.LightningModule, ABC):
         key = (self.seed * 1_000_003 + self.global_step) * 4099 + self.global_rank
         torch.manual_seed((key + (part << 48)) % 2**63)
         values = self.losses(batch)
-        if (self.global_step + 1) % LOG_EVERY == 0:
-            self.log_dict({f"train/{k}": v.detach() for k, v in values.items()}, sync_dist=True)
+        self._average(values, last=part == self.trainer.accumulate_grad_batches - 1)
         self.log("loss", values["loss"].detach(), prog_bar=True, logger=False)
         return values["loss"]
+
+    def on_train_epoch_start(self) -> None:
+        """Averages begin anew with a chunk, as they do in a run that goes on from its checkpoint."""
+        self._since, self._count = None, 0
+
+    def _average(self, values: dict[str, Tensor], *, last: bool) -> None:
+        """Log the means over the steps, and parts of steps, since the last row."""
+        figures = torch.stack([v.detach().float() for v in values.values()])
+        self._since = figures if self._since is None else self._since + figures
+        self._count += 1
+        if last and (self.global_step + 1) % LOG_EVERY == 0:
+            means = (self._since / self._count).unbind()
+            self.log_dict({f"train/{k}": v for k, v in zip(values, means, strict=True)}, sync_dist=True)
+            self._since, self._count = None, 0
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """The same losses on held-out data; every rank gets the same batches and the same figures.

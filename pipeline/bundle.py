@@ -5,7 +5,8 @@ A bundle opens from a run folder or from an exported one; both hold one folder p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,9 +26,10 @@ from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate, sample_seeds
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.artifact import Artifact
+from motionloom.pipeline.encoder_files import place_of
 from motionloom.pipeline.faces import FaceGenerator, FaceKind, FaceRequest, choose, expression, load_faces
 from motionloom.pipeline.model_store import LayoutFacts
-from motionloom.pipeline.networks import LoadedTma, load_gpt, load_tokenizer
+from motionloom.pipeline.networks import CPU, LoadedTma, device_of, load_gpt, load_tokenizer
 from motionloom.pipeline.sampling import SamplingConfig
 
 PARTS = (
@@ -60,7 +62,7 @@ class GeneratedMotion:
 
 @dataclass(frozen=True)
 class Bundle:
-    """The parts, loaded once."""
+    """The parts, loaded once and all on one device."""
 
     layout: MotionLayout
     stats: FeatureStats
@@ -73,30 +75,35 @@ class Bundle:
     """The face generators here, the paper's first; empty for body-only models."""
 
     @staticmethod
-    def open(folder: Path) -> Bundle:
+    def open(folder: Path, device: torch.device = CPU) -> Bundle:
         """Open a run folder or an exported folder."""
         if (folder / "bundle.json").is_file():
             facts = BundleFile.load_json(folder / "bundle.json")
             own = folder / facts.text_encoder
             encoder = str(own) if own.is_dir() else facts.text_encoder
-            return Bundle.from_parts({p: folder / p for p in PARTS if (folder / p).is_dir()}, encoder)
-        return Bundle.from_run(folder)
+            parts = {part: folder / part for part in PARTS if (folder / part).is_dir()}
+            return Bundle.from_parts(parts, encoder, device)
+        if not (folder / "recipe.yaml").is_file():
+            raise UserError(
+                f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no bundle.json)"
+            )
+        return Bundle.from_run(folder, device)
 
     @staticmethod
-    def from_run(run: Path) -> Bundle:
+    def from_run(run: Path, device: torch.device = CPU) -> Bundle:
         """Open the finished stages of a run."""
         parts = part_folders(run)
         if "text" not in parts:
             raise UserError(f"{run}: no finished text stage; run the recipe to the end first")
-        return Bundle.from_parts(parts, text_encoder_of(parts["text"]))
+        return Bundle.from_parts(parts, text_encoder_of(parts["text"]), device)
 
     @staticmethod
-    def from_parts(parts: dict[str, Path], text_encoder: str) -> Bundle:
+    def from_parts(parts: dict[str, Path], text_encoder: str, device: torch.device = CPU) -> Bundle:
         """Open one folder per part."""
         for role in REQUIRED:
             if role not in parts:
                 raise UserError(f"no finished '{role}' stage here; run the recipe to the end first")
-        tokenizer = load_tokenizer(parts["tokenizer"])
+        tokenizer = load_tokenizer(parts["tokenizer"], device)
         gpt, prior = load_gpt(parts["gpt"], tokenizer)
         return Bundle(
             layout=tokenizer.layout,
@@ -105,14 +112,19 @@ class Bundle:
             tokenizer=tokenizer,
             gpt=gpt,
             prior=prior,
-            tma=LoadedTma.load(parts["tma"]) if "tma" in parts else None,
-            faces=load_faces(parts),
+            tma=LoadedTma.load(parts["tma"], device) if "tma" in parts else None,
+            faces=load_faces(parts, device),
         )
 
     @cached_property
     def text_encoder(self) -> TextEncoder:
         """Loaded on first use; it is the slow part of starting."""
-        return load_text_encoder(self.text_encoder_name)
+        return load_text_encoder(self.text_encoder_name, device=str(self.device))
+
+    @property
+    def device(self) -> torch.device:
+        """Where all networks lie; what is made comes back as numpy arrays."""
+        return device_of(self.gpt)
 
     @property
     def max_seconds(self) -> float:
@@ -121,7 +133,7 @@ class Bundle:
 
     @property
     def max_groups(self) -> int:
-        """Longest motion in groups of four frames."""
+        """Longest motion in groups of frames."""
         return self.gpt.max_groups
 
     def generate(
@@ -129,15 +141,19 @@ class Bundle:
         captions: Sequence[str],
         *,
         face_captions: Sequence[str] | None = None,
-        seconds: float | None = None,
+        seconds: float | Sequence[float] | None = None,
         seed: int = 0,
         sampling: SamplingConfig | None = None,
         batch: int = 64,
     ) -> list[GeneratedMotion]:
-        """Motions for captions, in order; the same seed and caption give the same motion."""
+        """Motions for captions, in order; the same seed and caption give the same motion.
+
+        `seconds` is one length for all or one each; without it the model decides.
+        """
         faces = list(face_captions) if face_captions is not None else list(captions)
         if len(faces) != len(captions):
             raise UserError(f"{len(captions)} captions but {len(faces)} face captions")
+        groups = self._groups(seconds, len(captions))
         sampling = sampling or SamplingConfig()
         # One seed a motion, so that how they are batched plays no part.
         seeds = sample_seeds(seed, 2 * len(captions))
@@ -145,18 +161,18 @@ class Bundle:
         for start in range(0, len(captions), batch):
             part = slice(start, start + batch)
             both = seeds[: len(captions)][part], seeds[len(captions) :][part]
-            out += self._batch(list(captions[part]), faces[part], seconds, both, sampling)
+            lengths = None if groups is None else groups[part]
+            out += self._batch(list(captions[part]), faces[part], lengths, both, sampling)
         return out
 
     def _batch(
         self,
         captions: list[str],
         faces: list[str],
-        seconds: float | None,
+        groups: Tensor | None,
         seeds: tuple[list[int], list[int]],
         sampling: SamplingConfig,
     ) -> list[GeneratedMotion]:
-        groups = self._groups(seconds, len(captions))
         codes, lengths = self._sample(captions, groups, seeds[0], sampling)
         body = self._decode(codes, lengths)
         expressions: list[NDArray[np.float32]] | list[None] = [None] * len(captions)
@@ -181,15 +197,24 @@ class Bundle:
             return self.layout
         return MotionLayout.named("wholebody313", fps=self.layout.fps, family=self.layout.family)
 
-    def _groups(self, seconds: float | None, count: int) -> Tensor | None:
+    def _groups(self, seconds: float | Sequence[float] | None, count: int) -> Tensor | None:
+        """Lengths in groups of frames, int64 [count]."""
         if seconds is None:
             return None
-        groups = round(seconds * self.layout.fps / self.tokenizer.group_frames)
-        if not 1 <= groups <= self.max_groups:
-            raise UserError(
-                f"{seconds:g} s is out of reach: this model makes 0.2 to {self.max_seconds:.1f} s"
-            )
-        return torch.full((count,), groups)
+        wanted = list(seconds) if isinstance(seconds, Iterable) else [seconds] * count
+        if len(wanted) != count:
+            raise UserError(f"{count} captions but {len(wanted)} lengths in seconds")
+        unit, fps = self.tokenizer.group_frames, self.layout.fps
+        out = []
+        for length in wanted:
+            groups = round(length * fps / unit) if math.isfinite(length) else 0
+            if not 1 <= groups <= self.max_groups:
+                raise UserError(
+                    f"{length:g} s is out of reach: this model makes {unit / fps:.2g} to "
+                    f"{self.max_seconds:.1f} s"
+                )
+            out.append(groups)
+        return torch.tensor(out)
 
     def _sample(
         self, texts: list[str], groups: Tensor | None, seeds: list[int], s: SamplingConfig
@@ -207,9 +232,11 @@ class Bundle:
         return result.codes, result.groups
 
     def embed(self, texts: list[str]) -> Tensor:
-        """The GPT's text priors [n, E]."""
+        """The GPT's text priors [n, E], on its device."""
         encoded = self.text_encoder.encode(texts)
-        return torch.as_tensor(encoded.sentence) if self.prior == "sentence" else self._tma_text(encoded)
+        if self.prior == "sentence":
+            return torch.as_tensor(encoded.sentence).to(self.device)
+        return self._tma_text(encoded)
 
     def _tma_text(self, encoded: EncodedText) -> Tensor:
         if self.tma is None:
@@ -218,20 +245,19 @@ class Bundle:
 
     def _decode(self, codes: dict[str, Tensor], groups: Tensor) -> list[NDArray[np.float32]]:
         """Features in their own units, [T, D] a sample; each is decoded alone, so padding plays no part."""
-        streams, columns = self.tokenizer.streams, self.tokenizer.columns.numpy()
+        streams, columns = self.tokenizer.streams, self.tokenizer.columns.cpu().numpy()
         out = []
         for row, count in enumerate(groups.tolist()):
             single = {s.name: codes[s.name][row : row + 1, : count * s.per_group] for s in streams}
             with torch.no_grad():
-                motion = self.tokenizer.decode(single)[0].numpy()
+                motion = self.tokenizer.decode(single)[0].cpu().numpy()
             out.append((motion * self.stats.std[columns] + self.stats.mean[columns]).astype(np.float32))
         return out
 
 
 def part_folders(run: Path) -> dict[str, Path]:
     """Folder of each part in a run: as its `generate` stage names them, else by the part's own name."""
-    recipe = _resolved(run)
-    stages = recipe["stages"]
+    stages = stages_of(run)
     roles = {part: part for part in PARTS if part in stages}
     for entry in stages.values():
         if entry["kind"] == "generate":
@@ -241,16 +267,27 @@ def part_folders(run: Path) -> dict[str, Path]:
 
 
 def text_encoder_of(text_folder: Path) -> str:
-    """Name of the text encoder a text stage used."""
+    """The text encoder a text stage used: `minilm`, an absolute folder or a hub name."""
     artifact = Artifact.find(text_folder)
     if artifact is None:
         raise UserError(f"{text_folder}: the text stage has not finished")
-    return str(artifact.config["encoder"])
+    return place_of(text_folder) or str(artifact.config["encoder"])
 
 
-def _resolved(run: Path) -> dict[str, dict]:
-    path = run / "recipe.yaml"
-    if not path.is_file():
-        raise UserError(f"{run}: not a run folder (no recipe.yaml) and not an exported one (no bundle.json)")
-    data: dict[str, dict] = yaml.safe_load(path.read_text(encoding="utf-8"))
-    return data
+def stages_of(run: Path) -> dict[str, dict]:
+    """The stages of a run's resolved recipe, as they are written there."""
+    require_run(run)
+    recipe: dict[str, dict] = yaml.safe_load((run / "recipe.yaml").read_text(encoding="utf-8"))
+    return recipe["stages"]
+
+
+def require_run(folder: Path) -> None:
+    """Refuse what is no run folder, and say what it is instead."""
+    if (folder / "recipe.yaml").is_file():
+        return
+    if (folder / "bundle.json").is_file():
+        raise UserError(
+            f"{folder}: an exported folder, which generates and holds nothing else; name the run folder "
+            f"(runs/NAME) that it was made from"
+        )
+    raise UserError(f"{folder}: not a run folder (no recipe.yaml)")

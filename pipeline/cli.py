@@ -30,10 +30,14 @@ app = typer.Typer(
 )
 app.add_typer(data_app, name="data")
 
-RunFolder = Annotated[Path, typer.Argument(help="A run folder (runs/NAME), or a folder made by export.")]
+ModelFolder = Annotated[Path, typer.Argument(help="A run folder (runs/NAME), or a folder made by export.")]
+RunFolder = Annotated[Path, typer.Argument(help="A run folder (runs/NAME).")]
 Sets = Annotated[
     list[str] | None,
     typer.Option("--set", "-s", help="Override one value: stage.field=value. May be repeated."),
+]
+Device = Annotated[
+    str, typer.Option(help="auto (a GPU if there is one; stages go by the recipe), cpu, cuda or cuda:N.")
 ]
 _INTERRUPTED = 130
 
@@ -103,7 +107,7 @@ def run(
 
 @app.command()
 def generate(
-    run_folder: RunFolder,
+    run_folder: ModelFolder,
     captions: Annotated[
         list[str] | None, typer.Argument(help="What the person does; one motion each.")
     ] = None,
@@ -116,16 +120,23 @@ def generate(
     ] = "npz,bvh,mp4,html",
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same motion.")] = 0,
-    temperature: Annotated[float, typer.Option(help="Below 1: safer, above 1: more varied.")] = 1.0,
+    temperature: Annotated[
+        float, typer.Option(help="0: the likeliest tokens; below 1: safer, above 1: more varied.")
+    ] = 1.0,
     top_k: Annotated[int, typer.Option(help="Draw from the k likeliest tokens; 0 = all.")] = 0,
     top_p: Annotated[
         float, typer.Option(help="Draw from the likeliest tokens of this total probability.")
     ] = 0.95,
     cfg: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
+    face_cfg: Annotated[float | None, typer.Option(help="Guidance of the face; default: as --cfg.")] = None,
     face_model: Annotated[
         str | None, typer.Option(help="gpt, vae or diffusion; default: the first the run has.")
     ] = None,
-    steps: Annotated[int, typer.Option(help="Denoising steps of diffusion models.")] = 50,
+    sampler: Annotated[str, typer.Option(help="Of diffusion models: ddpm, ddim or dpm++.")] = "ddpm",
+    steps: Annotated[
+        int, typer.Option(help="Denoising steps of diffusion models, at most those of the training (1000).")
+    ] = 50,
+    device: Device = "auto",
 ) -> None:
     """Motions from captions, as npz, BVH, MP4 and one page to watch.
 
@@ -146,9 +157,12 @@ def generate(
             "top_k": top_k,
             "top_p": top_p,
             "cfg_scale": cfg,
+            "face_cfg_scale": face_cfg,
             "face_model": face_model,
+            "sampler": sampler,
             "denoising_steps": steps,
         },
+        device=device,
         console=make_console(),
     )
 
@@ -160,6 +174,7 @@ def evaluate(
     repeats: Annotated[
         int | None, typer.Option(help="Repetitions of everything that draws at random.")
     ] = None,
+    device: Device = "auto",
 ) -> None:
     """Figures on the test split, each beside its trivial answer.
 
@@ -167,22 +182,28 @@ def evaluate(
     """
     from motionloom.pipeline.run import evaluate_run
 
-    evaluate_run(run_folder, clips=clips, repeats=repeats, console=make_console())
+    evaluate_run(run_folder, clips=clips, repeats=repeats, device=device, console=make_console())
 
 
 @app.command()
 def retrieval(
     run_folder: RunFolder,
+    stage: Annotated[
+        str | None, typer.Option(help="The alignment stage, for example temos; default: tma.")
+    ] = None,
     split: Annotated[str | None, typer.Option(help="train, val or test; default: the test split.")] = None,
     seed: Annotated[int, typer.Option(help="Shuffles the batches of protocols C and D.")] = 0,
+    device: Device = "auto",
 ) -> None:
-    """Text-motion retrieval by the run's TMA under the paper's protocols A to D.
+    """Text-motion retrieval by the run's TMA, or by TEMOS, under the paper's protocols A to D.
 
     Example: `motionloom retrieval runs/humantomato-tiny`
+
+    Example: `motionloom retrieval runs/baselines-tiny --stage temos`
     """
     from motionloom.pipeline.retrieval import retrieval_command
 
-    retrieval_command(run_folder, split=split, seed=seed, console=make_console())
+    retrieval_command(run_folder, stage=stage, split=split, seed=seed, device=device, console=make_console())
 
 
 @app.command()
@@ -191,6 +212,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The page; default RUN/report.html.")
     ] = None,
+    device: Device = "auto",
 ) -> None:
     """One self-contained page: curves, codebooks, figures and motions to watch.
 
@@ -198,7 +220,7 @@ def report(
     """
     from motionloom.pipeline.run import report_run
 
-    report_run(run_folder, out, console=make_console())
+    report_run(run_folder, out, device=device, console=make_console())
 
 
 @app.command()

@@ -1,8 +1,9 @@
 """What a recipe's trainings will take, before they run: parameters, tokens, bits, memory of one process.
 
 Each network is built and its loss computed on fake tensors, which have shapes but no values, so the figures
-come from the code that will run. Memory counts weights, gradients, AdamW's two moments and everything kept
-for the backward pass; workspaces of kernels and the allocator's rounding come on top.
+come from the code that will run, under the precision it will run in. Memory counts weights, gradients,
+AdamW's two moments, codebooks with their averages and everything kept for the backward pass; workspaces of
+kernels and the allocator's rounding come on top.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.quantize.ema import EmaQuantizer
 from motionloom.models.stage_module import StageModule
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma
@@ -38,6 +40,8 @@ _CAPTION_TOKENS = 24
 _BYTES_A_PARAMETER = 16
 """Weight, gradient and AdamW's two moments in float32."""
 
+_HALF = {"bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -45,6 +49,8 @@ class Estimate:
 
     stage: str
     parameters: int
+    codebook: int
+    """Values of the codebooks, which learn by averages and have no gradient."""
     local_batch: int
     memory_bytes: int
     note: str
@@ -66,12 +72,13 @@ def estimate(recipe: Recipe) -> list[Estimate]:
             module, inputs, note = _fake(recipe, stage, layout, batch)
             prepare_module(module, config.train)
             parameters = sum(p.numel() for p in module.net.parameters())
-            kept = _saved_bytes(module, inputs)
-        if config.train.precision != "32-true":
-            kept //= 2
+            buffers = sum(b.numel() * b.element_size() for b in module.net.buffers())
+            books = [m for m in module.net.modules() if isinstance(m, EmaQuantizer)]
+            kept = _saved_bytes(module, inputs, _HALF.get(config.train.precision))
         holders = world if config.train.strategy == "fsdp" else 1
-        memory = parameters * _BYTES_A_PARAMETER // holders + kept
-        rows.append(Estimate(stage.name, parameters, batch, memory, note))
+        memory = parameters * _BYTES_A_PARAMETER // holders + buffers + kept
+        codebook = sum(book.codebook.numel() for book in books)
+        rows.append(Estimate(stage.name, parameters, codebook, batch, memory, note))
     return rows
 
 
@@ -82,6 +89,8 @@ def estimate_table(rows: list[Estimate]) -> Table:
         table.add_column(column, overflow="fold")
     for row in rows:
         parameters = f"{row.parameters / 1e6:.1f} M"
+        if row.codebook:
+            parameters += f" + {row.codebook / 1e6:.1f} M codebook"
         table.add_row(
             row.stage, parameters, str(row.local_batch), f"{row.memory_bytes / 2**30:.1f} GiB", row.note
         )
@@ -152,7 +161,7 @@ def _fake_gpt(
         "tokens": torch.zeros(batch, length, dtype=torch.int64),
         "kinds": order.expand(batch, -1),
         "text": torch.empty(batch, prior),
-        "sentence": torch.empty(batch, width),
+        "similarity": torch.empty(batch, width),
     }
     if align and tma is not None:
         inputs["tma_text"] = torch.empty(batch, tma.config.latent)
@@ -174,11 +183,12 @@ def _captioned(batch: int, frames: int, dim: int, width: int) -> dict[str, Any]:
         "text_tokens": torch.empty(batch, _CAPTION_TOKENS, width),
         "text_mask": torch.ones(batch, _CAPTION_TOKENS, dtype=torch.bool),
         "sentence": torch.empty(batch, width),
+        "similarity": torch.empty(batch, width),
     }
 
 
-def _saved_bytes(module: StageModule, inputs: dict[str, Any]) -> int:
-    """Bytes that the backward pass of one loss keeps, parameters apart."""
+def _saved_bytes(module: StageModule, inputs: dict[str, Any], half: torch.dtype | None) -> int:
+    """Bytes that the backward pass of one loss keeps, parameters apart; `half` is the type of autocast."""
     own = {p.untyped_storage()._cdata for p in module.parameters()}
     sizes: dict[int, int] = {}
 
@@ -189,6 +199,7 @@ def _saved_bytes(module: StageModule, inputs: dict[str, Any]) -> int:
         return tensor
 
     module.train()
-    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+    hooks = torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor)
+    with hooks, torch.autocast("cpu", dtype=half, enabled=half is not None):
         module.losses(inputs)["loss"]
     return sum(sizes.values())

@@ -20,7 +20,7 @@ from motionloom.models.metrics.reconstruction import accel, mpjpe, pa_mpjpe
 from motionloom.models.metrics.retrieval import recall
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.networks import LoadedTma
-from motionloom.pipeline.samples import Truth, joint_layout, reconstruct
+from motionloom.pipeline.samples import Truth, joint_layout, reconstruct_truth
 
 KEY_FRAMES = 16
 """Moments of a clip that the nearest-clip search compares."""
@@ -68,7 +68,7 @@ def reconstruction_figures(
     rows: dict[str, list[float]] = {}
     for truth in truths:
         real = local_joints(truth.features, layout)
-        found = reconstruct(tokenizer, stats, truth.features, truth.held)
+        found = reconstruct_truth(tokenizer, stats, truth)
         constant = np.broadcast_to(body, truth.features.shape)
         other = nearest.features(truth.features, truth.held)
         joints = slice(None) if truth.held & HANDS else slice(BODY_JOINTS)
@@ -188,7 +188,7 @@ def embed_motions(
         motion = torch.zeros(len(cut), int(length.max()), len(columns))
         for row, values in enumerate(cut):
             motion[row, : len(values)] = torch.from_numpy(values.astype(np.float32))
-        for i, latent in zip(rows, tma.embed_motion(motion, length), strict=True):
+        for i, latent in zip(rows, tma.embed_motion(motion, length).cpu(), strict=True):
             out[i] = latent
     return torch.stack([out[i] for i in range(len(motions))])
 

@@ -26,7 +26,7 @@ from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.pipeline.model_store import load_facts, load_weights
-from motionloom.pipeline.networks import LoadedTma, freeze, load_gpt, load_tokenizer
+from motionloom.pipeline.networks import CPU, LoadedTma, device_of, freeze, load_gpt, load_tokenizer
 from motionloom.pipeline.sampling import SamplingConfig
 
 FaceKind = Literal["gpt", "vae", "diffusion"]
@@ -47,7 +47,7 @@ class FaceRequest:
 
 
 class FaceGenerator(Protocol):
-    """Text to normalised expression."""
+    """Text to normalised expression, on the generator's device."""
 
     def make(self, request: FaceRequest) -> list[torch.Tensor]:
         """Normalised expressions [T, 50], in the order of the texts."""
@@ -70,8 +70,9 @@ class GptFace:
             raise UserError("this face GPT needs the TMA text encoder, and no tma part is here")
         groups = torch.tensor([-(-count // GROUP_FRAMES) for count in request.frames])
         codes = generate(
-            self.gpt, given, groups=groups, temperature=sampling.temperature, top_k=sampling.top_k or None,
-            top_p=sampling.top_p, cfg_scale=sampling.cfg_scale, seed=list(request.seeds),
+            self.gpt, given.to(device_of(self.gpt)), groups=groups, temperature=sampling.temperature,
+            top_k=sampling.top_k or None, top_p=sampling.top_p, cfg_scale=sampling.face_guidance,
+            seed=list(request.seeds),
         ).codes  # fmt: skip
         out = []
         for row, count in enumerate(request.frames):
@@ -92,13 +93,14 @@ class VaeFace:
     @torch.no_grad()
     def make(self, request: FaceRequest) -> list[torch.Tensor]:
         """See `FaceGenerator`. The latent is drawn from the text's Gaussian; temperature scales its width."""
-        text, frames, seeds = request.text, request.frames, request.seeds
-        mu, logvar = self.net.net.encode_text(torch.as_tensor(text.tokens), torch.as_tensor(text.mask))
+        frames, seeds, device = request.frames, request.seeds, self.net.device
+        tokens, mask = torch.as_tensor(request.text.tokens), torch.as_tensor(request.text.mask)
+        mu, logvar = self.net.net.encode_text(tokens.to(device), mask.to(device))
         noise = torch.stack(
             [torch.randn(mu.shape[1], generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         )
-        z = mu + request.sampling.temperature * (0.5 * logvar).exp() * noise
-        made = self.net.net.decode(z, torch.tensor(frames), max(frames))
+        z = mu + request.sampling.temperature * (0.5 * logvar).exp() * noise.to(device)
+        made = self.net.net.decode(z, torch.tensor(frames).to(device), max(frames))
         return [made[row, :count] for row, count in enumerate(frames)]
 
 
@@ -111,22 +113,23 @@ class DiffusionFace:
     def make(self, request: FaceRequest) -> list[torch.Tensor]:
         """See `FaceGenerator`."""
         sampling = request.sampling
+        text = torch.as_tensor(request.text.sentence).to(device_of(self.net))
         return sample_motions(
-            self.net, torch.as_tensor(request.text.sentence), request.frames, seeds=request.seeds,
-            sampler=sampling.sampler, steps=sampling.denoising_steps, guidance=sampling.cfg_scale,
+            self.net, text, request.frames, seeds=request.seeds,
+            sampler=sampling.sampler, steps=sampling.denoising_steps, guidance=sampling.face_guidance,
         )  # fmt: skip
 
 
-def load_faces(parts: dict[str, Path]) -> dict[FaceKind, FaceGenerator]:
+def load_faces(parts: dict[str, Path], device: torch.device = CPU) -> dict[FaceKind, FaceGenerator]:
     """The generators whose stages are finished; the paper's first."""
     out: dict[FaceKind, FaceGenerator] = {}
     if "face_gpt" in parts and "face_tokenizer" in parts:
-        tokenizer = load_tokenizer(parts["face_tokenizer"])
+        tokenizer = load_tokenizer(parts["face_tokenizer"], device)
         out["gpt"] = GptFace(tokenizer, *load_gpt(parts["face_gpt"], tokenizer))
     if "face_vae" in parts:
-        out["vae"] = VaeFace(LoadedTma.load(parts["face_vae"]))
+        out["vae"] = VaeFace(LoadedTma.load(parts["face_vae"], device))
     if "face_diffusion" in parts:
-        out["diffusion"] = DiffusionFace(load_diffusion(parts["face_diffusion"]))
+        out["diffusion"] = DiffusionFace(load_diffusion(parts["face_diffusion"], device))
     return out
 
 
@@ -142,17 +145,17 @@ def choose(faces: dict[FaceKind, FaceGenerator], wanted: FaceKind | None) -> Fac
     return faces[wanted]
 
 
-def load_diffusion(folder: Path) -> MotionDiffusion:
+def load_diffusion(folder: Path, device: torch.device = CPU) -> MotionDiffusion:
     """A trained denoiser."""
     facts = load_facts(folder)
     config = DiffusionConfig.parse(facts.config, str(folder))
     net = MotionDiffusion(config, facts.extra["motion_dim"], facts.extra["text_dim"])
     load_weights(folder, net)
-    freeze(net)
+    freeze(net.to(device))
     return net
 
 
 def expression(made: torch.Tensor, layout: MotionLayout, stats: FeatureStats) -> NDArray[np.float32]:
     """Expression in its own units [T, 50] of a normalised one."""
     columns = layout.part("face")
-    return np.asarray(made.numpy() * stats.std[columns] + stats.mean[columns], dtype=np.float32)
+    return np.asarray(made.cpu().numpy() * stats.std[columns] + stats.mean[columns], dtype=np.float32)

@@ -25,6 +25,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.distributed import alone
 from motionloom.pipeline.artifact import Artifact, InputStage
 from motionloom.pipeline.files import digest, remove_tree, write_json, write_text
+from motionloom.pipeline.hardware import Hardware
 from motionloom.pipeline.process import process_rank
 from motionloom.pipeline.recipe import Recipe, Stage
 from motionloom.pipeline.stage import StageContext, fingerprint_fields
@@ -186,6 +187,15 @@ def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
     return table
 
 
+def require_fit(rows: Sequence[PlannedStage], hardware: Hardware) -> None:
+    """Refuse, before anything runs, stages whose settings cannot run on this hardware."""
+    for row in rows:
+        try:
+            row.stage.config.require_fit(hardware)
+        except UserError as error:
+            raise UserError(f"stage {row.stage.name}: {error}") from None
+
+
 def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
     """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment.
 
@@ -194,8 +204,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     """
     todo = [row for row in plan if row.action in {"run", "resume"}]
     trained = [row for row in todo if row.stage.kind.trains]
-    for row in todo:
-        row.stage.config.require_fit(recipe.hardware)
+    require_fit(todo, recipe.hardware)
     leads = process_rank() == 0
     if not leads:
         todo = trained

@@ -6,12 +6,14 @@ The global batch belongs to the stage's config, so one process, eight GPUs or tw
 from __future__ import annotations
 
 import os
+import re
 from typing import Literal
 
 import torch
 from pydantic import Field
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.process import local_rank
 
 
 class Hardware(Config):
@@ -33,6 +35,17 @@ class Hardware(Config):
         if self.accelerator == "auto":
             return "gpu" if torch.cuda.is_available() else "cpu"
         return self.accelerator
+
+    def device(self) -> torch.device:
+        """Where this process computes what is not training: its own GPU, else the CPU."""
+        if self.resolved_accelerator() == "cpu":
+            return torch.device("cpu")
+        count = torch.cuda.device_count()
+        if count == 0:
+            raise UserError(
+                "hardware.accelerator is gpu and no GPU is here; set it to auto, or give --device cpu"
+            )
+        return torch.device("cuda", local_rank() % count)
 
     def resolved_devices(self) -> int:
         """Processes on this node."""
@@ -65,3 +78,18 @@ class Hardware(Config):
                 f"CPU{why}, {count} process{'es' if count > 1 else ''} x {torch.get_num_threads()} threads"
             )
         return where + (f", {nodes} nodes" if nodes > 1 else "")
+
+
+def choose_device(choice: str | torch.device) -> torch.device:
+    """`auto` (a GPU if there is one, else the CPU), `cpu`, `cuda` or `cuda:N`."""
+    name = str(choice)
+    if name == "auto":
+        return Hardware().device()
+    match = re.fullmatch(r"cpu|cuda(?::(\d+))?", name)
+    if match is None:
+        raise UserError(f"device '{name}': there is no such choice; take auto, cpu, cuda or cuda:N")
+    count = torch.cuda.device_count()
+    if name != "cpu" and int(match[1] or 0) >= count:
+        here = f"GPUs 0 to {count - 1} are" if count else "no GPU is"
+        raise UserError(f"device '{name}': {here} here; take another, or auto")
+    return torch.device(name)

@@ -18,6 +18,8 @@ from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import parse_tokenizer
 from motionloom.pipeline.model_store import load_facts, load_weights
 
+CPU = torch.device("cpu")
+
 
 def freeze(net: torch.nn.Module) -> None:
     """Evaluation mode and no gradients."""
@@ -25,18 +27,26 @@ def freeze(net: torch.nn.Module) -> None:
     net.requires_grad_(False)
 
 
-def load_tokenizer(folder: Path) -> Tokenizer:
+def device_of(net: torch.nn.Module) -> torch.device:
+    """Where a network lies, and what it is given must lie."""
+    return next(net.parameters()).device
+
+
+def load_tokenizer(folder: Path, device: torch.device = CPU) -> Tokenizer:
     """A trained tokenizer."""
     facts = load_facts(folder)
     config = parse_tokenizer(facts.config, f"{folder / 'model.json'}: config")
     net = build_tokenizer(config, facts.layout.layout())
     load_weights(folder, net)
-    return net.freeze()
+    return net.freeze().to(device)
 
 
 @dataclass(frozen=True)
 class LoadedTma:
-    """A trained alignment model and the columns it reads."""
+    """A trained alignment model and the columns it reads.
+
+    Its methods take tensors of any device and give those of its own.
+    """
 
     net: Tma
     layout: MotionLayout
@@ -45,37 +55,43 @@ class LoadedTma:
     """The columns it reads."""
 
     @staticmethod
-    def load(folder: Path) -> LoadedTma:
+    def load(folder: Path, device: torch.device = CPU) -> LoadedTma:
         """Read from a tma stage."""
         facts = load_facts(folder)
         extra = facts.extra
         net = Tma(TmaConfig.parse(facts.config, str(folder)), extra["motion_dim"], extra["text_dim"])
         load_weights(folder, net)
-        freeze(net)
+        freeze(net.to(device))
         return LoadedTma(net, facts.layout.layout(), int(extra["max_frames"]), extra.get("part", "bodyhand"))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network lies."""
+        return device_of(self.net)
 
     @torch.no_grad()
     def embed_text(self, tokens: Tensor, mask: Tensor, batch: int = 256) -> Tensor:
         """Text latents [n, 256] (the means)."""
         spans = [slice(first, first + batch) for first in range(0, len(tokens), batch)]
-        return torch.cat([self.net.encode_text(tokens[span], mask[span])[0] for span in spans])
+        near = [(tokens[span].to(self.device), mask[span].to(self.device)) for span in spans]
+        return torch.cat([self.net.encode_text(*given)[0] for given in near])
 
     def embed_captions(self, texts: list[str], cache: TextCache) -> Tensor:
-        """Text latents of captions in the cache."""
+        """Text latents of captions in the cache, on the CPU."""
         out = []
         for start in range(0, len(texts), 256):
             tokens, mask = cache.tokens(texts[start : start + 256])
-            out.append(self.embed_text(torch.as_tensor(tokens), torch.as_tensor(mask)))
+            out.append(self.embed_text(torch.as_tensor(tokens), torch.as_tensor(mask)).cpu())
         return torch.cat(out)
 
     @torch.no_grad()
     def embed_motion(self, motion: Tensor, length: Tensor) -> Tensor:
         """Motion latents [B, 256] of normalised features [B, T, D], the columns of `part`."""
-        return self.net.encode_motion(motion, length)[0]
+        return self.net.encode_motion(motion.to(self.device), length.to(self.device))[0]
 
 
 def load_gpt(folder: Path, tokenizer: Tokenizer) -> tuple[InterleavedGPT, str]:
-    """A trained GPT and the kind of text prior it was trained on ("tma" or "sentence")."""
+    """A trained GPT, on the tokenizer's device, and its kind of text prior ("tma" or "sentence")."""
     facts = load_facts(folder)
     expected = {s.name: s.num_codes for s in tokenizer.streams}
     if facts.extra["streams"] != expected or tuple(facts.extra["pattern"]) != tuple(tokenizer.pattern):
@@ -86,5 +102,5 @@ def load_gpt(folder: Path, tokenizer: Tokenizer) -> tuple[InterleavedGPT, str]:
     config = GptConfig.parse(facts.config, str(folder))
     net = InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, facts.extra["text_dim"])
     load_weights(folder, net)
-    freeze(net)
+    freeze(net.to(device_of(tokenizer)))
     return net, str(facts.extra["prior"])

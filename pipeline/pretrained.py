@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from huggingface_hub import ModelHubMixin, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
@@ -28,14 +29,14 @@ from motionloom.pipeline.bundle import (
     part_folders,
     text_encoder_of,
 )
+from motionloom.pipeline.encoder_files import BUILT_IN, copy_encoder
 from motionloom.pipeline.files import write_json
+from motionloom.pipeline.hardware import choose_device
 from motionloom.pipeline.model_store import LayoutFacts
 from motionloom.pipeline.sampling import SamplingConfig
 
 _WEIGHTS = ("model.safetensors", "model.json", "stats.safetensors")
 _ENCODER = "text_encoder"
-_ENCODER_FILES = (".safetensors", ".json", ".txt", ".model", ".md")
-"""What a text encoder's folder may bring along; pickled weights and code stay behind."""
 
 
 class MotionModel(
@@ -46,15 +47,19 @@ class MotionModel(
 ):
     """Captions to whole-body motions."""
 
-    def __init__(self, folder: Path | str) -> None:
+    def __init__(self, folder: Path | str, device: str | torch.device = "auto") -> None:
         self.folder = Path(folder)
-        self.bundle = Bundle.open(self.folder)
+        self.bundle = Bundle.open(self.folder, choose_device(device))
         # The mixin would write our argument, a local path, into the config.json that the hub wants.
         self._hub_mixin_config = {"format": "motionloom bundle"}
 
     @classmethod
     def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> MotionModel:
-        """A folder, or a name on the hub; `options` are the hub's (revision, token, local_files_only)."""
+        """A folder, or a name on the hub.
+
+        `options` are `device` (auto: a GPU if there is one; cpu, cuda, cuda:N) and the hub's (revision,
+        token, local_files_only).
+        """
         name = pretrained_model_name_or_path
         try:
             return super().from_pretrained(name, **options)
@@ -67,11 +72,14 @@ class MotionModel(
         captions: Sequence[str],
         *,
         face_captions: Sequence[str] | None = None,
-        seconds: float | None = None,
+        seconds: float | Sequence[float] | None = None,
         seed: int = 0,
         sampling: SamplingConfig | None = None,
     ) -> list[GeneratedMotion]:
-        """Motions for captions, in order; the same seed and caption give the same motion."""
+        """Motions for captions, in order; the same seed and caption give the same motion.
+
+        `seconds` is one length for all or one each; without it the model decides.
+        """
         return self.bundle.generate(
             captions, face_captions=face_captions, seconds=seconds, seed=seed, sampling=sampling
         )
@@ -93,23 +101,28 @@ class MotionModel(
         force_download: bool = False,
         local_files_only: bool = False,
         token: str | bool | None = None,
+        device: str | torch.device = "auto",
         **kwargs: Any,
     ) -> MotionModel:
         """Open a folder, or fetch one from the hub first."""
         if Path(model_id).is_dir():
-            return cls(model_id)
+            return cls(model_id, device)
         folder = snapshot_download(
             model_id, revision=revision, cache_dir=cache_dir, force_download=force_download,
             local_files_only=local_files_only, token=token,
             allow_patterns=["*.json", "*.safetensors", f"{_ENCODER}/*"],
         )  # fmt: skip
-        return cls(folder)
+        return cls(folder, device)
 
 
 def write_bundle(run: Path, out: Path) -> None:
     """Copy what generation needs of a run's finished stages into `out`; `bundle.json` is written last."""
     parts = part_folders(run)
     bundle = Bundle.from_run(run)  # opens every part, so a broken one is found before anything is copied
+    encoder = text_encoder_of(parts["text"])
+    if encoder != BUILT_IN:  # first, because it may not be found any more
+        copy_encoder(encoder, parts["text"], out / _ENCODER)
+        encoder = _ENCODER
     for role, source in parts.items():
         if role == "text":
             continue
@@ -117,23 +130,10 @@ def write_bundle(run: Path, out: Path) -> None:
         for name in _WEIGHTS:
             if (source / name).is_file():
                 shutil.copyfile(source / name, out / role / name)
-    encoder = text_encoder_of(parts["text"])
-    local = Path(encoder).expanduser()
-    if encoder != "minilm" and local.is_dir():
-        _copy_encoder(local, out / _ENCODER)
-        encoder = _ENCODER
     skeleton = bundle.layout.skeleton
     write_json(out / "skeleton.json", _plain(skeleton))
     facts = BundleFile(layout=LayoutFacts.of(bundle.layout), text_encoder=encoder)
     write_json(out / "bundle.json", facts.dump())
-
-
-def _copy_encoder(source: Path, target: Path) -> None:
-    for path in sorted(source.rglob("*")):
-        if path.is_file() and path.suffix in _ENCODER_FILES:
-            copy = target / path.relative_to(source)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, copy)
 
 
 def _plain(skeleton: Skeleton) -> dict[str, Any]:

@@ -23,6 +23,11 @@ def process_rank() -> int:
     return int(os.environ.get("NODE_RANK", 0)) + int(os.environ.get("LOCAL_RANK", 0))
 
 
+def local_rank() -> int:
+    """This process among those on its machine, as torchrun and Lightning or else SLURM state it."""
+    return int(os.environ.get("LOCAL_RANK", os.environ.get("SLURM_LOCALID", 0)))
+
+
 def leave(code: int) -> NoReturn:
     """End this process; one that trained with others ends without destructors.
 

@@ -197,7 +197,22 @@ def _stages(file: RecipeFile, where: str) -> tuple[Stage, ...]:
         kind = STAGES[kind_name]
         config = kind.config.parse(_numbers(fields), f"{where}: stages.{name}")
         out.append(Stage(name, kind, config, _resolve(name, kind, renamed, list(file.stages), where)))
+    _check_encoders(out, where)
     return _in_order(out, where)
+
+
+def _check_encoders(stages: list[Stage], where: str) -> None:
+    """A TMA must be given captions by the encoder that it was trained on."""
+    named = {stage.name: stage for stage in stages}
+    for stage in stages:
+        tma, own = named.get(stage.inputs.get("tma", "")), stage.inputs.get("text", "")
+        other = tma.inputs.get("text", "") if tma is not None else own
+        if own in named and other in named and named[own].config != named[other].config:
+            raise UserError(
+                f"{where}: stage '{stage.name}' reads captions as '{own}' encodes them, but its TMA "
+                f"'{stage.inputs['tma']}' was trained on those of '{other}'; name one text stage for both, "
+                f"or leave the TMA out (inputs: {{tma: null}})"
+            )
 
 
 def _in_order(stages: list[Stage], where: str) -> tuple[Stage, ...]:

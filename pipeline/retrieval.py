@@ -1,9 +1,10 @@
-"""Text-motion retrieval of a trained TMA under the paper's four protocols (HumanTOMATO section D.2)."""
+"""Text-motion retrieval by a trained TMA, or by TEMOS, under the paper's four protocols (HumanTOMATO D.2)."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -12,10 +13,11 @@ from rich.table import Table
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.models.metrics.retrieval import RECALLS, recall
-from motionloom.pipeline.bundle import part_folders
+from motionloom.pipeline.bundle import part_folders, stages_of
 from motionloom.pipeline.evaluation import embed_motions
 from motionloom.pipeline.files import write_json
 from motionloom.pipeline.graph import stage_folder
+from motionloom.pipeline.hardware import choose_device
 from motionloom.pipeline.networks import LoadedTma
 from motionloom.pipeline.samples import truth_of
 from motionloom.pipeline.sources import held_out, open_split, open_text
@@ -24,7 +26,6 @@ THRESHOLD = 0.9
 """Protocol B: captions with a higher sentence cosine count as the same."""
 
 BATCHES = {"C": 256, "D": 32}
-RESULT = "retrieval.json"
 
 
 @dataclass(frozen=True)
@@ -39,15 +40,18 @@ class ProtocolResult:
     """"t2m/R@1" ..., "t2m/MedR", and the same for "m2t"."""
 
 
-def retrieve(run: Path, *, split: str | None = None, seed: int = 0) -> list[ProtocolResult]:
-    """All four protocols on a split of a finished run; by default its test split, else another held out."""
-    parts = part_folders(run)
-    for role in ("tma", "stats", "text"):
-        if role not in parts:
-            raise UserError(f"{run}: no finished '{role}' stage; run the recipe up to it first")
-    data = stage_folder(run, "data")
+def retrieve(
+    run: Path, stage: str = "tma", *, split: str | None = None, seed: int = 0, device: str = "auto"
+) -> list[ProtocolResult]:
+    """All four protocols for one alignment stage of a run, on a split of its data.
+
+    By default its test split, else another held out.
+    """
+    parts = _folders(run, stage)
+    data = parts["data"]
     dataset = open_split(data, split or held_out(data, prefer="test"))
-    tma, stats = LoadedTma.load(parts["tma"]), FeatureStats.load(parts["stats"] / "stats.safetensors")
+    tma = LoadedTma.load(parts["model"], choose_device(device))
+    stats = FeatureStats.load(parts["stats"] / "stats.safetensors")
     cache = open_text(parts["text"])
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
     truths = [t for t in truths if t.caption and len(t.features) >= 4]
@@ -58,7 +62,7 @@ def retrieve(run: Path, *, split: str | None = None, seed: int = 0) -> list[Prot
     captions = [t.caption for t in truths]
     text = tma.embed_captions(captions, cache)
     motion = embed_motions(tma, stats, [t.features for t in truths], [t.held for t in truths])
-    sentence = torch.as_tensor(cache.sentence(captions))
+    sentence = torch.as_tensor(cache.similarity(captions))
     rows = [
         _result("A", "whole split", recall(text, motion)),
         _result(
@@ -72,14 +76,34 @@ def retrieve(run: Path, *, split: str | None = None, seed: int = 0) -> list[Prot
     return rows
 
 
+def _folders(run: Path, stage: str) -> dict[str, Path]:
+    """Folders of an alignment model ("model") and of what it was trained on, all finished."""
+    stages = stages_of(run)
+    aligned = [name for name, entry in stages.items() if entry["kind"] == "tma" and not _of_face(entry)]
+    if stage not in aligned:
+        known = f"this run has {', '.join(aligned)}" if aligned else "this run has none"
+        raise UserError(f"{run}: no stage '{stage}' that aligns text with body and hands; {known}")
+    inputs = stages[stage].get("inputs", {})
+    roles = {"model": stage, **{role: inputs.get(role) or role for role in ("data", "stats", "text")}}
+    found = {role: stage_folder(run, name) for role, name in roles.items()}
+    for folder in found.values():
+        if not (folder / "artifact.json").is_file():
+            raise UserError(f"{run}: no finished '{folder.name}' stage; run the recipe up to it first")
+    return found
+
+
+def _of_face(entry: dict[str, Any]) -> bool:
+    return entry.get("part") == "face"
+
+
 def _result(protocol: str, meaning: str, figures: dict[str, float]) -> ProtocolResult:
     size = int(figures.pop("size"))
     return ProtocolResult(protocol, meaning, size, figures)
 
 
-def retrieval_table(rows: list[ProtocolResult]) -> Table:
+def retrieval_table(rows: list[ProtocolResult], title: str) -> Table:
     """For a terminal: both ways, with what a guess would get."""
-    table = Table(title="TMA retrieval", title_justify="left")
+    table = Table(title=title, title_justify="left")
     for column in ("protocol", "", "among", "way", *(f"R@{k}" for k in RECALLS), "median rank"):
         table.add_column(column)
     for row in rows:
@@ -92,11 +116,22 @@ def retrieval_table(rows: list[ProtocolResult]) -> Table:
     return table
 
 
-def retrieval_command(run: Path, *, split: str | None, seed: int, console: Console) -> Path:
-    """Print the table and write RUN/retrieval.json."""
-    rows = retrieve(run, split=split, seed=seed)
-    console.print(retrieval_table(rows))
-    path = run / RESULT
-    write_json(path, {"threshold": THRESHOLD, "seed": seed, "protocols": [asdict(row) for row in rows]})
+def retrieval_command(
+    run: Path,
+    *,
+    stage: str | None = None,
+    split: str | None,
+    seed: int,
+    device: str = "auto",
+    console: Console,
+) -> Path:
+    """Print the table and write RUN/retrieval.json; of another `stage` than TMA, RUN/retrieval-STAGE.json."""
+    main = part_folders(run).get("tma", Path("tma")).name
+    stage = stage or main
+    rows = retrieve(run, stage, split=split, seed=seed, device=device)
+    console.print(retrieval_table(rows, "TMA retrieval" if stage == main else f"Retrieval of stage {stage}"))
+    path = run / ("retrieval.json" if stage == main else f"retrieval-{stage}.json")
+    facts = {"stage": stage, "threshold": THRESHOLD, "seed": seed}
+    write_json(path, {**facts, "protocols": [asdict(row) for row in rows]})
     console.print(str(path), soft_wrap=True)
     return path

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.bundle import Bundle
-from motionloom.pipeline.graph import Selection, execute, make_plan, plan_table, stage_folder
+from motionloom.pipeline.bundle import Bundle, require_run
+from motionloom.pipeline.graph import Selection, execute, make_plan, plan_table, require_fit, stage_folder
+from motionloom.pipeline.hardware import choose_device
 from motionloom.pipeline.outputs import Format, write_motions
 from motionloom.pipeline.pretrained import write_bundle
 from motionloom.pipeline.recipe import Recipe, load_recipe, nearest
@@ -38,6 +38,7 @@ def run_recipe(
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if dry_run:
         console.print(plan_table(loaded, plan))
+        require_fit(todo, loaded.hardware)
         console.print(f"{len(todo)} of {len(plan)} stages would run in {run}")
         return run
     if not todo:
@@ -77,16 +78,17 @@ def generate_motions(
     seconds: float | None = None,
     seed: int = 0,
     sampling: dict[str, Any] | None = None,
+    device: str = "auto",
     console: Console,
 ) -> list[Path]:
-    """Generate and write; returns the paths."""
+    """Generate and write; returns the paths. `device`: auto, cpu, cuda or cuda:N."""
     if not captions:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
     wanted = [f.strip() for f in formats.split(",") if f.strip()]
     for name in wanted:
         if name not in get_args(Format):
             raise UserError(f"--format {name}: no such format{nearest(name, get_args(Format))}")
-    bundle = Bundle.open(folder)
+    bundle = Bundle.open(folder, choose_device(device))
     motions = bundle.generate(
         captions,
         face_captions=face_captions,
@@ -100,8 +102,14 @@ def generate_motions(
     return paths
 
 
-def _stage_again(folder: Path, kind: str, console: Console, changes: dict[str, Any]) -> Path:
-    """Run one evaluating stage of a finished run again, into the run folder itself."""
+def _stage_again(
+    folder: Path, kind: str, console: Console, changes: dict[str, Any], device: str = "auto"
+) -> Path:
+    """Run one evaluating stage of a finished run again, into the run folder itself.
+
+    On `device`: auto is what the recipe's hardware says.
+    """
+    wanted = None if device == "auto" else choose_device(device)
     recipe = _recipe_of(folder)
     stage = next((s for s in recipe.stages if s.kind.name == kind), None)
     if stage is None:
@@ -116,22 +124,28 @@ def _stage_again(folder: Path, kind: str, console: Console, changes: dict[str, A
     target = folder / kind
     target.mkdir(exist_ok=True)
     context = StageContext(
-        stage.name, recipe.name, config, target, inputs, recipe.seed, recipe.hardware, console
+        stage.name, recipe.name, config, target, inputs, recipe.seed, recipe.hardware, console, wanted
     )
     stage.kind.run(context)
     return target
 
 
 def evaluate_run(
-    folder: Path, *, clips: int | None = None, repeats: int | None = None, console: Console
+    folder: Path,
+    *,
+    clips: int | None = None,
+    repeats: int | None = None,
+    device: str = "auto",
+    console: Console,
 ) -> Path:
     """Figures of a finished run; writes RUN/evaluate/metrics.json."""
-    return _stage_again(folder, "evaluate", console, {"clips": clips, "repeats": repeats}) / "metrics.json"
+    changes = {"clips": clips, "repeats": repeats}
+    return _stage_again(folder, "evaluate", console, changes, device) / "metrics.json"
 
 
-def report_run(folder: Path, out: Path | None, *, console: Console) -> Path:
+def report_run(folder: Path, out: Path | None, *, device: str = "auto", console: Console) -> Path:
     """The page of a finished run; returns its path."""
-    page = _stage_again(folder, "report", console, {}) / "report.html"
+    page = _stage_again(folder, "report", console, {}, device) / "report.html"
     if out is not None:
         shutil.copyfile(page, out)
         page = out
@@ -152,7 +166,5 @@ def export_run(folder: Path, out: Path, *, console: Console) -> Path:
 
 
 def _recipe_of(folder: Path) -> Recipe:
-    path = folder / "recipe.yaml"
-    if not path.is_file():
-        raise UserError(f"{folder}: not a run folder (no recipe.yaml)")
-    return replace(load_recipe(path))
+    require_run(folder)
+    return load_recipe(folder / "recipe.yaml")

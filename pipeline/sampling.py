@@ -13,15 +13,23 @@ from motionloom.models.diffusion.schedule import Sampler
 class SamplingConfig(Config):
     """How tokens, latents and noise are drawn."""
 
-    temperature: float = Field(1.0, gt=0)
+    temperature: float = Field(1.0, ge=0)
+    """Below 1 safer, above 1 more varied; 0 is greedy: the likeliest token, a latent's mean."""
     top_k: int = Field(0, ge=0)
     """0 keeps every token."""
     top_p: float = Field(0.95, gt=0, le=1)
     cfg_scale: float = Field(1.0, ge=1)
     """Classifier-free guidance; 1 is off. Needs a model trained with `condition_dropout` > 0."""
+    face_cfg_scale: float | None = Field(None, ge=1)
+    """The same of the face's GPT or diffusion model; None takes `cfg_scale`."""
     face_model: Literal["gpt", "vae", "diffusion"] | None = None
     """Which of the run's face generators; by default the first it has, in this order."""
     sampler: Sampler = "ddpm"
     """Sampler of diffusion models."""
     denoising_steps: int = Field(50, ge=1)
-    """Steps of diffusion models; the paper takes all 1000."""
+    """Steps of diffusion models, at most those of the training; the paper takes all 1000."""
+
+    @property
+    def face_guidance(self) -> float:
+        """Guidance of the face generator."""
+        return self.cfg_scale if self.face_cfg_scale is None else self.face_cfg_scale

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from pydantic import BaseModel
 from pydantic.config import JsonDict
 from rich.console import Console
@@ -38,6 +39,13 @@ class StageContext:
     seed: int
     hardware: Hardware
     console: Console
+    wanted_device: torch.device | None = None
+    """What a command was told by `--device`."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where a stage computes that does not train: as told, else as the recipe's hardware says."""
+        return self.wanted_device or self.hardware.device()
 
     def input(self, role: str) -> Path:
         """Folder of a required input."""

@@ -3,8 +3,9 @@
 One `tokens-SPLIT.safetensors` per split: for each stream the codes of all clips end to end, and where each
 clip begins, counted in groups of four frames. Written once by the `tokens` stage, never re-encoded by a GPT.
 
-A clip that lacks a part which the tokenizer models (hands, face) has codes, but those say what was never
-recorded: such clips are marked, and `whole_clips` leaves them out of GPT training.
+A clip that lacks a part which the tokenizer models (hands, face) has codes, but some of them say what was
+never recorded: clips that lack nothing are marked (`whole`). Which codes of the others a GPT may learn,
+`pipeline/gpt_data.py` says.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from torch.utils.data import Dataset
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.order import Source
 from motionloom.datasets.shards.plan import BatchPlan
-from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences
+from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences, stream_names
 from motionloom.pipeline.files import atomic
 
 Codes = dict[str, Tensor]
@@ -54,13 +55,17 @@ class TokenStore:
 
     def whole_clips(self) -> TokenStore:
         """The store of the clips in `whole` alone, in order."""
-        if self.whole.all():
+        return self.of(self.whole)
+
+    def of(self, chosen: NDArray[np.bool_]) -> TokenStore:
+        """The store of the `chosen` [n] clips alone, in order."""
+        if chosen.all():
             return self
         codes = {}
         for (name, flat), n in self._streams():
-            codes[name] = flat[torch.from_numpy(np.repeat(self.whole, self.groups * n))]
-        starts = np.concatenate([[0], np.cumsum(self.groups[self.whole])]).astype(np.int64)
-        return TokenStore(codes, starts, self.per_group, self.whole[self.whole])
+            codes[name] = flat[torch.from_numpy(np.repeat(chosen, self.groups * n))]
+        starts = np.concatenate([[0], np.cumsum(self.groups[chosen])]).astype(np.int64)
+        return TokenStore(codes, starts, self.per_group, self.whole[chosen])
 
     def _streams(self) -> list[tuple[tuple[str, Tensor], int]]:
         return [((name, flat), self.per_group[name]) for name, flat in self.codes.items()]
@@ -87,20 +92,49 @@ class TokenStore:
         return TokenStore(codes, tensors["starts"].numpy(), per_group, tensors["whole"].numpy())
 
 
+class TokenCaption(NamedTuple):
+    """A caption and the groups of its clip that it is about."""
+
+    row: int
+    """Its row in the list of all captions."""
+    first: int
+    end: int
+    """The group behind the last."""
+
+
+@dataclass(frozen=True)
+class HeldTokens:
+    """Which tokens and columns of n clips were recorded, by the bits of `ClipMeta.held`."""
+
+    bits: Tensor
+    """int64 [n]."""
+    streams: Tensor
+    """bool [4, K]: row b, streams of clips that hold the bits b."""
+    columns: Tensor
+    """bool [4, C]: the same for the tokenizer's columns."""
+
+    def known(self, items: list[int], batch: TokenSequence, ends: Tensor) -> Tensor:
+        """Bool [B, L]: false at codes of streams that the clips `items` [B] lack; `ends` int64 [K]."""
+        recorded = self.streams[self.bits[items]].gather(1, batch.kinds)
+        return recorded | (batch.tokens == ends[batch.kinds])
+
+
 @dataclass(frozen=True)
 class TokenBatches(Dataset[dict[str, Any]]):
     """Batch k of token sequences and text priors; a pure function of (seed, k).
 
-    In training a rank's share of an endless order; else the clips in order, all of them on every rank.
+    In training a rank's share of an endless order, with one caption drawn for each clip; else the clips in
+    order, all of them on every rank, with their first captions. A sequence is the stretch that its caption is
+    about, and ends where that ends.
     """
 
     store: TokenStore
-    captions: list[list[int]]
-    """Rows of `prior` that caption each clip."""
+    captions: list[list[TokenCaption]]
+    """The captions of each clip; their rows are rows of `prior`."""
     prior: Tensor
     """Text embeddings [n, E]."""
-    sentences: Tensor
-    """Sentence embeddings of the same captions [n, S]: which negatives of the alignment loss to leave out."""
+    similarity: Tensor
+    """sBERT embeddings of the same captions [n, S]: which negatives of the alignment loss to leave out."""
     pattern: tuple[str, ...]
     ends: Mapping[str, int]
     max_groups: int
@@ -113,10 +147,14 @@ class TokenBatches(Dataset[dict[str, Any]]):
     """Data sets and their weights, when several are mixed."""
     latents: Tensor | None = None
     """TMA's embeddings of the same captions [n, Z], for an alignment loss where `prior` is something else."""
+    held: HeldTokens | None = None
+    """Which tokens of the clips were recorded; None = all. Batches then also hold "known" bool [B, L] and
+    "held" bool [B, C]."""
 
     @cached_property
     def _plan(self) -> BatchPlan:
-        lengths = np.minimum(self.store.groups, self.max_groups)
+        spans = [sum(caption.end - caption.first for caption in own) // len(own) for own in self.captions]
+        lengths = np.minimum(np.array(spans), self.max_groups)
         return BatchPlan(len(self.captions), self.batch_size, self.seed, lengths, self.sources)
 
     def __len__(self) -> int:
@@ -132,25 +170,31 @@ class TokenBatches(Dataset[dict[str, Any]]):
         for item, turn in zip(items.tolist(), turns.tolist(), strict=True):
             rng = np.random.default_rng([self.seed, turn, item])
             choice = int(rng.integers(len(self.captions[item]))) if self.training else 0
-            rows.append(self.captions[item][choice])
-            sequences.append(self._sequence(item, rng))
+            caption = self.captions[item][choice]
+            rows.append(caption.row)
+            sequences.append(self._sequence(item, caption, rng))
         batch = pad_sequences(sequences)
-        latents = {} if self.latents is None else {"tma_text": self.latents[rows]}
+        more = {} if self.latents is None else {"tma_text": self.latents[rows]}
+        if self.held is not None:
+            ends = torch.tensor([self.ends[name] for name in stream_names(self.pattern)])
+            more["known"] = self.held.known(items.tolist(), batch, ends)
+            more["held"] = self.held.columns[self.held.bits[items]]
         return {
             "tokens": batch.tokens,
             "kinds": batch.kinds,
             "length": batch.length,
             "text": self.prior[rows],
-            "sentence": self.sentences[rows],
-            **latents,
+            "similarity": self.similarity[rows],
+            **more,
         }
 
-    def _sequence(self, item: int, rng: np.random.Generator) -> TokenSequence:
-        """One row; a clip that is longer than the block gives a random part without its end."""
-        groups = int(self.store.groups[item])
+    def _sequence(self, item: int, caption: TokenCaption, rng: np.random.Generator) -> TokenSequence:
+        """One row; a stretch that is longer than the block gives a random part without its end."""
+        first, groups = caption.first, caption.end - caption.first
         if groups <= self.max_groups:
-            return self._row(self.store.clip(item), closed=True)
-        first = int(rng.integers(groups - self.max_groups + 1)) if self.training else 0
+            return self._row(self.store.clip(item, first, groups), closed=True)
+        if self.training:
+            first += int(rng.integers(groups - self.max_groups + 1))
         return self._row(self.store.clip(item, first, self.max_groups), closed=False)
 
     def _row(self, codes: Codes, *, closed: bool) -> TokenSequence:

@@ -9,8 +9,8 @@ Choices:
   already turned into motion (docs/sources.md tells how much). That way keeps each clip's own bone lengths,
   which are HumanML3D's uniform ones.
 - `body133` (family `exact`) is made from the joints, or from the decoded vectors.
-- Segment captions stay captions with start and end; the loaders cut the frames. A mirrored clip `M<id>` tells
-  whose image it is and stays in the split of its original.
+- Segment captions stay captions with start and end; what trains on them cuts the frames or the tokens. A
+  mirrored clip `M<id>` tells whose image it is and stays in the split of its original.
 """
 
 from __future__ import annotations

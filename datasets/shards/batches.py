@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.crops import Crops, padded_length
 from motionloom.datasets.shards.plan import BatchPlan
 from motionloom.datasets.shards.randomness import uniform
+from motionloom.datasets.shards.spans import CaptionSpan, caption_spans
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.datasets.text.cache import TextCache
 
@@ -52,6 +53,8 @@ class CaptionBatch(MotionBatch):
     text_mask: Tensor
     sentence: Tensor
     """float32 [B, E], unit length."""
+    similarity: Tensor
+    """float32 [B, S], unit length: embeddings that say which captions mean the same."""
 
 
 class WindowBatches(Dataset[MotionBatch]):
@@ -159,23 +162,18 @@ class _CaptionedClips:
         texts = ["face_texts.json" if self.face else "texts.json"] if self.text is not None else []
         self.dataset.prefetch(clips.tolist(), ["motion.npy", *texts])
 
-    def captions(self, clip: int) -> list[tuple[str, int, int]]:
-        """(text, first frame, frame behind the last) of each caption that covers `min_frames` or more.
-
-        When none does, the one that covers most: a clip that qualifies always gives a pair.
-        """
-        frames = int(self.dataset.frames[clip])
+    def captions(self, clip: int) -> list[CaptionSpan]:
+        """The captions of a clip that cover `min_frames` or more, else the one that covers most."""
         found = self.dataset.face_texts(clip) if self.face else self.dataset.texts(clip)
-        spans = [(caption.text, *frame_span(caption, self.dataset.layout.fps, frames)) for caption in found]
-        long = [span for span in spans if span[2] - span[1] >= self.min_frames]
-        return long or [max(spans, key=lambda span: span[2] - span[1])]
+        frames = int(self.dataset.frames[clip])
+        return caption_spans(found, self.dataset.layout.fps, frames, self.min_frames)
 
     def make(
-        self, clips: NDArray[np.int64], spans: list[tuple[str, int, int]], crop: NDArray[np.float64]
+        self, clips: NDArray[np.int64], spans: list[CaptionSpan], crop: NDArray[np.float64]
     ) -> CaptionBatch:
         """The batch of `clips` [B] and their spans; `crop` in [0, 1) places the crop of too long a span."""
-        begin = np.array([span[1] for span in spans], dtype=np.int64)
-        whole = np.array([span[2] for span in spans], dtype=np.int64) - begin
+        begin = np.array([span.first for span in spans], dtype=np.int64)
+        whole = np.array([span.frames for span in spans], dtype=np.int64)
         length = np.minimum(whole, self.max_frames)
         begin += (crop * (whole - length + 1)).astype(np.int64)
         motion = np.empty((len(clips), padded_length(length), self.crops.width), dtype=np.float32)
@@ -183,7 +181,7 @@ class _CaptionedClips:
         for row, clip in enumerate(clips.tolist()):
             source = self.dataset.motion(clip)
             self.crops.fill(motion[row], source, int(begin[row]), int(length[row]), int(held[row]))
-        captions = [span[0] for span in spans]
+        captions = [span.text for span in spans]
         batch = {
             "motion": torch.from_numpy(motion),
             "length": torch.from_numpy(length),
@@ -197,6 +195,7 @@ class _CaptionedClips:
             batch["text_tokens"] = torch.from_numpy(tokens)
             batch["text_mask"] = torch.from_numpy(mask)
             batch["sentence"] = torch.from_numpy(self.text.sentence(captions))
+            batch["similarity"] = torch.from_numpy(self.text.similarity(captions))
         return batch  # type: ignore[return-value]
 
 
@@ -289,16 +288,9 @@ class EvalBatches(Dataset[CaptionBatch]):
         clips = source.clips[rows]
         source.prefetch(clips)
         if source.text is None:
-            spans = [("", 0, int(frames)) for frames in source.dataset.frames[clips]]
+            spans = [CaptionSpan("", 0, int(frames)) for frames in source.dataset.frames[clips]]
         else:
             spans = [source.captions(clip)[0] for clip in clips.tolist()]
         batch = source.make(clips, spans, np.zeros(len(clips)))
         batch["valid"] = torch.from_numpy(valid)
         return batch
-
-
-def frame_span(caption: Caption, fps: float, frames: int) -> tuple[int, int]:
-    """(first frame, frame behind the last) of a caption's stretch in a clip of `frames`; all when empty."""
-    first = min(max(round(caption.start * fps), 0), frames)
-    end = frames if caption.end is None else min(max(round(caption.end * fps), 0), frames)
-    return (first, end) if end > first else (0, frames)

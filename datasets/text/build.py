@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
@@ -29,8 +29,8 @@ from rich.progress import track
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.files import atomic_file, remove_temporaries, write_json
 from motionloom.datasets.shards.pool import Workers
-from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
-from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
+from motionloom.datasets.text.cache import SIMILARITY, CacheInfo, TextCache, key_of
+from motionloom.datasets.text.encoder import EncodedText, TextEncoder, load_text_encoder
 
 PART = 512
 """Captions a part, about."""
@@ -48,13 +48,27 @@ def build_text_cache(
     encoder_name: str,
     workers: int = 1,
     progress: bool = True,
+    device: str = "cpu",
+    similarity: str | None = None,
 ) -> TextCache:
     """Encode the captions that `folder` does not hold yet, in `workers` processes of one thread each.
 
     `encoder_name` as for `load_text_encoder`; another encoder's cache is replaced. The same captions give
-    the same bytes for any number of workers.
+    the same bytes for any number of workers. On a GPU (`device`) one process encodes them all.
+
+    `similarity` names the encoder whose sentence embeddings say which captions mean the same; None is
+    `encoder_name`.
     """
-    return _build(Path(folder), captions, load_text_encoder(encoder_name), encoder_name, workers, progress)
+    folder, captions = Path(folder), set(captions)
+    workers = workers if device == "cpu" else 1
+    encoder = load_text_encoder(encoder_name, device=device)
+    _build(folder, captions, encoder, encoder_name, workers, progress)
+    if similarity in (None, encoder_name):
+        shutil.rmtree(folder / SIMILARITY, ignore_errors=True)
+    else:
+        other = load_sentences(similarity, device=device)
+        _build(folder / SIMILARITY, captions, other, similarity, workers, progress, load_sentences)
+    return TextCache.open(folder)
 
 
 def build_with_encoder(
@@ -62,6 +76,27 @@ def build_with_encoder(
 ) -> TextCache:
     """The same in this process, with an encoder that is loaded already."""
     return _build(folder, captions, encoder, "", 1, progress)
+
+
+class SentencesOnly:
+    """A text encoder whose tokens are not wanted: each caption is one token, its sentence embedding."""
+
+    def __init__(self, encoder: TextEncoder) -> None:
+        self._encoder = encoder
+        self.name, self.dim = f"{encoder.name}:sentences", encoder.dim
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        """See `TextEncoder`."""
+        sentence = self._encoder.encode(captions).sentence
+        return EncodedText(sentence, sentence[:, None], np.ones((len(sentence), 1), dtype=bool))
+
+
+def load_sentences(spec: str, *, device: str = "cpu") -> SentencesOnly:
+    """`load_text_encoder` for sentence embeddings alone."""
+    return SentencesOnly(load_text_encoder(spec, device=device))
+
+
+Load = Callable[[str], TextEncoder]
 
 
 @dataclass(frozen=True)
@@ -86,11 +121,12 @@ class _EncodeWith:
 class _EncodeByName:
     """Encodes parts in another process: the encoder is loaded there, once."""
 
+    load: Load
     spec: str
     expected: str
 
     def __call__(self, part: _Part) -> None:
-        encoder = _loaded(self.spec)
+        encoder = _loaded(self.load, self.spec)
         if encoder.name != self.expected:
             raise UserError(f"text encoder '{self.spec}' changed while captions were encoded; run again")
         _encode_part(part, encoder)
@@ -103,6 +139,7 @@ def _build(
     spec: str,
     workers: int,
     progress: bool,
+    load: Load = load_text_encoder,
 ) -> TextCache:
     folder.mkdir(parents=True, exist_ok=True)
     wanted = {key_of(text): text for text in captions}
@@ -119,7 +156,7 @@ def _build(
     parts = _parts(new, wanted, place, encoder.name)
     missing = [part for part in parts if not _finished(part, encoder.dim)]
     workers = min(workers, len(missing) // PARTS_A_WORKER)
-    encode = _EncodeByName(spec, encoder.name) if workers > 1 else _EncodeWith(encoder)
+    encode = _EncodeByName(load, spec, encoder.name) if workers > 1 else _EncodeWith(encoder)
     with Workers(workers) as pool:
         done = pool.run(encode, missing)
         for _ in track(done, "encoding captions", total=len(missing), disable=not progress):
@@ -131,8 +168,8 @@ def _build(
 
 
 @lru_cache(maxsize=1)
-def _loaded(spec: str) -> TextEncoder:
-    return load_text_encoder(spec)
+def _loaded(load: Load, spec: str) -> TextEncoder:
+    return load(spec)
 
 
 def _reusable(folder: Path, encoder: TextEncoder) -> TextCache | None:

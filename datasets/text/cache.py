@@ -8,8 +8,9 @@
 | `offsets.npy`    | int64 [n + 1]: the tokens of caption i are rows `offsets[i] : offsets[i + 1]` |
 | `tokens.npy`     | float16 [sum, E], without padding |
 | `cache.json`     | encoder name, E, n; written last, so its presence means the rest is whole |
+| `similarity/`    | another encoder's sentence embeddings, where these are not to say what is alike |
 
-`datasets/text/build.py` makes these files.
+`datasets/text/build.py` makes these files; `similarity/` is a cache too, of one token a caption.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.encoder import TextEncoder
+
+SIMILARITY = "similarity"
 
 
 class CacheInfo(Config):
@@ -59,6 +62,8 @@ class TextCache:
                 raise UserError(f"{folder}/{name}.npy: not {list(shape)}; run the text stage again")
         if (np.diff(self._offsets) < 1).any() or self._offsets[0] != 0:
             raise UserError(f"{folder}/offsets.npy: damaged; run the text stage again")
+        other = folder / SIMILARITY
+        self._other = TextCache(other) if (other / "cache.json").exists() else None
         # The first eight bytes of the ascending keys as numbers: searched first, then the whole key is.
         self._heads = np.ascontiguousarray(self._keys[:, :8]).view(">u8").reshape(n).astype(np.uint64)
 
@@ -85,6 +90,10 @@ class TextCache:
     def sentence(self, captions: Sequence[str]) -> NDArray[np.float32]:
         """Unit-length sentence embeddings, [n, E]."""
         return np.asarray(self._sentence[self._rows(captions)], dtype=np.float32)
+
+    def similarity(self, captions: Sequence[str]) -> NDArray[np.float32]:
+        """Unit-length embeddings whose cosines say which captions mean the same, [n, S]."""
+        return self.sentence(captions) if self._other is None else self._other.sentence(captions)
 
     def tokens(self, captions: Sequence[str]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Token embeddings [n, S, E], zero padded to the longest, and the mask [n, S] of real tokens."""

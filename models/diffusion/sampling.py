@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.diffusion.schedule import Sampler
 
@@ -27,7 +28,13 @@ def sample_motions(
 
     Clips of one length are denoised together and each draws its noise from its own seed, so a motion does not
     depend on what it is generated with. `guidance` 1 is off; above it both passes go through one forward.
+    `UserError` for guidance of a model that never trained without text, and for more `steps` than the
+    training's.
     """
+    if guidance != 1 and net.config.condition_dropout == 0:
+        raise UserError(
+            "guidance needs a diffusion model trained with condition_dropout > 0; set face_cfg_scale to 1"
+        )
     net.eval()
     groups: dict[int, list[int]] = defaultdict(list)
     for row, count in enumerate(frames):

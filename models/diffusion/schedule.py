@@ -7,7 +7,7 @@ from typing import Any, Literal
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from pydantic import Field
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.schema import Config, UserError
 
 Sampler = Literal["ddpm", "ddim", "dpm++"]
 
@@ -36,7 +36,11 @@ class ScheduleConfig(Config):
         return DDPMScheduler(clip_sample=False, **self.arguments())  # type: ignore[no-untyped-call]
 
     def sampler(self, kind: Sampler, steps: int) -> Any:
-        """A sampler set to `steps` denoising steps."""
+        """A sampler set to `steps` denoising steps, at most those of the training."""
+        if steps > self.steps:
+            raise UserError(
+                f"{steps} denoising steps are more than the {self.steps} of this model's training; take fewer"
+            )
         made: Any
         if kind == "ddpm":
             made = self.noiser()

@@ -20,23 +20,24 @@ from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
 
 
-def predicted(tokens: Tensor, logits: Tensor) -> Tensor:
+def predicted(tokens: Tensor, logits: Tensor, known: Tensor | None = None) -> Tensor:
     """Bool [B, L]: real tokens the grammar does not already decide (padding and the Ends after the first are
-    out).
+    out), and of those the `known` [B, L] ones (None = all): not the codes of a part that the clip lacks.
     """
-    return (tokens != PAD) & (torch.isfinite(logits).sum(-1) > 1)
+    free = (tokens != PAD) & (torch.isfinite(logits).sum(-1) > 1)
+    return free if known is None else free & known
 
 
-def cross_entropy(logits: Tensor, tokens: Tensor) -> Tensor:
+def cross_entropy(logits: Tensor, tokens: Tensor, known: Tensor | None = None) -> Tensor:
     """Mean over the `predicted` tokens of all ranks; logits [B, L, V], tokens int64 [B, L] padded with -1."""
     each = F.cross_entropy(logits.flatten(0, 1), tokens.flatten(), ignore_index=PAD, reduction="none")
-    return masked_mean(each.view_as(tokens), predicted(tokens, logits))
+    return masked_mean(each.view_as(tokens), predicted(tokens, logits, known))
 
 
-def accuracy(logits: Tensor, tokens: Tensor, kinds: Tensor, kind: int) -> Tensor:
+def accuracy(logits: Tensor, tokens: Tensor, kinds: Tensor, kind: int, known: Tensor | None = None) -> Tensor:
     """Share of one stream's `predicted` tokens that are the most likely ones."""
     hit = (logits.argmax(-1) == tokens).float()
-    return masked_mean(hit, predicted(tokens, logits) & (kinds == kind))
+    return masked_mean(hit, predicted(tokens, logits, known) & (kinds == kind))
 
 
 def corrupt(tokens: Tensor, kinds: Tensor, ends: Tensor, pkeep: float) -> Tensor:
@@ -96,15 +97,21 @@ def align_loss(
     tma: Tma,
     gumbel_temperature: float,
     temperature: float,
-    threshold: float,
+    threshold: float | None,
     sample: bool,
+    held: Tensor | None = None,
 ) -> Tensor:
-    """L_align of one batch: logits [B, L, V], text_latent [B, Z] (TMA's text mean), sentence [B, E] for the
-    filter.
+    """L_align of one batch: logits [B, L, V], text_latent [B, Z] (TMA's text mean), sentence [B, S] for the
+    filter of negatives.
+
+    `held` bool [B, dim]: columns of the tokenizer that the clip holds (None = all). What it does not hold
+    takes no part in decoding, and TMA reads the mean there, as it did in its own training.
     """
     groups = group_counts(tokens, kinds, gpt.ends, len(gpt.pattern))
     weights = soft_codes(gpt, logits, groups, temperature=gumbel_temperature, sample=sample)
     frames = groups * tokenizer.group_frames
-    motion = tokenizer.decode_soft(weights, frames)
+    motion = tokenizer.decode_soft(weights, frames, held)
+    if held is not None:
+        motion = motion.masked_fill(~held[:, None], 0.0)
     latent, _ = tma.encode_motion(motion, frames)
     return info_nce(text_latent, latent, sentence, temperature=temperature, threshold=threshold)

@@ -26,7 +26,8 @@ class GptLossConfig(Config):
     """eta [ours]; 0 turns L_align off, and the tokenizer and TMA are then not needed."""
     gumbel_temperature: float = Field(default=1.0, gt=0)
     temperature: float = Field(default=0.1, gt=0)
-    threshold: float = Field(default=0.85, ge=-1, le=1)
+    threshold: float | None = Field(default=0.85, ge=-1, le=1)
+    """Captions with a higher sBERT cosine are not negatives of each other; null keeps all negatives."""
 
 
 class GptModule(StageModule):
@@ -68,21 +69,24 @@ class GptModule(StageModule):
         """Loss of one batch.
 
         "tokens" int64 [B, L] padded with -1, "kinds" int64 [B, L], "text" float32 [B, E] (the prior); for
-        L_align also "sentence" [B, E'] (optional) and "tma_text" [B, Z], TMA's text means, where the prior is
-        not TMA's.
+        L_align also "similarity" [B, S] (sBERT embeddings, for the filter; optional) and "tma_text" [B, Z],
+        TMA's text means, where the prior is not TMA's. Of clips that lack a part: "known" bool [B, L], false
+        at that part's codes, which are neither read nor predicted, and "held" bool [B, C], the tokenizer's
+        columns that they hold (both optional: all).
         """
         net, config = self.net, self.net.config
         tokens, kinds, text = batch["tokens"], batch["kinds"], batch["text"]
+        known = batch.get("known")
         inputs, drop = None, None
         if self.training:
             drop = torch.rand(len(text), device=text.device) < config.condition_dropout
             if config.pkeep < 1:
                 inputs = corrupt(tokens, kinds, net.ends, config.pkeep)
-        logits = net(tokens, kinds, text, inputs=inputs, drop_text=drop)
-        ce = cross_entropy(logits, tokens)
+        logits = net(tokens, kinds, text, inputs=inputs, drop_text=drop, known=known)
+        ce = cross_entropy(logits, tokens, known)
         values = {"loss": ce, "ce": ce}
         for kind, name in enumerate(net.names):
-            values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind)
+            values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind, known)
         if self.tokenizer is not None and self.tma is not None:
             values["align"] = self._align(batch, logits, self.tokenizer, self.tma)
             values["loss"] = ce + self.loss_config.align_weight * values["align"]
@@ -105,13 +109,14 @@ class GptModule(StageModule):
             batch["tokens"],
             batch["kinds"],
             text_latent,
-            batch.get("sentence"),
+            batch.get("similarity"),
             tokenizer=tokenizer.module,
             tma=motion_model,
             gumbel_temperature=config.gumbel_temperature,
             temperature=config.temperature,
             threshold=config.threshold,
             sample=self.training,
+            held=batch.get("held"),
         )
 
 

@@ -11,6 +11,8 @@ Notable choices:
 - `condition_dropout` replaces the projected text by a learned null input, for classifier-free guidance
   [ours].
 - Positions are learned embeddings.
+- In training, codes of a part that a clip lacks are read as the zero vector, as the tokenizer's decoder reads
+  them [ours]. Sampling makes every part.
 
 Legend: B batch, L tokens, D width, E text width, V largest vocabulary (K + 1).
 """
@@ -111,6 +113,7 @@ class InterleavedGPT(nn.Module):
         *,
         inputs: Tensor | None = None,
         drop_text: Tensor | None = None,
+        known: Tensor | None = None,
     ) -> Tensor:
         """Logits of every token given the text and the tokens before it.
 
@@ -120,6 +123,7 @@ class InterleavedGPT(nn.Module):
             text: float [B, E].
             inputs: What the network reads instead of `tokens` (corrupted tokens); legality follows `tokens`.
             drop_text: Bool [B], samples whose text is replaced by the null input.
+            known: Bool [B, L], false at codes of a part that the clip lacks: read as zero. None = all.
 
         Returns:
             float32 [B, L, V]; -inf where a token is illegal. At padded positions the values mean nothing.
@@ -131,7 +135,10 @@ class InterleavedGPT(nn.Module):
                 "raise block_size or shorten max_frames"
             )
         seen = tokens if inputs is None else inputs
-        x = torch.cat([self.embed_text(text, drop_text), self.embed(seen[:, :-1], kinds[:, :-1])], dim=1)
+        read = self.embed(seen[:, :-1], kinds[:, :-1])
+        if known is not None:
+            read = read.masked_fill(~known[:, :-1, None], 0.0)
+        x = torch.cat([self.embed_text(text, drop_text), read], dim=1)
         return self.logits(self.hidden(x), kinds, self.legal(tokens, kinds))
 
     def embed_text(self, text: Tensor, drop: Tensor | None = None) -> Tensor:

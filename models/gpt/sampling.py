@@ -200,4 +200,7 @@ def _check_settings(
     if not 0 < top_p <= 1:
         raise UserError(f"top_p {top_p} must be above 0 and at most 1")
     if cfg_scale != 1 and gpt.config.condition_dropout == 0:
-        raise UserError("guidance needs a GPT trained with condition_dropout > 0; set cfg_scale: 1")
+        raise UserError(
+            "guidance needs a GPT trained with condition_dropout > 0; set cfg_scale to 1, for the face's GPT "
+            "face_cfg_scale"
+        )

@@ -49,8 +49,9 @@ class FsqQuantizer(nn.Module):
         """Nothing is updated outside the optimizer."""
 
     def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
-        """Quantize z [B, L, d]; `mask` [B, L] False = padding, which is not counted. `update` has no effect.
+        """Quantize z [B, L, d]; `mask` [B, L] False = padding, which is not counted.
 
+        There is nothing to update; without `update` the metrics are this rank's, as in evaluation.
         The rounding is straight-through and float32 under autocast too.
         """
         with torch.autocast(z.device.type, enabled=False):
@@ -62,7 +63,7 @@ class FsqQuantizer(nn.Module):
             quantized = _linear(self.leave, rounded / half)
             used = torch.ones_like(codes, dtype=torch.float32) if mask is None else mask.float()
             counts = used.new_zeros(self.num_codes).index_add_(0, codes.flatten(), used.flatten())
-            if self.training:
+            if self.training and update:
                 counts = sum_over_ranks(counts)
         zero = counts.new_zeros(())
         metrics = {"penalty": zero, **usage_metrics(counts), "dead": zero, "resets": zero}

@@ -52,7 +52,7 @@ def latent_loss(text: Tensor, motion: Tensor) -> Tensor:
 
 
 def false_negatives(sentence: Tensor, threshold: float) -> Tensor:
-    """Bool [N, N]: pairs whose captions say the same, cosine of sentence embeddings [N, E] above `threshold`.
+    """Bool [N, N]: pairs whose captions say the same, cosine of sBERT embeddings [N, E] above `threshold`.
 
     Exact duplicates are included (OpenTMA keeps those whose cosine rounds to 1.0 as negatives), the diagonal
     never is.
@@ -68,20 +68,19 @@ def info_nce(
     sentence: Tensor | None = None,
     *,
     temperature: float = 0.1,
-    threshold: float = 0.85,
+    threshold: float | None = 0.85,
 ) -> Tensor:
-    """Symmetric InfoNCE on cosine similarity over the global batch: text, motion [B, Z], sentence [B, E] or
-    None.
+    """Symmetric InfoNCE on cosine similarity over the global batch: text, motion [B, Z], sentence [B, E].
 
     Rows are gathered from all ranks with gradient: every rank computes the same global loss, and the gradient
     that reaches a rank's rows, averaged by DDP, equals that of one process. Pairs of `false_negatives` leave
-    the softmax.
+    the softmax; without `sentence` or `threshold` every pair is a negative.
     """
     with torch.autocast(text.device.type, enabled=False):
         text = F.normalize(gather_rows_with_grad(text.float()), dim=-1)
         motion = F.normalize(gather_rows_with_grad(motion.float()), dim=-1)
         logits = text @ motion.T / temperature
-        if sentence is not None:
+        if sentence is not None and threshold is not None:
             logits = logits.masked_fill(false_negatives(gather_rows(sentence), threshold), -torch.inf)
         target = torch.arange(len(logits), device=logits.device)
         return 0.5 * (F.cross_entropy(logits, target) + F.cross_entropy(logits.T, target))

@@ -23,8 +23,8 @@ class TmaLossConfig(Config):
     latent: float = Field(default=1e-5, ge=0)
     contrastive: float = Field(default=0.1, ge=0)
     temperature: float = Field(default=0.1, gt=0)
-    threshold: float = Field(default=0.85, ge=-1, le=1)
-    """Captions with a higher sentence cosine are not negatives of each other."""
+    threshold: float | None = Field(default=0.85, ge=-1, le=1)
+    """Captions with a higher sBERT cosine are not negatives of each other; null keeps all negatives."""
 
 
 class TmaModule(StageModule):
@@ -46,7 +46,7 @@ class TmaModule(StageModule):
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D], "length" [B], "text_tokens" [B, S, E], "text_mask",
-        "sentence" [B, E], "held" bool [B, D] (optional: all).
+        "similarity" [B, S] (sBERT embeddings, for the filter), "held" bool [B, D] (optional: all).
 
         Columns of a part that a clip does not hold are 0, the mean, for the encoder and not reconstructed.
         Latents are sampled in training and are the means in evaluation. InfoNCE contrasts the means, as the
@@ -67,7 +67,7 @@ class TmaModule(StageModule):
         contrastive = info_nce(
             text[0],
             moved[0],
-            batch["sentence"],
+            batch["similarity"],
             temperature=weight.temperature,
             threshold=weight.threshold,
         )

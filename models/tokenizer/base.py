@@ -134,6 +134,12 @@ class Tokenizer(nn.Module, ABC):
         """Bool [B] for each stream that belongs to a part which clips may lack: true where it is lacking."""
         return {}
 
+    def lost(self, held: Tensor) -> dict[str, Tensor]:
+        """Bool [B] for each stream of a part that clips may lack: true where `held` [B, dim] lacks it. The
+        stream's codes then say nothing.
+        """
+        return self._lost(held)
+
     def forward(self, x: Tensor, length: Tensor | None = None, held: Tensor | None = None) -> TokenizerOutput:
         """Read, quantize and write x [B, T, dim]; `length` [B] = valid frames. Training updates codebooks.
 
@@ -171,10 +177,14 @@ class Tokenizer(nn.Module, ABC):
             vectors[name] = without(vectors[name], lost)
         return self._decode(vectors, length)
 
-    def decode_soft(self, weights: dict[str, Tensor], length: Tensor | None = None) -> Tensor:
+    def decode_soft(
+        self, weights: dict[str, Tensor], length: Tensor | None = None, held: Tensor | None = None
+    ) -> Tensor:
         """`decode` for weights over the codes [B, L, K], differentiable in them; one-hot gives `decode`."""
         books = self.codebooks()
         vectors = {s.name: weights[s.name] @ books[s.name].codebook.to(weights[s.name]) for s in self.streams}
+        for name, lost in self._lost(held).items():
+            vectors[name] = without(vectors[name], lost)
         return self._decode(vectors, length)
 
     def features(self, written: Tensor, length: Tensor | None = None) -> Tensor:

@@ -90,7 +90,16 @@ class Basis(nn.Module):
             self.std.copy_(torch.as_tensor(std, dtype=torch.float32))
 
     def enter(self, x: Tensor) -> Tensor:
-        """Features [..., D] -> coordinates [..., D]."""
+        """Features [..., D] -> coordinates [..., D]. In float32 under autocast too: it is what is learnt."""
+        with torch.autocast(x.device.type, enabled=False):
+            return self._enter(x)
+
+    def leave(self, seen: Tensor) -> Tensor:
+        """The inverse of `enter`; half types come out as float32, whose resolution joints need."""
+        with torch.autocast(seen.device.type, enabled=False):
+            return self._leave(seen.to(torch.promote_types(seen.dtype, torch.float32)))
+
+    def _enter(self, x: Tensor) -> Tensor:
         seen = x * self.gain.to(x.dtype) if self.louder else x
         if not self.bends:
             return seen
@@ -101,8 +110,7 @@ class Basis(nn.Module):
             seen = seen.index_copy(-1, columns, values.flatten(-4).to(x.dtype))
         return seen
 
-    def leave(self, seen: Tensor) -> Tensor:
-        """The inverse of `enter`."""
+    def _leave(self, seen: Tensor) -> Tensor:
         x = seen / self.gain.to(seen.dtype) if self.louder else seen
         if not self.bends:
             return x

@@ -1,11 +1,11 @@
-"""Motion diffusion stage: the paper's second facial baseline (HumanTOMATO B.5.2)."""
+"""Motion diffusion stage, of the face: the paper's second facial baseline (HumanTOMATO B.5.2)."""
 
 from __future__ import annotations
 
 from typing import Any, Literal
 
 import torch
-from pydantic import Field
+from pydantic import Field, field_validator
 from torch.utils.data import Dataset
 
 from motionloom.datasets.shards.batches import CaptionBatches, EvalBatches
@@ -23,12 +23,19 @@ class DiffusionStageConfig(TrainedStageConfig):
 
     net: DiffusionConfig = DiffusionConfig()
     train: TrainConfig = TrainConfig(steps=200_000, batch_size=64)
-    part: Literal["bodyhand", "face"] = "face"
-    """What is denoised; `face` takes the face captions."""
+    part: Literal["face"] = "face"
+    """What is denoised: the face, told by the face captions."""
     max_frames: int = Field(196, ge=8)
     """Longer clips are cropped at random."""
     min_frames: int = Field(16, ge=1)
     """Shorter clips are left out."""
+
+    @field_validator("part", mode="before")
+    @classmethod
+    def _faces_only(cls, part: str) -> str:
+        if part != "face":
+            raise ValueError(f"a diffusion stage makes faces only, not {part}: leave `part` out")
+        return part
 
 
 def run_diffusion(context: StageContext) -> None:
@@ -39,17 +46,16 @@ def run_diffusion(context: StageContext) -> None:
         open_stats(context.input("stats")),
         open_text(context.input("text")),
     )
-    dataset = open_split(data, "train")
+    dataset = open_split(data, "train", training=True)
     columns = part_columns(dataset.layout, config.part)
     torch.manual_seed(context.seed)
     net = MotionDiffusion(config.net, motion_dim=len(columns), text_dim=text.dim)
     module = DiffusionModule(net, config.optim, seed=context.seed, max_steps=config.train.steps)
-    face = config.part == "face"
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
         return CaptionBatches(
             dataset, stats, text, batch_size=batch, max_frames=config.max_frames,
-            min_frames=config.min_frames, seed=context.seed, rank=rank, world=world, face=face,
+            min_frames=config.min_frames, seed=context.seed, rank=rank, world=world, face=True,
             columns=columns,
         )  # fmt: skip
 
@@ -58,7 +64,7 @@ def run_diffusion(context: StageContext) -> None:
     def validation() -> Dataset[Any]:
         return EvalBatches(
             held, stats, text, batch_size=32, max_frames=config.max_frames, min_frames=config.min_frames,
-            face=face, columns=columns,
+            face=True, columns=columns,
         )  # fmt: skip
 
     fit(context, module, config.train, train, validation, config.optim.grad_clip)

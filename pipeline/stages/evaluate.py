@@ -10,6 +10,7 @@ import torch
 from pydantic import Field
 from rich.table import Table
 
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.bundle import Bundle, text_encoder_of
 from motionloom.pipeline.evaluation import (
     Interval,
@@ -21,7 +22,7 @@ from motionloom.pipeline.evaluation import (
 )
 from motionloom.pipeline.files import write_json
 from motionloom.pipeline.progress import bar
-from motionloom.pipeline.samples import Truth, spread, truth_of
+from motionloom.pipeline.samples import Truth, captioned, spread, truth_of
 from motionloom.pipeline.sampling import SamplingConfig
 from motionloom.pipeline.sources import held_out, open_split, open_text
 from motionloom.pipeline.stage import StageConfig, StageContext
@@ -43,11 +44,17 @@ def run_evaluate(context: StageContext) -> None:
     """Write `metrics.json` and print it as tables."""
     config: EvaluateConfig = context.config
     data = context.input("data")
-    bundle = Bundle.from_parts(dict(context.inputs), text_encoder_of(context.input("text")))
+    bundle = Bundle.from_parts(dict(context.inputs), text_encoder_of(context.input("text")), context.device)
     split = held_out(data, prefer="test")
     dataset = open_split(data, split)
     truths = [truth_of(dataset, i) for i in sorted(spread(dataset, config.clips))]
     truths = [t for t in truths if len(t.features) >= bundle.tokenizer.group_frames]
+    if not truths:
+        raise UserError(
+            f"{dataset.where}: no captioned clip of split '{split}' is long enough for one group of tokens"
+        )
+    if left := int((~captioned(dataset)).sum()):
+        context.console.print(f"    {split}: {left} clips without a caption are left out")
     figures: dict[str, Any] = {"split": split, "clips": len(truths)}
     figures["bits_per_second"] = bundle.tokenizer.bits_per_second
     figures["reconstruction_mm"] = reconstruction_figures(

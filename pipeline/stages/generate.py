@@ -25,7 +25,7 @@ class GenerateConfig(StageConfig):
 def run_generate(context: StageContext) -> None:
     """Generate, decode and write."""
     config: GenerateConfig = context.config
-    bundle = Bundle.from_parts(dict(context.inputs), text_encoder_of(context.input("text")))
+    bundle = Bundle.from_parts(dict(context.inputs), text_encoder_of(context.input("text")), context.device)
     captions, faces = list(config.captions), list(config.captions)
     if not captions:
         data = context.input("data")

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import cache
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
+from pydantic import Field
 from torch.utils.data import Dataset
 
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.clips import ClipDataset, in_order
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.pipeline.gpt_data import GptClips, gpt_clips
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
 from motionloom.pipeline.networks import LoadedTma, load_tokenizer
-from motionloom.pipeline.sources import captions_of, held_out, open_split, open_text
+from motionloom.pipeline.sources import held_out, open_split, open_text
 from motionloom.pipeline.stage import StageContext
 from motionloom.pipeline.token_store import TokenBatches, TokenStore
 from motionloom.pipeline.training import TrainConfig, TrainedStageConfig, fit
@@ -36,6 +35,8 @@ class GptStageConfig(TrainedStageConfig):
     """First input of the GPT: the TMA text latent (section 3.5) or the plain sentence embedding."""
     face: bool = False
     """Train on the face captions."""
+    min_frames: int = Field(16, ge=1)
+    """Captions about fewer frames are left out where the clip has a longer one."""
 
 
 def run_gpt(context: StageContext) -> None:
@@ -47,7 +48,7 @@ def run_gpt(context: StageContext) -> None:
     needed = config.prior == "tma" or align
     if needed and tma_folder is None:
         raise UserError(f"stage {context.name}: prior 'tma' and align_weight > 0 need a tma stage before it")
-    tma = LoadedTma.load(tma_folder) if needed and tma_folder is not None else None
+    tma = LoadedTma.load(tma_folder, context.device) if needed and tma_folder is not None else None
     text = open_text(context.input("text"))
     text_dim = tma.net.config.latent if config.prior == "tma" and tma else text.dim
     torch.manual_seed(context.seed)
@@ -62,28 +63,31 @@ def run_gpt(context: StageContext) -> None:
         tma=tma.net if align and tma else None,
     )
     data = context.input("data")
+    per_group = {s.name: s.per_group for s in tokenizer.streams}
+
+    @cache
+    def clips_of(split: str) -> GptClips:
+        store = TokenStore.load(context.input("tokens") / f"tokens-{split}.safetensors", per_group)
+        clips = gpt_clips(
+            open_split(data, split), store, tokenizer, face=config.face, min_frames=config.min_frames
+        )
+        if clips.uncaptioned:
+            kind = "face caption" if config.face else "caption"
+            context.console.print(f"    {split}: {clips.uncaptioned} clips without a {kind} are left out")
+        return clips
 
     def batches(split: str, batch: int, rank: int = 0, world: int = 1, *, training: bool) -> TokenBatches:
-        dataset = open_split(data, split)
-        store = TokenStore.load(
-            context.input("tokens") / f"tokens-{split}.safetensors",
-            {s.name: s.per_group for s in tokenizer.streams},
-        )
-        clips = np.flatnonzero(store.whole)
-        if len(clips) == 0:
-            raise UserError(
-                f"stage {context.name}: no clip of split '{split}' holds all that the tokenizer models "
-                f"(hands, face): train a tokenizer of another `part`, or take other data"
-            )
-        captions, known = captions_by_row(dataset, clips, face=config.face)
-        sentences = torch.as_tensor(text.sentence(known))
-        latents = tma.embed_captions(known, text) if tma is not None else None
-        prior = latents if config.prior == "tma" and latents is not None else sentences
+        clips = clips_of(split)
+        latents = tma.embed_captions(clips.texts, text) if tma is not None else None
+        if config.prior == "tma" and latents is not None:
+            prior = latents
+        else:
+            prior = torch.as_tensor(text.sentence(clips.texts))
         return TokenBatches(
-            store.whole_clips(),
-            captions,
+            clips.store,
+            clips.captions,
             prior,
-            sentences,
+            torch.as_tensor(text.similarity(clips.texts)),
             net.pattern,
             net.num_codes,
             net.max_groups,
@@ -92,9 +96,9 @@ def run_gpt(context: StageContext) -> None:
             rank,
             world,
             training,
-            # Weights count; the order of shards does not, as the tokens are all in memory.
-            tuple(replace(source, shards=None) for source in dataset.sources(clips)),
+            clips.sources,
             latents=latents if align and config.prior != "tma" else None,
+            held=clips.held,
         )
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
@@ -114,19 +118,3 @@ def run_gpt(context: StageContext) -> None:
         layout = open_split(data, "train").layout
         facts = ModelFacts(kind="gpt", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra)
         save_model(context.folder, net, facts)
-
-
-def captions_by_row(
-    dataset: ClipDataset, clips: NDArray[np.int64], *, face: bool
-) -> tuple[list[list[int]], list[str]]:
-    """For each of `clips` the rows of its captions in the list of all of them, and that list."""
-    names: dict[str, int] = {}
-    captions = []
-    for index in in_order(dataset, "face_texts.json" if face else "texts.json", clips=clips.tolist()):
-        found = [c.text for c in captions_of(dataset, index, face=face)]
-        if not found:
-            raise UserError(
-                f"clip {dataset.ids[index]}: no {'face ' if face else ''}caption to train a GPT on"
-            )
-        captions.append([names.setdefault(caption, len(names)) for caption in found])
-    return captions, list(names)

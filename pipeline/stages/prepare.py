@@ -5,6 +5,7 @@ from __future__ import annotations
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.shards.statistics import compute
 from motionloom.datasets.text.build import build_text_cache
+from motionloom.pipeline.encoder_files import keep_place
 from motionloom.pipeline.sources import captions_of, open_split, splits_of
 from motionloom.pipeline.stage import StageConfig, StageContext
 
@@ -20,7 +21,11 @@ class TextConfig(StageConfig):
     """Sentence and token embeddings of every caption, computed once."""
 
     encoder: str = "minilm"
-    """`minilm` (comes with the installation), a local sentence-transformers folder, or a hub name."""
+    """`minilm` (comes with the installation), a folder with a sentence-transformers, BERT-like or CLIP model,
+    or a name on the Hugging Face hub."""
+    similarity: str = "minilm"
+    """The encoder, named likewise, that says which captions mean the same: the paper's sBERT (D.1, D.2), for
+    the filter of negatives and retrieval protocol B, whatever `encoder` is."""
 
 
 def run_stats(context: StageContext) -> None:
@@ -34,6 +39,7 @@ def run_stats(context: StageContext) -> None:
 
 def run_text(context: StageContext) -> None:
     """Embed the captions of all splits."""
+    keep_place(context.config.encoder, context.folder)
     captions: set[str] = set()
     for split in splits_of(context.input("data")):
         dataset = open_split(context.input("data"), split)
@@ -46,6 +52,8 @@ def run_text(context: StageContext) -> None:
         context.config.encoder,
         workers=context.hardware.convert_workers,
         progress=context.console.is_terminal,
+        device=str(context.device),
+        similarity=context.config.similarity,
     )
     context.console.print(
         f"    {len(captions)} different captions, {cache.dim}-d embeddings by {cache.encoder}"

@@ -16,7 +16,7 @@ from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
-from motionloom.pipeline.samples import Truth, joint_layout, reconstruct, spread, truth_of
+from motionloom.pipeline.samples import Truth, joint_layout, reconstruct, reconstruct_truth, spread, truth_of
 from motionloom.pipeline.sampling import SamplingConfig
 from motionloom.pipeline.sources import held_out, open_split
 from motionloom.pipeline.stage import StageConfig, StageContext
@@ -35,7 +35,7 @@ class ReportConfig(StageConfig):
 
 def run_report(context: StageContext) -> None:
     """Write `report.html`."""
-    bundle = Bundle.from_parts(dict(context.inputs), text_encoder_of(context.input("text")))
+    bundle = Bundle.from_parts(dict(context.inputs), text_encoder_of(context.input("text")), context.device)
     data = context.input("data")
     split = held_out(data, prefer="test")
     dataset = open_split(data, split)
@@ -74,7 +74,7 @@ def _motions(bundle: Bundle, truths: list[Truth], generated: list[GeneratedMotio
         face_tokens = bundle.faces.get("gpt")
         if truth.face is not None and isinstance(face_tokens, GptFace):
             again = synthetic_face_controls(reconstruct(face_tokens.tokenizer, bundle.stats, truth.face))
-        rebuilt = decode(reconstruct(bundle.tokenizer, bundle.stats, truth.features, truth.held), layout)
+        rebuilt = decode(reconstruct_truth(bundle.tokenizer, bundle.stats, truth), layout)
         for label, joints, controls in (
             ("recorded", truth.joints, face),
             ("reconstruction", rebuilt, again),
@@ -95,9 +95,10 @@ def _figures(page: Page, folder: Path | None) -> None:
 
 def _curves(page: Page, context: StageContext) -> None:
     page.add_heading("Training")
+    books = ("recon", "perplexity", "usage", "dead", "resets")
     wanted = {
-        "tokenizer": ("recon", "perplexity"),
-        "face_tokenizer": ("recon",),
+        "tokenizer": books,
+        "face_tokenizer": books,
         "tma": ("contrastive", "loss"),
         "gpt": ("ce", "accuracy"),
         "face_gpt": ("ce",),

@@ -59,7 +59,8 @@ STAGES: dict[str, StageKind] = {
             settle=data.settle_shards,
         ),
         StageKind("stats", "mean and deviation", prepare.StatsConfig, prepare.run_stats, ("data",)),
-        StageKind("text", "caption embeddings", prepare.TextConfig, prepare.run_text, ("data",)),
+        # Version 2: `similarity`.
+        StageKind("text", "caption embeddings", prepare.TextConfig, prepare.run_text, ("data",), version=2),
         _tokenizer("h2vq", "H2VQ tokenizer", tokenizer.H2VQStageConfig),
         _tokenizer("vq", "VQ tokenizer", tokenizer.VqStageConfig),
         _tokenizer("rvq", "RVQ tokenizer", tokenizer.RvqStageConfig),
@@ -71,6 +72,7 @@ STAGES: dict[str, StageKind] = {
             tma.TmaStageConfig,
             tma.run_tma,
             ("data", "stats", "text"),
+            version=2,  # the filter of negatives is sBERT's
             trains=True,
         ),
         StageKind(
@@ -90,10 +92,17 @@ STAGES: dict[str, StageKind] = {
             gpt.GptStageConfig,
             gpt.run_gpt,
             ("data", "text", "tokenizer", "tokens", "tma?"),
+            version=2,  # captions about parts of clips, clips without hands, sBERT's filter
             trains=True,
         ),
+        # Version 2 of these three: captions about parts of clips; none without a caption.
         StageKind(
-            "generate", "motions from captions", generate.GenerateConfig, generate.run_generate, _ALL_MODELS
+            "generate",
+            "motions from captions",
+            generate.GenerateConfig,
+            generate.run_generate,
+            _ALL_MODELS,
+            version=2,
         ),
         StageKind(
             "evaluate",
@@ -101,6 +110,7 @@ STAGES: dict[str, StageKind] = {
             evaluate.EvaluateConfig,
             evaluate.run_evaluate,
             _ALL_MODELS,
+            version=2,
         ),
         StageKind(
             "report",
@@ -108,6 +118,7 @@ STAGES: dict[str, StageKind] = {
             report.ReportConfig,
             report.run_report,
             (*_ALL_MODELS, "generate?", "evaluate?"),
+            version=2,
         ),
     )
 }

@@ -8,10 +8,21 @@ import torch
 from pydantic import Field
 from torch.utils.data import Dataset
 
+from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.batches import EvalBatches, WindowBatches
+from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import FsqConfig, H2VQConfig, RvqConfig, SeparateConfig, VqConfig
+from motionloom.models.tokenizer.config import (
+    AnyTokenizerConfig,
+    EmaTokenizerConfig,
+    FsqConfig,
+    H2VQConfig,
+    RvqConfig,
+    SeparateConfig,
+    VqConfig,
+)
 from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.pipeline.hardware import Hardware
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
 from motionloom.pipeline.sources import held_out, open_split, open_stats
 from motionloom.pipeline.stage import StageContext
@@ -24,6 +35,22 @@ class _TokenizerStageConfig(TrainedStageConfig):
     """Frames of a training window."""
     windows_per_clip: int = Field(1, ge=1)
     """Windows cut from one read of a clip."""
+    net: AnyTokenizerConfig
+
+    def require_fit(self, hardware: Hardware) -> None:
+        """A codebook must get several times the vectors that it resets codes below."""
+        super().require_fit(hardware)
+        if not isinstance(self.net, EmaTokenizerConfig):
+            return
+        vectors = self.train.batch_size // self.train.accumulate * self.window // GROUP_FRAMES
+        needed = 2 * self.net.num_codes * self.net.reset_below
+        if vectors < needed:
+            raise UserError(
+                f"a codebook of {self.net.num_codes} codes gets {vectors} vectors an update and resets codes "
+                f"used less than {self.net.reset_below:g} times: it would replace codes for ever. Set "
+                f"net.reset_below to {vectors / self.net.num_codes / 4:.2g} or less, or raise "
+                "train.batch_size"
+            )
 
 
 class H2VQStageConfig(_TokenizerStageConfig):
@@ -88,7 +115,7 @@ def run_tokenizer(context: StageContext) -> None:
         return EvalBatches(
             held,
             stats,
-            batch_size=8,
+            batch_size=64,  # enough tokens that its perplexity compares with training's
             max_frames=4 * config.window,
             columns=columns,
         )

@@ -13,7 +13,7 @@ from pydantic import Field
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.pipeline.networks import load_tokenizer
+from motionloom.pipeline.networks import device_of, load_tokenizer
 from motionloom.pipeline.progress import bar
 from motionloom.pipeline.sources import open_split, open_stats, splits_of
 from motionloom.pipeline.stage import StageConfig, StageContext
@@ -29,7 +29,8 @@ class TokensConfig(StageConfig):
 
 def run_tokens(context: StageContext) -> None:
     """Write `tokens-SPLIT.safetensors` for every split."""
-    tokenizer, stats = load_tokenizer(context.input("tokenizer")), open_stats(context.input("stats"))
+    tokenizer = load_tokenizer(context.input("tokenizer"), context.device)
+    stats = open_stats(context.input("stats"))
     for split in splits_of(context.input("data")):
         dataset = open_split(context.input("data"), split)
         with bar(context.console) as progress:
@@ -48,7 +49,7 @@ def run_tokens(context: StageContext) -> None:
             for s in tokenizer.streams
         )
         lacking = len(dataset) - len(whole.groups)
-        note = f"; {lacking} clips lack hands or a face: no GPT learns their tokens" if lacking else ""
+        note = f"; {lacking} clips lack hands or a face: no GPT learns tokens of those" if lacking else ""
         context.console.print(
             f"    {split}: {len(dataset)} clips, {int(store.starts[-1])} groups; {used}{note}"
         )
@@ -61,17 +62,21 @@ def encode_split(
     batch_frames: int,
     advance: Callable[[int], None] | None = None,
 ) -> TokenStore:
-    """Codes of all clips in order. Clips are cut to a multiple of the group length and batched by length."""
-    unit = tokenizer.group_frames
+    """Codes of all clips in order, encoded where the tokenizer lies.
+
+    Clips are cut to a multiple of the group length and batched by length.
+    """
+    unit, device = tokenizer.group_frames, device_of(tokenizer)
     groups = np.maximum(np.asarray(dataset.frames) // unit, 1)
     starts = np.concatenate([[0], np.cumsum(groups)]).astype(np.int64)
     per_group = {s.name: s.per_group for s in tokenizer.streams}
-    held = dataset.layout.held_columns[:, tokenizer.columns.numpy()]
+    held = dataset.layout.held_columns[:, tokenizer.columns.cpu().numpy()]
     flat = {name: torch.zeros(int(starts[-1]) * n, dtype=torch.int64) for name, n in per_group.items()}
     for items in _by_length(groups, batch_frames // unit):
         motion, length = padded(tokenizer, dataset, stats, items)
-        with torch.no_grad():
-            codes = tokenizer.encode(motion, length, torch.from_numpy(held[dataset.held[items]]))
+        mask = torch.from_numpy(held[dataset.held[items]])
+        found = tokenizer.encode(motion.to(device), length.to(device), mask.to(device))
+        codes = {name: values.cpu() for name, values in found.items()}
         for row, item in enumerate(items.tolist()):
             for name, n in per_group.items():
                 begin, count = int(starts[item]) * n, int(groups[item]) * n
@@ -89,7 +94,7 @@ def padded(
 
     Columns that a clip does not hold are as stored: the tokenizer is told which ones.
     """
-    unit, columns = tokenizer.group_frames, tokenizer.columns.numpy()
+    unit, columns = tokenizer.group_frames, tokenizer.columns.cpu().numpy()
     lengths = [max(int(dataset.frames[i]) // unit, 1) * unit for i in items]
     motion = torch.zeros(len(items), max(lengths), len(columns))
     for row, (item, length) in enumerate(zip(items.tolist(), lengths, strict=True)):

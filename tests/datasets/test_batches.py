@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -12,8 +13,9 @@ from torch.utils.data import DataLoader
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, UserError
-from motionloom.datasets.shards.batches import CaptionBatches, EvalBatches, WindowBatches, frame_span
+from motionloom.datasets.shards.batches import CaptionBatch, CaptionBatches, EvalBatches, WindowBatches
 from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.spans import frame_span
 from motionloom.datasets.shards.statistics import FeatureStats, compute
 from motionloom.datasets.text.cache import TextCache
 from motionloom.datasets.text.encoder import EncodedText
@@ -229,6 +231,33 @@ def test_evaluation_sees_every_clip_once_in_order(
     assert "sentence" not in without[0]
     with pytest.raises(IndexError):
         without[len(without)]
+
+
+class Likeness(WordLengths):
+    """Another encoder, of another width."""
+
+    name = "likeness"
+    dim = 3
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        sentence = np.eye(3, dtype=np.float32)[[len(caption) % 3 for caption in captions]]
+        return EncodedText(sentence, sentence[:, None], np.ones((len(captions), 1), dtype=bool))
+
+
+def test_batches_hold_the_embeddings_that_say_what_is_alike(
+    train: ShardDataset, stats: FeatureStats, text: TextCache, tmp_path: Path
+) -> None:
+    def batch_of(cache: TextCache) -> CaptionBatch:
+        return CaptionBatches(train, stats, cache, batch_size=8, max_frames=40, min_frames=8)[0]
+
+    plain = batch_of(text)
+    assert torch.equal(plain["similarity"], plain["sentence"]), "one encoder for both"
+    captions = list(text.captions_by_key().values())
+    TextCache.build(tmp_path / "similarity", captions, Likeness(), progress=False)
+    batch = batch_of(TextCache.build(tmp_path, captions, WordLengths(), progress=False))
+    assert torch.equal(batch["sentence"], plain["sentence"])
+    wanted = np.eye(3)[[len(caption) % 3 for caption in batch["caption"]]]
+    np.testing.assert_array_equal(batch["similarity"].numpy(), wanted)
 
 
 def test_caption_stretches_in_frames() -> None:

@@ -169,3 +169,15 @@ def test_hand_codes_read_the_shape_and_body_codes_the_turn() -> None:
 def test_fingers_alone_are_refused(part: Part) -> None:
     with pytest.raises(UserError, match="finger_gain"):
         basis_of(part)
+
+
+@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
+def test_autocast_leaves_the_coordinates_in_float32(half: torch.dtype) -> None:
+    basis = basis_of()
+    x = torch.randn(2, 8, 313, generator=torch.Generator().manual_seed(0))
+    seen = basis.enter(x)
+    back = basis.leave(seen)
+    with torch.autocast("cpu", dtype=half):
+        assert torch.equal(basis.enter(x), seen)
+        assert torch.equal(basis.leave(seen), back)
+        assert basis.leave(seen.to(half)).dtype == torch.float32

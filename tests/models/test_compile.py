@@ -38,6 +38,7 @@ def captioned(dim: int) -> dict[str, Any]:
         "text_tokens": torch.randn(4, 5, 12),
         "text_mask": torch.arange(5)[None] < torch.tensor([[5], [4], [3], [2]]),
         "sentence": torch.nn.functional.normalize(torch.randn(4, 12), dim=-1),
+        "similarity": torch.nn.functional.normalize(torch.randn(4, 12), dim=-1),
     }
 
 
@@ -73,7 +74,7 @@ def gpt() -> tuple[StageModule, dict[str, Any]]:
     groups = torch.tensor([4, 3, 2, 4])
     codes = {"body": torch.randint(16, (4, 8)), "hand": torch.randint(16, (4, 4))}
     tokens, kinds, _ = interleave(codes, book.pattern, ends=net.num_codes, groups=groups)
-    batch = {"tokens": tokens, "kinds": kinds, "text": torch.randn(4, 16), "sentence": torch.randn(4, 12)}
+    batch = {"tokens": tokens, "kinds": kinds, "text": torch.randn(4, 16), "similarity": torch.randn(4, 12)}
     return module, batch
 
 
@@ -105,3 +106,17 @@ def test_one_graph_and_the_same_losses(case: str) -> None:
     loss = compiled(batch)["loss"]
     loss.backward()
     assert all(p.grad is not None for p in module.net.parameters() if p.requires_grad)
+
+
+def test_many_stages_compile_in_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recipe's tokenizers share the code of their losses, of which only so many graphs may exist."""
+    monkeypatch.setattr(torch._dynamo.config, "recompile_limit", 4)
+    compiler = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda f, **options: compiler(f, backend="eager", **options))
+    for kind in ("h2vq", "rvq", "separate", "fsq"):
+        module, batch = CASES[kind]()
+        module.compile_losses()
+        for size in (4, 3):
+            for mode in (True, False):
+                module.train(mode)
+                assert module.losses({name: value[:size] for name, value in batch.items()})["loss"] > 0

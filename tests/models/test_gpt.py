@@ -195,7 +195,7 @@ def align_module(**loss: float) -> tuple[GptModule, dict[str, torch.Tensor]]:
     )
     codes = {s.name: torch.randint(0, 9, (4, 5 * s.per_group)) for s in tokenizer.streams}
     seq = interleave(codes, tokenizer.pattern, ends=net.num_codes, groups=torch.tensor([5, 2, 3, 4]))
-    batch = {**seq._asdict(), "text": torch.randn(4, 16), "sentence": torch.eye(4)}
+    batch = {**seq._asdict(), "text": torch.randn(4, 16), "similarity": torch.eye(4)}
     return module, batch
 
 

@@ -159,6 +159,7 @@ def captioned(held: list[int], columns: Tensor) -> dict[str, Tensor]:
         "text_tokens": torch.randn(size, 3, 6),
         "text_mask": torch.ones(size, 3, dtype=torch.bool),
         "sentence": torch.randn(size, 6),
+        "similarity": torch.eye(size, 6),
     }
 
 

@@ -50,6 +50,7 @@ def captioned(dim: int) -> dict[str, Tensor]:
         "text_tokens": torch.randn(4, 5, 12),
         "text_mask": torch.arange(5)[None] < torch.tensor([[5], [4], [3], [2]]),
         "sentence": torch.randn(4, 12),
+        "similarity": torch.eye(4, 12),
     }
 
 
@@ -81,7 +82,7 @@ def gpt() -> Case:
     groups = torch.tensor([4, 3, 2, 4])
     tokens, kinds, length = interleave(codes, book.pattern, ends=net.num_codes, groups=groups)
     text, sentence = torch.randn(4, 16), torch.randn(4, 12)
-    return module, {"tokens": tokens, "kinds": kinds, "length": length, "text": text, "sentence": sentence}
+    return module, {"tokens": tokens, "kinds": kinds, "length": length, "text": text, "similarity": sentence}
 
 
 CASES: dict[str, Callable[[], Case]] = {

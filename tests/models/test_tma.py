@@ -104,7 +104,7 @@ def toy_batch(seed: int, size: int = 32) -> dict[str, torch.Tensor]:
         "length": length,
         "text_tokens": tokens,
         "text_mask": torch.ones(size, 3, dtype=torch.bool),
-        "sentence": torch.eye(size),
+        "similarity": torch.eye(size),
     }
 
 

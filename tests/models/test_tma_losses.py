@@ -15,7 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
+from motionloom.models.gpt.module import GptLossConfig
 from motionloom.models.gpt.tokens import interleave
+from motionloom.models.stage_module import OptimConfig
 from motionloom.models.tma.losses import (
     false_negatives,
     info_nce,
@@ -24,6 +26,8 @@ from motionloom.models.tma.losses import (
     latent_loss,
     reconstruction_loss,
 )
+from motionloom.models.tma.module import TmaLossConfig, TmaModule
+from motionloom.models.tma.network import Tma, TmaConfig
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +69,28 @@ def test_info_nce_equals_opentma_where_its_duplicates_round_below_one(
     assert golden["n_filtered"][3] == 0  # in this file OpenTMA's rule and ours select the same pairs
     assert false_negatives(sentence, 0.85).sum() == golden["n_filtered"][2]
     close(info_nce(text, motion, sentence), golden["opentma_infonce_t0.1_filter085"])
+
+
+def test_without_a_threshold_every_pair_is_a_negative() -> None:
+    """A threshold of 1 would still leave out duplicates whose cosine rounds to more than 1."""
+    torch.manual_seed(0)
+    text, motion = torch.randn(8, 5), torch.randn(8, 5)
+    sentence = torch.randn(1, 384).expand(8, -1) * torch.rand(8, 1)
+    close(info_nce(text, motion, sentence, threshold=None), info_nce(text, motion))
+    assert GptLossConfig(threshold=None).threshold is TmaLossConfig(threshold=None).threshold is None
+    module = TmaModule(
+        Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), 5, 5), OptimConfig(), seed=0, max_steps=1,
+        loss=TmaLossConfig(threshold=None),
+    ).eval()  # fmt: skip
+    batch = {
+        "motion": torch.randn(8, 4, 5), "length": torch.full((8,), 4), "text_tokens": torch.randn(8, 2, 5),
+        "text_mask": torch.ones(8, 2, dtype=torch.bool), "similarity": sentence,
+    }  # fmt: skip
+    everything = module.losses(batch)["contrastive"]
+    module.loss_config = TmaLossConfig()
+    assert module.losses(batch)["contrastive"] == 0, "all captions are one"
+    batch["similarity"] = torch.eye(8)
+    close(module.losses(batch)["contrastive"], everything)
 
 
 def test_exact_duplicates_are_filtered_and_the_diagonal_never(golden: dict[str, torch.Tensor]) -> None:
@@ -157,12 +183,12 @@ def test_two_ranks_equal_one_process(tmp_path: Path) -> None:
             "length": torch.tensor([12, 5, 3, 9, 12, 11]),
             "text_tokens": torch.randn(6, 4, 5, generator=generator),
             "text_mask": torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
-            "sentence": sentence,
+            "similarity": sentence,
         },
         "gpt": {
             **sequence._asdict(),
             "text": torch.randn(6, 16, generator=generator),
-            "sentence": sentence.clone(),
+            "similarity": sentence.clone(),
         },
     }
     for name, batch in batches.items():

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import lightning as L
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.stage_module import OptimConfig
+from motionloom.models.stage_module import OptimConfig, StageModule
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, Recon, RvqConfig, VqConfig
 from motionloom.models.tokenizer.losses import reconstruction_loss, tokenizer_loss, velocity_loss
@@ -122,3 +123,45 @@ def test_same_seed_same_weights() -> None:
         trainer.fit(module, DataLoader(Waves(net.columns, 5, seed=1), batch_size=None))
         states.append(net.state_dict())
     assert all(torch.equal(v, states[1][k]) for k, v in states[0].items())
+
+
+class Counting(StageModule):
+    """A loss that grows by one a batch."""
+
+    def __init__(self) -> None:
+        super().__init__(torch.nn.Linear(1, 1), OptimConfig(), seed=0, max_steps=20)
+        self.batches = 0
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        self.batches += 1
+        return {"loss": self.net(torch.zeros(1)).sum() * 0 + self.batches}
+
+
+class Rows(L.Callback):
+    """What the module logs, by step."""
+
+    def __init__(self) -> None:
+        self.rows: dict[int, float] = {}
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        if "train/loss" in trainer.callback_metrics:
+            self.rows.setdefault(trainer.global_step, float(trainer.callback_metrics["train/loss"]))
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_a_row_of_the_log_is_the_mean_since_the_last(parts: int) -> None:
+    rows = Rows()
+    trainer = L.Trainer(
+        max_steps=20,
+        accumulate_grad_batches=parts,
+        accelerator="cpu",
+        logger=False,
+        callbacks=[rows],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    batches = [{"length": torch.ones(1)} for _ in range(20 * parts)]
+    trainer.fit(Counting(), DataLoader(batches, batch_size=None))
+    assert rows.rows[10] == pytest.approx(np.mean(range(1, 10 * parts + 1)))
+    assert rows.rows[20] == pytest.approx(np.mean(range(10 * parts + 1, 20 * parts + 1)))

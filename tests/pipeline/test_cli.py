@@ -116,6 +116,11 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "evaluate nothing": (["evaluate", "nowhere"], "nowhere: not a run folder"),
     "report nothing": (["report", "nowhere"], "nowhere: not a run folder"),
     "export nothing": (["export", "nowhere"], "nowhere: not a run folder"),
+    "retrieval of nothing": (["retrieval", "nowhere"], "nowhere: not a run folder"),
+    "diffusion of the body": (
+        ["run", "baselines-tiny", "--set", "face_diffusion.part=bodyhand"],
+        "a diffusion stage makes faces only, not bodyhand",
+    ),
     "check nothing": (["data", "check", "nowhere"], "nowhere: no such folder"),
     "stats of nothing": (["data", "stats", "nowhere"], "nowhere/manifest.json: no such file"),
     "convert nothing": (

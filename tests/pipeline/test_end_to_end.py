@@ -14,6 +14,8 @@ import bvhio
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import yaml
+from safetensors.numpy import load_file, save_file
 
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.schema import UserError
@@ -233,6 +235,43 @@ def test_retrieval_under_four_protocols(copy: Path, call: Callable[..., Any]) ->
         assert f"R@{k}" in done.out
         assert threshold[f"t2m/R@{k}"] >= whole[f"t2m/R@{k}"], "more counts as a hit"
     assert whole["t2m/R@1"] <= whole["t2m/R@3"] <= whole["t2m/R@10"] <= 1
+
+
+def test_retrieval_by_another_alignment_stage(
+    small_run: Any, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(small_run.folder, run)
+    done = call("retrieval", run, "--stage", "temos")
+    assert done.code == 2 and "no stage 'temos'" in done.err and "this run has tma" in done.err
+    assert "face_vae" not in done.err
+    recipe = yaml.safe_load((run / "recipe.yaml").read_text())
+    recipe["stages"]["temos"] = recipe["stages"]["tma"]
+    (run / "recipe.yaml").write_text(yaml.safe_dump(recipe, sort_keys=False))
+    unfinished = call("retrieval", run, "--stage", "temos")
+    assert unfinished.code == 2 and "no finished 'temos' stage" in unfinished.err
+    shutil.copytree(run / "stages/tma", run / "stages/temos")
+    weights = load_file(run / "stages/temos/model.safetensors")
+    weights["text_encoder.project.weight"] *= -1
+    save_file(weights, run / "stages/temos/model.safetensors")
+    assert call("retrieval", run).code == 0
+    other = call("retrieval", run, "--stage", "temos")
+    assert other.code == 0 and "Retrieval of stage temos" in other.out
+    ours, theirs = (json.loads((run / f"retrieval{x}.json").read_text()) for x in ("", "-temos"))
+    assert ours["stage"] == "tma" and theirs["stage"] == "temos"
+    assert [row["protocol"] for row in theirs["protocols"]] == list("ABCD")
+    assert ours["protocols"] != theirs["protocols"]
+
+
+@pytest.mark.parametrize("command", ["retrieval", "evaluate", "report", "export"])
+def test_an_exported_folder_is_called_one(
+    command: str, copy: Path, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    assert call("export", copy, "-o", tmp_path / "model").code == 0
+    done = call(command, tmp_path / "model")
+    assert done.code == 2 and "an exported folder" in done.err and "name the run folder" in done.err
+    help_text = call(command, "--help").out
+    assert "A run folder (runs/NAME)." in help_text and "made by export" not in help_text
 
 
 def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..., Any]) -> None:

@@ -19,7 +19,7 @@ stages:
   stats: {kind: stats}
   text: {kind: text}
   tokenizer: {kind: h2vq, train: {batch_size: 64}}
-  vanilla: {kind: vq, net: {num_codes: 1024}, train: {batch_size: 64}}
+  vanilla: {kind: vq, net: {num_codes: 1024, reset_below: 0.2}, train: {batch_size: 64}}
   tma: {kind: tma, train: {batch_size: 64}}
   tokens: {kind: tokens}
   gpt: {kind: gpt, loss: {align_weight: 0.0}, train: {batch_size: 64}}
@@ -55,6 +55,28 @@ def test_memory_follows_batch_and_checkpointing(paper: Path) -> None:
     assert memory("gpt.train.accumulate=2") == half
 
 
+def test_half_precision_keeps_the_losses_whole(paper: Path) -> None:
+    rows = {
+        precision: next(
+            row
+            for row in estimate(load_recipe(paper, [f"gpt.train.precision={precision}"]))
+            if row.stage == "gpt"
+        )
+        for precision in ("32-true", "bf16-mixed")
+    }
+    kept = {name: row.memory_bytes - 16 * row.parameters for name, row in rows.items()}
+    assert 0.5 * kept["32-true"] < kept["bf16-mixed"] < 0.9 * kept["32-true"]
+
+
+def test_codebooks_are_told(paper: Path) -> None:
+    row = next(r for r in estimate(load_recipe(paper)) if r.stage == "vanilla")
+    assert row.codebook == 1024 * 512
+    large = estimate(load_recipe(paper, ["vanilla.net.num_codes=4096", "vanilla.net.reset_below=0.1"]))
+    other = next(r for r in large if r.stage == "vanilla")
+    # The codebook itself and its running sums, float32.
+    assert other.memory_bytes - row.memory_bytes >= 3072 * 512 * 2 * 4
+
+
 def test_saved_bytes_of_a_known_network() -> None:
     """Against the real thing: sizes of the storages that real tensors keep."""
     from motionloom.datasets.motion.layout import MotionLayout
@@ -72,7 +94,7 @@ def test_saved_bytes_of_a_known_network() -> None:
             net = build_tokenizer(config, MotionLayout.named("body133"))
             module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms())
             batch = {"motion": torch.zeros(4, 16, 133), "length": torch.full((4,), 16)}
-            sizes.append(_saved_bytes(module, batch))
+            sizes.append(_saved_bytes(module, batch, None))
     assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
 
 

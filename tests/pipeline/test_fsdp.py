@@ -63,7 +63,7 @@ class Tokens(Dataset[dict[str, Tensor]]):
         tokens, kinds, length = interleave(codes, self.net.pattern, ends=self.net.num_codes, groups=groups)
         text = torch.randn(self.batch, 16, generator=generator)
         sentence = torch.randn(self.batch, 6, generator=generator)
-        batch = {"tokens": tokens, "kinds": kinds, "length": length, "text": text, "sentence": sentence}
+        batch = {"tokens": tokens, "kinds": kinds, "length": length, "text": text, "similarity": sentence}
         return {name: value[self.rows] for name, value in batch.items()}
 
 

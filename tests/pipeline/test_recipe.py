@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.recipe import load_recipe, shipped_recipes
+from motionloom.pipeline.run import run_recipe
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -92,3 +94,40 @@ def test_extends_merges_into_the_base(tmp_path: Path) -> None:
     assert recipe.name == "child"
     assert recipe.stage("data").config.clips == 9  # type: ignore[attr-defined]
     assert [s.name for s in recipe.stages] == ["data", "stats"]
+
+
+CAPTIONED = """
+name: two-encoders
+stages:
+  data: {kind: synth, clips: 8}
+  stats: {kind: stats}
+  text: {kind: text}
+  clip: {kind: text, encoder: some-clip}
+  tma: {kind: tma}
+  tokenizer: {kind: h2vq}
+  tokens: {kind: tokens}
+  gpt: {kind: gpt, prior: sentence, inputs: {text: clip}}
+"""
+
+
+def test_a_tma_on_captions_of_another_encoder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        UserError, match=r"'gpt' reads captions as 'clip' .* its TMA 'tma' .* those of 'text'"
+    ):
+        load_recipe(write(tmp_path, CAPTIONED))
+    for change in (("inputs: {text: clip}", "inputs: {text: clip, tma: null}"), ("some-clip", "minilm")):
+        load_recipe(write(tmp_path, CAPTIONED.replace(*change)))
+
+
+@pytest.mark.parametrize("override", ["tokenizer.net.reset_below=1.0", "tokenizer.net.num_codes=8192"])
+def test_a_codebook_too_large_for_its_batches_is_refused(override: str, tmp_path: Path) -> None:
+    for dry_run in (True, False):
+        with pytest.raises(UserError, match=r"stage tokenizer: .*net.reset_below to 0\.\d+ or less"):
+            run_recipe(
+                "humantomato-tiny",
+                tmp_path,
+                overrides=[override],
+                dry_run=dry_run,
+                console=Console(quiet=True),
+            )
+    assert not list(tmp_path.rglob("artifact.json")), "refused before anything ran"
