@@ -6,12 +6,14 @@ bytes.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.files import sha256_file, write_json
 
 FILE_NAME = "artifact.json"
@@ -30,7 +32,7 @@ class OutputFile(Config):
 class InputStage(Config):
     """The stage that fed a role, and its fingerprint then."""
 
-    stage: str
+    stage: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
     fingerprint: str
 
 
@@ -70,3 +72,34 @@ class Artifact(Config):
         done = self.model_copy(update={"outputs": outputs})
         write_json(folder / FILE_NAME, done.dump())
         return done
+
+
+def require_consistent(run: Path, stages: Iterable[str]) -> None:
+    """Refuse stages of a run that were made from something else than what their inputs hold now.
+
+    Goes up to the first stage of all. What is gone without a trace cannot be compared and is let through.
+    """
+    todo, seen = list(stages), set[str]()
+    while todo:
+        name = todo.pop()
+        artifact = Artifact.find(run / "stages" / name)
+        if name in seen or artifact is None:
+            continue
+        seen.add(name)
+        for source in dict.fromkeys((i.stage, i.fingerprint) for i in artifact.inputs.values()):
+            stage, fingerprint = source
+            if _fingerprint_now(run / "stages" / stage) not in (None, fingerprint):
+                raise UserError(
+                    f"{run}: stage '{name}' was made from another '{stage}', which has been made anew since; "
+                    f"finish the run: motionloom run {run / 'recipe.yaml'} -o {run}"
+                )
+            todo.append(stage)
+
+
+def _fingerprint_now(folder: Path) -> str | None:
+    """Of what a stage's folder holds, finished or not; None if nothing is there."""
+    artifact = Artifact.find(folder)
+    if artifact is not None:
+        return artifact.fingerprint
+    started = folder / "started.json"
+    return str(json.loads(started.read_text())["fingerprint"]) if started.is_file() else None

@@ -6,10 +6,11 @@ A bundle opens from a run folder or from an exported one; both hold one folder p
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,8 +26,9 @@ from motionloom.datasets.text.encoder import EncodedText, TextEncoder, load_text
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate, sample_seeds
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.pipeline.artifact import Artifact
-from motionloom.pipeline.encoder_files import place_of
+from motionloom.pipeline.artifact import Artifact, require_consistent
+from motionloom.pipeline.asked import caption_list, require_seed, require_used, require_words, sampling_of
+from motionloom.pipeline.encoder_files import BUILT_IN, place_of
 from motionloom.pipeline.faces import FaceGenerator, FaceKind, FaceRequest, choose, expression, load_faces
 from motionloom.pipeline.model_store import LayoutFacts
 from motionloom.pipeline.networks import CPU, LoadedTma, device_of, load_gpt, load_tokenizer
@@ -43,6 +45,33 @@ class BundleFile(Config):
 
     layout: LayoutFacts
     text_encoder: str
+    """`minilm`, or the folder beside this file."""
+    parts: tuple[str, ...] | None = None
+    """The folders of the parts; a folder of an earlier version does not list them."""
+
+    def encoder_in(self, folder: Path) -> str:
+        """The text encoder to load: nothing outside `folder` is ever followed."""
+        name = self.text_encoder
+        if name == BUILT_IN:
+            return name
+        if name in {"", ".", ".."} or "/" in name or "\\" in name or not (folder / name).is_dir():
+            raise UserError(
+                f"{folder / 'bundle.json'}: text_encoder = {name!r} is neither '{BUILT_IN}' nor a folder "
+                f"beside this file; export the run again"
+            )
+        return str(folder / name)
+
+    def parts_in(self, folder: Path) -> dict[str, Path]:
+        """The folder of each part."""
+        if self.parts is None:
+            return {part: folder / part for part in PARTS if (folder / part).is_dir()}
+        for part in self.parts:
+            if part not in PARTS or not (folder / part).is_dir():
+                raise UserError(
+                    f"{folder / 'bundle.json'}: its part '{part}' is not here; copy the whole folder, or "
+                    f"export the run again"
+                )
+        return {part: folder / part for part in self.parts}
 
 
 @dataclass(frozen=True)
@@ -79,10 +108,7 @@ class Bundle:
         """Open a run folder or an exported folder."""
         if (folder / "bundle.json").is_file():
             facts = BundleFile.load_json(folder / "bundle.json")
-            own = folder / facts.text_encoder
-            encoder = str(own) if own.is_dir() else facts.text_encoder
-            parts = {part: folder / part for part in PARTS if (folder / part).is_dir()}
-            return Bundle.from_parts(parts, encoder, device)
+            return Bundle.from_parts(facts.parts_in(folder), facts.encoder_in(folder), device)
         if not (folder / "recipe.yaml").is_file():
             raise UserError(
                 f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no bundle.json)"
@@ -93,6 +119,7 @@ class Bundle:
     def from_run(run: Path, device: torch.device = CPU) -> Bundle:
         """Open the finished stages of a run."""
         parts = part_folders(run)
+        require_consistent(run, (folder.name for folder in parts.values()))
         if "text" not in parts:
             raise UserError(f"{run}: no finished text stage; run the recipe to the end first")
         return Bundle.from_parts(parts, text_encoder_of(parts["text"]), device)
@@ -143,18 +170,25 @@ class Bundle:
         face_captions: Sequence[str] | None = None,
         seconds: float | Sequence[float] | None = None,
         seed: int = 0,
-        sampling: SamplingConfig | None = None,
+        sampling: SamplingConfig | Mapping[str, Any] | None = None,
         batch: int = 64,
+        strict: bool = False,
     ) -> list[GeneratedMotion]:
-        """Motions for captions, in order; the same seed and caption give the same motion.
+        """Motions for captions, in order; the same seed, captions and settings give the same motions.
 
-        `seconds` is one length for all or one each; without it the model decides.
+        A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
+        the model decides. With `strict`, empty captions and options without effect are refused.
         """
-        faces = list(face_captions) if face_captions is not None else list(captions)
+        captions, sampling = caption_list(captions), sampling_of(sampling)
+        require_seed(seed)
+        faces = captions if face_captions is None else caption_list(face_captions, "face_captions")
+        if strict:
+            require_words(captions)
+            require_words(faces, "face_captions")
+            require_used(self.faces, face_captions, sampling)
         if len(faces) != len(captions):
             raise UserError(f"{len(captions)} captions but {len(faces)} face captions")
         groups = self._groups(seconds, len(captions))
-        sampling = sampling or SamplingConfig()
         # One seed a motion, so that how they are batched plays no part.
         seeds = sample_seeds(seed, 2 * len(captions))
         out: list[GeneratedMotion] = []
@@ -162,7 +196,7 @@ class Bundle:
             part = slice(start, start + batch)
             both = seeds[: len(captions)][part], seeds[len(captions) :][part]
             lengths = None if groups is None else groups[part]
-            out += self._batch(list(captions[part]), faces[part], lengths, both, sampling)
+            out += self._batch(captions[part], faces[part], lengths, both, sampling)
         return out
 
     def _batch(
@@ -277,8 +311,15 @@ def text_encoder_of(text_folder: Path) -> str:
 def stages_of(run: Path) -> dict[str, dict]:
     """The stages of a run's resolved recipe, as they are written there."""
     require_run(run)
-    recipe: dict[str, dict] = yaml.safe_load((run / "recipe.yaml").read_text(encoding="utf-8"))
-    return recipe["stages"]
+    path = run / "recipe.yaml"
+    try:
+        recipe = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise UserError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
+    stages = recipe.get("stages") if isinstance(recipe, dict) else None
+    if not isinstance(stages, dict) or not all(isinstance(e, dict) and "kind" in e for e in stages.values()):
+        raise UserError(f"{path}: holds no stages; run the recipe again into this folder")
+    return stages
 
 
 def require_run(folder: Path) -> None:

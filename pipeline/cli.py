@@ -82,6 +82,9 @@ def run(
     until: Annotated[str | None, typer.Option(help="Only this stage and what it needs.")] = None,
     only: Annotated[str | None, typer.Option(help="Only this stage; its inputs must be finished.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Run the selected stages even if finished.")] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Go on in the folder of another recipe's run.")
+    ] = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
 
@@ -90,7 +93,7 @@ def run(
 
     Example: `motionloom run humantomato-tiny --dry-run`
 
-    Example: `motionloom run humantomato-tiny --set tma.optim.lr=2e-4 --until tma`
+    Example: `motionloom run humantomato-tiny -o runs/second --set tma.optim.lr=2e-4 --until tma`
     """
     from motionloom.pipeline.graph import Selection
     from motionloom.pipeline.run import run_recipe
@@ -101,6 +104,7 @@ def run(
         overrides=sets or (),
         select=Selection(first, until, only, force),
         dry_run=dry_run,
+        replace=replace,
         console=make_console(),
     )
 
@@ -119,7 +123,7 @@ def generate(
         str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html.")
     ] = "npz,bvh,mp4,html",
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same motion.")] = 0,
+    seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
     temperature: Annotated[
         float, typer.Option(help="0: the likeliest tokens; below 1: safer, above 1: more varied.")
     ] = 1.0,
@@ -132,10 +136,13 @@ def generate(
     face_model: Annotated[
         str | None, typer.Option(help="gpt, vae or diffusion; default: the first the run has.")
     ] = None,
-    sampler: Annotated[str, typer.Option(help="Of diffusion models: ddpm, ddim or dpm++.")] = "ddpm",
+    sampler: Annotated[
+        str | None, typer.Option(help="Of diffusion models: ddpm (default), ddim or dpm++.")
+    ] = None,
     steps: Annotated[
-        int, typer.Option(help="Denoising steps of diffusion models, at most those of the training (1000).")
-    ] = 50,
+        int | None,
+        typer.Option(help="Denoising steps of diffusion models, default 50, at most those trained (1000)."),
+    ] = None,
     device: Device = "auto",
 ) -> None:
     """Motions from captions, as npz, BVH, MP4 and one page to watch.
@@ -144,6 +151,7 @@ def generate(
     """
     from motionloom.pipeline.run import generate_motions
 
+    of_models = {"face_cfg_scale": face_cfg, "sampler": sampler, "denoising_steps": steps}
     generate_motions(
         run_folder,
         captions or [],
@@ -157,10 +165,8 @@ def generate(
             "top_k": top_k,
             "top_p": top_p,
             "cfg_scale": cfg,
-            "face_cfg_scale": face_cfg,
             "face_model": face_model,
-            "sampler": sampler,
-            "denoising_steps": steps,
+            **{name: value for name, value in of_models.items() if value is not None},
         },
         device=device,
         console=make_console(),

@@ -34,12 +34,10 @@ def synth(
 
     Example: `motionloom data synth shards --clips 200`
     """
-    from motionloom.datasets.synth.generate import SynthConfig, synthesize
-    from motionloom.pipeline.data_commands import say_manifest
+    from motionloom.pipeline.data_commands import synth_command
 
-    config = SynthConfig.parse({"clips": clips, "seed": seed, "layout": layout, "music": music}, "data synth")
-    console = make_console()
-    say_manifest(synthesize(config, out, workers=workers), out, console)
+    fields = {"clips": clips, "seed": seed, "layout": layout, "music": music}
+    synth_command(fields, out, workers=workers, console=make_console())
 
 
 @data_app.command()

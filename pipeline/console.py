@@ -37,5 +37,6 @@ def quiet_libraries() -> None:
         ".*LeafSpec.*",
         ".*ckpt_path.*",
         ".*dirpath has changed.*",
+        ".*`srun` command is available.*",  # said of every process that srun did not start
     ):
         warnings.filterwarnings("ignore", message)

@@ -17,6 +17,8 @@ from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.check import examine
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.statistics import compute
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.files import require_file_place, require_folder
 
 
 def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
@@ -39,6 +41,13 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
         f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), "
         f"{manifest.fps:g} fps, {', '.join(manifest.licences) or manifest.licence}"
     )
+
+
+def synth_command(fields: dict[str, Any], out: Path, *, workers: int, console: Console) -> None:
+    """Write synthetic clips."""
+    config = SynthConfig.parse(fields, "data synth")
+    require_folder(out)
+    say_manifest(synthesize(config, out, workers=workers), out, console)
 
 
 def convert_command(
@@ -77,6 +86,7 @@ def convert_command(
         if wait:
             say_manifest(wait_for(submission, console), out, console)
         return
+    require_folder(out)
     conversion = converter.prepare(config, out=out, workers=workers, progress=shown)
     manifest = run_conversion(
         conversion, out, workers=workers, strict=strict, clips_per_shard=clips_per_shard, progress=shown
@@ -97,6 +107,12 @@ def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: C
     if not path.exists():
         raise UserError(f"{path}: no such folder or file")
     files = path.is_file() or _holds_files(path)
+    of_files = [f"--{name}" for name, value in rules.items() if value not in (None, "auto")]
+    if of_files and not files:
+        raise UserError(
+            f"{path}: {', '.join(of_files)} is for single files; a data set says this in its manifest.json; "
+            f"leave it out"
+        )
     count, warned = _check_files(path, rules, console) if files else _check_dataset(path, console)
     if strict:
         count += warned
@@ -146,6 +162,7 @@ def report_command(root: Path, out: Path | None, *, check: bool, clips: int, con
     from motionloom.pipeline.data_report import write_data_report  # drawing is imported when it is needed
 
     path = out or root / "report.html"
+    require_file_place(path)
     write_data_report(root, path, check=check, clips=clips, progress=console.is_terminal)
     console.print(str(path), markup=False, soft_wrap=True)
 
@@ -153,6 +170,8 @@ def report_command(root: Path, out: Path | None, *, check: bool, clips: int, con
 def stats_command(root: Path, *, group: bool, out: Path | None, console: Console) -> None:
     """Describe a data set."""
     manifest = Manifest.load_json(root / "manifest.json")
+    if out is not None:
+        require_file_place(out)
     say_manifest(manifest, root, console)
     dataset = ShardDataset.open(root, "train")
     lengths = np.asarray(dataset.frames) / dataset.layout.fps
@@ -166,5 +185,6 @@ def stats_command(root: Path, *, group: bool, out: Path | None, console: Console
         table.add_row(name, str(size), f"{mean:.4f}", f"{std.mean():.4f}", f"{std.max():.4f}")
     console.print(table)
     if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
         stats.save(out)
         console.print(str(out))

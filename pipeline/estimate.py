@@ -3,7 +3,8 @@
 Each network is built and its loss computed on fake tensors, which have shapes but no values, so the figures
 come from the code that will run, under the precision it will run in. Memory counts weights, gradients,
 AdamW's two moments, codebooks with their averages and everything kept for the backward pass; workspaces of
-kernels and the allocator's rounding come on top.
+kernels and the allocator's rounding come on top. Attention weights are not counted: a GPU's fused kernels
+keep none. A CPU keeps them where `attention_dropout` is above 0.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.layers.transformer import SelfAttention
 from motionloom.models.quantize.ema import EmaQuantizer
 from motionloom.models.stage_module import StageModule
 from motionloom.models.tma.module import TmaModule
@@ -70,6 +72,9 @@ def estimate(recipe: Recipe) -> list[Estimate]:
         batch = config.train.local_batch(world)
         with FakeTensorMode(allow_non_fake_inputs=True):
             module, inputs, note = _fake(recipe, stage, layout, batch)
+            for part in module.modules():
+                if isinstance(part, SelfAttention):
+                    part.attention_dropout = 0.0
             prepare_module(module, config.train)
             parameters = sum(p.numel() for p in module.net.parameters())
             buffers = sum(b.numel() * b.element_size() for b in module.net.buffers())

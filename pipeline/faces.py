@@ -149,7 +149,8 @@ def load_diffusion(folder: Path, device: torch.device = CPU) -> MotionDiffusion:
     """A trained denoiser."""
     facts = load_facts(folder)
     config = DiffusionConfig.parse(facts.config, str(folder))
-    net = MotionDiffusion(config, facts.extra["motion_dim"], facts.extra["text_dim"])
+    dims = (facts.fact(folder, key, int) for key in ("motion_dim", "text_dim"))
+    net = MotionDiffusion(config, *dims)
     load_weights(folder, net)
     freeze(net.to(device))
     return net

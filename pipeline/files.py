@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.schema import UserError
+
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
@@ -24,6 +26,20 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_folder(folder: Path) -> None:
+    """Refuse a place for files that is a file, or lies below one; nothing is made yet."""
+    there = next((place for place in (folder, *folder.parents) if place.exists()), folder)
+    if there.exists() and not there.is_dir():
+        raise UserError(f"{there}: is a file, and a folder is needed here; choose another name")
+
+
+def require_file_place(path: Path) -> None:
+    """Refuse a name for a file that is a folder, or lies below a file; nothing is made yet."""
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; name a file, like {path / 'NAME'}")
+    require_folder(path.parent)
 
 
 def write_text(path: Path, text: str) -> None:

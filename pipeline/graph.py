@@ -56,6 +56,8 @@ class PlannedStage:
     fingerprint: str
     action: Action
     reason: str
+    asked: bool = False
+    """The selection names it to run again (`--from`, `--force`)."""
 
 
 def stage_folder(run: Path, name: str) -> Path:
@@ -66,12 +68,7 @@ def stage_folder(run: Path, name: str) -> Path:
 def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
     """Decide for every stage, in order, what happens to it."""
     select = select or Selection()
-    for name in (select.first, select.until, select.only):
-        if name is not None:
-            recipe.stage(name)
-    wanted = _ancestors(recipe, select.until) if select.until else {s.name for s in recipe.stages}
-    if select.only:
-        wanted = {select.only}
+    wanted = selected(recipe, select)
     forced = _descendants(recipe, select.first) if select.first else set()
     if select.force:
         forced |= wanted
@@ -82,7 +79,7 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
         action, reason = _decide(stage, fingerprint, run, rows, forced, select)
         if stage.name not in wanted and action != "skip":
             action, reason = "leave", "not selected"
-        rows[stage.name] = PlannedStage(stage, fingerprint, action, reason)
+        rows[stage.name] = PlannedStage(stage, fingerprint, action, reason, stage.name in forced)
         plan.append(rows[stage.name])
     if select.only:
         for role, name in recipe.stage(select.only).inputs.items():
@@ -91,6 +88,44 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
                     f"--only {select.only}: its input '{role}' ({name}) is not finished; run it first"
                 )
     return plan
+
+
+def selected(recipe: Recipe, select: Selection) -> set[str]:
+    """Names of the stages that may run; refuses selections that contradict each other."""
+    first, until, only = select.first, select.until, select.only
+    for name in (first, until, only):
+        if name is not None:
+            recipe.stage(name)
+    for option, name in (("--from", first), ("--until", until)):
+        if only and name and name != only:
+            raise UserError(f"--only {only} runs that stage alone: leave {option} {name} out")
+    if first and until and first not in _ancestors(recipe, until):
+        raise UserError(
+            f"--from {first} --until {until}: '{until}' does not need '{first}', so there is nothing between "
+            f"them; leave one out"
+        )
+    if first and select.force and not only:
+        raise UserError(
+            f"--from {first} runs that stage and those below it again, --force all that are selected: leave "
+            f"one out"
+        )
+    if only:
+        return {only}
+    return _ancestors(recipe, until) if until else {stage.name for stage in recipe.stages}
+
+
+def replaced_trainings(run: Path, plan: Sequence[PlannedStage]) -> tuple[list[str], list[str]]:
+    """Trainings that the plan deletes though nobody asked for it by name: finished ones, and started ones."""
+    finished, started = [], []
+    for row in plan:
+        folder = stage_folder(run, row.stage.name)
+        if not row.stage.kind.trains or row.action != "run" or row.asked:
+            continue
+        if Artifact.find(folder) is not None:
+            finished.append(row.stage.name)
+        elif (folder / "checkpoints").is_dir():
+            started.append(row.stage.name)
+    return finished, started
 
 
 def _fingerprint(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> str:

@@ -53,7 +53,14 @@ class Hardware(Config):
             return self.devices
         if "RANK" in os.environ and "LOCAL_WORLD_SIZE" in os.environ:  # torchrun has decided
             return int(os.environ["LOCAL_WORLD_SIZE"])
-        return torch.cuda.device_count() if self.resolved_accelerator() == "gpu" else 1
+        if self.resolved_accelerator() == "cpu":
+            return 1
+        if torch.cuda.device_count() == 0:
+            raise UserError(
+                "hardware.accelerator is gpu and no GPU is here; set hardware.devices to plan for another "
+                "machine, or hardware.accelerator to auto"
+            )
+        return torch.cuda.device_count()
 
     def world(self) -> int:
         """Processes on all nodes."""
@@ -71,7 +78,8 @@ class Hardware(Config):
         """One readable line about what runs where."""
         count, nodes = self.resolved_devices(), self.nodes
         if self.resolved_accelerator() == "gpu":
-            where = f"{count} x {torch.cuda.get_device_name(0)}"
+            here = torch.cuda.is_available()
+            where = f"{count} x {torch.cuda.get_device_name(0) if here else 'GPU (none is here)'}"
         else:
             why = "" if self.accelerator == "cpu" else " (no GPU found)"
             where = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from pydantic import Field
@@ -13,6 +13,8 @@ from safetensors.torch import load_file, save
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.files import atomic, write_json
+
+Fact = TypeVar("Fact")
 
 
 class LayoutFacts(Config):
@@ -39,6 +41,16 @@ class ModelFacts(Config):
     config: dict[str, Any]
     layout: LayoutFacts
     extra: dict[str, Any] = Field(default_factory=dict)
+
+    def fact(self, folder: Path, key: str, kind: type[Fact]) -> Fact:
+        """A fact in `extra`, of the kind it must be."""
+        value = self.extra.get(key)
+        if not isinstance(value, kind):
+            missing = "is required" if key not in self.extra else f"= {value!r:.60} is no {kind.__name__}"
+            raise UserError(
+                f"{folder / 'model.json'}: key 'extra.{key}' {missing}; run or export the stage again"
+            )
+        return value
 
 
 def save_model(folder: Path, net: torch.nn.Module, facts: ModelFacts) -> None:

@@ -58,11 +58,12 @@ class LoadedTma:
     def load(folder: Path, device: torch.device = CPU) -> LoadedTma:
         """Read from a tma stage."""
         facts = load_facts(folder)
-        extra = facts.extra
-        net = Tma(TmaConfig.parse(facts.config, str(folder)), extra["motion_dim"], extra["text_dim"])
+        dims = (facts.fact(folder, key, int) for key in ("motion_dim", "text_dim"))
+        net = Tma(TmaConfig.parse(facts.config, str(folder)), *dims)
         load_weights(folder, net)
         freeze(net.to(device))
-        return LoadedTma(net, facts.layout.layout(), int(extra["max_frames"]), extra.get("part", "bodyhand"))
+        frames = facts.fact(folder, "max_frames", int)
+        return LoadedTma(net, facts.layout.layout(), frames, facts.extra.get("part", "bodyhand"))
 
     @property
     def device(self) -> torch.device:
@@ -94,13 +95,14 @@ def load_gpt(folder: Path, tokenizer: Tokenizer) -> tuple[InterleavedGPT, str]:
     """A trained GPT, on the tokenizer's device, and its kind of text prior ("tma" or "sentence")."""
     facts = load_facts(folder)
     expected = {s.name: s.num_codes for s in tokenizer.streams}
-    if facts.extra["streams"] != expected or tuple(facts.extra["pattern"]) != tuple(tokenizer.pattern):
+    streams, pattern = facts.fact(folder, "streams", dict), facts.fact(folder, "pattern", list)
+    if streams != expected or tuple(pattern) != tuple(tokenizer.pattern):
         raise UserError(
-            f"{folder}: this GPT was trained on streams {facts.extra['streams']}, "
+            f"{folder}: this GPT was trained on streams {streams}, "
             f"the tokenizer has {expected}; train it again on this tokenizer"
         )
     config = GptConfig.parse(facts.config, str(folder))
-    net = InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, facts.extra["text_dim"])
+    net = InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, facts.fact(folder, "text_dim", int))
     load_weights(folder, net)
     freeze(net.to(device_of(tokenizer)))
-    return net, str(facts.extra["prior"])
+    return net, facts.fact(folder, "prior", str)

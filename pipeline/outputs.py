@@ -13,7 +13,7 @@ import numpy as np
 from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.kinematics import joints_to_rotations
 from motionloom.pipeline.bundle import GeneratedMotion
-from motionloom.pipeline.files import atomic
+from motionloom.pipeline.files import atomic, require_folder
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
@@ -32,6 +32,7 @@ def write_motions(
     folder: Path, motions: Sequence[GeneratedMotion], formats: Sequence[Format], *, title: str, seed: int
 ) -> list[Path]:
     """Write every motion in every format; the page holds all of them. Returns the paths."""
+    require_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     out: list[Path] = []
     for number, motion in enumerate(motions):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntry
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.bundle import (
+    PARTS,
     Bundle,
     BundleFile,
     GeneratedMotion,
@@ -37,6 +38,8 @@ from motionloom.pipeline.sampling import SamplingConfig
 
 _WEIGHTS = ("model.safetensors", "model.json", "stats.safetensors")
 _ENCODER = "text_encoder"
+_HUB_CONFIG = {"format": "motionloom bundle"}
+"""`config.json`, which the hub looks for; nothing here reads it."""
 
 
 class MotionModel(
@@ -51,7 +54,7 @@ class MotionModel(
         self.folder = Path(folder)
         self.bundle = Bundle.open(self.folder, choose_device(device))
         # The mixin would write our argument, a local path, into the config.json that the hub wants.
-        self._hub_mixin_config = {"format": "motionloom bundle"}
+        self._hub_mixin_config = dict(_HUB_CONFIG)
 
     @classmethod
     def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> MotionModel:
@@ -61,6 +64,8 @@ class MotionModel(
         token, local_files_only).
         """
         name = pretrained_model_name_or_path
+        if Path(name).is_dir():  # the hub's own way in warns of a run folder, which has no config.json
+            return cls(name, options.get("device", "auto"))
         try:
             return super().from_pretrained(name, **options)
         except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
@@ -74,14 +79,16 @@ class MotionModel(
         face_captions: Sequence[str] | None = None,
         seconds: float | Sequence[float] | None = None,
         seed: int = 0,
-        sampling: SamplingConfig | None = None,
+        sampling: SamplingConfig | Mapping[str, Any] | None = None,
     ) -> list[GeneratedMotion]:
-        """Motions for captions, in order; the same seed and caption give the same motion.
+        """Motions for captions, in order; the same seed, captions and settings give the same motions.
 
-        `seconds` is one length for all or one each; without it the model decides.
+        A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
+        the model decides. `sampling` is a `SamplingConfig` or a mapping like `{"top_p": 0.9}`. An option that
+        this model takes no notice of is refused.
         """
         return self.bundle.generate(
-            captions, face_captions=face_captions, seconds=seconds, seed=seed, sampling=sampling
+            captions, face_captions=face_captions, seconds=seconds, seed=seed, sampling=sampling, strict=True
         )
 
     def _save_pretrained(self, save_directory: Path) -> None:
@@ -132,7 +139,9 @@ def write_bundle(run: Path, out: Path) -> None:
                 shutil.copyfile(source / name, out / role / name)
     skeleton = bundle.layout.skeleton
     write_json(out / "skeleton.json", _plain(skeleton))
-    facts = BundleFile(layout=LayoutFacts.of(bundle.layout), text_encoder=encoder)
+    write_json(out / "config.json", _HUB_CONFIG)
+    held = tuple(part for part in PARTS if part in parts and part != "text")
+    facts = BundleFile(layout=LayoutFacts.of(bundle.layout), text_encoder=encoder, parts=held)
     write_json(out / "bundle.json", facts.dump())
 
 

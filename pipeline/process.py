@@ -18,9 +18,23 @@ def process_rank() -> int:
     """
     if "RANK" in os.environ:
         return int(os.environ["RANK"])
-    if "SLURM_PROCID" in os.environ and "SLURM_NTASKS" in os.environ:
+    if srun_tasks() > 1:
         return int(os.environ["SLURM_PROCID"])
     return int(os.environ.get("NODE_RANK", 0)) + int(os.environ.get("LOCAL_RANK", 0))
+
+
+def srun_tasks() -> int:
+    """Processes that srun started together with this one; 1 without srun.
+
+    A batch script, or a shell that salloc gives, knows the job's SLURM_NTASKS too and is one process all the
+    same: srun alone counts the tasks of a step.
+    """
+    if "SLURM_PROCID" not in os.environ:
+        return 1
+    if "SLURM_STEP_NUM_TASKS" in os.environ:
+        return int(os.environ["SLURM_STEP_NUM_TASKS"])
+    # No script has another number than 0.
+    return int(os.environ.get("SLURM_NTASKS", 1)) if int(os.environ["SLURM_PROCID"]) else 1
 
 
 def local_rank() -> int:

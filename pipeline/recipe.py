@@ -15,6 +15,7 @@ file beside this one. `--set stage.field=value` overrides one value.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.hardware import Hardware
@@ -38,6 +39,15 @@ class RecipeFile(Config):
     seed: int = Field(0, ge=0)
     hardware: Hardware = Hardware()
     stages: dict[str, dict[str, Any]]
+
+    @field_validator("stages")
+    @classmethod
+    def _plain_names(cls, stages: dict[str, Any]) -> dict[str, Any]:
+        """A stage's name is its folder in the run."""
+        for name in stages:
+            if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
+                raise ValueError(f"stage name '{name}': use letters, digits, - and _ only")
+        return stages
 
 
 @dataclass(frozen=True)
@@ -120,8 +130,9 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Reci
     data = _read(path, depth=0)
     for override in overrides:
         _apply(data, override)
-    file = RecipeFile.parse(data, str(path))
-    return Recipe(file.name, file.description, file.seed, file.hardware, _stages(file, str(path)))
+    where = f"{path} with --set" if overrides else str(path)
+    file = RecipeFile.parse(data, where)
+    return Recipe(file.name, file.description, file.seed, file.hardware, _stages(file, where))
 
 
 def _read(path: Path, depth: int) -> dict[str, Any]:
@@ -129,6 +140,8 @@ def _read(path: Path, depth: int) -> dict[str, Any]:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: not valid YAML: {error}") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
     if not isinstance(data, dict):
         raise UserError(f"{path}: a recipe is a mapping with 'name' and 'stages'")
     base = data.pop("extends", None)
@@ -260,6 +273,6 @@ def _resolve(name: str, kind: StageKind, renamed: Any, known: list[str], where: 
         elif role in renamed or not optional:
             raise UserError(
                 f"{where}: stage '{name}' needs a stage '{source}' (role '{role}')"
-                f"{nearest(source, [other for other in known if other != name])}"
+                f"{nearest(str(source), [other for other in known if other != name])}"
             )
     return inputs

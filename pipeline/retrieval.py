@@ -13,6 +13,7 @@ from rich.table import Table
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.models.metrics.retrieval import RECALLS, recall
+from motionloom.pipeline.artifact import require_consistent
 from motionloom.pipeline.bundle import part_folders, stages_of
 from motionloom.pipeline.evaluation import embed_motions
 from motionloom.pipeline.files import write_json
@@ -89,6 +90,7 @@ def _folders(run: Path, stage: str) -> dict[str, Path]:
     for folder in found.values():
         if not (folder / "artifact.json").is_file():
             raise UserError(f"{run}: no finished '{folder.name}' stage; run the recipe up to it first")
+    require_consistent(run, (folder.name for folder in found.values()))
     return found
 
 

@@ -7,11 +7,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
+import yaml
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.artifact import require_consistent
+from motionloom.pipeline.asked import caption_list, require_seed, require_words
 from motionloom.pipeline.bundle import Bundle, require_run
-from motionloom.pipeline.graph import Selection, execute, make_plan, plan_table, require_fit, stage_folder
+from motionloom.pipeline.files import require_file_place, require_folder
+from motionloom.pipeline.graph import (
+    Selection,
+    execute,
+    make_plan,
+    plan_table,
+    replaced_trainings,
+    require_fit,
+    selected,
+    stage_folder,
+)
 from motionloom.pipeline.hardware import choose_device
 from motionloom.pipeline.outputs import Format, write_motions
 from motionloom.pipeline.pretrained import write_bundle
@@ -27,9 +40,13 @@ def run_recipe(
     overrides: Sequence[str] = (),
     select: Selection | None = None,
     dry_run: bool = False,
+    replace: bool = False,
     console: Console,
 ) -> Path:
-    """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed."""
+    """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
+
+    A folder of another recipe is refused without `replace`.
+    """
     loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
     if dry_run:
@@ -39,9 +56,21 @@ def run_recipe(
     if dry_run:
         console.print(plan_table(loaded, plan))
         require_fit(todo, loaded.hardware)
+    if not replace:
+        _require_same_recipe(run, loaded.name)
+    finished, started = replaced_trainings(run, plan)
+    for what, names in (("finished", finished), ("unfinished", started)):
+        if names:
+            console.print(f"[yellow]replaces {what} trainings: {', '.join(names)}[/]")
+    if dry_run:
         console.print(f"{len(todo)} of {len(plan)} stages would run in {run}")
         return run
-    if not todo:
+    chosen = selected(loaded, select or Selection())
+    if not todo and len(chosen) < len(plan):
+        console.print(
+            f"{run}: the selected stages are finished ({len(chosen)} of {len(plan)}), nothing to do"
+        )
+    elif not todo:
         console.print(f"{run}: all {len(plan)} stages are finished, nothing to do")
     else:
         console.print(
@@ -51,21 +80,38 @@ def run_recipe(
         execute(loaded, run, plan, console)
     for row in plan:
         page = stage_folder(run, row.stage.name) / "report.html"
-        if row.stage.kind.name == "report" and page.is_file():
+        # Not the page of an earlier run with other settings.
+        if row.stage.kind.name == "report" and row.action != "leave" and page.is_file():
             console.print(f"watch it: {page.resolve()}", soft_wrap=True)
     return run
 
 
+def _require_same_recipe(run: Path, name: str) -> None:
+    """Never replace the stages of another recipe's run unasked."""
+    path = run / "recipe.yaml"
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return  # it is about to be written anew
+    if isinstance(found, dict) and found.get("name", name) != name:
+        raise UserError(
+            f"{run}: holds a run of recipe '{found['name']}', not '{name}'; choose another folder with "
+            f"--out, or give --replace to go on here: what fits is kept, the rest is made anew"
+        )
+
+
 def _say_estimate(recipe: Recipe, console: Console) -> None:
     """What the trainings would take, where the recipe says enough."""
-    from motionloom.pipeline.estimate import estimate, estimate_table
+    from motionloom.pipeline.estimate import data_layout, estimate, estimate_table
 
     if not any(stage.kind.trains for stage in recipe.stages):
         return
     try:
-        console.print(estimate_table(estimate(recipe)))
+        data_layout(recipe)
     except UserError as error:
         console.print(str(error))
+        return
+    console.print(estimate_table(estimate(recipe)))
 
 
 def generate_motions(
@@ -88,13 +134,16 @@ def generate_motions(
     for name in wanted:
         if name not in get_args(Format):
             raise UserError(f"--format {name}: no such format{nearest(name, get_args(Format))}")
+    if not wanted:
+        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4 or html")
+    # All that needs no model is checked before one is opened.
+    require_words(caption_list(captions))
+    require_seed(seed)
+    require_folder(out)
+    drawing = SamplingConfig.parse(sampling or {}, "sampling")
     bundle = Bundle.open(folder, choose_device(device))
     motions = bundle.generate(
-        captions,
-        face_captions=face_captions,
-        seconds=seconds,
-        seed=seed,
-        sampling=SamplingConfig.parse(sampling or {}, "sampling"),
+        captions, face_captions=face_captions, seconds=seconds, seed=seed, sampling=drawing, strict=True
     )
     paths = write_motions(out, motions, wanted, title=folder.name, seed=seed)  # type: ignore[arg-type]
     for path in paths:
@@ -114,13 +163,15 @@ def _stage_again(
     stage = next((s for s in recipe.stages if s.kind.name == kind), None)
     if stage is None:
         raise UserError(f"{folder}: its recipe has no {kind} stage; add one and run it again")
-    config = stage.config.model_copy(update={k: v for k, v in changes.items() if v is not None})
+    given = {name: value for name, value in changes.items() if value is not None}
+    config = stage.kind.config.parse({**stage.config.dump(), **given}, kind)
     inputs = {role: stage_folder(folder, name) for role, name in stage.inputs.items()}
     for role, path in inputs.items():
         if not (path / "artifact.json").is_file():
             raise UserError(
                 f"{folder}: stage '{path.name}' (role {role}) is not finished; run the recipe first"
             )
+    require_consistent(folder, (path.name for path in inputs.values()))
     target = folder / kind
     target.mkdir(exist_ok=True)
     context = StageContext(
@@ -145,8 +196,11 @@ def evaluate_run(
 
 def report_run(folder: Path, out: Path | None, *, device: str = "auto", console: Console) -> Path:
     """The page of a finished run; returns its path."""
+    if out is not None:
+        require_file_place(out)
     page = _stage_again(folder, "report", console, {}, device) / "report.html"
     if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(page, out)
         page = out
     console.print(str(page.resolve()), soft_wrap=True)
@@ -155,6 +209,7 @@ def report_run(folder: Path, out: Path | None, *, device: str = "auto", console:
 
 def export_run(folder: Path, out: Path, *, console: Console) -> Path:
     """Copy what generation needs into one folder."""
+    require_folder(out)
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
     write_bundle(folder, out)

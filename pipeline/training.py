@@ -28,6 +28,7 @@ from motionloom.pipeline.hardware import Hardware
 from motionloom.pipeline.process import TeamError
 from motionloom.pipeline.progress import MetricLog, StepProgress
 from motionloom.pipeline.stage import RUNTIME, StageConfig, StageContext
+from motionloom.pipeline.team import environment
 
 _KEPT = 2
 """Checkpoints kept: the newest, and one more in case that is torn."""
@@ -149,7 +150,11 @@ def fit(
         enable_version_counter=False,  # a torn file is written again under its own name
     )
     validate = max(1, -(-config.validate_every // chunk)) if config.validate_every and validation else None
+    if hardware.resolved_accelerator() == "gpu":
+        hardware.device()  # refuses in one sentence where there is no GPU
     trainer = L.Trainer(
+        default_root_dir=context.folder,
+        plugins=environment(),
         accelerator=hardware.lightning_accelerator(),
         devices=hardware.resolved_devices(),
         num_nodes=hardware.nodes,

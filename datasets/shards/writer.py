@@ -52,6 +52,9 @@ T = TypeVar("T")
 WORK_FOLDER = ".work"
 """Inside the folder of the shards: what a first step makes; removed when the manifest stands."""
 
+SOURCE_CHECKSUM = "source_sha256"
+"""The option that tells of the source's content: a finished dataset follows its source."""
+
 FirstStep = Callable[[Sequence[T], Workers], None]
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -98,7 +101,7 @@ def write_dataset(
     _check_arguments(name, workers, clips_per_shard, options)
     out.mkdir(parents=True, exist_ok=True)
     with folder_lock(out, shared=part is not None), Workers(workers) as pool:
-        _check_same_dataset(out, name)
+        _check_same_dataset(out, name, layout, options)
         made_from = {
             "schema_version": SCHEMA_VERSION,
             "layout": [layout.name, layout.family, layout.fps, layout.skeleton_name],
@@ -191,16 +194,30 @@ def _check_arguments(name: str, workers: int, clips_per_shard: int, options: dic
         raise UserError(f"converter options must be plain JSON values: {error}") from None
 
 
-def _check_same_dataset(out: Path, name: str) -> None:
-    """Never write over another dataset's folder."""
+def _check_same_dataset(out: Path, name: str, layout: MotionLayout, options: dict[str, Any]) -> None:
+    """Never write over another dataset, or over a finished one that was made with other options."""
     try:
-        found = json.loads((out / MANIFEST_FILE).read_bytes()).get("name")
+        manifest = json.loads((out / MANIFEST_FILE).read_bytes())
+        found, before = manifest.get("name"), dict(manifest.get("options") or {})
     except FileNotFoundError:
         return
-    except (ValueError, AttributeError):
+    except (ValueError, AttributeError, TypeError):
         raise UserError(f"{out / MANIFEST_FILE}: not a manifest; choose another folder") from None
     if found != name:
         raise UserError(f"{out} holds dataset '{found}', not '{name}'; choose another folder")
+    before |= {"layout": manifest.get("layout"), "fps": manifest.get("fps")}
+    now = {**json.loads(json.dumps(options)), "layout": layout.name, "fps": layout.fps}
+    changed = [
+        f"{key} {json.dumps(before.get(key))} -> {json.dumps(now.get(key))}"
+        for key in sorted({*before, *now})
+        if key != SOURCE_CHECKSUM and before.get(key) != now.get(key)
+    ]
+    if changed:
+        raise UserError(
+            f"{out} holds this dataset, finished with other options ({'; '.join(changed[:3])}"
+            f"{f'; and {len(changed) - 3} more' if len(changed) > 3 else ''}); choose another folder, or "
+            f"delete this one to make it anew"
+        )
 
 
 def _remove_strays(out: Path, name: str, keep: set[Path]) -> None:

@@ -10,9 +10,10 @@ Legend: B batch, T frames, D motion features, E text width.
 from __future__ import annotations
 
 import math
+from typing import Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from motionloom.datasets.schema import Config
@@ -31,6 +32,12 @@ class DiffusionConfig(Config):
     condition_dropout: float = Field(default=0.1, ge=0, lt=1)
     """Share of samples trained without text; 0 turns guidance off."""
     schedule: ScheduleConfig = ScheduleConfig()
+
+    @model_validator(mode="after")
+    def _heads_divide(self) -> Self:
+        if self.dim % self.heads:
+            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
+        return self
 
 
 class MotionDiffusion(nn.Module):

@@ -20,9 +20,10 @@ Legend: B batch, L tokens, D width, E text width, V largest vocabulary (K + 1).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from motionloom.datasets.schema import Config, UserError
@@ -49,6 +50,12 @@ class GptConfig(Config):
     """Probability that an input token is kept; the others become random codes of their stream (T2M-GPT uses
     0.5).
     """
+
+    @model_validator(mode="after")
+    def _heads_divide(self) -> Self:
+        if self.dim % self.heads:
+            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
+        return self
 
 
 class InterleavedGPT(nn.Module):
@@ -78,6 +85,12 @@ class InterleavedGPT(nn.Module):
                 f"the token pattern {self.pattern} names {missing}; the streams are {list(sizes)}"
             )
         self.names = stream_names(pattern)
+        needed = 1 + len(self.pattern) + len(self.names)
+        if config.block_size < needed:
+            raise UserError(
+                f"block_size {config.block_size} holds no motion: the text, {len(self.pattern)} tokens and "
+                f"{len(self.names)} End tokens take {needed}"
+            )
         self.num_codes = {name: sizes[name] for name in self.names}
         """Codes per stream, which is also the stream's End token."""
         self.vocabulary = max(self.num_codes.values()) + 1

@@ -14,8 +14,10 @@ Legend: B batch, T frames, D motion features, S text tokens, E text width, Z lat
 
 from __future__ import annotations
 
+from typing import Self
+
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from motionloom.datasets.schema import Config
@@ -33,6 +35,12 @@ class TmaConfig(Config):
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
     frame_stride: int = Field(default=1, ge=1)
     """Every n-th frame is fed and reconstructed; 1 is the paper."""
+
+    @model_validator(mode="after")
+    def _heads_divide(self) -> Self:
+        if self.latent % self.heads:
+            raise ValueError(f"latent {self.latent} must be a multiple of heads {self.heads}")
+        return self
 
 
 class GaussianEncoder(nn.Module):

@@ -76,11 +76,8 @@ def run_shards(context: StageContext) -> None:
     for part in config.parts():
         manifest, _ = read_manifest(open_store(part.path, config.cache))
         layouts.append((part.path, manifest_layout(manifest)))
-        if config.layout is not None and manifest.layout != config.layout:
-            raise UserError(
-                f"{part.path}: layout {manifest.layout}, but stage {context.name} wants {config.layout}; "
-                f"convert to that layout, or leave `layout` out"
-            )
+        if config.layout is not None:
+            _require_named(config.layout, manifest, part.path)
         if config.verify and not is_url(part.path):
             problems = check(Path(part.path))
             if problems:
@@ -96,6 +93,14 @@ def run_shards(context: StageContext) -> None:
     settle_shards(config, context.folder)
 
 
+def _require_named(layout: str, manifest: Manifest, place: str) -> None:
+    if manifest.layout != layout:
+        raise UserError(
+            f"{place}: layout {manifest.layout}, but the recipe wants {layout}; convert to that layout, or "
+            f"leave `layout` out"
+        )
+
+
 def settle_shards(config: ShardsStageConfig, folder: Path) -> None:
     """Write down how the recipe wants the shards read now; done again whenever the recipe runs."""
     write_json(folder / READER, Reader(mode=config.mode, cache=config.cache).dump())
@@ -103,6 +108,14 @@ def settle_shards(config: ShardsStageConfig, folder: Path) -> None:
 
 def shards_source(config: ShardsStageConfig) -> dict[str, Any]:
     """Checksums of the manifests, which hold those of the shards."""
+    for part in config.parts():
+        if not is_url(part.path) and not Path(part.path).is_dir():
+            raise UserError(
+                f"{part.path}: no such folder; set the path of the data stage to a folder of shards, for "
+                f"example with --set data.path=FOLDER"
+            )
+        if config.layout is not None:
+            _require_named(config.layout, read_manifest(open_store(part.path, config.cache))[0], part.path)
     manifests = [read_manifest(open_store(part.path, config.cache))[1] for part in config.parts()]
     return {"manifests": manifests}
 

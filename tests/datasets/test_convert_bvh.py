@@ -235,6 +235,9 @@ def test_changed_file_and_changed_option_are_not_reused(copy: Path, tmp_path: Pa
     second = convert(config(copy), tmp_path / "out")
     frames = [{s.split: s.frames for s in m.shards}["val"] for m in (first, second)]
     assert frames == [65, 98]
+    with pytest.raises(UserError, match=r"finished with other options \(fps 20.0 -> 10.0\)"):
+        convert(config(copy, fps=10.0), tmp_path / "out")
+    (tmp_path / "out" / "manifest.json").unlink()
     third = convert(config(copy, fps=10.0), tmp_path / "out")
     assert {s.split: s.frames for s in third.shards}["val"] == 49
 

@@ -143,9 +143,22 @@ def test_damaged_or_differently_made_shards_are_not_kept(made: ModuleType, tmp_p
     made.write(tmp_path / "a")
     assert digests(tmp_path / "a") == want
 
+    (tmp_path / "a" / "manifest.json").unlink()  # as if it had not been finished
     made.write(tmp_path / "a", count=40)
     made.write(tmp_path / "b", count=40)
     assert digests(tmp_path / "a") == digests(tmp_path / "b"), "shards of the longer plan must go"
+
+
+def test_a_finished_set_is_not_replaced_by_one_with_other_options(made: ModuleType, tmp_path: Path) -> None:
+    made.write(tmp_path, options={"size": 60, "source_sha256": "a", "more": [1]})
+    want = digests(tmp_path)
+    with pytest.raises(UserError, match=r"finished with other options \(more \[1\] -> null; size 60 -> 4\)"):
+        made.write(tmp_path, count=4, options={"size": 4, "source_sha256": "a"})
+    assert digests(tmp_path) == want
+    made.write(tmp_path, options={"size": 60, "source_sha256": "a", "more": (1,)})
+    assert digests(tmp_path) == want
+    made.write(tmp_path, options={"size": 60, "source_sha256": "b", "more": [1]})  # the source has changed
+    assert digests(tmp_path) != want
 
 
 def test_rejections_name_the_fix(made: ModuleType, tmp_path: Path) -> None:

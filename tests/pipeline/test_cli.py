@@ -109,9 +109,15 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "unknown --until": (["run", "humantomato-tiny", "--until", "gtp", "--dry-run"], "did you mean 'gpt'"),
     "unfinished input": (["run", "humantomato-tiny", "--only", "gpt"], "is not finished"),
     "no source folder": (["run", "bvh-body", "--set", "data.source=nowhere"], "nowhere: no such folder"),
-    "no shards": (["run", "humantomato-paper", "--set", "data.path=nowhere"], "nowhere: no manifest.json"),
+    "no shards": (
+        ["run", "humantomato-paper", "--set", "data.path=nowhere"],
+        "nowhere: no such folder; set the path of the data stage",
+    ),
     "not a run": (["generate", "nowhere", "a person walks"], "nowhere: not a run folder"),
     "no caption": (["generate", "nowhere"], "give at least one caption"),
+    "empty caption": (["generate", "nowhere", "a person walks", " "], "captions[1] is empty"),
+    "no format": (["generate", "nowhere", "a person walks", "-f", ""], "names no format"),
+    "negative seed": (["generate", "nowhere", "a person walks", "--seed", "-1"], "seed -1: a seed is"),
     "unknown format": (["generate", "nowhere", "a person walks", "-f", "npz,bhv"], "did you mean 'bvh'"),
     "evaluate nothing": (["evaluate", "nowhere"], "nowhere: not a run folder"),
     "report nothing": (["report", "nowhere"], "nowhere: not a run folder"),
@@ -130,6 +136,44 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "synth of a wrong layout": (["data", "synth", "out", "--layout", "body13"], "layout"),
     "synth of no clips": (["data", "synth", "out", "--clips", "0"], "clips"),
 }
+
+
+WRONG_PLACES: dict[str, tuple[list[str], str]] = {
+    "generate": (["generate", "nowhere", "a person walks", "-o", "file"], "file: is a file"),
+    "generate below": (["generate", "nowhere", "a person walks", "-o", "file/sub"], "file: is a file"),
+    "synth": (["data", "synth", "file", "--clips", "4"], "file: is a file"),
+    "export": (["export", "nowhere", "-o", "file"], "file: is a file"),
+    "report": (["report", "nowhere", "-o", "folder"], "folder: is a folder; name a file"),
+    "data report": (["data", "report", "SHARDS", "-o", "file/page.html"], "file: is a file"),
+    "data stats": (["data", "stats", "SHARDS", "-o", "folder"], "folder: is a folder; name a file"),
+    "check with the options of files": (
+        ["data", "check", "SHARDS", "--layout", "foo", "--seconds", "3"],
+        "--layout, --seconds is for single files",
+    ),
+    "run of an empty recipe": (["evaluate", "empty"], "empty/recipe.yaml: a recipe is a mapping"),
+    "model of an empty recipe": (["generate", "empty", "jump"], "empty/recipe.yaml: holds no stages"),
+    "model of no YAML": (["export", "broken", "-o", "new"], "broken/recipe.yaml: cannot be read"),
+    "model of stages without a kind": (["export", "kindless"], "kindless/recipe.yaml: holds no stages"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_PLACES)
+def test_a_wrong_place_is_answered_in_a_sentence(
+    name: str, shards: Path, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("folder", "empty", "broken", "kindless"):
+        (tmp_path / folder).mkdir()
+    files = {"file": "", "empty/recipe.yaml": "", "broken/recipe.yaml": "stages: [", "kindless/recipe.yaml":
+             "stages: {gpt: 3}"}  # fmt: skip
+    for path, text in files.items():
+        (tmp_path / path).write_text(text)
+    before = sorted(tmp_path.rglob("*"))
+    words, says = WRONG_PLACES[name]
+    done = call(*(str(shards) if word == "SHARDS" else word for word in words))
+    assert done.code == 2 and says in text_of(done.err) and "Traceback" not in done.err
+    assert len(done.err.strip().splitlines()) == 1
+    assert sorted(tmp_path.rglob("*")) == before, "a refused command left files behind"
 
 
 @pytest.mark.parametrize("name", MISTAKES)
@@ -165,12 +209,16 @@ def test_synth_writes_the_same_shards_as_the_function(shards: Path, tmp_path: Pa
     done = call("data", "synth", out, "--clips", 6, "--layout", "body133", "--workers", 1)
     assert done.code == 0 and "body133" in done.out
     assert call("data", "check", out).code == 0
-    again = call("data", "synth", out, "--clips", 6, "--layout", "wholebody363", "--workers", 1)
-    assert again.code == 0 and "wholebody363" in again.out
+    made = {path: path.read_bytes() for path in out.iterdir()}
+    other = call("data", "synth", out, "--clips", 4, "--layout", "wholebody363", "--workers", 1)
+    assert other.code == 2 and "clips 6 -> 4" in other.err and "choose another folder" in other.err
+    assert made == {path: path.read_bytes() for path in out.iterdir()}
+    again = call("data", "synth", out, "--clips", 6, "--layout", "body133", "--workers", 1)
+    assert again.code == 0 and made == {path: path.read_bytes() for path in out.iterdir()}
 
 
 def test_stats_describes_and_writes(shards: Path, tmp_path: Path, call: Call) -> None:
-    out = tmp_path / "stats.safetensors"
+    out = tmp_path / "new/folder/stats.safetensors"
     done = call("data", "stats", shards, "--out", out)
     assert done.code == 0 and "clip length: median" in done.out and "root_height" in done.out
     first, stored = out.read_bytes(), load_file(out)

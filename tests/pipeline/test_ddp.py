@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 # Without what draws per process (dropout, latent noise), so that one and two processes can be compared.
 RECIPE = """
 extends: small
-name: pair
+name: small
 stages:
   tokenizer: {train: {steps: 4, checkpoint_every: 2, validate_every: 2}}
   tma:

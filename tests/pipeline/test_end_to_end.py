@@ -280,7 +280,10 @@ def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..
     figures = json.loads((copy / "evaluate/metrics.json").read_text())
     assert figures["clips"] == 4 and figures["split"] == "test"
     assert figures["reconstruction_mm"]["mpjpe"] > 0
-    page = tmp_path / "page.html"
+    for wrong in (("--repeats", 0), ("--clips", -4)):
+        done = call("evaluate", copy, *wrong)
+        assert done.code == 2 and f"evaluate: key '{wrong[0][2:]}' = {wrong[1]}" in done.err
+    page = tmp_path / "new/folder/page.html"
     done = call("report", copy, "-o", page)
     assert done.code == 0 and done.out.strip() == str(page)
     assert "Figures on held-out clips" in page.read_text()

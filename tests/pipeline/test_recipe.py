@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.recipe import load_recipe, shipped_recipes
 from motionloom.pipeline.run import run_recipe
 
@@ -51,6 +53,9 @@ def test_override_changes_one_value() -> None:
         ("tma.train.steps=0", "train.steps"),
         ("hardware.device=2", "did you mean 'hardware.devices'|did you mean 'devices'"),
         ("tma.kind=tmaa", "is no stage kind; did you mean 'tma'"),
+        ("gpt.net.heads=7", "with --set: stages.gpt: .*dim 160 must be a multiple of heads 7"),
+        ("tma.net.heads=3", "latent 128 must be a multiple of heads 3"),
+        ("tokenizer.inputs.data=null", "stage 'tokenizer' needs a stage 'None'"),
     ],
 )
 def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> None:
@@ -68,6 +73,8 @@ def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> N
         ),
         ("name: x\nstage: {}", "unknown key 'stage'; did you mean 'stages'"),
         ("name: ../x\nstages: {}", "name"),
+        ("name: x\nstages: {../../victim: {kind: stats}}", "stage name '../../victim'"),
+        ("name: x\nstages: {/tmp/victim: {kind: stats}}", "stage name '/tmp/victim'"),
         ("[1, 2]", "mapping"),
         ("a: [", "not valid YAML"),
         ("extends: recipe\nname: x", "circle"),
@@ -131,3 +138,30 @@ def test_a_codebook_too_large_for_its_batches_is_refused(override: str, tmp_path
                 console=Console(quiet=True),
             )
     assert not list(tmp_path.rglob("artifact.json")), "refused before anything ran"
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("gpt.net.block_size=4", "block_size 4 holds no motion.* take 6"),
+        ("hardware.accelerator=gpu", "no GPU is here; set hardware.devices"),
+    ],
+)
+def test_a_dry_run_refuses_what_cannot_run(override: str, says: str, tmp_path: Path) -> None:
+    if "gpu" in override and torch.cuda.is_available():
+        pytest.skip("there is a GPU here")
+    console = Console(record=True, width=500)
+    with pytest.raises(UserError, match=says):
+        run_recipe("humantomato-tiny", tmp_path, overrides=[override], dry_run=True, console=console)
+
+
+def test_shards_that_are_not_there_or_of_another_layout(tmp_path: Path) -> None:
+    path = tmp_path / "recipe.yaml"
+    path.write_text("name: x\nstages: {data: {kind: shards, path: shards}, stats: {kind: stats}}")
+    missing = [f"data.path={tmp_path / 'nowhere'}"]
+    with pytest.raises(UserError, match="nowhere: no such folder; set the path of the data stage"):
+        run_recipe(path, tmp_path / "run", overrides=missing, dry_run=True, console=Console(quiet=True))
+    synthesize(SynthConfig(clips=4), tmp_path / "shards", workers=1)
+    other = [f"data.path={tmp_path / 'shards'}", "data.layout=body133"]
+    with pytest.raises(UserError, match="layout wholebody363, but the recipe wants body133"):
+        run_recipe(path, tmp_path / "run", overrides=other, dry_run=True, console=Console(quiet=True))

@@ -17,8 +17,9 @@ from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
+from motionloom.pipeline.asked import require_used
 from motionloom.pipeline.bundle import Bundle
-from motionloom.pipeline.faces import DiffusionFace, GptFace
+from motionloom.pipeline.faces import DiffusionFace, GptFace, VaeFace
 from motionloom.pipeline.networks import freeze
 from motionloom.pipeline.sampling import SamplingConfig
 
@@ -144,6 +145,53 @@ def test_more_steps_than_were_trained_are_refused(sampler: Any) -> None:
     assert face is not None and np.isfinite(face).all()
 
 
+WRONG_ASKS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
+    "one text": ((), {"captions": "wave"}, r"captions is one text; give a list, also of one: .*\['wave'\]"),
+    "one face text": ((), {"face_captions": "abc"}, r"face_captions is one text; .*\['abc'\]"),
+    "no text": ((), {"captions": ["a", 3, "b"]}, r"captions\[1\] = 3: not a text"),
+    "empty": ((), {"captions": ["a", " ", "b"]}, r"captions\[1\] is empty"),
+    "negative seed": ((), {"seed": -1}, "seed -1: a seed is a whole number"),
+    "broken seed": ((), {"seed": 0.5}, "seed 0.5: a seed is a whole number"),
+    "misspelt sampling": ((), {"sampling": {"topp": 0.9}}, "unknown key 'topp'; did you mean 'top_p'"),
+    "no sampling": ((), {"sampling": 3}, "sampling: "),
+    "face of no face": ((), {"face_captions": CAPTIONS}, "this model makes no face"),
+    "guidance of no face": ((), {"sampling": {"face_cfg_scale": 3.0}}, "this model makes no face"),
+    "steps of no face": ((), {"sampling": {"denoising_steps": 9}}, r"\(--steps\): only a diffusion model"),
+    "sampler of a GPT": (("gpt",), {"sampling": {"sampler": "ddim"}}, r"\(--sampler\): .*; leave it out"),
+    "steps beside a diffusion model": (
+        ("gpt", "diffusion"),
+        {"sampling": {"denoising_steps": 9}},
+        "choose --face-model diffusion",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_ASKS)
+def test_what_has_no_sense_or_no_effect_is_refused(name: str) -> None:
+    faces, asked, says = WRONG_ASKS[name]
+    with pytest.raises(UserError, match=says):
+        bundle(faces=faces).generate(**{"captions": CAPTIONS, "seconds": 0.2, "strict": True, **asked})
+
+
+def test_a_face_by_a_vae_takes_no_guidance() -> None:
+    face: Any = {"vae": VaeFace(None)}  # type: ignore[arg-type]
+    require_used(face, CAPTIONS, SamplingConfig(cfg_scale=2.0))
+    with pytest.raises(UserError, match="VAE knows no guidance"):
+        require_used(face, CAPTIONS, SamplingConfig(face_cfg_scale=2.0))
+
+
+def test_sampling_may_be_a_mapping() -> None:
+    model, asked = bundle(faces=("gpt", "diffusion")), {"top_p": 0.5, "temperature": 2.0}
+    ours, theirs = (
+        model.generate(CAPTIONS, seconds=0.4, seed=1, sampling=sampling, strict=True)
+        for sampling in (asked, SamplingConfig(**asked))
+    )
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(one.features, other.features)
+    steps = {"denoising_steps": 2, "face_model": "diffusion"}
+    assert len(model.generate(CAPTIONS, seconds=0.2, sampling=steps, strict=True)) == 3
+
+
 def test_the_commands_options_reach_the_sampling(
     call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
@@ -154,6 +202,9 @@ def test_the_commands_options_reach_the_sampling(
     assert seen["sampling"] == SamplingConfig(
         sampler="dpm++", denoising_steps=7, cfg_scale=3, face_cfg_scale=1.5, temperature=0
     )
+    assert seen["strict"] and seen["sampling"].model_fields_set >= {"sampler", "denoising_steps"}
+    assert call("generate", "somewhere", "a person walks", "-o", tmp_path, "-f", "npz").code == 0
+    assert not seen["sampling"].model_fields_set & {"sampler", "denoising_steps", "face_cfg_scale"}
     wrong = call("generate", "somewhere", "a person walks", "--sampler", "euler")
     assert wrong.code == 2 and "sampler" in wrong.err and "ddim" in wrong.err
 

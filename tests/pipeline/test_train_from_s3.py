@@ -143,11 +143,11 @@ def test_reader_and_cache_may_change_without_training_again(
         first = recipe(tmp_path, "one", {**common, "cache": {**old, "gigabytes": 0}})
         assert call("run", first, "--out", tmp_path / "run", "--until", "stats").code == 0
         second = recipe(tmp_path, "two", {**common, "mode": "streamed", "cache": new})
-        done = call("run", second, "--out", tmp_path / "run", "--until", "tokenizer")
+        done = call("run", second, "--out", tmp_path / "run", "--until", "tokenizer", "--replace")
         assert done.code == 0 and "1 of 5 stages to run" in done.out, done.out
         assert list((tmp_path / "b").glob("*.tar")), "the finished data stage hands the new cache on"
         third = recipe(tmp_path, "three", {"path": url, "order": "global", "cache": new})
-        plan = call("run", third, "--out", tmp_path / "run", "--dry-run")
+        plan = call("run", third, "--out", tmp_path / "run", "--dry-run", "--replace")
         assert "5 of 5 stages would run" in plan.out and "changed: " in plan.out, plan.out
 
 
