@@ -172,7 +172,7 @@ def test_a_mix_of_a_folder_and_a_server_trains(
         ({"path": "x", "mode": "streamed"}, "needs order: streamed"),
         ({"path": "x", "cache": {"gigabyte": 3}}, "did you mean 'gigabytes'"),
         ({"path": "pipe:touch PWNED"}, "not from 'pipe:'"),
-        ({"path": "/nowhere/at/all"}, "no manifest.json"),
+        ({"path": "/nowhere/at/all"}, "no such folder; set the path of the data stage"),
     ],
 )
 def test_contradictions_are_named(
