@@ -82,10 +82,12 @@ def require_consistent(run: Path, stages: Iterable[str]) -> None:
     todo, seen = list(stages), set[str]()
     while todo:
         name = todo.pop()
-        artifact = Artifact.find(run / "stages" / name)
-        if name in seen or artifact is None:
+        if name in seen:
             continue
         seen.add(name)
+        artifact = Artifact.find(run / "stages" / name)
+        if artifact is None:
+            continue
         for source in dict.fromkeys((i.stage, i.fingerprint) for i in artifact.inputs.values()):
             stage, fingerprint = source
             if _fingerprint_now(run / "stages" / stage) not in (None, fingerprint):

@@ -1,19 +1,27 @@
-"""A launcher and a recipe that disagree are refused, before two processes train into the same files."""
+"""A launcher and a recipe that disagree are refused, before two processes train into the same files.
+
+Requeueing under SLURM is left to the run itself, which resumes whatever happens.
+"""
 
 from __future__ import annotations
 
 import os
+import signal
 import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
+from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.hardware import Hardware
 from motionloom.pipeline.process import process_rank, srun_tasks
-from motionloom.pipeline.team import Team
+from motionloom.pipeline.run import run_recipe
+from motionloom.pipeline.team import Team, environment
 
 RECIPE = """
 name: x
@@ -114,6 +122,37 @@ def test_a_script_or_a_shell_inside_a_job_is_one_process(srun: Srun, monkeypatch
     assert Team.start(cpu()).world == 1
     monkeypatch.setenv("LOCAL_RANK", "1")  # started by Lightning's own launcher
     assert process_rank() == 1
+
+
+def test_a_checkpoint_of_lightnings_requeueing_is_not_taken_up(
+    srun: Srun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    srun(1)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hpc_ckpt_1.ckpt").write_bytes(b"of another stage")
+    (tmp_path / "x.yaml").write_text(RECIPE)
+    before = signal.getsignal(signal.SIGUSR1)
+    run = run_recipe(tmp_path / "x.yaml", tmp_path / "run", console=Console(quiet=True))
+    assert (run / "stages/tokenizer/model.safetensors").is_file()
+    assert signal.getsignal(signal.SIGUSR1) == before
+
+
+def test_the_environment_is_slurms_only_under_srun(srun: Srun, monkeypatch: pytest.MonkeyPatch) -> None:
+    srun(1)
+    assert isinstance(environment(), LightningEnvironment), "alone"
+    monkeypatch.setenv("SLURM_NTASKS", "2")
+    monkeypatch.setenv("SLURM_NTASKS_PER_NODE", "2")
+    assert isinstance(environment(), LightningEnvironment), "one process of a script that may use two"
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
+    monkeypatch.setenv("SLURM_JOB_NAME", "interactive")  # srun inside salloc
+    found = environment()
+    assert isinstance(found, SLURMEnvironment) and not found.auto_requeue
+    with monkeypatch.context() as inside:
+        for name in ("TORCHELASTIC_RUN_ID", "RANK", "GROUP_RANK", "LOCAL_RANK", "LOCAL_WORLD_SIZE"):
+            inside.setenv(name, "0")
+        assert environment() is None, "torchrun inside SLURM"
+    monkeypatch.delenv("SLURM_NTASKS")
+    assert environment() is None
 
 
 @pytest.mark.slow
