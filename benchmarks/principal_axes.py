@@ -1,4 +1,4 @@
-"""What a code of few numbers keeps of a frame, by the frame's coordinates (models/tokenizer/basis.py).
+"""What a code of few numbers keeps of a frame, by the frame's coordinates (models.layers.basis.py).
 
     python benchmarks/principal_axes.py RUN        # a run with synthetic shards and their statistics
 
@@ -21,7 +21,7 @@ from rich.table import Table
 
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.synth.measure import agrees
-from motionloom.models.tokenizer.basis import Basis
+from motionloom.models.layers.basis import Basis
 from motionloom.pipeline.evaluation import local_joints, pose_errors
 from motionloom.pipeline.samples import joint_layout, truth_of
 from motionloom.pipeline.sources import open_split, open_stats

@@ -126,7 +126,7 @@ def _fake(
         dim = len(layout.part(config.part))
         inputs = _captioned(batch, config.max_frames, dim, width)
         if kind == "tma":
-            tma = Tma(config.net, dim, width)
+            tma = Tma.of_layout(config.net, layout, config.part, width)
             return TmaModule(tma, config.optim, seed=0, max_steps=1, loss=config.loss), inputs, ""
         denoiser = MotionDiffusion(config.net, dim, width)
         return DiffusionModule(denoiser, config.optim, seed=0, max_steps=1), inputs, ""
@@ -150,7 +150,7 @@ def _fake_gpt(
     tma = None
     if "tma" in stage.inputs:
         tma_config: Any = recipe.stage(stage.inputs["tma"]).config
-        tma = Tma(tma_config.net, len(layout.part(tma_config.part)), width)
+        tma = Tma.of_layout(tma_config.net, layout, tma_config.part, width)
     prior = tma.config.latent if config.prior == "tma" and tma is not None else width
     net = InterleavedGPT(config.net, book.streams, book.pattern, prior)
     align = config.loss.align_weight > 0 and tma is not None

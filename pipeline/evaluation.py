@@ -183,12 +183,13 @@ def embed_motions(
     out: dict[int, Tensor] = {}
     for start in range(0, len(order), batch):
         rows = order[start : start + batch].tolist()
-        cut = [np.where(masks[i], (motions[i][: tma.max_frames] - mean) / std, 0.0) for i in rows]
+        cut = [(motions[i][: tma.max_frames] - mean) / std for i in rows]
         length = torch.tensor([len(m) for m in cut])
         motion = torch.zeros(len(cut), int(length.max()), len(columns))
         for row, values in enumerate(cut):
             motion[row, : len(values)] = torch.from_numpy(values.astype(np.float32))
-        for i, latent in zip(rows, tma.embed_motion(motion, length).cpu(), strict=True):
+        near = torch.from_numpy(masks[rows])
+        for i, latent in zip(rows, tma.embed_motion(motion, length, near).cpu(), strict=True):
             out[i] = latent
     return torch.stack([out[i] for i in range(len(motions))])
 

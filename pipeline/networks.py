@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -58,12 +59,18 @@ class LoadedTma:
     def load(folder: Path, device: torch.device = CPU) -> LoadedTma:
         """Read from a tma stage."""
         facts = load_facts(folder)
-        dims = (facts.fact(folder, key, int) for key in ("motion_dim", "text_dim"))
-        net = Tma(TmaConfig.parse(facts.config, str(folder)), *dims)
+        layout, part = facts.layout.layout(), facts.extra.get("part", "bodyhand")
+        if part not in get_args(Part) or not layout.has_part(part):
+            raise UserError(
+                f"{folder / 'model.json'}: key 'extra.part' = {part!r} is no part of layout {layout.name}; "
+                "run or export the stage again"
+            )
+        text_dim = facts.fact(folder, "text_dim", int)
+        net = Tma.of_layout(TmaConfig.parse(facts.config, str(folder)), layout, part, text_dim)
         load_weights(folder, net)
         freeze(net.to(device))
         frames = facts.fact(folder, "max_frames", int)
-        return LoadedTma(net, facts.layout.layout(), frames, facts.extra.get("part", "bodyhand"))
+        return LoadedTma(net, layout, frames, part)
 
     @property
     def device(self) -> torch.device:
@@ -86,9 +93,13 @@ class LoadedTma:
         return torch.cat(out)
 
     @torch.no_grad()
-    def embed_motion(self, motion: Tensor, length: Tensor) -> Tensor:
-        """Motion latents [B, 256] of normalised features [B, T, D], the columns of `part`."""
-        return self.net.encode_motion(motion.to(self.device), length.to(self.device))[0]
+    def embed_motion(self, motion: Tensor, length: Tensor, held: Tensor | None = None) -> Tensor:
+        """Motion latents [B, 256] of normalised features [B, T, D], the columns of `part`.
+
+        `held` bool [B, D]: those that each motion holds (None = all).
+        """
+        near = None if held is None else held.to(self.device)
+        return self.net.encode_motion(motion.to(self.device), length.to(self.device), near)[0]
 
 
 def load_gpt(folder: Path, tokenizer: Tokenizer) -> tuple[InterleavedGPT, str]:

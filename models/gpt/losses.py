@@ -113,5 +113,5 @@ def align_loss(
     motion = tokenizer.decode_soft(weights, frames, held)
     if held is not None:
         motion = motion.masked_fill(~held[:, None], 0.0)
-    latent, _ = tma.encode_motion(motion, frames)
+    latent, _ = tma.encode_motion(motion, frames, held)
     return info_nce(text_latent, latent, sentence, temperature=temperature, threshold=threshold)

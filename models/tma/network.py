@@ -8,6 +8,8 @@ Notable choices:
 - The decoder puts the latent in front of the frame queries and lets them attend to it. TEMOS attends to a
   one-token memory by cross-attention, which is the same information path with one softmax over a single key.
 - `frame_stride` n feeds and reconstructs every n-th frame. 1 is the paper; small CPU runs take 2 to 4.
+- Gains [ours] let it read and reconstruct motion in the coordinates of `Basis`, where a hand's shape is the
+  same numbers wherever the hand is; in the paper's features small networks do not see it.
 
 Legend: B batch, T frames, D motion features, S text tokens, E text width, Z latent width.
 """
@@ -20,7 +22,9 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import Config
+from motionloom.models.layers.basis import Basis
 from motionloom.models.layers.transformer import Transformer, length_mask, sinusoid
 
 
@@ -35,6 +39,10 @@ class TmaConfig(Config):
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
     frame_stride: int = Field(default=1, ge=1)
     """Every n-th frame is fed and reconstructed; 1 is the paper."""
+    root_gain: float = Field(default=1.0, gt=0)
+    """How much more the root's columns count than others [ours]; see `layers/basis.py`."""
+    finger_gain: float = Field(default=0.0, ge=0)
+    """Above 0, fingers count by how they bend, in bone lengths times this [ours]; see `layers/basis.py`."""
 
     @model_validator(mode="after")
     def _heads_divide(self) -> Self:
@@ -93,28 +101,56 @@ def _stack(config: TmaConfig) -> Transformer:
 
 
 class Tma(nn.Module):
-    """Motion encoder, text encoder and motion decoder over one latent space."""
+    """Motion encoder, text encoder and motion decoder over one latent space.
 
-    def __init__(self, config: TmaConfig, motion_dim: int, text_dim: int) -> None:
+    Args:
+        config: Sizes.
+        motion_dim: D.
+        text_dim: E.
+        basis: Coordinates of the motion, as `of_layout` makes them; None = the features themselves.
+    """
+
+    def __init__(self, config: TmaConfig, motion_dim: int, text_dim: int, basis: Basis | None = None) -> None:
         super().__init__()
+        if basis is None and (config.root_gain != 1 or config.finger_gain):
+            raise ValueError("gains need the layout of the motion; build this TMA with Tma.of_layout")
         self.config = config
         self.motion_dim = motion_dim
         self.text_dim = text_dim
+        self.basis = basis
         self.motion_encoder = GaussianEncoder(config, motion_dim)
         self.text_encoder = GaussianEncoder(config, text_dim)
         self.motion_decoder = MotionDecoder(config, motion_dim)
+
+    @classmethod
+    def of_layout(cls, config: TmaConfig, layout: MotionLayout, part: Part, text_dim: int) -> Self:
+        """For one part of the clips of a layout; `basis.learn` then takes how its columns are normalised."""
+        columns = layout.part(part)
+        basis = None
+        if config.root_gain != 1 or config.finger_gain:
+            basis = Basis(layout, columns, root_gain=config.root_gain, finger_gain=config.finger_gain)
+        return cls(config, len(columns), text_dim, basis)
+
+    def read(self, x: Tensor, held: Tensor | None = None) -> Tensor:
+        """Motion [B, T, D] in the coordinates that are encoded and reconstructed; 0, the mean, in the columns
+        that a clip does not hold (`held` bool [B, D]; None = all are held).
+        """
+        seen = x if self.basis is None else self.basis.enter(x)
+        return seen if held is None else seen.masked_fill(~held[:, None], 0.0)
 
     def strided(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
         """Every `frame_stride`-th frame of x [B, T, D], and the lengths in such frames (rounded up)."""
         stride = self.config.frame_stride
         return x[:, ::stride], (length + stride - 1) // stride
 
-    def encode_motion(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        """x [B, T, D] normalised features, length int64 [B] frames -> (mu, logvar), float32 [B, Z]."""
+    def encode_motion(self, x: Tensor, length: Tensor, held: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """x [B, T, D] normalised features, length int64 [B] frames, `held` as in `read` -> (mu, logvar),
+        float32 [B, Z].
+        """
         if x.shape[-1] != self.motion_dim:
             raise ValueError(f"TMA was built for {self.motion_dim} motion features, got {x.shape[-1]}")
         x, length = self.strided(x, length)
-        mu, logvar = self.motion_encoder(x, length_mask(length, x.shape[1]))
+        mu, logvar = self.motion_encoder(self.read(x, held), length_mask(length, x.shape[1]))
         return mu, logvar
 
     def encode_text(self, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -125,9 +161,18 @@ class Tma(nn.Module):
         return mu, logvar
 
     def decode(self, z: Tensor, length: Tensor, frames: int) -> Tensor:
-        """Z [B, Z] -> [B, ceil(frames / stride), D] at every `frame_stride`-th frame; zero past `length`
-        frames.
+        """Z [B, Z] -> normalised features [B, ceil(frames / stride), D] at every `frame_stride`-th frame;
+        zero past `length` frames.
         """
+        written = self.write(z, length, frames)
+        if self.basis is None:
+            return written
+        stride = self.config.frame_stride
+        mask = length_mask((length + stride - 1) // stride, written.shape[1])
+        return self.basis.leave(written) * mask[..., None]
+
+    def write(self, z: Tensor, length: Tensor, frames: int) -> Tensor:
+        """`decode` in the coordinates of `read`: what the reconstruction is judged in."""
         stride = self.config.frame_stride
         mask = length_mask((length + stride - 1) // stride, (frames + stride - 1) // stride)
         out: Tensor = self.motion_decoder(z, mask)

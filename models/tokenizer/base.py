@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
+from motionloom.models.layers.basis import Basis
 from motionloom.models.quantize.base import Codebook
-from motionloom.models.tokenizer.basis import Basis
 from motionloom.models.tokenizer.config import BaseTokenizerConfig
 
 GROUP_FRAMES = 4

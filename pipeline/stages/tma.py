@@ -60,7 +60,9 @@ def run_tma(context: StageContext) -> None:
     dataset = open_split(data, "train", training=True)
     columns = part_columns(dataset.layout, config.part)
     torch.manual_seed(context.seed)
-    net = Tma(config.net, motion_dim=len(columns), text_dim=text.dim)
+    net = Tma.of_layout(config.net, dataset.layout, config.part, text.dim)
+    if net.basis is not None:
+        net.basis.learn(stats.mean[columns], stats.std[columns])
     module = TmaModule(net, config.optim, seed=context.seed, max_steps=config.train.steps, loss=config.loss)
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
@@ -94,12 +96,7 @@ def run_tma(context: StageContext) -> None:
 
     fit(context, module, config.train, train, validation, config.optim.grad_clip)
     if module.global_rank == 0:
-        extra: dict[str, Any] = {
-            "motion_dim": len(columns),
-            "text_dim": text.dim,
-            "max_frames": config.max_frames,
-        }
-        extra["part"] = config.part
+        extra = {"text_dim": text.dim, "max_frames": config.max_frames, "part": config.part}
         facts = ModelFacts(
             kind="tma", config=config.net.dump(), layout=LayoutFacts.of(dataset.layout), extra=extra
         )

@@ -9,8 +9,8 @@ import torch
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
+from motionloom.models.layers.basis import Basis
 from motionloom.models.stage_module import OptimConfig
-from motionloom.models.tokenizer.basis import Basis
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
 from motionloom.models.tokenizer.module import TokenizerModule

@@ -54,7 +54,8 @@ def tokenizer(kind: str) -> tuple[StageModule, dict[str, Any]]:
 
 
 def tma() -> tuple[StageModule, dict[str, Any]]:
-    net = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), 313, 12)
+    config = TmaConfig(latent=16, ff=16, layers=1, heads=2, root_gain=5.0, finger_gain=2.0)
+    net = Tma.of_layout(config, LAYOUT, "bodyhand", 12)
     return TmaModule(net, OPTIM, seed=0, max_steps=1), captioned(313)
 
 

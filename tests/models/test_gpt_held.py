@@ -108,7 +108,7 @@ def test_tma_reads_such_clips_as_in_its_own_training(
     assert module.tma is not None
     tma, read = module.tma.module, []
     encode = tma.encode_motion
-    monkeypatch.setattr(tma, "encode_motion", lambda x, length: (read.append(x), encode(x, length))[1])
+    monkeypatch.setattr(tma, "encode_motion", lambda x, *given: (read.append(x), encode(x, *given))[1])
     batch = batch_of(tokenizer)
     module.losses(batch)
     logits = module.net(batch["tokens"], batch["kinds"], batch["text"], known=batch["known"])

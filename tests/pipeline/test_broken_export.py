@@ -88,8 +88,7 @@ def test_a_part_is_one_that_is_known(part: str, model: Path) -> None:
     ("part", "key"),
     [
         ("gpt", "text_dim"), ("gpt", "streams"), ("gpt", "pattern"), ("gpt", "prior"), ("tma", "text_dim"),
-        ("tma", "motion_dim"), ("tma", "max_frames"), ("face_diffusion", "motion_dim"),
-        ("face_diffusion", "text_dim"),
+        ("tma", "max_frames"), ("face_diffusion", "motion_dim"), ("face_diffusion", "text_dim"),
     ],
 )  # fmt: skip
 def test_a_lost_fact_is_named(part: str, key: str, model: Path) -> None:
@@ -101,6 +100,12 @@ def test_a_lost_fact_is_named(part: str, key: str, model: Path) -> None:
         change(path, edit)
         with pytest.raises(UserError, match=f"{part}/model.json: key 'extra.{key}' {says}"):
             Bundle.open(model)
+
+
+def test_a_part_that_the_layout_does_not_have_is_named(model: Path) -> None:
+    change(model / "tma/model.json", lambda facts: facts["extra"].update(part="wings"))
+    with pytest.raises(UserError, match=r"model.json: key 'extra.part' = 'wings' is no part of layout"):
+        Bundle.open(model)
 
 
 def test_seeds_go_by_the_place_in_the_list(whole: Path) -> None:

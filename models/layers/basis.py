@@ -1,7 +1,7 @@
-"""`Basis`: the coordinates in which a tokenizer reads, writes and judges a frame [ours].
+"""`Basis`: the coordinates in which a tokenizer, or TMA, reads, writes and judges a frame [ours].
 
-Normalised features let the directions of largest spread decide where the bits of a code go. Two things that
-people see at once are small there:
+Normalised features let the directions of largest spread decide where the bits of a code, or the first layer
+of an encoder, go. Two things that people see at once are small there:
 
 - Where the path leads: 4 of 313 columns, whose errors add up along a clip. `root_gain` multiplies them, as
   the public HumanML3D code does (its `feat_bias` is 5).
@@ -11,7 +11,7 @@ people see at once are small there:
   palm's own frame, where a fist is the same numbers wherever the hand points. Velocities are read relative
   to the parent joint's.
 
-Both are undone on the way out: a tokenizer takes and gives the paper's features, and without gains it is the
+Both are undone on the way out: a network takes and gives the paper's features, and without gains it is the
 paper's. Zero is the mean in both.
 """
 
@@ -32,7 +32,7 @@ INDEX, MIDDLE, PINKY = 0, 1, 2
 
 
 class Basis(nn.Module):
-    """Normalised features of some columns of a layout <-> the tokenizer's coordinates.
+    """Normalised features of some columns of a layout <-> a network's coordinates.
 
     Args:
         layout: Layout of the full frames.
