@@ -52,6 +52,7 @@ def recipe(folder: Path, shards: Path, seed: int, steps: int) -> Path:
                 "heads": 4,
                 "attention_dropout": 0.0,
                 "frame_stride": 4,
+                "finger_gain": 4.0,
             },
             "loss": {"threshold": threshold},
             "optim": {"lr": 5.0e-4, "warmup_steps": 50, "schedule": "cosine"},
