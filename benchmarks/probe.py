@@ -1,10 +1,11 @@
-"""What TMA's text embedding says about each attribute, also in combinations that training never showed.
+"""What TMA's embeddings say about each attribute, also in combinations that training never showed.
 
     python benchmarks/probe.py runs/humantomato-learning
 
 A linear reader (logistic regression) learns every attribute of the truth from the embeddings of training
-captions and is asked about test captions: those of held-out combinations that the attribute belongs to, and
-the others. Whatever it cannot read in the embedding, no GPT can do. The sentence embedding stands beside it.
+captions, or motions, and is asked about test clips: those of held-out combinations that the attribute
+belongs to, and the others. What it cannot read in the captions' embeddings no GPT can do, and what the
+motions' do not say the captions' cannot learn from them. The sentence embedding stands beside them.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from rich.console import Console
 from rich.table import Table
 from sklearn.linear_model import LogisticRegression
 
+from motionloom.datasets.shards.statistics import FeatureStats
+from motionloom.pipeline.evaluation import embed_motions
 from motionloom.pipeline.networks import LoadedTma
 from motionloom.pipeline.samples import Truth, truth_of
 from motionloom.pipeline.sources import open_split, open_text
@@ -72,10 +75,14 @@ def main() -> None:
     chosen = np.random.default_rng(1).permutation(len(split))[: args.train]
     truths = [truth_of(split, int(i)) for i in chosen], test_truths(args.run)
     tma, cache = LoadedTma.load(stages / "tma"), open_text(stages / "text")
-    readers: dict[str, list[NDArray[np.float32]]] = {"TMA": [], "sentence encoder": []}
+    stats = FeatureStats.load(stages / "stats/stats.safetensors")
+    readers: dict[str, list[NDArray[np.float32]]] = {
+        "TMA, captions": [], "TMA, motions": [], "sentence encoder": []
+    }  # fmt: skip
     for part in truths:
         captions = [t.caption for t in part]
-        readers["TMA"].append(tma.embed_captions(captions, cache).numpy())
+        readers["TMA, captions"].append(tma.embed_captions(captions, cache).numpy())
+        readers["TMA, motions"].append(embed_motions(tma, stats, [t.features for t in part]).numpy())
         readers["sentence encoder"].append(np.asarray(cache.sentence(captions)))
     table = Table("read right", *(f"{name}: {kind}" for name in readers for kind in ("held out", "other")))
     for attribute in ATTRIBUTES:
