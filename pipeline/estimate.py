@@ -71,7 +71,10 @@ def estimate(recipe: Recipe) -> list[Estimate]:
         assert isinstance(config, TrainedStageConfig)
         batch = config.train.local_batch(world)
         with FakeTensorMode(allow_non_fake_inputs=True):
-            module, inputs, note = _fake(recipe, stage, layout, batch)
+            try:
+                module, inputs, note = _fake(recipe, stage, layout, batch)
+            except UserError as error:
+                raise UserError(f"stage {stage.name}: {error}") from None
             for part in module.modules():
                 if isinstance(part, SelfAttention):
                     part.attention_dropout = 0.0

@@ -8,6 +8,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.estimate import estimate
 from motionloom.pipeline.recipe import load_recipe
 from motionloom.pipeline.run import run_recipe
@@ -114,3 +115,14 @@ def test_dry_run_tells(paper: Path, tmp_path: Path) -> None:
     assert "98 body + 49 hand + 2 End = 149 for 196 frames" in said
     assert "GiB" in said
     assert not (tmp_path / "run").exists()
+
+
+def test_a_layout_that_does_not_fit_is_told_with_the_stage() -> None:
+    recipe = load_recipe("humantomato-tiny", ["data.layout=body133"])
+    with pytest.raises(UserError, match="stage tokenizer: layout body133 has no hand columns"):
+        estimate(recipe)
+    recipe = load_recipe("bvh-body", ["data.layout=body133", "tma.net.finger_gain=4"])
+    with pytest.raises(
+        UserError, match=r"stage tma: finger_gain needs body and hands together \(layout body133\)"
+    ):
+        estimate(recipe)
