@@ -204,7 +204,7 @@ def draw(shares: dict[str, Shares], path: Path) -> None:
     axes.set_xticks(range(len(names)), names)
     axes.set_ylabel("right, %")
     axes.set_title("held-out combinations of words")
-    axes.legend(ncols=3, fontsize=8)
+    figure.legend(loc="outside lower center", ncols=len(shares), fontsize=8)
     figure.savefig(path, dpi=120)
 
 
