@@ -23,9 +23,9 @@ from motionloom.pipeline.render.picture import contact_sheet
 
 CAPTIONS = (
     "a person waves with the left hand",
-    "a person walks in a counter-clockwise circle",
-    "a person kicks with the right leg twice",
-    "a person sits down on a chair",
+    "a person walks forward",
+    "a person kicks with the right leg",
+    "a person does a squat",
 )
 SYNTHETIC = SynthConfig(seed=7)
 SYNTHETIC_CLIPS = (44, 11, 10, 12)
