@@ -1,4 +1,4 @@
-"""What a code of few numbers keeps of a frame, by the frame's coordinates (models.layers.basis.py).
+"""What a code of few numbers keeps of a frame, by the frame's coordinates (models/layers/basis.py).
 
     python benchmarks/principal_axes.py RUN        # a run with synthetic shards and their statistics
 

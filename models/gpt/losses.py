@@ -111,7 +111,5 @@ def align_loss(
     weights = soft_codes(gpt, logits, groups, temperature=gumbel_temperature, sample=sample)
     frames = groups * tokenizer.group_frames
     motion = tokenizer.decode_soft(weights, frames, held)
-    if held is not None:
-        motion = motion.masked_fill(~held[:, None], 0.0)
     latent, _ = tma.encode_motion(motion, frames, held)
     return info_nce(text_latent, latent, sentence, temperature=temperature, threshold=threshold)

@@ -5,8 +5,8 @@ z_hat_B = Q_B(Conv1d(Concat(Transform(z_hat_H), z_B))). The paper leaves open: T
 up-sampling and a linear projection; the fusing Conv1d has kernel 3; the decoder reads both latents at the
 body rate and doubles it once.
 
-With a `finger_gain` (`basis.py`) the hand codes read how fingers bend and nothing else; how the hand is
-turned is left to the body codes, which read the knuckles [ours].
+With a `finger_gain` (`layers/basis.py`) the hand codes read how fingers bend and nothing else; how the hand
+is turned is left to the body codes, which read the knuckles [ours].
 
 A clip without hands gives the hand codebook nothing to learn; its hand latents are 0 wherever they are read.
 """

@@ -107,8 +107,13 @@ def test_tma_reads_such_clips_as_in_its_own_training(
     module, tokenizer = made(kind)
     assert module.tma is not None
     tma, read = module.tma.module, []
-    encode = tma.encode_motion
-    monkeypatch.setattr(tma, "encode_motion", lambda x, *given: (read.append(x), encode(x, *given))[1])
+    reader = tma.read
+
+    def watched(x: torch.Tensor, held: torch.Tensor | None = None) -> torch.Tensor:
+        read.append(reader(x, held))
+        return read[-1]
+
+    monkeypatch.setattr(tma, "read", watched)
     batch = batch_of(tokenizer)
     module.losses(batch)
     logits = module.net(batch["tokens"], batch["kinds"], batch["text"], known=batch["known"])
