@@ -88,7 +88,9 @@ class GptModule(StageModule):
         for kind, name in enumerate(net.names):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind, known)
         if self.tokenizer is not None and self.tma is not None:
-            values["align"] = self._align(batch, logits, self.tokenizer, self.tma)
+            # A motion predicted without its text cannot follow it: to the others it is a negative, no more.
+            told = logits if drop is None else torch.where(drop[:, None, None], logits.detach(), logits)
+            values["align"] = self._align(batch, told, self.tokenizer, self.tma)
             values["loss"] = ce + self.loss_config.align_weight * values["align"]
         return values
 

@@ -238,6 +238,27 @@ def test_alignment_on_known_logits_decodes_the_codes() -> None:
     )
 
 
+def test_alignment_teaches_nothing_where_the_text_was_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    module, batch = align_module()
+    module.net.config = TINY.model_copy(update={"condition_dropout": 0.5})
+    seen: dict[str, torch.Tensor] = {}
+    forward = module.net.forward
+
+    def watched(*args: torch.Tensor, **named: torch.Tensor) -> torch.Tensor:
+        logits = forward(*args, **named)
+        logits.retain_grad()
+        seen.update(logits=logits, dropped=named["drop_text"])
+        return logits
+
+    monkeypatch.setattr(module.net, "forward", watched)
+    module.train()
+    torch.manual_seed(1)
+    module.losses(batch)["align"].backward()
+    moved = seen["logits"].grad.abs().sum((1, 2)) > 0
+    assert torch.equal(moved, ~seen["dropped"])
+    assert 0 < moved.sum() < len(moved), "both kinds are in the batch"
+
+
 def test_frozen_neighbours_cannot_change() -> None:
     module, batch = align_module()
     tokenizer, tma = module.tokenizer._module, module.tma._module
