@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from pydantic import Field
@@ -14,6 +14,7 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, align_loss, corrupt, cross_entropy
 from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.gpt.samples import log_likelihood, policy_loss, rewards, sample
 from motionloom.models.stage_module import OptimConfig, StageModule
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
@@ -24,7 +25,14 @@ class GptLossConfig(Config):
 
     align_weight: float = Field(default=0.1, ge=0)
     """eta [ours]; 0 turns L_align off, and the tokenizer and TMA are then not needed."""
+    align_on: Literal["predictions", "samples"] = "predictions"
+    """What L_align judges [ours]: tokens predicted after the true ones, or motions that the model samples
+    itself. Those take several times longer; start such a stage from a trained GPT
+    (`inputs: {start: gpt}`)."""
+    samples: int = Field(default=2, ge=2)
+    """Motions sampled for each caption, for `align_on: samples`."""
     gumbel_temperature: float = Field(default=1.0, gt=0)
+    """Of the codes, for `align_on: predictions`."""
     temperature: float = Field(default=0.1, gt=0)
     threshold: float | None = Field(default=0.85, ge=-1, le=1)
     """Captions with a higher sBERT cosine are not negatives of each other; null keeps all negatives."""
@@ -90,21 +98,20 @@ class GptModule(StageModule):
         if self.tokenizer is not None and self.tma is not None:
             # A motion predicted without its text cannot follow it: to the others it is a negative, no more.
             told = logits if drop is None else torch.where(drop[:, None, None], logits.detach(), logits)
-            values["align"] = self._align(batch, told, self.tokenizer, self.tma)
+            values["align"] = self._align(batch, told, self.tokenizer.module, self.tma.module)
             values["loss"] = ce + self.loss_config.align_weight * values["align"]
         return values
 
-    def _align(
-        self, batch: dict[str, Any], logits: Tensor, tokenizer: Frozen[Tokenizer], tma: Frozen[Tma]
-    ) -> Tensor:
+    def _align(self, batch: dict[str, Any], logits: Tensor, tokenizer: Tokenizer, tma: Tma) -> Tensor:
         config = self.loss_config
-        motion_model = tma.module
         text_latent = batch.get("tma_text", batch["text"])
-        if text_latent.shape[-1] != motion_model.config.latent:
+        if text_latent.shape[-1] != tma.config.latent:
             raise UserError(
-                f"L_align compares TMA latents of width {motion_model.config.latent} and the text prior has "
+                f"L_align compares TMA latents of width {tma.config.latent} and the text prior has "
                 f"{text_latent.shape[-1]}; give TMA's text means as 'tma_text' or set align_weight: 0"
             )
+        if config.align_on == "samples":
+            return self._align_samples(batch, text_latent, tokenizer, tma)
         return align_loss(
             self.net,
             logits,
@@ -112,14 +119,38 @@ class GptModule(StageModule):
             batch["kinds"],
             text_latent,
             batch.get("similarity"),
-            tokenizer=tokenizer.module,
-            tma=motion_model,
+            tokenizer=tokenizer,
+            tma=tma,
             gumbel_temperature=config.gumbel_temperature,
             temperature=config.temperature,
             threshold=config.threshold,
             sample=self.training,
             held=batch.get("held"),
         )
+
+    def _align_samples(
+        self, batch: dict[str, Any], text_latent: Tensor, tokenizer: Tokenizer, tma: Tma
+    ) -> Tensor:
+        config, known = self.loss_config, batch.get("known")
+        count = config.samples if self.training else 1
+        drawn = sample(self.net, batch["text"], count)
+        reward = rewards(
+            drawn.codes,
+            text_latent,
+            batch.get("similarity"),
+            tokenizer=tokenizer,
+            tma=tma,
+            temperature=config.temperature,
+            threshold=config.threshold,
+            held=batch.get("held"),
+        )
+        if not self.training:
+            return -reward.mean()
+        lacking = None
+        if known is not None:
+            streams = range(len(self.net.names))
+            lacking = torch.stack([(~known & (batch["kinds"] == k)).any(1) for k in streams], dim=1)
+        return policy_loss(reward, *log_likelihood(self.net, drawn, lacking), count)
 
 
 def _check(net: InterleavedGPT, tokenizer: Tokenizer, tma: Tma) -> None:

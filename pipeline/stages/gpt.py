@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -12,9 +13,11 @@ from torch.utils.data import Dataset
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.gpt_data import GptClips, gpt_clips
+from motionloom.pipeline.hardware import Hardware
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
-from motionloom.pipeline.networks import LoadedTma, load_tokenizer
+from motionloom.pipeline.networks import LoadedTma, load_gpt, load_tokenizer
 from motionloom.pipeline.sources import held_out, open_split, open_text
 from motionloom.pipeline.stage import StageContext
 from motionloom.pipeline.token_store import TokenBatches, TokenStore
@@ -38,6 +41,28 @@ class GptStageConfig(TrainedStageConfig):
     min_frames: int = Field(16, ge=1)
     """Captions about fewer frames are left out where the clip has a longer one."""
 
+    def require_fit(self, hardware: Hardware) -> None:
+        """A model that samples as it trains is neither one graph nor cut over ranks."""
+        super().require_fit(hardware)
+        sampled = self.loss.align_weight > 0 and self.loss.align_on == "samples"
+        if sampled and (self.train.compile or self.train.strategy == "fsdp"):
+            raise UserError(
+                "loss.align_on samples draws motions token by token, which train.compile and train.strategy "
+                "fsdp cannot do; set compile: false and strategy: ddp, or align_on: predictions"
+            )
+
+
+def _take_weights(net: InterleavedGPT, prior: Prior, start: Path, tokenizer: Tokenizer) -> None:
+    """Begin with the weights of a trained GPT stage in the folder `start`."""
+    trained, trained_prior = load_gpt(start, tokenizer)
+    ours, theirs = ({k: v.shape for k, v in n.state_dict().items()} for n in (net, trained))
+    if ours != theirs or prior != trained_prior:
+        raise UserError(
+            f"stage '{start.name}' (role 'start') has other sizes or another prior than this one; give both "
+            f"the same `net` and `prior`"
+        )
+    net.load_state_dict(trained.state_dict())
+
 
 def run_gpt(context: StageContext) -> None:
     """Train on exported tokens."""
@@ -53,6 +78,9 @@ def run_gpt(context: StageContext) -> None:
     text_dim = tma.net.config.latent if config.prior == "tma" and tma else text.dim
     torch.manual_seed(context.seed)
     net = InterleavedGPT(config.net, tokenizer.streams, tokenizer.pattern, text_dim)
+    start = context.optional("start")
+    if start is not None:
+        _take_weights(net, config.prior, start, tokenizer)
     module = GptModule(
         net,
         config.optim,

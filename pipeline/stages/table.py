@@ -91,8 +91,8 @@ STAGES: dict[str, StageKind] = {
             "GPT over motion tokens",
             gpt.GptStageConfig,
             gpt.run_gpt,
-            ("data", "text", "tokenizer", "tokens", "tma?"),
-            version=2,  # captions about parts of clips, clips without hands, sBERT's filter
+            ("data", "text", "tokenizer", "tokens", "tma?", "start?"),
+            version=3,  # captions about parts of clips, clips without hands, sBERT's filter, dropped texts
             trains=True,
         ),
         # Version 2 of these three: captions about parts of clips; none without a caption.

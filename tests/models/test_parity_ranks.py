@@ -9,7 +9,8 @@ The networks that learn are float64. In float32 the order of a sum changes the l
 gradient by its own size: where the true gradient is zero (the bias of attention keys, which a softmax
 cancels) it turns that bit into a step of the learning rate. Codebooks, losses and code assignment stay
 float32, as in training.
-Nothing is drawn: there is no dropout, and the networks that sample latents or codes run in evaluation mode.
+Nothing is drawn: there is no dropout, and the networks that sample latents or codes run in evaluation mode,
+or draw by seeds that do not depend on the rank.
 
 The processes run this file as a script.
 """
@@ -132,6 +133,36 @@ def gpt() -> tuple[StageModule, Batches]:
     return module.eval(), batch
 
 
+def gpt_samples() -> tuple[StageModule, Batches]:
+    """L_align on motions that the model draws: each row with its own seed, whatever rank it is on."""
+    module, batch = gpt()
+    assert isinstance(module, GptModule) and module.tokenizer is not None and module.tma is not None
+    still = module.net.config.model_copy(
+        update={"dropout": 0.0, "attention_dropout": 0.0, "condition_dropout": 0.0}
+    )
+    net = InterleavedGPT(still, module.tokenizer.module.streams, module.net.pattern, text_dim=16)
+    drawn = UndrawnGpt(
+        net, OPTIM, seed=0, max_steps=STEPS, loss=GptLossConfig(align_weight=1.0, align_on="samples"),
+        tokenizer=module.tokenizer.module, tma=module.tma.module,
+    )  # fmt: skip
+    return drawn.train(), batch
+
+
+class UndrawnGpt(GptModule):
+    """The seeds of the samples are those of the whole batch, of which each rank takes its part."""
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """As the base class, with the draws replaced."""
+        whole = BATCH * self.loss_config.samples
+        mine = slice(rank() * whole // world_size(), (rank() + 1) * whole // world_size())
+        randint, generator = torch.randint, torch.Generator().manual_seed(0)
+        try:
+            torch.randint = lambda high, _: randint(high, (whole,), generator=generator)[mine]  # type: ignore[assignment]
+            return super().losses(batch)
+        finally:
+            torch.randint = randint
+
+
 def diffusion() -> tuple[StageModule, Batches]:
     net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2), 20, TEXT)
     module = Undrawn(net, OPTIM, seed=0, max_steps=STEPS)
@@ -175,6 +206,7 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "tma, compiled": tma,
     "gpt": gpt,
     "gpt, compiled": gpt,
+    "gpt, samples": gpt_samples,
     "diffusion": diffusion,
 }
 
