@@ -1,6 +1,6 @@
 """L_align as the loss sees it: of the truth, of a GPT's predictions after it, and of its own samples.
 
-    python benchmarks/alignment.py runs/humantomato-learning [--stages gpt gpt_unaligned]
+    python benchmarks/alignment.py runs/humantomato-learning [--stages gpt_unaligned gpt]
 
 L_align (HumanTOMATO section 3.6) decodes tokens that are predicted after the *true* ones. What it can still
 correct is its distance to the value that the true tokens have, decoded by the same tokenizer and read by the
@@ -94,7 +94,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path)
-    parser.add_argument("--stages", nargs="+", default=["gpt", "gpt_unaligned"])
+    parser.add_argument("--stages", nargs="+", default=["gpt_unaligned", "gpt_predictions", "gpt"])
     parser.add_argument("--batch", type=int, default=16, help="captions that are told apart")
     parser.add_argument("--count", type=int, default=40, help="batches")
     args = parser.parse_args()

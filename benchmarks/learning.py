@@ -5,8 +5,9 @@
 
 - Retrieval among 32 clips that all do something different (no two have the same truth), both ways.
 - What the captions of opposite motions look like to TMA and to the frozen sentence encoder.
-- Motions generated for held-out combinations of known words, measured on their joints: by the paper's GPT,
-  by one that reads the sentence embedding and by one without the alignment loss. Faces by each generator.
+- Motions generated for held-out combinations of known words, measured on their joints: by the GPT with the
+  alignment loss, by those without it, with it on predictions, and with the sentence embedding as the prior.
+  Faces by each generator.
 
 Writes `learning.json` and `learning.png` into the run's folder.
 """
@@ -53,9 +54,10 @@ PAIRS = (
 )
 SIZE = 32
 GPTS = {
-    "gpt": "TMA prior, alignment loss",
-    "gpt_sentence": "sentence prior, alignment loss",
-    "gpt_unaligned": "TMA prior alone",
+    "gpt": "L_align on samples",
+    "gpt_unaligned": "without L_align",
+    "gpt_predictions": "L_align on predictions",
+    "gpt_sentence": "sentence prior, without L_align",
 }
 
 Shares = dict[str, dict[str, float]]
