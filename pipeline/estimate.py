@@ -21,7 +21,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import MotionDiffusion
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.layers.transformer import SelfAttention
 from motionloom.models.quantize.ema import EmaQuantizer
@@ -157,14 +157,13 @@ def _fake_gpt(
     prior = tma.config.latent if config.prior == "tma" and tma is not None else width
     net = InterleavedGPT(config.net, book.streams, book.pattern, prior)
     align = config.loss.align_weight > 0 and tma is not None
-    if align and config.loss.align_on == "samples":
-        # The backward pass goes through the samples as through more rows; what judges them keeps nothing.
-        align, batch = False, batch * (1 + config.loss.samples)
     module = GptModule(
-        net, config.optim, seed=0, max_steps=1,
-        loss=config.loss if align else GptLossConfig(align_weight=0),
+        net, config.optim, seed=0, max_steps=1, loss=config.loss,
         tokenizer=book.freeze() if align else None, tma=tma if align else None,
     )  # fmt: skip
+    if align and config.loss.align_on == "samples":
+        # The backward pass goes through the samples as through more rows; what judges them keeps nothing.
+        module.tokenizer, batch = None, batch * (1 + config.loss.samples)
     groups = net.max_groups
     ends = len(net.names)
     length = groups * len(net.pattern) + ends

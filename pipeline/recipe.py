@@ -211,6 +211,7 @@ def _stages(file: RecipeFile, where: str) -> tuple[Stage, ...]:
         config = kind.config.parse(_numbers(fields), f"{where}: stages.{name}")
         out.append(Stage(name, kind, config, _resolve(name, kind, renamed, list(file.stages), where)))
     _check_encoders(out, where)
+    _check_starts(out, where)
     return _in_order(out, where)
 
 
@@ -225,6 +226,32 @@ def _check_encoders(stages: list[Stage], where: str) -> None:
                 f"{where}: stage '{stage.name}' reads captions as '{own}' encodes them, but its TMA "
                 f"'{stage.inputs['tma']}' was trained on those of '{other}'; name one text stage for both, "
                 f"or leave the TMA out (inputs: {{tma: null}})"
+            )
+
+
+_SIZES = ("layers", "dim", "heads", "ff", "block_size")
+
+
+def _check_starts(stages: list[Stage], where: str) -> None:
+    """A GPT can go on from another's weights where both are one network that reads and writes the same."""
+    named = {stage.name: stage for stage in stages}
+    for stage in stages:
+        start = named.get(stage.inputs.get("start", ""))
+        if start is None:
+            continue
+        ours: Any = stage.config
+        theirs: Any = start.config
+        if start.kind is not stage.kind:
+            wrong = [f"kind ({start.kind.name})"]
+        else:
+            wrong = [f"net.{size}" for size in _SIZES if getattr(ours.net, size) != getattr(theirs.net, size)]
+            wrong += ["prior"] if ours.prior != theirs.prior else []
+            roles = ("text", "tokenizer") + (("tma",) if ours.prior == "tma" else ())
+            wrong += [f"inputs.{role}" for role in roles if start.inputs.get(role) != stage.inputs.get(role)]
+        if wrong:
+            raise UserError(
+                f"{where}: stage '{stage.name}' starts from '{start.name}', which differs in "
+                f"{', '.join(wrong)}; give both the same"
             )
 
 

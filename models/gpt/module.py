@@ -96,54 +96,51 @@ class GptModule(StageModule):
         for kind, name in enumerate(net.names):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind, known)
         if self.tokenizer is not None and self.tma is not None:
-            # A motion predicted without its text cannot follow it: to the others it is a negative, no more.
-            told = logits if drop is None else torch.where(drop[:, None, None], logits.detach(), logits)
-            values["align"] = self._align(batch, told, self.tokenizer.module, self.tma.module)
+            values["align"] = self._align(batch, logits, drop, self.tokenizer.module, self.tma.module)
             values["loss"] = ce + self.loss_config.align_weight * values["align"]
         return values
 
-    def _align(self, batch: dict[str, Any], logits: Tensor, tokenizer: Tokenizer, tma: Tma) -> Tensor:
-        config = self.loss_config
-        text_latent = batch.get("tma_text", batch["text"])
-        if text_latent.shape[-1] != tma.config.latent:
+    def _align(
+        self, batch: dict[str, Any], logits: Tensor, drop: Tensor | None, tokenizer: Tokenizer, tma: Tma
+    ) -> Tensor:
+        config, similarity = self.loss_config, batch.get("similarity")
+        latent = batch.get("tma_text", batch["text"])
+        if latent.shape[-1] != tma.config.latent:
             raise UserError(
                 f"L_align compares TMA latents of width {tma.config.latent} and the text prior has "
-                f"{text_latent.shape[-1]}; give TMA's text means as 'tma_text' or set align_weight: 0"
+                f"{latent.shape[-1]}; give TMA's text means as 'tma_text' or set align_weight: 0"
             )
+        judge: dict[str, Any] = {
+            "tokenizer": tokenizer,
+            "tma": tma,
+            "temperature": config.temperature,
+            "threshold": config.threshold,
+            "held": batch.get("held"),
+        }
         if config.align_on == "samples":
-            return self._align_samples(batch, text_latent, tokenizer, tma)
+            return self._align_samples(batch, latent, similarity, judge)
+        if drop is not None:
+            # A motion predicted without its text cannot follow it: to the others it is a negative, no more.
+            logits = torch.where(drop[:, None, None], logits.detach(), logits)
         return align_loss(
             self.net,
             logits,
             batch["tokens"],
             batch["kinds"],
-            text_latent,
-            batch.get("similarity"),
-            tokenizer=tokenizer,
-            tma=tma,
+            latent,
+            similarity,
             gumbel_temperature=config.gumbel_temperature,
-            temperature=config.temperature,
-            threshold=config.threshold,
             sample=self.training,
-            held=batch.get("held"),
+            **judge,
         )
 
     def _align_samples(
-        self, batch: dict[str, Any], text_latent: Tensor, tokenizer: Tokenizer, tma: Tma
+        self, batch: dict[str, Any], latent: Tensor, similarity: Tensor | None, judge: dict[str, Any]
     ) -> Tensor:
-        config, known = self.loss_config, batch.get("known")
-        count = config.samples if self.training else 1
+        known = batch.get("known")
+        count = self.loss_config.samples if self.training else 1
         drawn = sample(self.net, batch["text"], count)
-        reward = rewards(
-            drawn.codes,
-            text_latent,
-            batch.get("similarity"),
-            tokenizer=tokenizer,
-            tma=tma,
-            temperature=config.temperature,
-            threshold=config.threshold,
-            held=batch.get("held"),
-        )
+        reward = rewards(drawn.codes, latent, similarity, **judge)
         if not self.training:
             return -reward.mean()
         lacking = None

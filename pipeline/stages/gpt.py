@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -13,7 +12,6 @@ from torch.utils.data import Dataset
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.gpt_data import GptClips, gpt_clips
 from motionloom.pipeline.hardware import Hardware
 from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
@@ -52,18 +50,6 @@ class GptStageConfig(TrainedStageConfig):
             )
 
 
-def _take_weights(net: InterleavedGPT, prior: Prior, start: Path, tokenizer: Tokenizer) -> None:
-    """Begin with the weights of a trained GPT stage in the folder `start`."""
-    trained, trained_prior = load_gpt(start, tokenizer)
-    ours, theirs = ({k: v.shape for k, v in n.state_dict().items()} for n in (net, trained))
-    if ours != theirs or prior != trained_prior:
-        raise UserError(
-            f"stage '{start.name}' (role 'start') has other sizes or another prior than this one; give both "
-            f"the same `net` and `prior`"
-        )
-    net.load_state_dict(trained.state_dict())
-
-
 def run_gpt(context: StageContext) -> None:
     """Train on exported tokens."""
     config: GptStageConfig = context.config
@@ -80,7 +66,7 @@ def run_gpt(context: StageContext) -> None:
     net = InterleavedGPT(config.net, tokenizer.streams, tokenizer.pattern, text_dim)
     start = context.optional("start")
     if start is not None:
-        _take_weights(net, config.prior, start, tokenizer)
+        net.load_state_dict(load_gpt(start, tokenizer)[0].state_dict())
     module = GptModule(
         net,
         config.optim,

@@ -56,17 +56,21 @@ def test_a_stage_starts_from_anothers_weights(run: Callable[..., tuple[Any, Path
     assert 0 < rows[0]["val/align"] < 20
 
 
-def test_other_sizes_are_refused(run: Callable[..., tuple[Any, Path]]) -> None:
-    outcome, folder = run(net={"layers": 2, "dim": 48, "heads": 4, "ff": 96})
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"net": {**MORE["net"], "heads": 2}}, "net.heads, net.block_size"),
+        ({"prior": "sentence"}, "prior"),
+        ({"inputs": {"start": "face_gpt"}}, "net.dim, net.ff, prior, inputs.tokenizer"),
+        ({"inputs": {"start": "tma"}}, "kind (tma)"),
+    ],
+)
+def test_another_network_is_refused_before_anything_runs(
+    run: Callable[..., tuple[Any, Path]], changes: dict[str, Any], named: str
+) -> None:
+    outcome, _ = run("--dry-run", **changes)
     assert outcome.code == 2
-    assert "'gpt' (role 'start') has other sizes" in " ".join(outcome.err.split())
-    assert not (folder / "artifact.json").exists()
-
-
-def test_other_prior_is_refused(run: Callable[..., tuple[Any, Path]]) -> None:
-    outcome, _ = run(prior="sentence")
-    assert outcome.code == 2
-    assert "other sizes or another prior" in " ".join(outcome.err.split())
+    assert f"which differs in {named};" in " ".join(outcome.err.split())
 
 
 @pytest.mark.parametrize("train", [{"compile": True}, {"strategy": "fsdp"}])
