@@ -59,9 +59,9 @@ def test_a_stage_starts_from_anothers_weights(run: Callable[..., tuple[Any, Path
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"net": {**MORE["net"], "heads": 2}}, "net.heads, net.block_size"),
+        ({"net": {**MORE["net"], "heads": 2}}, "net.heads"),
         ({"prior": "sentence"}, "prior"),
-        ({"inputs": {"start": "face_gpt"}}, "net.dim, net.ff, prior, inputs.tokenizer"),
+        ({"inputs": {"start": "face_gpt"}}, "net.dim, net.ff, prior, inputs.tokenizer, inputs.tma"),
         ({"inputs": {"start": "tma"}}, "kind (tma)"),
     ],
 )
