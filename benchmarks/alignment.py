@@ -27,10 +27,10 @@ from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.tokens import deinterleave
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.pipeline.gpt_data import gpt_clips
-from motionloom.pipeline.networks import LoadedTma, load_gpt, load_tokenizer
-from motionloom.pipeline.sources import open_split, open_text
-from motionloom.pipeline.token_store import TokenBatches, TokenStore
+from motionloom.pipeline.stages.gpt_data import gpt_clips
+from motionloom.pipeline.store.data import open_split, open_text
+from motionloom.pipeline.store.networks import LoadedTma, load_gpt, load_tokenizer
+from motionloom.pipeline.store.tokens import TokenBatches, TokenStore
 
 THRESHOLDS = (0.85, None)
 ROWS = ("truth", "predicted after the truth", "own samples")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.canonical import heading
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.pipeline.bundle import Bundle
+from motionloom.pipeline.inference.bundle import Bundle
 
 Joints = NDArray[np.float64]
 SKELETON = Skeleton.named("smpl22")

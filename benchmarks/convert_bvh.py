@@ -25,9 +25,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from motionloom.datasets.convert.archives import list_batches
-from motionloom.datasets.convert.bvh import BvhConfig, prepare_bvh
-from motionloom.datasets.convert.conversion import SCAN_FILE, run_conversion
+from motionloom.datasets.convert.bvh.convert import BvhConfig, prepare_bvh
+from motionloom.datasets.convert.common.archives import list_batches
+from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.schema import Manifest
 

@@ -28,20 +28,20 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.features import decode
-from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.datasets.synth.face import read
 from motionloom.datasets.synth.measure import agrees
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.models.gpt.sampling import sample_seeds
 from motionloom.models.metrics.retrieval import recall
-from motionloom.pipeline.bundle import Bundle, part_folders, text_encoder_of
-from motionloom.pipeline.evaluation import embed_motions
-from motionloom.pipeline.faces import FaceRequest, expression, load_faces
-from motionloom.pipeline.networks import LoadedTma
-from motionloom.pipeline.samples import Truth, joint_layout, reconstruct_truth, truth_of
-from motionloom.pipeline.sampling import SamplingConfig
-from motionloom.pipeline.sources import open_split, open_text
+from motionloom.pipeline.evaluation.figures import embed_motions
+from motionloom.pipeline.evaluation.truth import Truth, joint_layout, reconstruct_truth, truth_of
+from motionloom.pipeline.inference.bundle import Bundle, part_folders, text_encoder_of
+from motionloom.pipeline.inference.faces import FaceRequest, expression, load_faces
+from motionloom.pipeline.inference.sampling import SamplingConfig
+from motionloom.pipeline.store.data import open_split, open_text
+from motionloom.pipeline.store.networks import LoadedTma
 
 matplotlib.use("Agg")
 

@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from motionloom.datasets.loading.batches import WindowBatches
+from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Split
-from motionloom.datasets.shards.batches import WindowBatches
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.shards.statistics import FeatureStats, compute
 from motionloom.datasets.shards.writer import write_dataset
 
 LAYOUT = MotionLayout.named("h3d263")

@@ -22,8 +22,8 @@ from learning import retrieval, similarities, test_truths
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.pipeline.run import run_recipe
-from motionloom.pipeline.samples import Truth
+from motionloom.pipeline.evaluation.truth import Truth
+from motionloom.pipeline.runs.api import run_recipe
 
 THRESHOLDS = {"tma_85": 0.85, "tma_95": 0.95, "tma_none": None}
 """Stage -> cosine above which two captions are not negatives; None keeps all negatives."""

@@ -22,9 +22,9 @@ from rich.table import Table
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.layers.basis import Basis
-from motionloom.pipeline.evaluation import local_joints, pose_errors
-from motionloom.pipeline.samples import joint_layout, truth_of
-from motionloom.pipeline.sources import open_split, open_stats
+from motionloom.pipeline.evaluation.figures import local_joints, pose_errors
+from motionloom.pipeline.evaluation.truth import joint_layout, truth_of
+from motionloom.pipeline.store.data import open_split, open_stats
 
 GAINS = {"the paper's features": (1.0, 0.0), "fingers in the palm's frame": (5.0, 4.0)}
 

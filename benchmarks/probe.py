@@ -22,11 +22,11 @@ from rich.console import Console
 from rich.table import Table
 from sklearn.linear_model import LogisticRegression
 
-from motionloom.datasets.shards.statistics import FeatureStats
-from motionloom.pipeline.evaluation import embed_motions
-from motionloom.pipeline.networks import LoadedTma
-from motionloom.pipeline.samples import Truth, truth_of
-from motionloom.pipeline.sources import open_split, open_text
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.pipeline.evaluation.figures import embed_motions
+from motionloom.pipeline.evaluation.truth import Truth, truth_of
+from motionloom.pipeline.store.data import open_split, open_text
+from motionloom.pipeline.store.networks import LoadedTma
 
 ATTRIBUTES = ("action", "direction", "side", "count", "speed", "left_hand", "right_hand")
 

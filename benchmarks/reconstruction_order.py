@@ -23,11 +23,11 @@ from rich.table import Table
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.evaluation import reconstruction_figures
-from motionloom.pipeline.networks import load_tokenizer
-from motionloom.pipeline.run import run_recipe
-from motionloom.pipeline.samples import truth_of
-from motionloom.pipeline.sources import open_split, open_stats
+from motionloom.pipeline.evaluation.figures import reconstruction_figures
+from motionloom.pipeline.evaluation.truth import truth_of
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.store.data import open_split, open_stats
+from motionloom.pipeline.store.networks import load_tokenizer
 
 matplotlib.use("Agg")
 

@@ -18,7 +18,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from motionloom.datasets.synth.generate import SynthConfig, make_clip
-from motionloom.pipeline.bundle import Bundle
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.render.picture import contact_sheet
 
 CAPTIONS = (

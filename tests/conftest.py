@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,10 @@ os.environ["NUMBA_CACHE_DIR"] = str(
     / "numba"
     / os.environ.get("PYTEST_XDIST_WORKER", "one")
 )
+
+
+# The tests import the helper modules by their bare names, and so do spawned workers, which inherit the path.
+sys.path.append(str(Path(__file__).parent / "helpers"))
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("configs", "datasets", "models", "pipeline")
-BOTTOM = ("motionloom.datasets.motion", "motionloom.datasets.schema")
+BOTTOM = ("motionloom.datasets.motion", "motionloom.datasets.schema", "motionloom.datasets.conditions")
 BOTTOM_LIBRARIES = {"numpy", "torch", "roma", "scipy", "pydantic", "motionloom"}
 
 

@@ -15,8 +15,8 @@ import typer
 import yaml
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.pipeline.cli import app
-from motionloom.pipeline.recipe import load_recipe, shipped_recipes
+from motionloom.pipeline.cli.main import app
+from motionloom.pipeline.runs.recipe import load_recipe, shipped_recipes
 from motionloom.pipeline.stages.table import STAGES
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import DIM, VERSION, AudioSettings, audio_features
 from motionloom.datasets.audio.sound import read_sound
-from motionloom.datasets.shards.files import sha256_of, write_with
+from motionloom.datasets.base.files import sha256_of, write_with
 
 
 class AudioCache:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from motionloom.datasets.convert.conversion import SCAN_FILE, Conversion, ConvertConfig
+from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion, ConvertConfig
 from motionloom.datasets.schema import UserError
 
 
@@ -49,35 +49,35 @@ _HERE = "motionloom.datasets.convert"
 
 CONVERTERS: dict[str, Converter] = {
     "humanml3d": Converter(
-        f"{_HERE}.humanml3d",
+        f"{_HERE}.humanml3d.convert",
         "HumanMl3dConfig",
         "prepare_humanml3d",
         "HumanML3D: new_joints or new_joint_vecs, texts and split files to shards.",
         "HumanML3D shards",
     ),
     "motionx": Converter(
-        f"{_HERE}.motionx",
+        f"{_HERE}.motionx.convert",
         "MotionXConfig",
         "prepare_motionx",
         "Motion-X: SMPL-X parameters (322-d), body, hand and face texts to shards.",
         "Motion-X shards",
     ),
     "aistpp": Converter(
-        f"{_HERE}.aistpp",
+        f"{_HERE}.aistpp.convert",
         "AistppConfig",
         "prepare_aistpp",
         "AIST++: SMPL dances with their music to shards.",
         "aist_plusplus_final shards",
     ),
     "amass": Converter(
-        f"{_HERE}.amass",
+        f"{_HERE}.amass.convert",
         "AmassConfig",
         "prepare_amass",
         "AMASS: SMPL-H and SMPL-X .npz files to shards.",
         "AMASS shards",
     ),
     "bvh": Converter(
-        f"{_HERE}.bvh",
+        f"{_HERE}.bvh.convert",
         "BvhConfig",
         "prepare_bvh",
         "BVH files of any skeleton, loose or in tar archives, to shards.",

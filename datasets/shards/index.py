@@ -28,8 +28,8 @@ from typing import BinaryIO, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import write_with
 from motionloom.datasets.schema import HELD_ALL, Config, Dropped, ShardInfo, Split, UserError
-from motionloom.datasets.shards.files import write_with
 from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.tar import TarClip, read_npy_header, scan_tar
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.randomness import permutation, words
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.randomness import permutation, words
 
 # Last elements of keys. `BatchPlan` draws its pools by (seed, epoch, n >= 1), so a zero in the third place
 # keeps these apart from them; no key may end in zero (numpy pads keys with zeros).

@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SCHEMA_VERSION, Caption, ClipMeta, Manifest, Split, UserError
 from motionloom.datasets.shards.access import Access, MappedShards, RangedShards
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.files import sha256_of
 from motionloom.datasets.shards.index import INDEX_FILE, MANIFEST_FILE, SPLITS, read_index
 from motionloom.datasets.shards.order import Source
 from motionloom.datasets.shards.reading import Reading

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
+from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of, write_json
+from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Dropped, ShardInfo, Split, UserError
-from motionloom.datasets.shards.files import HashingFile, atomic_file, sha256_of, write_json
 from motionloom.datasets.shards.index import SPLITS, ShardIndex, clip_entries, index_path, shard_stem
-from motionloom.datasets.shards.randomness import permutation
 from motionloom.datasets.shards.sample import DropClip, MotionType, Sample, encode_sample
 
 T = TypeVar("T")

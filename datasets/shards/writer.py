@@ -23,9 +23,11 @@ from typing import Any, Generic, TypeVar
 
 from rich.progress import Progress
 
+from motionloom.datasets.base.files import remove_temporaries, sync_folder, write_json
+from motionloom.datasets.base.lock import folder_lock
+from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SCHEMA_VERSION, Dropped, Manifest, ShardInfo, Split, UserError
-from motionloom.datasets.shards.files import remove_temporaries, sync_folder, write_json
 from motionloom.datasets.shards.index import (
     MANIFEST_FILE,
     SPLITS,
@@ -34,8 +36,6 @@ from motionloom.datasets.shards.index import (
     index_path,
     save_index,
 )
-from motionloom.datasets.shards.lock import folder_lock
-from motionloom.datasets.shards.pool import Workers
 from motionloom.datasets.shards.sample import MotionType
 from motionloom.datasets.shards.tasks import (
     Convert,

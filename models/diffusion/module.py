@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from motionloom.models.diffusion.network import MotionDiffusion
-from motionloom.models.distributed import masked_mean
 from motionloom.models.layers.transformer import length_mask
-from motionloom.models.stage_module import OptimConfig, StageModule
+from motionloom.models.training.distributed import masked_mean
+from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 
 class DiffusionModule(StageModule):

@@ -12,12 +12,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from motionloom.models.distributed import masked_mean
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import PAD
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.training.distributed import masked_mean
 
 
 def predicted(tokens: Tensor, logits: Tensor, known: Tensor | None = None) -> Tensor:

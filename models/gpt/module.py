@@ -15,9 +15,9 @@ from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, align_loss, corrupt, cross_entropy
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.samples import log_likelihood, policy_loss, rewards, sample
-from motionloom.models.stage_module import OptimConfig, StageModule
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 
 class GptLossConfig(Config):

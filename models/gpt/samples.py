@@ -17,7 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from motionloom.models.distributed import gather_rows, masked_mean, rank
 from motionloom.models.gpt.losses import predicted
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate
@@ -25,6 +24,7 @@ from motionloom.models.gpt.tokens import PAD, Codes, TokenSequence, interleave
 from motionloom.models.tma.losses import false_negatives
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.training.distributed import gather_rows, masked_mean, rank
 
 
 class Samples(NamedTuple):

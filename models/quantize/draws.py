@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from motionloom.models.distributed import gather_rows, rank
+from motionloom.models.training.distributed import gather_rows, rank
 
 _LAST = 2**62
 """Key of a row that must not be drawn; greater than every real key (at most 56 bits)."""

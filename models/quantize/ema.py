@@ -25,9 +25,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import Config
-from motionloom.models.distributed import is_distributed, sum_over_ranks, world_size
 from motionloom.models.quantize.base import QuantizerOutput, usage_metrics
 from motionloom.models.quantize.draws import draw_rows
+from motionloom.models.training.distributed import is_distributed, sum_over_ranks, world_size
 
 
 class QuantizerConfig(Config):

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.distributed import sum_over_ranks
 from motionloom.models.quantize.base import QuantizerOutput, usage_metrics
+from motionloom.models.training.distributed import sum_over_ranks
 
 _MARGIN = 1e-3
 """Keeps the outermost value of each scalar reachable: tanh itself never gets to 1."""

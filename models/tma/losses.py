@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from motionloom.models.distributed import gather_rows, gather_rows_with_grad, masked_mean
+from motionloom.models.training.distributed import gather_rows, gather_rows_with_grad, masked_mean
 
 
 def reconstruction_loss(pred: Tensor, target: Tensor, mask: Tensor, held: Tensor | None = None) -> Tensor:

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from motionloom.datasets.schema import Config
 from motionloom.models.layers.transformer import length_mask
-from motionloom.models.stage_module import OptimConfig, StageModule
 from motionloom.models.tma.losses import info_nce, kl_four, latent_loss, reconstruction_loss
 from motionloom.models.tma.network import Tma
+from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 
 class TmaLossConfig(Config):

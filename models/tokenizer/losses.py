@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from motionloom.models.distributed import masked_mean
 from motionloom.models.tokenizer.config import Recon
+from motionloom.models.training.distributed import masked_mean
 
 
 def reconstruction_loss(

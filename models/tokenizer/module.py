@@ -6,10 +6,10 @@ from typing import Any
 
 from torch import Tensor
 
-from motionloom.models.stage_module import OptimConfig, StageModule
 from motionloom.models.tokenizer.base import Tokenizer, TokenizerOutput
 from motionloom.models.tokenizer.config import Recon
 from motionloom.models.tokenizer.losses import tokenizer_loss
+from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 
 class TokenizerModule(StageModule):

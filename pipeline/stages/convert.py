@@ -5,18 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from motionloom.datasets.convert.aistpp import AistppConfig
-from motionloom.datasets.convert.amass import AmassConfig
-from motionloom.datasets.convert.bvh import BvhConfig
-from motionloom.datasets.convert.conversion import ConvertConfig, run_conversion
-from motionloom.datasets.convert.humanml3d import HumanMl3dConfig
-from motionloom.datasets.convert.motionx import MotionXConfig
+from motionloom.datasets.convert.aistpp.convert import AistppConfig
+from motionloom.datasets.convert.amass.convert import AmassConfig
+from motionloom.datasets.convert.bvh.convert import BvhConfig
+from motionloom.datasets.convert.common.conversion import ConvertConfig, run_conversion
+from motionloom.datasets.convert.humanml3d.convert import HumanMl3dConfig
+from motionloom.datasets.convert.motionx.convert import MotionXConfig
 from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.files import sha256_file
-from motionloom.pipeline.sources import SHARDS
-from motionloom.pipeline.stage import StageConfig, StageContext
 from motionloom.pipeline.stages.data import say_shards
+from motionloom.pipeline.stages.stage import StageConfig, StageContext
+from motionloom.pipeline.store.data import SHARDS
+from motionloom.pipeline.store.files import sha256_file
 
 
 class HumanMl3dStageConfig(HumanMl3dConfig, StageConfig):

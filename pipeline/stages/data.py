@@ -7,16 +7,16 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from motionloom.datasets.check.dataset import check
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, UserError
-from motionloom.datasets.shards.check import check
 from motionloom.datasets.shards.reader import manifest_layout, read_manifest, require_layout
 from motionloom.datasets.shards.reading import CacheConfig, Reading
 from motionloom.datasets.shards.store import is_url, open_store
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.files import write_json
-from motionloom.pipeline.sources import READER, REFERENCE, SHARDS, DataPart, Reader, Reference
-from motionloom.pipeline.stage import RUNTIME, StageConfig, StageContext
+from motionloom.pipeline.stages.stage import RUNTIME, StageConfig, StageContext
+from motionloom.pipeline.store.data import READER, REFERENCE, SHARDS, DataPart, Reader, Reference
+from motionloom.pipeline.store.files import write_json
 
 
 class SynthStageConfig(SynthConfig, StageConfig):

@@ -8,14 +8,14 @@ import torch
 from pydantic import Field, field_validator
 from torch.utils.data import Dataset
 
-from motionloom.datasets.shards.batches import CaptionBatches, EvalBatches
+from motionloom.datasets.loading.batches import CaptionBatches, EvalBatches
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
-from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
-from motionloom.pipeline.sources import held_out, open_split, open_stats, open_text
-from motionloom.pipeline.stage import StageContext
+from motionloom.pipeline.stages.stage import StageContext
 from motionloom.pipeline.stages.tma import part_columns
-from motionloom.pipeline.training import TrainConfig, TrainedStageConfig, fit
+from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig, fit
+from motionloom.pipeline.store.data import held_out, open_split, open_stats, open_text
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, save_model
 
 
 class DiffusionStageConfig(TrainedStageConfig):

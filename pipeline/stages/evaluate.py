@@ -11,8 +11,7 @@ from pydantic import Field
 from rich.table import Table
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.bundle import Bundle, text_encoder_of
-from motionloom.pipeline.evaluation import (
+from motionloom.pipeline.evaluation.figures import (
     Interval,
     chance,
     embed_motions,
@@ -20,12 +19,13 @@ from motionloom.pipeline.evaluation import (
     retrieval_figures,
     truth_agreement,
 )
-from motionloom.pipeline.files import write_json
-from motionloom.pipeline.progress import bar
-from motionloom.pipeline.samples import Truth, captioned, spread, truth_of
-from motionloom.pipeline.sampling import SamplingConfig
-from motionloom.pipeline.sources import held_out, open_split, open_text
-from motionloom.pipeline.stage import StageConfig, StageContext
+from motionloom.pipeline.evaluation.truth import Truth, captioned, spread, truth_of
+from motionloom.pipeline.inference.bundle import Bundle, text_encoder_of
+from motionloom.pipeline.inference.sampling import SamplingConfig
+from motionloom.pipeline.stages.progress import bar
+from motionloom.pipeline.stages.stage import StageConfig, StageContext
+from motionloom.pipeline.store.data import held_out, open_split, open_text
+from motionloom.pipeline.store.files import write_json
 
 
 class EvaluateConfig(StageConfig):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from motionloom.pipeline.bundle import Bundle, text_encoder_of
-from motionloom.pipeline.outputs import FORMATS, Format, write_motions
-from motionloom.pipeline.samples import spread, truth_of
-from motionloom.pipeline.sampling import SamplingConfig
-from motionloom.pipeline.sources import held_out, open_split
-from motionloom.pipeline.stage import StageConfig, StageContext
+from motionloom.pipeline.evaluation.truth import spread, truth_of
+from motionloom.pipeline.inference.bundle import Bundle, text_encoder_of
+from motionloom.pipeline.inference.outputs import FORMATS, Format, write_motions
+from motionloom.pipeline.inference.sampling import SamplingConfig
+from motionloom.pipeline.stages.stage import StageConfig, StageContext
+from motionloom.pipeline.store.data import held_out, open_split
 
 
 class GenerateConfig(StageConfig):

@@ -12,14 +12,14 @@ from torch.utils.data import Dataset
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.pipeline.gpt_data import GptClips, gpt_clips
-from motionloom.pipeline.hardware import Hardware
-from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
-from motionloom.pipeline.networks import LoadedTma, load_gpt, load_tokenizer
-from motionloom.pipeline.sources import held_out, open_split, open_text
-from motionloom.pipeline.stage import StageContext
-from motionloom.pipeline.token_store import TokenBatches, TokenStore
-from motionloom.pipeline.training import TrainConfig, TrainedStageConfig, fit
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
+from motionloom.pipeline.stages.stage import StageContext
+from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig, fit
+from motionloom.pipeline.store.data import held_out, open_split, open_text
+from motionloom.pipeline.store.networks import LoadedTma, load_gpt, load_tokenizer
+from motionloom.pipeline.store.tokens import TokenBatches, TokenStore
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, save_model
 
 Prior = Literal["tma", "sentence"]
 

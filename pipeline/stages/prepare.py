@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.shards.clips import in_order
-from motionloom.datasets.shards.statistics import compute
 from motionloom.datasets.text.build import build_text_cache
-from motionloom.pipeline.encoder_files import keep_place
-from motionloom.pipeline.sources import captions_of, open_split, splits_of
-from motionloom.pipeline.stage import StageConfig, StageContext
+from motionloom.pipeline.stages.stage import StageConfig, StageContext
+from motionloom.pipeline.store.data import captions_of, open_split, splits_of
+from motionloom.pipeline.store.encoder_files import keep_place
 
 
 class StatsConfig(StageConfig):

@@ -9,20 +9,27 @@ import numpy as np
 from pydantic import Field
 
 from motionloom.datasets.motion.features import decode
-from motionloom.pipeline.artifact import Artifact
-from motionloom.pipeline.bundle import Bundle, GeneratedMotion, text_encoder_of
-from motionloom.pipeline.faces import GptFace
+from motionloom.pipeline.evaluation.truth import (
+    Truth,
+    joint_layout,
+    reconstruct,
+    reconstruct_truth,
+    spread,
+    truth_of,
+)
+from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion, text_encoder_of
+from motionloom.pipeline.inference.faces import GptFace
+from motionloom.pipeline.inference.sampling import SamplingConfig
 from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
-from motionloom.pipeline.samples import Truth, joint_layout, reconstruct, reconstruct_truth, spread, truth_of
-from motionloom.pipeline.sampling import SamplingConfig
-from motionloom.pipeline.sources import held_out, open_split
-from motionloom.pipeline.stage import StageConfig, StageContext
 from motionloom.pipeline.stages.evaluate import figure_rows
-from motionloom.pipeline.token_store import TokenStore
-from motionloom.pipeline.training import read_metrics
+from motionloom.pipeline.stages.stage import StageConfig, StageContext
+from motionloom.pipeline.stages.training import read_metrics
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.data import held_out, open_split
+from motionloom.pipeline.store.tokens import TokenStore
 
 
 class ReportConfig(StageConfig):

@@ -5,7 +5,6 @@ A new stage is a network file, a LightningModule file, a line here and a recipe 
 
 from __future__ import annotations
 
-from motionloom.pipeline.stage import StageConfig, StageKind
 from motionloom.pipeline.stages import (
     convert,
     data,
@@ -19,6 +18,7 @@ from motionloom.pipeline.stages import (
     tokenizer,
     tokens,
 )
+from motionloom.pipeline.stages.stage import StageConfig, StageKind
 
 _ALL_MODELS = (
     "data",

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from torch.utils.data import Dataset
 
+from motionloom.datasets.loading.batches import CaptionBatches, EvalBatches
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.batches import CaptionBatches, EvalBatches
 from motionloom.models.tma.module import TmaLossConfig, TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
-from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
-from motionloom.pipeline.sources import held_out, open_split, open_stats, open_text
-from motionloom.pipeline.stage import StageContext
-from motionloom.pipeline.training import TrainConfig, TrainedStageConfig, fit
+from motionloom.pipeline.stages.stage import StageContext
+from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig, fit
+from motionloom.pipeline.store.data import held_out, open_split, open_stats, open_text
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, save_model
 
 
 class TmaStageConfig(TrainedStageConfig):

@@ -8,8 +8,8 @@ import torch
 from pydantic import Field
 from torch.utils.data import Dataset
 
+from motionloom.datasets.loading.batches import EvalBatches, WindowBatches
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.batches import EvalBatches, WindowBatches
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import (
@@ -22,11 +22,11 @@ from motionloom.models.tokenizer.config import (
     VqConfig,
 )
 from motionloom.models.tokenizer.module import TokenizerModule
-from motionloom.pipeline.hardware import Hardware
-from motionloom.pipeline.model_store import LayoutFacts, ModelFacts, save_model
-from motionloom.pipeline.sources import held_out, open_split, open_stats
-from motionloom.pipeline.stage import StageContext
-from motionloom.pipeline.training import TrainConfig, TrainedStageConfig, fit
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.stage import StageContext
+from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig, fit
+from motionloom.pipeline.store.data import held_out, open_split, open_stats
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, save_model
 
 
 class _TokenizerStageConfig(TrainedStageConfig):

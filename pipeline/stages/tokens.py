@@ -10,14 +10,14 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.statistics import FeatureStats
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.pipeline.networks import device_of, load_tokenizer
-from motionloom.pipeline.progress import bar
-from motionloom.pipeline.sources import open_split, open_stats, splits_of
-from motionloom.pipeline.stage import StageConfig, StageContext
-from motionloom.pipeline.token_store import TokenStore
+from motionloom.pipeline.stages.progress import bar
+from motionloom.pipeline.stages.stage import StageConfig, StageContext
+from motionloom.pipeline.store.data import open_split, open_stats, splits_of
+from motionloom.pipeline.store.networks import device_of, load_tokenizer
+from motionloom.pipeline.store.tokens import TokenStore
 
 
 class TokensConfig(StageConfig):

@@ -1,16 +1,12 @@
-"""Shared by the tests of `datasets`: the helper modules beside this file, and data that several need."""
+"""Shared by the tests of `datasets`: the helper modules, and data that several need."""
 
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
-
-# The tests import the helper modules by their bare names, and so do spawned workers, which inherit the path.
-sys.path.append(str(Path(__file__).parent))
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import shutil
 import subprocess
@@ -11,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.pipeline import cli
+from motionloom.pipeline.cli import main as cli
 
 Joints = NDArray[np.float64]
 
@@ -211,14 +209,6 @@ def until() -> Callable[..., None]:
             page.wait_for_timeout(20)
 
     return go
-
-
-@pytest.fixture(scope="module")
-def borrow() -> Iterator[Callable[[str], ModuleType]]:
-    """`borrow("loopback")`: a helper module of the tests of `datasets`."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[1] / "datasets"))
-        yield importlib.import_module
 
 
 @dataclass(frozen=True)

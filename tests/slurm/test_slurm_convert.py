@@ -20,8 +20,8 @@ from rich.console import Console
 from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.convert_job import ConvertJob, run_part
-from motionloom.pipeline.slurm_convert import LOG_FOLDER, ClusterConfig, submit_conversion, wait_for
+from motionloom.pipeline.launch.convert_job import ConvertJob, run_part
+from motionloom.pipeline.launch.slurm_convert import LOG_FOLDER, ClusterConfig, submit_conversion, wait_for
 
 pytest.importorskip("submitit")
 

@@ -10,9 +10,15 @@ import pytest
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline import slurm_convert
-from motionloom.pipeline.convert_job import JobResult, main, result_path
-from motionloom.pipeline.slurm_convert import ClusterConfig, Link, Submission, submit_conversion, wait_for
+from motionloom.pipeline.launch import slurm_convert
+from motionloom.pipeline.launch.convert_job import JobResult, main, result_path
+from motionloom.pipeline.launch.slurm_convert import (
+    ClusterConfig,
+    Link,
+    Submission,
+    submit_conversion,
+    wait_for,
+)
 
 
 def test_words_become_options() -> None:

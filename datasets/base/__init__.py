@@ -1,0 +1,1 @@
+"""Files, locks, process pools and seeded draws that every room uses."""

@@ -1,0 +1,140 @@
+"""One sample as a stranger reads it: every member is parsed, nothing is believed.
+
+The first thing that makes the clip unusable raises; what is merely odd is returned.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Caption, ClipMeta, ShardInfo, UserError
+from motionloom.datasets.shards.sample import captions_from_json, require_finite
+from motionloom.datasets.shards.tar import TarClip, read_npy_header
+
+END_TOLERANCE = 0.5
+"""Seconds a caption may reach past its clip: sources round their times."""
+
+
+@dataclass(frozen=True)
+class CheckedClip:
+    """A clip that can be read. `oddities` are (kind, message)."""
+
+    meta: ClipMeta
+    motion: NDArray[np.floating]
+    captions: int
+    audio_width: int | None
+    oddities: list[tuple[str, str]] = field(default_factory=list)
+
+
+def read_member(file: BinaryIO, clip: TarClip, name: str) -> bytes:
+    """Content of one member of an open shard."""
+    start, size = clip.members[name]
+    file.seek(start)
+    return file.read(size)
+
+
+def read_meta(file: BinaryIO, path: Path, clip: TarClip) -> ClipMeta:
+    """`meta.json` of a clip of an open shard; `UserError` when it is not one."""
+    where = f"{path}: '{clip.key}.meta.json'"
+    try:
+        data = json.loads(read_member(file, clip, "meta.json"))
+    except ValueError as error:
+        raise UserError(f"{where}: not valid JSON ({error})") from None
+    return ClipMeta.parse(data, where)
+
+
+def read_motion(file: BinaryIO, path: Path, clip: TarClip) -> NDArray[np.floating]:
+    """`motion.npy` of a clip of an open shard, as stored."""
+    return _array(read_member(file, clip, "motion.npy"), f"{path}: '{clip.key}.motion.npy'")
+
+
+def check_clip(
+    file: BinaryIO, path: Path, clip: TarClip, shard: ShardInfo, layout: MotionLayout
+) -> CheckedClip:
+    """Read one clip of an open shard. Raises `UserError` or `ValueError` at the first thing wrong."""
+    meta = read_meta(file, path, clip)
+    stated = (meta.layout, meta.family, meta.fps, meta.skeleton, meta.split)
+    wanted = (layout.name, layout.family, layout.fps, layout.skeleton_name, shard.split)
+    if stated != wanted:
+        raise ValueError(f"meta.json says layout, family, fps, skeleton, split = {stated}, not {wanted}")
+    motion = read_motion(file, path, clip)
+    if motion.shape != (meta.frames, layout.dim) or not len(motion):
+        raise ValueError(f"motion.npy is {list(motion.shape)}, wanted {[meta.frames, layout.dim]}")
+    require_finite("motion.npy", motion)
+    limits = human_limits(layout)
+    absurd = beyond(motion, layout, limits, ABSURD)
+    if absurd:
+        raise ValueError(f"motion.npy: {absurd}: a wrong unit, scale or layout")
+    oddities: list[tuple[str, str]] = []
+    strange = beyond(motion, layout, limits)
+    if strange:
+        oddities.append(("beyond what a person can do", f"motion.npy: {strange}"))
+    captions = 0
+    for name in ("texts.json", "face_texts.json"):
+        if name in clip.members:
+            found = captions_from_json(read_member(file, clip, name), f"{path}: '{clip.key}.{name}'")
+            captions += len(found) if name == "texts.json" else 0
+            oddities += _check_captions(name, found, meta.frames / layout.fps)
+    if captions == 0:
+        oddities.append(("no captions", "no captions"))
+    if not meta.licence.strip():
+        oddities.append(("no licence", "meta.json states no licence"))
+    return CheckedClip(meta, motion, captions, _check_audio(file, path, clip), oddities)
+
+
+def _check_captions(name: str, captions: list[Caption], seconds: float) -> Iterator[tuple[str, str]]:
+    """Raises for captions nobody can train on; yields those that reach past the clip."""
+    for number, caption in enumerate(captions, start=1):
+        where = f"{name}: caption {number}"
+        if not caption.text.strip():
+            raise ValueError(f"{where} is empty")
+        if caption.start >= seconds:
+            raise ValueError(f"{where} starts at {caption.start:g} s, the clip ends at {seconds:.2f} s")
+        end = seconds if caption.end is None else caption.end
+        if not (np.isfinite(caption.start) and np.isfinite(end)) or caption.start < 0:
+            raise ValueError(f"{where} has the times {caption.start} to {end}")
+        if end <= caption.start:
+            raise ValueError(f"{where} ends at {end:g} s, not after its start at {caption.start:g} s")
+        if end > seconds + END_TOLERANCE:
+            yield "captions past the clip", f"{where} ends at {end:g} s, the clip at {seconds:.2f} s"
+
+
+def _check_audio(file: BinaryIO, path: Path, clip: TarClip) -> int | None:
+    """Width of the audio features, if any; raises when features or sound cannot be used."""
+    if "audio.flac" in clip.members:
+        _check_sound(read_member(file, clip, "audio.flac"))
+    if "audio.npy" not in clip.members:
+        return None
+    audio = _array(read_member(file, clip, "audio.npy"), f"{path}: '{clip.key}.audio.npy'")
+    if audio.ndim != 2 or not len(audio):
+        raise ValueError(f"audio.npy is {list(audio.shape)}, not [T_audio >= 1, features]")
+    require_finite("audio.npy", audio)
+    return int(audio.shape[1])
+
+
+def _check_sound(raw: bytes) -> None:
+    import soundfile  # only data with sound pays for the import
+
+    try:
+        info = soundfile.info(io.BytesIO(raw))
+    except soundfile.LibsndfileError as error:
+        raise ValueError(f"audio.flac: not readable sound ({error})") from None
+    if info.frames < 1 or info.channels != 1:
+        raise ValueError(f"audio.flac: {info.frames} samples in {info.channels} channels, wanted mono sound")
+
+
+def _array(raw: bytes, where: str) -> NDArray[np.floating]:
+    header = read_npy_header(io.BytesIO(raw), where)
+    if header.data + int(np.prod(header.shape)) * header.dtype.itemsize != len(raw):
+        raise UserError(f"{where}: the array is cut short or too long")
+    return np.frombuffer(raw, header.dtype, offset=header.data).reshape(header.shape)

@@ -1,0 +1,196 @@
+"""`check`: read a whole dataset as a stranger would and list everything wrong with it.
+
+Errors: manifest or index absent or contradicting the tars, stray or missing shards, size and sha256, tar
+structure, members that do not parse, NaN, values no motion can have (`ranges.py`), empty captions, sound that
+cannot be read, and clips that leak from one split into another (`duplicates.py`).
+
+Warnings: values beyond what a person can do, clips without captions, captions that reach past their clip, the
+same motion twice in one split, a licence the manifest does not know, no training split.
+
+One shard's directory and one clip are in memory at a time, and 40 bytes for every clip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+
+from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.check.clip import CheckedClip, check_clip
+from motionloom.datasets.check.duplicates import ClipTable
+from motionloom.datasets.check.findings import Findings, Problem
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.shards.index import (
+    INDEX_FILE,
+    SPLITS,
+    ShardIndex,
+    SplitIndex,
+    clip_entries,
+    index_path,
+    load_index,
+)
+from motionloom.datasets.shards.reader import load_manifest, manifest_layout
+from motionloom.datasets.shards.tar import scan_tar
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """The outcome for a whole dataset. All findings are counted, at most a thousand of one kind listed."""
+
+    errors: list[Problem]
+    warnings: list[Problem]
+    error_kinds: dict[str, int]
+    warning_kinds: dict[str, int]
+    clips: int
+    """Sound clips."""
+    frames: int
+
+
+def check(root: Path, *, progress: bool = False) -> list[Problem]:
+    """Everything wrong with the dataset in `root`; an empty list when it is sound. Warnings are left out."""
+    return examine(root, progress=progress).errors
+
+
+def examine(root: Path, *, progress: bool = False) -> CheckReport:
+    """Errors and warnings of the dataset in `root`. Never raises for what it finds in the data."""
+    try:
+        manifest = load_manifest(root)
+        layout = manifest_layout(manifest)
+    except UserError as error:
+        problem = Problem(str(root), str(error).removeprefix(f"{root}: "))
+        return CheckReport([problem], [], {"manifest": 1}, {}, 0, 0)
+    findings, frames = Findings(), 0
+    _stray_files(root, manifest, findings)
+    table = ClipTable(root, manifest.shards, layout)
+    widths: dict[int, str] = {}
+    for number, shard in enumerate(track(manifest.shards, "checking shards", disable=not progress)):
+        indexed = _indexed_held(root / shard.name)
+        try:
+            for row, key, clip in _checked_clips(root / shard.name, shard, layout, findings):
+                where = f"{shard.name}: '{key}'"
+                if row < len(indexed) and indexed[row] != clip.meta.held:
+                    findings.error("index", where, "has_hands or has_face is not what the index says")
+                table.add(number, row, clip.meta, clip.motion)
+                frames += clip.meta.frames
+                for kind, message in clip.oddities:
+                    findings.warn(kind, where, message)
+                _against_manifest(where, clip, manifest, widths, findings)
+        except (UserError, OSError) as error:
+            findings.error("tar", shard.name, str(error).removeprefix(f"{root / shard.name}: "))
+    table.report(findings)
+    if not any(shard.split == "train" for shard in manifest.shards):
+        findings.warn("no training split", str(root), "no clips in split 'train'")
+    for split in SPLITS:
+        shards = [shard for shard in manifest.shards if shard.split == split]
+        if shards:
+            _check_index(root, split, shards, findings)
+    return CheckReport(
+        findings.all_errors(str(root)),
+        findings.all_warnings(str(root)),
+        dict(findings.error_kinds),
+        dict(findings.warning_kinds),
+        len(table),
+        frames,
+    )
+
+
+def _stray_files(root: Path, manifest: Manifest, findings: Findings) -> None:
+    listed = [shard.name for shard in manifest.shards]
+    for name in sorted({name for name in listed if listed.count(name) > 1}):
+        findings.error("manifest", name, "listed twice in the manifest")
+    for path in sorted(root.glob("*.tar")):
+        if path.name not in listed:
+            findings.error("manifest", path.name, "not in the manifest; delete it or convert again")
+
+
+def _checked_clips(
+    path: Path, shard: ShardInfo, layout: MotionLayout, findings: Findings
+) -> Iterator[tuple[int, str, CheckedClip]]:
+    """(row, key, clip) of every sound clip of one shard; what is wrong on the way goes to `findings`."""
+    if not path.exists():
+        findings.error("shard", shard.name, "the shard is missing")
+        return
+    size = path.stat().st_size
+    if size != shard.bytes:
+        changed = f"{size} bytes, the manifest says {shard.bytes}: truncated or changed"
+        findings.error("shard", shard.name, changed)
+    elif sha256_of(path) != shard.sha256:
+        findings.error("shard", shard.name, "the sha256 is not the manifest's: damaged")
+    clips = scan_tar(path)
+    if len(clips) != shard.samples:
+        findings.error("shard", shard.name, f"{len(clips)} samples, the manifest says {shard.samples}")
+    frames = 0
+    with path.open("rb") as file:
+        for row, clip in enumerate(clips):
+            try:
+                checked = check_clip(file, path, clip, shard, layout)
+            except (UserError, ValueError) as error:
+                message = str(error).removeprefix(f"{path}: ")
+                findings.error("clip", f"{shard.name}: '{clip.key}'", message)
+                continue
+            frames += checked.meta.frames
+            yield row, clip.key, checked
+    if frames != shard.frames:
+        findings.error("shard", shard.name, f"{frames} sound frames, the manifest says {shard.frames}")
+
+
+def _against_manifest(
+    where: str, clip: CheckedClip, manifest: Manifest, widths: dict[int, str], findings: Findings
+) -> None:
+    """Whether a sound clip fits what the manifest says of all clips."""
+    licence = clip.meta.licence
+    if licence not in {manifest.licence, *manifest.licences}:
+        findings.warn("licence", where, f"licence '{licence}' is not in the manifest")
+    if clip.audio_width is not None:
+        widths.setdefault(clip.audio_width, where)
+        first = next(iter(widths))
+        if clip.audio_width != first:
+            other = f"audio.npy has {clip.audio_width} columns, that of {widths[first]} has {first}"
+            findings.error("audio", where, other)
+
+
+def _indexed_held(path: Path) -> list[int]:
+    """What a shard's index says its clips hold; an unreadable index is reported with the indices."""
+    try:
+        return [clip.held for clip in ShardIndex.load_json(index_path(path)).clips]
+    except (UserError, OSError):
+        return []
+
+
+def _check_index(root: Path, split: Split, shards: list[ShardInfo], findings: Findings) -> None:
+    """Whether both indices say what the tars say."""
+    before = findings.error_kinds["index"]
+    # A generator: the JSON indices of a large split would not fit into memory together.
+    rebuilt = SplitIndex.build(_sound_indices(root, shards, findings))
+    if findings.error_kinds["index"] > before:
+        return
+    try:
+        flat = load_index(root, split, shards)
+    except UserError as error:
+        findings.error("index", INDEX_FILE, str(error).removeprefix(f"{root / INDEX_FILE}: "))
+        return
+    if any(
+        not np.array_equal(getattr(flat, field.name), getattr(rebuilt, field.name)) for field in fields(flat)
+    ):
+        other = f"split '{split}' says something else than the shards' own indices"
+        findings.error("index", INDEX_FILE, other)
+
+
+def _sound_indices(root: Path, shards: list[ShardInfo], findings: Findings) -> Iterator[ShardIndex]:
+    for shard in shards:
+        path = root / shard.name
+        try:
+            stored = ShardIndex.load_json(index_path(path))
+            entries = clip_entries(path, [(clip.id, clip.held) for clip in stored.clips])
+        except (UserError, OSError, ValueError) as error:
+            findings.error("index", index_path(path).name, f"does not fit its tar: {error}")
+            continue
+        if stored.shard != shard or stored.clips != entries:
+            findings.error("index", index_path(path).name, "other contents than the tar or the manifest")
+            continue
+        yield stored

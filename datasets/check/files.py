@@ -1,0 +1,246 @@
+"""Check single source files, with the very readers that the converters use: `ok`, or the reason why not.
+
+| suffix | read as |
+|---|---|
+| `.tar` | a WebDataset shard without manifest (`shards/foreign.py`) |
+| `.npy` | a motion array of the layout asked for (Motion-X's `smplx322` unless told), or joints |
+| `.npz` | SMPL parameters as AMASS publishes them |
+| `.pkl` | an AIST++ annotation, through the restricted unpickler |
+| `.bvh` | BVH |
+| `.wav`, `.flac`, `.ogg`, `.mp3` | sound |
+| `.txt` | captions of HumanML3D's grammar, plain lines, or a list of ids |
+
+Nothing is written, run or extracted, whatever a file holds.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from motionloom.datasets.audio.sound import read_sound
+from motionloom.datasets.check.foreign import inspect_tar
+from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
+from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
+from motionloom.datasets.convert.common.arrays import load_array, read_array_header
+from motionloom.datasets.convert.common.features import require_human
+from motionloom.datasets.convert.common.files import read_text_file
+from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
+from motionloom.datasets.convert.common.smpl_npz import read_motion, read_motion_header
+from motionloom.datasets.convert.common.splits import check_id, read_split_files
+from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.text.clean import usable_caption
+
+TEXTS = ("auto", "humanml", "plain", "ids")
+"""How `.txt` files are read. `auto`: ids by the name of the file or its folder, else HumanML3D's grammar."""
+
+JOINTS = {"joints22": (22, 3), "joints52": (52, 3)}
+"""Further names for `layout`: joint positions [T, N, 3] in metres."""
+
+_SPLIT_NAMES = frozenset((*SPLITS, "train_val", "all"))
+_SPLIT_FOLDERS = frozenset(("splits", "split"))
+
+
+@dataclass(frozen=True)
+class FileRules:
+    """What single files are expected to hold."""
+
+    layout: str | None = None
+    """Layout of arrays. None: `.npy` files are Motion-X's `smplx322`, shards may hold any width."""
+    fps: float | None = None
+    """Frame rate, for the ranges of speeds; None = the layout's usual one."""
+    texts: str = "auto"
+    seconds: float | None = None
+    """Length of the clips that captions belong to; None leaves their ends unchecked."""
+
+    def __post_init__(self) -> None:
+        if self.texts not in TEXTS:
+            raise UserError(f"texts '{self.texts}': choose one of {', '.join(TEXTS)}")
+        if self.layout not in (None, *JOINTS, *LAYOUTS):
+            raise UserError(f"no motion layout '{self.layout}'; known: {', '.join((*LAYOUTS, *JOINTS))}")
+
+    def motion_layout(self) -> MotionLayout:
+        """The layout of arrays (not for joints)."""
+        return MotionLayout.named(self.layout or "smplx322", fps=self.fps)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What one file is. `problems` is empty when it may be used; `notes` are worth knowing."""
+
+    path: Path
+    what: str = ""
+    problems: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """Whether the file may be used."""
+        return not self.problems
+
+    def __str__(self) -> str:
+        return f"{self.path}: {'; '.join(self.problems) if self.problems else f'ok, {self.what}'}"
+
+
+def check_file(path: Path, rules: FileRules | None = None) -> Verdict:
+    """Read one file as its suffix says. Raises `UserError` only for suffixes that nothing here reads."""
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise UserError(f"{path}: nothing here reads '{path.suffix}' files; known: {', '.join(_READERS)}")
+    if not path.is_file():  # a pipe would be waited for
+        return Verdict(path, problems=["no such file" if not path.exists() else "not a plain file"])
+    try:
+        return reader(path, rules or FileRules())
+    except UserError as error:
+        return Verdict(path, problems=[str(error).removeprefix(f"{path}: ")])
+    except OSError as error:
+        return Verdict(path, problems=[f"cannot be read ({error.strerror or error})"])
+
+
+def check_folder(folder: Path, rules: FileRules | None = None) -> Iterator[Verdict]:
+    """Every file below a folder that can be read, in order of its path; links to folders are not followed.
+
+    A folder that holds at least two of `train.txt`, `val.txt`, `test.txt` is also checked for ids in two
+    splits.
+    """
+    for here, folders, names in os.walk(folder):
+        folders.sort()
+        splits = [split for split in SPLITS if f"{split}.txt" in names]
+        if len(splits) > 1:
+            yield _check_splits(Path(here), splits)
+        for name in sorted(names):
+            if Path(name).suffix.lower() in _READERS:
+                yield check_file(Path(here) / name, rules)
+
+
+def _check_splits(folder: Path, splits: Sequence[str]) -> Verdict:
+    try:
+        ids, notes = read_split_files(folder)
+    except UserError as error:
+        return Verdict(folder, problems=[str(error)])
+    return Verdict(folder, f"splits {', '.join(splits)}: {len(ids)} ids, none in two", notes=notes)
+
+
+def _check_tar(path: Path, rules: FileRules) -> Verdict:
+    layout = rules.motion_layout() if rules.layout in LAYOUTS else None
+    report = inspect_tar(path, layout)
+    return Verdict(path, f"shard of {report.samples} samples", report.problems, report.notes)
+
+
+def _check_npy(path: Path, rules: FileRules) -> Verdict:
+    if rules.layout is not None and rules.layout in JOINTS:
+        values = load_array(path, width=JOINTS[rules.layout])
+        require_human(values, rules.fps or 20.0)
+        return Verdict(path, f"joints {list(values.shape)} {values.dtype}")
+    layout = rules.motion_layout()
+    try:
+        values = load_array(path, width=layout.dim)
+    except UserError as error:
+        raise UserError(f"{error}{_layout_hint(path, layout)}") from None
+    limits = human_limits(layout)
+    absurd = beyond(values, layout, limits, ABSURD)
+    if absurd:
+        raise UserError(f"{path}: absurd value: {absurd}: a wrong unit, scale or layout")
+    strange = beyond(values, layout, limits)
+    notes = [f"beyond what a person can do: {strange}"] if strange else []
+    return Verdict(path, f"{layout.name} {list(values.shape)} {values.dtype}", notes=notes)
+
+
+def _layout_hint(path: Path, layout: MotionLayout) -> str:
+    """The layout that a whole array of another width seems to have."""
+    try:
+        shape, _ = read_array_header(path)
+    except UserError:
+        return ""
+    if len(shape) == 3 and (shape[1:] in JOINTS.values()):
+        return f"; for joints: --layout joints{shape[1]}"
+    known = [name for name in LAYOUTS if MotionLayout.named(name).dim == shape[-1] != layout.dim]
+    return f"; for this width: --layout {known[0]}" if len(shape) == 2 and known else ""
+
+
+def _check_npz(path: Path, rules: FileRules) -> Verdict:
+    header = read_motion_header(path, str(path))
+    read_motion(path, str(path), hands=header.hands)
+    rate = "no frame rate" if header.fps is None else f"{header.fps:g} fps"
+    return Verdict(path, f"{header.kind} parameters, {header.frames} frames, {rate}")
+
+
+def _check_pickle(path: Path, rules: FileRules) -> Verdict:
+    motion = read_aist_motion(path)
+    return Verdict(path, f"AIST++ motion, {len(motion.poses)} frames")
+
+
+def _check_bvh(path: Path, rules: FileRules) -> Verdict:
+    motion = read_bvh(path)
+    return Verdict(path, f"BVH, {len(motion.joints)} joints, {motion.frames} frames, {motion.fps:g} fps")
+
+
+def _check_sound(path: Path, rules: FileRules) -> Verdict:
+    samples, rate = read_sound(path)
+    return Verdict(path, f"sound, {len(samples) / rate:.2f} s at {rate} Hz")
+
+
+def _check_text(path: Path, rules: FileRules) -> Verdict:
+    kind = rules.texts
+    if kind == "auto":
+        named = path.stem.lower() in _SPLIT_NAMES or path.parent.name.lower() in _SPLIT_FOLDERS
+        kind = "ids" if named else "humanml"
+    if kind == "ids":
+        return _check_ids(path)
+    if kind == "humanml":
+        captions, problems = read_humanml_captions(path, seconds=rules.seconds)
+        count = len(captions)
+    else:
+        lines = [line for line in read_text_file(path).split("\n") if line.strip()]
+        problems = [
+            f"line {number}: no usable caption"
+            for number, line in enumerate(lines, 1)
+            if not usable_caption(line)
+        ]
+        count = len(lines) - len(problems)
+    if not count and not problems:
+        problems = ["no usable text"]
+    elif not count:
+        problems = [*problems, "no usable text is left"]
+    return Verdict(path, f"{count} captions", problems)
+
+
+def _check_ids(path: Path) -> Verdict:
+    seen: dict[str, int] = {}
+    problems, notes = [], []
+    for number, line in enumerate(read_text_file(path).split("\n"), start=1):
+        clip_id = line.strip()
+        if not clip_id:
+            continue
+        try:
+            check_id(clip_id, f"line {number}")
+        except UserError as error:
+            problems.append(str(error))
+            continue
+        if clip_id in seen:
+            notes.append(
+                f"line {number}: id '{clip_id}' is also in line {seen[clip_id]}; the first one counts"
+            )
+        seen.setdefault(clip_id, number)
+    if not seen and not problems:
+        problems.append("no ids")
+    return Verdict(path, f"{len(seen)} ids", problems, notes)
+
+
+_READERS: dict[str, Callable[[Path, FileRules], Verdict]] = {
+    ".tar": _check_tar,
+    ".npy": _check_npy,
+    ".npz": _check_npz,
+    ".pkl": _check_pickle,
+    ".bvh": _check_bvh,
+    **dict.fromkeys((".wav", ".flac", ".ogg", ".mp3"), _check_sound),
+    ".txt": _check_text,
+}
+
+FILE_SUFFIXES = frozenset(_READERS)
+"""Suffixes that `check_file` reads."""

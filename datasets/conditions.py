@@ -1,0 +1,56 @@
+"""What a motion is conditioned on: one `Condition` a modality, in one mapping from shards to networks.
+
+A row of a batch that lacks a modality has no true position in that modality's mask, so clips with text, with
+music, with both and with neither lie in one batch. `MODALITIES` is the table of what there is: a third
+modality is one line here and one encoder (`models/condition/`).
+
+Legend: B batch, L positions, E features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class Condition(NamedTuple):
+    """One modality of a batch."""
+
+    features: Tensor
+    """float32 [B, L, E]: word features of a text, frames of a sound; zero where `mask` is false."""
+    mask: Tensor
+    """bool [B, L]."""
+    pooled: Tensor | None = None
+    """float32 [B, E]: the whole in one vector (a sentence embedding), where the modality has one."""
+
+    @property
+    def present(self) -> Tensor:
+        """bool [B]: rows that have this modality."""
+        return self.mask.any(1)
+
+
+Conditions = Mapping[str, Condition]
+"""Modality -> its part of the batch. All share B."""
+
+
+@dataclass(frozen=True)
+class Modality:
+    """One line of the table of modalities."""
+
+    name: str
+    member: str
+    """The shard member whose presence says that a clip has it."""
+    timed: bool
+    """Whether its positions lie on the motion's time line, frame for frame."""
+
+
+MODALITIES: dict[str, Modality] = {
+    modality.name: modality
+    for modality in (
+        Modality("text", "texts.json", timed=False),
+        Modality("audio", "audio.npy", timed=True),
+    )
+}

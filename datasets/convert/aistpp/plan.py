@@ -1,0 +1,319 @@
+"""AIST++ conversion, first step: options, and a plan of what becomes of every file of the source.
+
+Every annotation that is not left out anyway is read (a file is small, and only its content says how long it
+is and whether it can be used); of the music only the headers are.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+from rich.progress import track
+
+from motionloom.datasets.audio.sound import sound_seconds
+from motionloom.datasets.convert.aistpp.lists import SequenceLists, read_lists
+from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
+from motionloom.datasets.convert.common.conversion import ConvertConfig, count_licences, drop, limited
+from motionloom.datasets.convert.common.features import frames_after
+from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.plan import ConversionPlan, Subset, frames_by_split
+from motionloom.datasets.convert.common.splits import hash_split
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Dropped, Split, UserError
+from motionloom.datasets.shards.index import SPLITS
+
+FPS = 60.0
+LAYOUTS = ("body133", "h3d263", "smpl75")
+MOTION_LICENCE = "CC-BY-4.0"
+MUSIC_LICENCE = "CC-BY-4.0 AND LicenseRef-AIST-Dance-DB"
+"""Annotations: CC BY 4.0. Music: the terms of use of the AIST Dance Video Database, which no converter can
+grant; shards that hold sound, or features made from it, stand under both.
+"""
+RELEASED: dict[Split, int] = {"train": 980, "val": 20, "test": 20}
+"""Ids in the official cross-modal split files."""
+
+MOTIONS = "motions"
+SOUND_SUFFIXES = (".wav", ".flac", ".mp3", ".ogg")
+
+SEQUENCE = re.compile(r"g([A-Z]{2})_s([A-Z]{2})_c(?:All|\d\d)_d(\d+)_m([A-Z]{2}\d+)_ch(\d+)")
+"""Genre, situation (BM basic, FM advanced), dancer, music, choreography."""
+
+
+class AistppConfig(ConvertConfig):
+    """Options of the AIST++ converter; `source` is the folder of the annotations, with motions/ in it."""
+
+    name: str = "aistpp"
+    """Name of the data set; part of the shards' file names."""
+    layout: str = "body133"
+    """`body133` or `h3d263` from the joints, or `smpl75`: UDE's translation and axis-angles."""
+    fps: float = Field(default=20.0, gt=0, le=240)
+    """Frame rate of the shards; the source has 60."""
+    splits: Path | None = None
+    """Folder of crossmodal_train.txt, _val.txt and _test.txt; default: splits/ in the source."""
+    unlisted: Literal["drop", "hash"] = "drop"
+    """Sequences in no split file: left out, or split 80/5/15 by a hash of their music."""
+    ignore_list: Path | None = None
+    """List of bad sequences; default: ignore_list.txt in the source."""
+    music: Literal["require", "optional", "none"] = "require"
+    """Whether a sequence needs its music; `none` converts the motion alone."""
+    music_folder: Path | None = None
+    """Folder of `<sequence>.wav` or `<music>.wav` (also flac, mp3, ogg); default: wavs/ in the source."""
+    music_offset: float = Field(default=0.0, ge=0)
+    """Second of the music at which the motion begins."""
+    max_music_gap: float = Field(default=1.0, ge=0)
+    """Seconds of motion that may be cut where the music ends first; beyond that the sequence is left out."""
+    audio_features: bool = True
+    """Store the 438 audio features."""
+    audio_fps: float | None = Field(default=None, gt=0)
+    """Rows of audio features a second; default: one for every motion frame. The published ones have 60."""
+    sound_rate: int = Field(default=16_000, ge=0, le=192_000)
+    """Sample rate at which the sound itself is stored; 0 leaves it out."""
+    caption_genre: bool = False
+    """Give every clip the caption "a dancer performs ...", by the genre in its name."""
+    body_model: Path | None = None
+    """SMPL model (.npz) for the bone lengths; default: the package's neutral skeleton."""
+
+    def motion_layout(self) -> MotionLayout:
+        """The layout of the written shards; AIST++ has neither fingers nor a face."""
+        if self.layout not in LAYOUTS:
+            raise UserError(f"layout {self.layout} cannot be made from AIST++; use {', '.join(LAYOUTS)}")
+        return super().motion_layout()
+
+    @property
+    def sound_folder(self) -> Path:
+        """Where the music lies."""
+        return self.music_folder or self.source / "wavs"
+
+    @property
+    def stores_music(self) -> bool:
+        """Whether anything of the music goes into the shards."""
+        return self.music != "none" and (self.audio_features or self.sound_rate > 0)
+
+
+@dataclass(frozen=True)
+class AistClip:
+    """A clip of the plan."""
+
+    id: str
+    split: Split
+    frames: int
+    """Frames in the file, at 60 a second."""
+    used: int
+    """Frames before the music ends."""
+    sound: str | None
+    """Name of the music file in its folder."""
+    licence: str
+
+    def label(self) -> str:
+        """Name of the clip in reports."""
+        return f"{MOTIONS}/{self.id}.pkl"
+
+
+def music_of(sequence: str) -> str:
+    """`mBR0` of `gBR_sBM_cAll_d04_mBR0_ch01`."""
+    return "m" + _fields(sequence)[3]
+
+
+def genre_of(sequence: str) -> str:
+    """`BR` of `gBR_sBM_cAll_d04_mBR0_ch01`."""
+    return _fields(sequence)[0]
+
+
+def _fields(sequence: str) -> tuple[str, ...]:
+    found = SEQUENCE.fullmatch(sequence)
+    if found is None:
+        raise UserError(f"'{sequence}' is not an AIST++ name like gBR_sBM_cAll_d04_mBR0_ch01")
+    return found.groups()
+
+
+@dataclass(frozen=True)
+class _Music:
+    """Music files by name without suffix, their lengths in seconds, and those that cannot be read."""
+
+    files: dict[str, str]
+    seconds: dict[str, float]
+    broken: list[Dropped]
+
+    def of(self, sequence: str) -> str | None:
+        """The file of a sequence: one of its own before the whole piece."""
+        return self.files.get(sequence) or self.files.get(music_of(sequence))
+
+
+def plan_aistpp(config: AistppConfig, *, progress: bool = False) -> ConversionPlan[AistClip]:
+    """Find every sequence and decide what becomes of it, without converting anything."""
+    layout = config.motion_layout()
+    folder = config.source / MOTIONS
+    if not folder.is_dir():
+        raise UserError(f"{config.source}: no {MOTIONS}/ in it; give the folder of the AIST++ annotations")
+    lists = read_lists(
+        config.splits or config.source / "splits",
+        config.ignore_list or config.source / "ignore_list.txt",
+        splits_required=config.splits is not None,
+        ignore_required=config.ignore_list is not None,
+    )
+    music = _find_music(config)
+    names = sorted(path.name for path in folder.iterdir() if path.suffix == ".pkl" and path.name[0] != ".")
+    items: list[tuple[Split, AistClip]] = []
+    dropped: list[Dropped] = []
+    broken: list[Dropped] = list(music.broken)
+    cut = 0
+    for name in track(names, "reading the source", disable=not progress):
+        label = f"{MOTIONS}/{name}"
+        try:
+            found = _decide(config, lists, music, name.removesuffix(".pkl"), label)
+        except UserError as error:
+            broken.append(drop(label, error))
+            continue
+        if isinstance(found, str):
+            dropped.append(Dropped(source=label, reason=found))
+            continue
+        cut += found.used < found.frames
+        items.append((found.split, found))
+    notes = [*lists.notes, *_notes(config, music, items, cut)]
+    items = limited(items, AistClip.label, config.limit, notes)
+
+    present = {name.removesuffix(".pkl") for name in names}
+    missing = {
+        sequence: split
+        for sequence, split in lists.splits.items()
+        if sequence not in present and sequence not in lists.ignored
+    }
+    return ConversionPlan(
+        name=f"{config.source.name} -> {config.name}",
+        items=items,
+        frames=frames_by_split((split, frames_after(clip.used, FPS, layout)) for split, clip in items),
+        found=len(names),
+        missing=[
+            Dropped(source=f"{MOTIONS}/{sequence}.pkl", reason=f"listed in split '{split}', but not here")
+            for sequence, split in missing.items()
+        ],
+        dropped=dropped,
+        broken=broken,
+        ignored=_count_ignored(config, lists, music),
+        notes=notes,
+        subsets=_subsets(present, lists, missing, items),
+        licences=count_licences([clip.licence for _, clip in items]),
+    )
+
+
+def _decide(
+    config: AistppConfig, lists: SequenceLists, music: _Music, sequence: str, label: str
+) -> AistClip | str:
+    """The clip to convert, or why it is left out; `UserError` when its file cannot be used at all."""
+    _fields(sequence)
+    if sequence in lists.ignored:
+        return "on the ignore list"
+    split = lists.splits.get(sequence)
+    if split is None and (config.unlisted == "hash" or not lists.splits):
+        # By music: pieces are shared by many dances, and one in two splits would leak.
+        split = hash_split(music_of(sequence))
+    if split is None:
+        return "in no split file"
+    sound = None if config.music == "none" else music.of(sequence)
+    if sound is not None and sound not in music.seconds:
+        sound = None
+    if sound is None and config.music == "require":
+        return f"no readable music: {sequence} or {music_of(sequence)} in {config.sound_folder.name}/"
+    licence = config.licence or (MUSIC_LICENCE if sound and config.stores_music else MOTION_LICENCE)
+    problem = config.licence_problem(licence)
+    if problem:
+        return problem
+    frames = len(read_aist_motion(inside(config.source / MOTIONS, f"{sequence}.pkl", label), label).poses)
+    used = frames
+    if sound is not None:
+        seconds = music.seconds[sound] - config.music_offset
+        used = min(frames, max(0, int(seconds * FPS + 1e-6)))
+        if not used or frames - used > config.max_music_gap * FPS:
+            return f"{frames / FPS:.2f} s of motion, but {max(seconds, 0):.2f} s of music in {sound}"
+    return config.length_problem(used / FPS) or AistClip(sequence, split, frames, used, sound, licence)
+
+
+def _find_music(config: AistppConfig) -> _Music:
+    """The music files of the source and their lengths."""
+    music = _Music({}, {}, [])
+    folder = config.sound_folder
+    if config.music == "none":
+        return music
+    if not folder.is_dir():
+        if config.music == "require" or config.music_folder is not None:
+            raise UserError(
+                f"{folder}: no such folder of music; give --music-folder, or convert with --music none"
+            )
+        return music
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in SOUND_SUFFIXES or path.name.startswith("."):
+            continue
+        label = f"{folder.name}/{path.name}"
+        music.files.setdefault(path.stem, path.name)
+        try:
+            music.seconds[path.name] = sound_seconds(inside(folder, path.name, label), label)
+        except UserError as error:
+            music.broken.append(drop(label, error))
+    return music
+
+
+def _notes(config: AistppConfig, music: _Music, items: list[tuple[Split, AistClip]], cut: int) -> list[str]:
+    """What a user should know about music, beside single files."""
+    notes = []
+    if cut:
+        notes.append(f"{cut} sequences end with their music, at most {config.max_music_gap:g} s early")
+    longer = sum(
+        music.seconds[clip.sound] - config.music_offset - clip.used / FPS > config.max_music_gap
+        for _, clip in items
+        if clip.sound is not None and Path(clip.sound).stem == clip.id
+    )
+    if longer:
+        notes.append(
+            f"{longer} sequences have music of their own that goes on for more than "
+            f"{config.max_music_gap:g} s after them; its end is cut"
+        )
+    silent = sum(clip.sound is None for _, clip in items)
+    if silent and config.music == "optional":
+        notes.append(f"{silent} sequences have no music")
+    pieces = {split: {music_of(clip.id) for s, clip in items if s == split} for split in SPLITS}
+    for split in ("val", "test"):
+        shared = sorted(pieces["train"] & pieces[split])
+        if shared:
+            some = ", ".join(shared[:5]) + (", ..." if len(shared) > 5 else "")
+            notes.append(f"{len(shared)} pieces of music are in train and in {split}: {some}")
+    return notes
+
+
+def _count_ignored(config: AistppConfig, lists: SequenceLists, music: _Music) -> int:
+    """Files of the source that are neither annotations of motion, music nor lists: keypoints, cameras."""
+    used = {path.resolve() for path in lists.files}
+    used |= {(config.sound_folder / name).resolve() for name in music.files.values()}
+    motions = (config.source / MOTIONS).resolve()
+    count = 0
+    for folder, _, names in os.walk(config.source):
+        here = Path(folder).resolve()
+        for name in names:
+            motion = here == motions and name.endswith(".pkl") and not name.startswith(".")
+            count += not motion and here / name not in used
+    return count
+
+
+def _subsets(
+    present: set[str],
+    lists: SequenceLists,
+    missing: dict[str, Split],
+    items: list[tuple[Split, AistClip]],
+) -> dict[str, Subset]:
+    """By split file, with the official numbers; the ignored and the unlisted beside them."""
+    table: dict[str, Subset] = {}
+    found = Counter(lists.splits.get(sequence) for sequence in present)
+    absent = Counter(missing.values())
+    used = Counter(lists.splits.get(clip.id) for _, clip in items)
+    for split in SPLITS if lists.splits else ():
+        table[f"crossmodal {split}"] = Subset(found[split], used[split], absent[split], RELEASED[split])
+    if found[None]:
+        table["in no split"] = Subset(found[None], used[None])
+    if lists.ignored:
+        table["on the ignore list"] = Subset(len(present & lists.ignored))
+    return table

@@ -1,0 +1,1 @@
+"""BVH to shards."""

@@ -1,0 +1,184 @@
+"""BVH folders and archives -> shards: any skeleton, through a joint map (`datasets/motion/joint_map.py`).
+
+Three steps, each independent of the number of workers:
+1. plan (`bvh_plan.py`): read every file once; list it with its captions, split, frame count and digest;
+2. features: one task a batch (an archive, or 64 loose files) parses, maps, resamples and encodes its clips
+   into a file of the work folder, so an archive is unpacked once although its clips go to many shards;
+3. shards: the clips are copied from those files.
+A killed run resumes at the first unfinished batch or shard; a finished one finds its shards and makes
+nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.convert.bvh.plan import SUFFIX, BvhClip, BvhConfig, plan_bvh
+from motionloom.datasets.convert.common.archives import Batch
+from motionloom.datasets.convert.common.conversion import Conversion, digest, drop
+from motionloom.datasets.convert.common.feature_store import store_batch, stored_batch, stored_features
+from motionloom.datasets.convert.common.features import features_of
+from motionloom.datasets.convert.common.first_step import FirstStep
+from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.motion.joint_map import JointMap
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.schema import Dropped, UserError
+from motionloom.datasets.shards.sample import Sample
+
+__all__ = ["BvhConfig", "plan_bvh", "prepare_bvh"]
+
+CONVERTER = "bvh"
+CONVERTER_VERSION = 2
+
+
+def prepare_bvh(
+    config: BvhConfig, *, workers: int = 1, progress: bool = False, scan: Path | None = None
+) -> Conversion[BvhClip]:
+    """Plan the conversion. `scan` is a file that remembers what unchanged files hold."""
+    clips = BvhClips.of(config)  # a wrong map should fail before the long part
+    plan = plan_bvh(config, workers=workers, progress=progress, scan=scan)
+    options = config.options() | {"source_sha256": digest([clip.found.sha256 for _, clip in plan.items])}
+    groups: dict[int, list[BvhClip]] = {}
+    for _, clip in plan.items:
+        groups.setdefault(clip.number, []).append(clip)
+    batches = [
+        BvhBatch(clips, group[0].batch, number, tuple(clip.label() for clip in group), digest(options))
+        for number, group in sorted(groups.items())
+    ]
+    positions = {batch.number: position for position, batch in enumerate(batches)}
+    return Conversion(
+        config=config,
+        plan=plan,
+        convert=clips,
+        describe=BvhClip.label,
+        licence=config.licence,
+        converter=CONVERTER,
+        version=CONVERTER_VERSION,
+        options=options,
+        first=FirstStep(batches, lambda clip: positions[clip.number], clips.take),
+    )
+
+
+@dataclass(frozen=True)
+class BvhClips:
+    """Makes samples of clips: all that every clip of a conversion has in common."""
+
+    config: BvhConfig
+    joint_map: JointMap
+
+    @staticmethod
+    def of(config: BvhConfig) -> BvhClips:
+        """Read the joint map."""
+        target = config.motion_layout().skeleton_name
+        return BvhClips(config, JointMap.load(config.joint_map, target=target))
+
+    @cached_property
+    def layout(self) -> MotionLayout:
+        """The layout of the samples."""
+        return self.config.motion_layout()
+
+    def __call__(self, clip: BvhClip) -> Sample:
+        """One clip by itself. An archive is read up to the clip: for many clips, make the batch."""
+        for file in clip.batch.read(SUFFIX):
+            if file.path == clip.found.path:
+                return self._sample(clip, self.features(clip.label(), file.data))
+        raise UserError(f"{clip.label()}: no longer in the source")
+
+    def take(self, clip: BvhClip, folder: Path) -> Sample:
+        """One clip from the files of the first step."""
+        return self._sample(clip, stored_features(_path(folder, clip.number), clip.label()))
+
+    def features(self, label: str, data: bytes) -> NDArray[np.float32]:
+        """Features [T', D] of one file; `label` names it in errors."""
+        config = self.config
+        motion = read_bvh(data, name=label)
+        joints = self.joint_map.apply(motion, unit=config.unit, up=config.up)
+        try:
+            return features_of(
+                joints, config.source_fps or motion.fps, self.layout, same_bones=config.retarget
+            )
+        except UserError as error:
+            raise UserError(f"{label}: {error} (read with unit '{config.unit}', up '{config.up}')") from None
+
+    def _sample(self, clip: BvhClip, motion: NDArray[np.float32]) -> Sample:
+        layout = self.layout
+        meta = layout.clip_meta(
+            clip.id,
+            source=clip.label(),
+            split=clip.split,
+            frames=len(motion),
+            licence=self.config.licence,
+            has_hands=layout.num_joints > BODY_JOINTS,
+            has_face=False,
+        )
+        return Sample(meta=meta, motion=motion, texts=list(clip.texts))
+
+
+@dataclass(frozen=True)
+class BvhBatch:
+    """One archive, or a run of loose files: read once, all its clips converted on the way."""
+
+    clips: BvhClips
+    batch: Batch
+    number: int
+    labels: tuple[str, ...]
+    options: str
+    """Digest of what the features depend on, the content of the source included."""
+
+    @property
+    def size(self) -> int:
+        """Number of clips."""
+        return len(self.labels)
+
+    def is_made(self, folder: Path) -> bool:
+        """Whether an earlier run made it from the same inputs."""
+        return stored_batch(_path(folder, self.number), self._fingerprint()) is not None
+
+    def make(self, folder: Path) -> None:
+        """Convert the clips into a batch file."""
+        dim, fingerprint = self.clips.layout.dim, self._fingerprint()
+        store_batch(_path(folder, self.number), self._made(), dim=dim, fingerprint=fingerprint)
+
+    def trial(self, seconds: float) -> int:
+        """Convert clips without keeping them for about so long; how many."""
+        end = time.perf_counter() + seconds
+        for count, _ in enumerate(self._made(), start=1):
+            if time.perf_counter() > end:
+                return count
+        return self.size
+
+    def _fingerprint(self) -> str:
+        return digest([CONVERTER_VERSION, self.options, self.labels])
+
+    def _made(self) -> Iterator[tuple[str, NDArray[np.float32] | Dropped]]:
+        waiting = set(self.labels)
+        try:
+            for file in self.batch.read(SUFFIX):
+                if file.label not in waiting:  # a second member of the same name finds nothing
+                    continue
+                waiting.remove(file.label)
+                try:
+                    if file.error:
+                        raise UserError(f"{file.label}: {file.error}")
+                    yield file.label, self.clips.features(file.label, file.data)
+                except MemoryError:
+                    raise
+                except Exception as error:  # whatever a bad file makes of the libraries below
+                    yield file.label, drop(file.label, error)
+                if not waiting:
+                    return
+        except UserError as error:
+            for label in self.labels:
+                if label in waiting:
+                    yield label, drop(label, error)
+
+
+def _path(folder: Path, number: int) -> Path:
+    return folder / f"{number:06d}.bin"

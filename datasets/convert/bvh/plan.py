@@ -1,0 +1,182 @@
+"""BVH conversion, first step: options, and a plan of what becomes of every file of the source."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+from pydantic import Field
+
+from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.convert.common.archives import Batch, list_batches
+from motionloom.datasets.convert.common.captions import CaptionTable, read_captions
+from motionloom.datasets.convert.common.conversion import ConvertConfig, count_licences, drop, limited
+from motionloom.datasets.convert.common.features import frames_after
+from motionloom.datasets.convert.common.plan import ConversionPlan, frames_by_split
+from motionloom.datasets.convert.common.scan import BatchScan, FoundFile, scan_batches
+from motionloom.datasets.convert.common.splits import check_id, hash_split, read_split_files
+from motionloom.datasets.motion.bvh_text import read_header
+from motionloom.datasets.motion.joint_map import Unit, Up
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Caption, Dropped, Split, UserError
+
+SUFFIX = ".bvh"
+
+
+class BvhConfig(ConvertConfig):
+    """Options of the BVH converter."""
+
+    source: Path
+    """A folder of .bvh files and/or tar archives of them, or one such file."""
+    joint_map: Path
+    """JSON file that says which joints of the files stand for ours (docs/sources.md)."""
+    captions: Path | None = None
+    """JSON lines: id, file, captions, split. Without it clips have no captions."""
+    splits: Path | None = None
+    """Folder of train.txt, val.txt, test.txt; else the captions' `split`, else 80/5/15 by hash of the id."""
+    name: str = "bvh"
+    """Name of the data set; part of the shards' file names."""
+    licence: str
+    """Licence of the clips, kept in every sample."""
+    layout: str = "body133"
+    """Feature layout of the shards: body133 or h3d263."""
+    fps: float = Field(default=20.0, gt=0, le=240)
+    """Frame rate of the shards; clips are resampled by time."""
+    source_fps: float | None = Field(default=None, gt=0)
+    """True frame rate of the files, for collections that state a wrong one."""
+    unit: Unit = "cm"
+    """Length unit of the files."""
+    up: Up = "y"
+    """Upward axis of the files."""
+    retarget: bool = False
+    """Give every clip the bone lengths of the layout's skeleton."""
+    uncaptioned: Literal["drop", "keep"] = "drop"
+    """What to do with clips that a captions file does not list."""
+
+    def motion_layout(self) -> MotionLayout:
+        """The layout of the written shards."""
+        layout = super().motion_layout()
+        if layout.family == "raw" or layout.has("face"):
+            raise UserError(f"layout {self.layout} cannot be made from joints; use body133 or h3d263")
+        return layout
+
+    def options(self, *local: str) -> dict[str, Any]:
+        """What the output depends on, for the manifest: files by name and digest instead of local paths."""
+        given = super().options(*local)
+        for key in ("joint_map", "captions"):
+            path: Path | None = getattr(self, key)
+            given[key] = {"file": path.name, "sha256": sha256_of(path)} if path else None
+        given["splits"] = bool(self.splits)
+        return given
+
+
+@dataclass(frozen=True)
+class BvhClip:
+    """A clip of the plan."""
+
+    batch: Batch
+    number: int
+    """Position of its batch in the source."""
+    found: FoundFile
+    id: str
+    split: Split
+    texts: tuple[Caption, ...]
+
+    def label(self) -> str:
+        """Name of the clip in reports."""
+        return self.found.label
+
+
+def plan_bvh(
+    config: BvhConfig, *, workers: int = 1, progress: bool = False, scan: Path | None = None
+) -> ConversionPlan[BvhClip]:
+    """Find every clip and decide what becomes of it, without converting anything.
+
+    `scan` is a file that remembers what unchanged files hold.
+    """
+    batches, ignored = list_batches(config.source, SUFFIX)
+    scans = scan_batches(batches, SUFFIX, _header, keep=scan, workers=workers, progress=progress)
+    return _decide(config, batches, scans, ignored)
+
+
+def _header(data: bytes, label: str) -> tuple[int, float]:
+    header = read_header(data, name=label)
+    return header.frames, header.fps
+
+
+def _decide(
+    config: BvhConfig, batches: list[Batch], scans: list[BatchScan], ignored: int
+) -> ConversionPlan[BvhClip]:
+    """Which of the files found become samples, in which split."""
+    found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
+    broken = [scan.problem for scan in scans if scan.problem is not None]
+    refused = config.licence_problem(config.licence)
+    table = read_captions(config.captions) if config.captions else CaptionTable({}, {})
+    listed, notes = read_split_files(config.splits) if config.splits else ({}, [])
+    items: list[tuple[Split, BvhClip]] = []
+    dropped: list[Dropped] = []
+    uncaptioned: list[str] = []
+    ids: dict[str, str] = {}
+    contents: dict[str, str] = {}
+    unreadable: set[str] = set()
+    other_rate = 0
+    # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
+    for number, clip in sorted(found, key=lambda pair: table.find(pair[1].path) is None):
+        row = table.find(clip.path)
+        try:
+            clip_id = row.id if row else check_id(str(PurePosixPath(clip.path).with_suffix("")), clip.label)
+        except UserError as error:
+            broken.append(drop(clip.label, error))
+            continue
+        if clip.problem:
+            unreadable.add(clip_id)
+            broken.append(drop(clip.label, UserError(clip.problem)))
+            continue
+        texts = row.texts(source="captions") if row else ()
+        if config.captions and not texts:
+            uncaptioned.append(clip.label)
+        other_rate += bool(row and row.fps and abs(row.fps - clip.fps) > 0.01 * clip.fps)
+        if clip_id in ids:
+            reason = f"second file for clip id '{clip_id}'; the first is {ids[clip_id]}"
+        elif clip.sha256 in contents:
+            reason = f"same bytes as {contents[clip.sha256]}"
+        elif config.captions and not texts and config.uncaptioned == "drop":
+            reason = "no captions"
+        elif config.splits and clip_id not in listed:
+            reason = "in no split file"
+        else:
+            reason = refused or config.length_problem(clip.frames / (config.source_fps or clip.fps))
+        ids.setdefault(clip_id, clip.label)
+        contents.setdefault(clip.sha256, clip.label)
+        if reason:
+            dropped.append(Dropped(source=clip.label, reason=reason))
+            continue
+        split = listed.get(clip_id) or (row.split if row else None) or hash_split(clip_id)
+        items.append((split, BvhClip(batches[number], number, clip, clip_id, split, texts)))
+    if other_rate:
+        notes.append(f"{other_rate} captions state another frame rate than their file; the file's counts")
+    items = limited(items, lambda clip: clip.id, config.limit, notes)
+    layout = config.motion_layout()
+    wanted = {clip_id: row.file or clip_id for clip_id, row in table.rows.items()}
+    wanted |= {clip_id: clip_id for clip_id in listed if clip_id not in wanted}
+    return ConversionPlan(
+        name=f"{config.source.name} -> {config.name}",
+        items=items,
+        frames=frames_by_split(
+            (split, frames_after(planned.found.frames, config.source_fps or planned.found.fps, layout))
+            for split, planned in items
+        ),
+        found=len(found),
+        missing=[
+            Dropped(source=name, reason=f"clip '{clip_id}' is listed, but its file is not in the source")
+            for clip_id, name in wanted.items()
+            if clip_id not in ids and clip_id not in unreadable
+        ],
+        uncaptioned=uncaptioned,
+        dropped=dropped,
+        broken=broken,
+        ignored=ignored,
+        notes=notes,
+        licences=count_licences([config.licence] * len(items)),
+    )

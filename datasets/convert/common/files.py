@@ -1,0 +1,85 @@
+"""Files of a source: text, paths that can never leave the folder, and reading many of them at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeVar
+
+from rich.progress import Progress
+
+from motionloom.datasets.convert.common.splits import check_id
+from motionloom.datasets.schema import UserError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+MAX_TEXT_BYTES = 64 << 20
+"""A text file beyond this is refused unread; the longest split list of a release has a few MB."""
+
+_BOM = b"\xef\xbb\xbf"
+
+
+def read_text_file(path: Path, name: str | None = None) -> str:
+    """The text of a UTF-8 file, with or without a byte order mark; every line ends in a plain newline.
+
+    `name` stands for the path in errors that go into a manifest. `UserError` when the file cannot be read, is
+    far too long, or is not UTF-8; the last names the byte, counted from 0 at the start of the file.
+    """
+    name = str(path) if name is None else name
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_TEXT_BYTES + 1)
+    except OSError as error:
+        raise UserError(f"{name}: cannot read ({error.strerror})") from None
+    if len(raw) > MAX_TEXT_BYTES:
+        raise UserError(f"{name}: more than {MAX_TEXT_BYTES} bytes; is it a text file?")
+    body = raw.removeprefix(_BOM)
+    try:
+        text = body.decode("utf-8")
+    except UnicodeDecodeError as error:
+        at = error.start + len(raw) - len(body)
+        raise UserError(
+            f"{name}: not UTF-8 text at byte {at} (0x{raw[at]:02x}); save the file as UTF-8"
+        ) from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def inside(root: Path, relative: str, name: str | None = None) -> Path:
+    """`root / relative`, which need not exist; `UserError` unless it really lies below `root`.
+
+    Refused: absolute names, `..`, back slashes, drive letters, and links that point out of `root`. `root`
+    itself may be a link (people keep the parts of a release on different disks). `name` stands for `relative`
+    in errors.
+    """
+    name = relative if name is None else name
+    check_id(relative, name)
+    path, linked = root, False
+    for part in relative.split("/"):
+        path = path / part
+        linked = linked or path.is_symlink()
+    if not linked:  # the usual case, at a third of the cost of resolving
+        return path
+    try:
+        safe = path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError):  # a link that points at itself
+        safe = False
+    if not safe:
+        raise UserError(f"{name}: a link that leaves {root.name}/; copy the file in its place")
+    return path
+
+
+def read_in_threads(
+    read: Callable[[T], R], items: Sequence[T], *, workers: int, progress: bool, before: int = 0
+) -> Iterator[R]:
+    """What `read` makes of every item, in their order; the bar counts `before` items as done already.
+
+    Threads are enough: opening many files waits for the disk, unpacking and hashing run outside the
+    interpreter's lock.
+    """
+    with Progress(disable=not progress) as bar, ThreadPoolExecutor(max(workers, 1)) as pool:
+        shown = bar.add_task("reading the source", total=before + len(items), completed=before)
+        for made in pool.map(read, items):
+            yield made
+            bar.advance(shown)

@@ -1,0 +1,316 @@
+"""HumanML3D conversion, first step: options, and a plan of what becomes of every file of the source.
+
+Headers and captions are read, motion data is not. Everything in the folder is accounted for: clips to
+convert, left out, broken or missing, caption lines that are wrong, and a count of the files nobody needs.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from motionloom.datasets.convert.common.arrays import check_array_header
+from motionloom.datasets.convert.common.conversion import ConvertConfig, count_licences, drop, limited
+from motionloom.datasets.convert.common.features import frames_after
+from motionloom.datasets.convert.common.files import inside, read_in_threads
+from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
+from motionloom.datasets.convert.common.plan import ConversionPlan, Subset, frames_by_split
+from motionloom.datasets.convert.common.splits import (
+    check_id,
+    hash_splits,
+    keep_mirrors_together,
+    original_of,
+    read_split_files,
+)
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Caption, Dropped, Split, UserError
+from motionloom.datasets.shards.index import SPLITS
+
+FPS = 20.0
+VECS, JOINTS = "new_joint_vecs", "new_joints"
+WIDTHS: dict[str, int | tuple[int, ...]] = {VECS: 263, JOINTS: (22, 3)}
+LAYOUTS = ("h3d263", "body133")
+LICENCE = (
+    "HumanML3D: motion derived from AMASS (non-commercial research only, no redistribution) and HumanAct12; "
+    "captions MIT"
+)
+RELEASED: dict[Split, int] = {"train": 23384, "val": 1460, "test": 4384}
+"""Ids in the official split files, mirrored ones included."""
+
+_SIDE = re.compile(r"\b(?:left|right|(?:counter|anti)?-?clockwise)\b", re.IGNORECASE)
+_NOTED_FILES = 50
+"""Caption files with bad lines that are named one by one."""
+
+
+class HumanMl3dConfig(ConvertConfig):
+    """Options of the HumanML3D converter; `source` is the folder HumanML3D/ of the release."""
+
+    name: str = "humanml3d"
+    """Name of the data set; part of the shards' file names."""
+    layout: str = "h3d263"
+    """`h3d263` keeps the published vectors; `body133` is made from the joints."""
+    fps: float = Field(default=FPS, gt=0, le=240)
+    """Frame rate of the shards. At any other than 20 the published vectors are made again from the joints."""
+    use: Literal["auto", "vecs", "joints"] = "auto"
+    """`vecs` reads new_joint_vecs/ only, `joints` new_joints/ only. `auto` takes what the layout needs least
+    work for, and where both are there, leaves out clips for which they differ."""
+    retarget: bool = False
+    """Give every clip the bone lengths of the layout's skeleton (published vectors are then made again)."""
+    uncaptioned: Literal["drop", "keep"] = "drop"
+    """What to do with clips that have no usable caption."""
+
+    def motion_layout(self) -> MotionLayout:
+        """The layout of the written shards; 22 joints hold no hands."""
+        if self.layout not in LAYOUTS:
+            raise UserError(f"layout {self.layout} cannot be made from HumanML3D; use {' or '.join(LAYOUTS)}")
+        return super().motion_layout()
+
+    @property
+    def keeps_vectors(self) -> bool:
+        """Whether the published vectors become the shards' features as they are, where they are read."""
+        return self.layout == "h3d263" and self.fps == FPS and not self.retarget
+
+    @property
+    def folders(self) -> tuple[str, ...]:
+        """Motion folders to read, the preferred one first."""
+        if self.use != "auto":
+            return (VECS,) if self.use == "vecs" else (JOINTS,)
+        return (VECS, JOINTS) if self.keeps_vectors else (JOINTS, VECS)
+
+
+@dataclass(frozen=True)
+class HumanMl3dClip:
+    """A clip of the plan."""
+
+    id: str
+    split: Split
+    files: tuple[str, ...]
+    """Motion files by their names in the source: the one to use, then the one to compare with, if any."""
+    frames: int
+    """Frames in the files, at 20 a second."""
+    texts: tuple[Caption, ...]
+    licence: str
+
+    def label(self) -> str:
+        """Name of the clip in reports."""
+        return self.files[0]
+
+
+@dataclass(frozen=True)
+class _Scanned:
+    """What one clip's files say."""
+
+    files: tuple[str, ...]
+    frames: int = 0
+    texts: tuple[Caption, ...] = ()
+    broken: tuple[Dropped, ...] = ()
+    problems: tuple[str, ...] = ()
+
+
+def plan_humanml3d(
+    config: HumanMl3dConfig, *, workers: int = 1, progress: bool = False
+) -> ConversionPlan[HumanMl3dClip]:
+    """Find every clip and decide what becomes of it, without converting anything."""
+    layout = config.motion_layout()
+    if not config.source.is_dir():
+        raise UserError(f"{config.source}: no such folder")
+    present, strange = _list_motion(config)
+    texts = _list_texts(config)
+    splits, notes = _read_splits(config, sorted(present))
+    ids = sorted(present)
+    scan = partial(_scan, config, texts, present)
+    scanned = dict(zip(ids, read_in_threads(scan, ids, workers=workers, progress=progress), strict=True))
+
+    licence = config.licence or LICENCE
+    items: list[tuple[Split, HumanMl3dClip]] = []
+    dropped: list[Dropped] = []
+    whole = {clip_id: found for clip_id, found in scanned.items() if found.frames}
+    for clip_id, found in whole.items():
+        split = splits.get(clip_id)
+        reason = "in no split file" if split is None else _problem(config, found, licence)
+        if split is None or reason:
+            dropped.append(Dropped(source=found.files[0], reason=reason))
+            continue
+        items.append((split, HumanMl3dClip(clip_id, split, found.files, found.frames, found.texts, licence)))
+    notes += _caption_notes(scanned)
+    strays = len(texts.ids.keys() - present.keys())
+    if strays:
+        notes.append(f"{strays} caption files in {texts.folder}/ belong to no motion file here")
+    items = limited(items, HumanMl3dClip.label, config.limit, notes)
+
+    missing = {clip_id: split for clip_id, split in splits.items() if clip_id not in present}
+    wanted = "/ or ".join(config.folders)
+    return ConversionPlan(
+        name=f"{config.source.name} -> {config.name}",
+        items=items,
+        frames=frames_by_split((split, _frames_made(config, clip, layout)) for split, clip in items),
+        found=len(present),
+        missing=[
+            Dropped(source=clip_id, reason=f"listed in {split}.txt, but not in {wanted}/")
+            for clip_id, split in missing.items()
+        ],
+        uncaptioned=[found.files[0] for found in whole.values() if not found.texts],
+        dropped=dropped,
+        broken=strange + [problem for found in scanned.values() for problem in found.broken],
+        ignored=_count_ignored(config, texts.folder),
+        notes=notes,
+        subsets=_subsets(present, splits, missing, items),
+        licences=count_licences([clip.licence for _, clip in items]),
+    )
+
+
+def _frames_made(config: HumanMl3dConfig, clip: HumanMl3dClip, layout: MotionLayout) -> int:
+    """Frames in the shards: vectors that are kept lose none."""
+    if config.keeps_vectors and clip.files[0].startswith(VECS):
+        return clip.frames
+    return frames_after(clip.frames, FPS, layout)
+
+
+def _problem(config: HumanMl3dConfig, found: _Scanned, licence: str) -> str:
+    """Why a clip of a split is left out; empty when it may come."""
+    if not found.texts and config.uncaptioned == "drop":
+        return "no usable caption"
+    return config.licence_problem(licence) or config.length_problem(found.frames / FPS)
+
+
+def _list_motion(config: HumanMl3dConfig) -> tuple[dict[str, tuple[str, ...]], list[Dropped]]:
+    """Clip id -> its motion files, the preferred first; and files whose names cannot be ids."""
+    found: dict[str, list[str]] = {}
+    strange: list[Dropped] = []
+    folders = [folder for folder in config.folders if (config.source / folder).is_dir()]
+    if not folders:
+        wanted = "/ or ".join(config.folders)
+        raise UserError(f"{config.source}: no {wanted}/ in it; give the folder HumanML3D/ of the release")
+    for folder in folders:
+        for name in sorted(path.name for path in (config.source / folder).iterdir()):
+            if not name.endswith(".npy") or name.startswith("."):
+                continue
+            label = f"{folder}/{name}"
+            try:
+                found.setdefault(check_id(name.removesuffix(".npy"), label), []).append(label)
+            except UserError as error:
+                strange.append(drop(label, error))
+    return {clip_id: tuple(files) for clip_id, files in found.items()}, strange
+
+
+@dataclass(frozen=True)
+class _Texts:
+    """The caption files of the source."""
+
+    folder: str
+    """Its name in the source; empty without one."""
+    ids: dict[str, str]
+    """Clip id -> file name."""
+
+
+def _list_texts(config: HumanMl3dConfig) -> _Texts:
+    """The caption files; some unpack texts.zip one level too deep."""
+    for folder in ("texts/texts", "texts"):
+        if (config.source / folder).is_dir():
+            names = [path.name for path in (config.source / folder).iterdir()]
+            texts = [name for name in names if name.endswith(".txt") and not name.startswith(".")]
+            return _Texts(folder, {name.removesuffix(".txt"): name for name in texts})
+    if config.uncaptioned == "keep":
+        return _Texts("", {})
+    hint = "unpack texts.zip" if (config.source / "texts.zip").exists() else "clips would have no captions"
+    raise UserError(f"{config.source}: no texts/ in it; {hint} (or --uncaptioned keep)")
+
+
+def _read_splits(config: HumanMl3dConfig, ids: list[str]) -> tuple[dict[str, Split], list[str]]:
+    """Split of every id, by the split files, else by hash of the id that a clip has unmirrored."""
+    if not any((config.source / f"{split}.txt").is_file() for split in SPLITS):
+        return hash_splits(ids)
+    splits, notes = read_split_files(config.source)
+    keep_mirrors_together(splits, original_of, config.source)
+    return splits, notes
+
+
+def _scan(
+    config: HumanMl3dConfig, texts: _Texts, present: dict[str, tuple[str, ...]], clip_id: str
+) -> _Scanned:
+    """Headers and captions of one clip."""
+    found = _Scanned(present[clip_id])
+    lengths = {}
+    for label in found.files:
+        folder = label.split("/", 1)[0]
+        try:
+            path = inside(config.source / folder, f"{clip_id}.npy", label)
+            lengths[label] = check_array_header(path, width=WIDTHS[folder], name=label)
+        except UserError as error:
+            return replace(found, broken=(drop(label, error),))
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{label} {frames}" for label, frames in lengths.items())
+        reason = f"frames differ ({told}); choose one with --use vecs or --use joints"
+        return replace(found, broken=(Dropped(source=found.files[0], reason=reason),))
+    found = replace(found, frames=lengths[found.files[0]])
+    if clip_id not in texts.ids:
+        return found
+    label = f"{texts.folder}/{texts.ids[clip_id]}"
+    try:
+        path = inside(config.source / texts.folder, texts.ids[clip_id], label)
+        captions, problems = read_humanml_captions(path, seconds=found.frames / FPS, name=label)
+    except UserError as error:
+        return replace(found, broken=(drop(label, error),))
+    told = "; ".join(problems)
+    return replace(found, texts=tuple(captions), problems=(f"{label}: {told}",) if problems else ())
+
+
+def _caption_notes(scanned: dict[str, _Scanned]) -> list[str]:
+    """Caption lines that were left out, and mirrored clips that still name the side of their original."""
+    wrong = [problem for found in scanned.values() for problem in found.problems]
+    notes = wrong[:_NOTED_FILES]
+    if len(wrong) > _NOTED_FILES:
+        notes.append(f"... and {len(wrong) - _NOTED_FILES} more caption files with lines left out")
+    copied = []
+    for clip_id, found in scanned.items():
+        original = scanned.get(original_of(clip_id) or "")
+        said = {caption.text for caption in original.texts} if original else set()
+        same = [
+            caption.text for caption in found.texts if caption.text in said and _SIDE.search(caption.text)
+        ]
+        copied += [f"{clip_id} '{same[0]}'"] if same else []
+    if copied:
+        notes.append(
+            f"{len(copied)} mirrored clips repeat a caption of their original that names a side, so it may "
+            f"be the wrong one: {', '.join(copied[:3])}{', ...' if len(copied) > 3 else ''}"
+        )
+    return notes
+
+
+def _count_ignored(config: HumanMl3dConfig, texts: str) -> int:
+    """Files of the source that are neither motion, captions nor split files: statistics, samples, lists."""
+    ours = {f"{split}.txt" for split in SPLITS}
+    ends = {texts: ".txt", **dict.fromkeys(config.folders, ".npy")}
+    count = 0
+    for folder, _, names in os.walk(config.source):
+        here = Path(folder).relative_to(config.source).as_posix()
+        if here == ".":
+            count += sum(name not in ours for name in names)
+        else:
+            end = ends.get(here)
+            count += sum(end is None or not name.endswith(end) or name.startswith(".") for name in names)
+    return count
+
+
+def _subsets(
+    present: dict[str, tuple[str, ...]],
+    splits: dict[str, Split],
+    missing: dict[str, Split],
+    items: list[tuple[Split, HumanMl3dClip]],
+) -> dict[str, Subset]:
+    """By split file: the release does not say which clip came from which of its sources."""
+    found, absent = Counter(splits.get(clip_id) for clip_id in present), Counter(missing.values())
+    used = Counter(split for split, _ in items)
+    table: dict[str, Subset] = {}
+    for split in SPLITS:
+        table[split] = Subset(found[split], used[split], absent[split], RELEASED[split])
+    if found[None]:
+        table["in no split"] = Subset(found=found[None])
+    return table

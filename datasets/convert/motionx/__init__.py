@@ -1,0 +1,1 @@
+"""Motion-X to shards."""

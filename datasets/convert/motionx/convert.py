@@ -1,0 +1,149 @@
+"""Motion-X -> shards: 322 SMPL-X columns at 30 fps to whole-body features with hands and face.
+
+Choices:
+- Joints come from the pose alone: forward kinematics on the user's body model with each clip's shape, or on a
+  neutral skeleton, where shapes have no effect. Heading, floor and origin are made canonical for every clip,
+  since video subsets lie about in their camera's world.
+- The face is the 50 expression columns. Jaw and face shape are not features (HumanTOMATO section 4.2); layout
+  `smplx322` keeps all columns.
+- Nothing is invented: a clip whose expression is all zero and that has no face motion file says
+  `has_face = False`, one whose finger poses are all zero `has_hands = False`. Zero is what the sources of
+  Motion-X hold where they know nothing (EgoBody's hands, for instance).
+- Face motion files are written in at conversion, stretched over the clip; GRAB keeps its own jaw.
+- Translations of `aist/` become metres exactly once, whether or not the user ran Motion-X's script.
+- 30 fps is believed. Motion-X's scripts thin AMASS by whole steps, so clips from 100 Hz sources really have
+  33.3 fps and play a tenth too slowly here; the files do not say which.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.convert.common.arrays import load_array
+from motionloom.datasets.convert.common.conversion import Conversion, digest
+from motionloom.datasets.convert.common.features import body_of, features_of, require_human
+from motionloom.datasets.convert.common.splits import original_of
+from motionloom.datasets.convert.motionx.parameters import (
+    BETAS,
+    EXPRESSION,
+    FACE_WIDTH,
+    HANDS,
+    RAW,
+    TRANS,
+    resample_parameters,
+    scale_aist,
+    value_limits,
+    with_face,
+    z_up_to_y_up,
+)
+from motionloom.datasets.convert.motionx.plan import (
+    AIST,
+    FPS,
+    LICENCE,
+    MotionXClip,
+    MotionXConfig,
+    plan_motionx,
+)
+from motionloom.datasets.convert.motionx.text import read_frame_texts
+from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
+from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.shards.sample import Sample
+
+__all__ = ["MotionXConfig", "convert_clip", "plan_motionx", "prepare_motionx", "read_parameters"]
+
+CONVERTER = "motionx"
+CONVERTER_VERSION = 1
+
+
+def prepare_motionx(
+    config: MotionXConfig, *, workers: int = 1, progress: bool = False
+) -> Conversion[MotionXClip]:
+    """Look at the whole source; everything is told, nothing is converted yet."""
+    body = body_of(config.body_model, config.skeleton)  # a wrong one should fail before the long part
+    plan = plan_motionx(config, workers=workers, progress=progress)
+    told = []
+    for _, clip in plan.items:
+        sizes = [(config.source / file).stat().st_size for file in clip.files]
+        texts = [caption.dump() for caption in (*clip.texts, *clip.face_texts)]
+        told.append([clip.id, clip.files, sizes, clip.licence, texts])
+    return Conversion(
+        config=config,
+        plan=plan,
+        convert=partial(convert_clip, config, body),
+        describe=MotionXClip.label,
+        licence=config.licence or (next(iter(plan.licences)) if len(plan.licences) == 1 else LICENCE),
+        converter=CONVERTER,
+        version=CONVERTER_VERSION,
+        options=config.options()
+        | {
+            "splits": bool(config.splits),
+            "body_model": body.statement,
+            "source_sha256": digest(told),
+        },
+    )
+
+
+def convert_clip(config: MotionXConfig, body: BodyModel, clip: MotionXClip) -> Sample:
+    """Read one clip and make its features. `UserError` for anything that cannot be a person's motion."""
+    layout = config.motion_layout()
+    values = read_parameters(config, clip)
+    has_face = bool(values[:, EXPRESSION].any())
+    joints = parameters_to_joints(values, body)
+    if layout.family == "raw":
+        require_human(joints, FPS)
+        motion = resample_parameters(values, FPS, layout.fps).astype(np.float32)
+    else:
+        face = values[:, EXPRESSION] if layout.has("face") and has_face else None
+        motion = features_of(joints, FPS, layout, face=face, same_bones=config.retarget)
+    meta = layout.clip_meta(
+        clip.id,
+        source=clip.label(),
+        split=clip.split,
+        frames=len(motion),
+        licence=clip.licence,
+        has_hands=layout.num_joints > BODY_JOINTS and bool(values[:, HANDS].any()),
+        has_face=layout.has("face") and has_face,
+        mirror_of=original_of(clip.id),
+    )
+    texts = [*clip.texts, *_frame_captions(config, clip)]
+    return Sample(meta=meta, motion=motion, texts=texts, face_texts=list(clip.face_texts))
+
+
+def read_parameters(config: MotionXConfig, clip: MotionXClip) -> NDArray[np.float64]:
+    """The clip's columns [T, 322], repaired: metres, Y up, face motion written in."""
+    raw = load_array(config.source / clip.path, width=RAW.dim, name=clip.path, limit=value_limits())
+    if len(raw) != clip.frames:
+        raise UserError(
+            f"{clip.path}: {len(raw)} frames, {clip.frames} when the plan was made; convert again"
+        )
+    values = raw.astype(np.float64)
+    if clip.subset == AIST:
+        values = scale_aist(values)
+    if config.up == "z":
+        values = z_up_to_y_up(values)
+    if clip.face is not None:
+        face = load_array(config.source / clip.face, width=FACE_WIDTH, name=clip.face, limit=1000.0)
+        values = with_face(values, face, keep_jaw=clip.subset == "GRAB")
+    return values
+
+
+def parameters_to_joints(values: NDArray[np.float64], body: BodyModel) -> NDArray[np.float64]:
+    """Columns [T, 322] -> joints [T, N, 3] in metres, of as many joints as the body's skeleton has."""
+    count = len(body.skeleton)
+    rotations = values[:, : 3 * count].reshape(len(values), count, 3)
+    # The shape is one a clip; where a fit let it waver, the median is that of most frames.
+    return smpl_joints(rotations, values[:, TRANS], body, np.median(values[:, BETAS], axis=0))
+
+
+def _frame_captions(config: MotionXConfig, clip: MotionXClip) -> list[Caption]:
+    return [
+        caption
+        for source, file in clip.frame_texts
+        for caption in read_frame_texts(
+            config.source / file, source=source, frames=clip.frames, fps=FPS, name=file
+        )
+    ]

@@ -1,0 +1,220 @@
+"""Where a copy of Motion-X keeps what: every release and every set of scripts names its folders differently.
+
+Nothing about the tree is assumed but names: a folder called like one of `_KINDS`, or like the zip file it
+came from (`motionx_seq_text_v1.1`), holds that kind of file, at most a few levels below the source. What
+follows it in a path is the clip's id: `motion_data/smplx_322/GRAB/s8/mug_toast_1.npy` is
+`GRAB/s8/mug_toast_1`, and so is `texts/GRAB_txt/s8/mug_toast_1.txt`. Base names repeat over the folders, so
+the whole id is the key.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+from motionloom.datasets.convert.common.conversion import drop
+from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.splits import check_id
+from motionloom.datasets.schema import Dropped, UserError
+
+Kind = Literal["motion", "face motion", "captions", "face texts", "body texts", "hand texts"]
+
+OFFICIAL = {
+    "EgoBody": 980,
+    "GRAB": 1335,
+    "HAA500": 5231,
+    "aist": 1470,
+    "animation": 329,
+    "dance": 163,
+    "fitness": 16730,
+    "game_motion": 10217,
+    "humanml": 26288,
+    "humman": 744,
+    "idea400": 12513,
+    "kungfu": 1040,
+    "music": 3565,
+    "perform": 475,
+}
+"""Subsets and the ids that the published `all.txt` lists for each."""
+
+_VERSION = r"(?:[_-]?v?\d+(?:\.\d+)*)?"
+_KINDS: dict[Kind, tuple[str, str]] = {
+    "motion": (rf"smplx_?322|(?:motion_data|motionx_smplx){_VERSION}", ".npy"),
+    "face motion": (rf"(?:motionx_)?face_motion(?:_data)?{_VERSION}", ".npy"),
+    "captions": (rf"(?:semantic_(?:label|text)s?|motionx_seq_texts?){_VERSION}", ".txt"),
+    "face texts": (rf"(?:motionx_)?face_texts?{_VERSION}", ".txt"),
+    "body texts": (rf"(?:motionx_)?body_texts?{_VERSION}", ".json"),
+    "hand texts": (rf"(?:motionx_)?hand_texts?{_VERSION}", ".json"),
+}
+"""Names of the folder (any case) and of the files of each kind."""
+_PATTERNS = {kind: re.compile(names, re.IGNORECASE) for kind, (names, _) in _KINDS.items()}
+_SMPLX = re.compile(r"smplx_?322", re.IGNORECASE)
+"""The inner folder of motion and, although its files have 153 columns, of face motion."""
+_SCRIPTS = re.compile(r"(humanml|grab|egobody)_(motion|texts?|txt)", re.IGNORECASE)
+"""What the authors' scripts call a subset until it is moved in its place."""
+_CASE = {name.lower(): name for name in OFFICIAL}
+_DEEP = 5
+"""Levels below the source at which the folder of a kind may lie."""
+
+
+@dataclass(frozen=True)
+class MotionXFiles:
+    """The files of a source by kind and clip id; paths are relative to the source, with `/`."""
+
+    by_kind: dict[Kind, dict[str, str]]
+    folders: dict[Kind, Counter[str]]
+    """Folders taken for each kind and the files in each."""
+    broken: list[Dropped] = field(default_factory=list)
+    """Names that cannot be ids, and links that leave their folder."""
+    repeated: list[Dropped] = field(default_factory=list)
+    """Motion files whose id another file has already."""
+    second: Counter[Kind] = field(default_factory=Counter)
+    """Other files whose id a file of their kind has already."""
+    others: set[str] = field(default_factory=set)
+    """Files of no kind."""
+
+    def notes(self) -> list[str]:
+        """Which folders were taken for what."""
+        told = []
+        for kind, folders in self.folders.items():
+            named = [f"{folder or '.'}/ ({count} files)" for folder, count in sorted(folders.items())]
+            told.append(f"{kind}: {', '.join(named) if named else 'none in this source'}")
+        told += [f"{kind}: {count} files of clips that have one" for kind, count in self.second.items()]
+        return told
+
+
+@dataclass(frozen=True)
+class _Place:
+    """What the path of a folder says."""
+
+    kind: Kind
+    root: str
+    """Folder taken for the kind."""
+    rest: tuple[str, ...]
+    """Folders of the ids below it."""
+    smplx: bool
+    """Whether an inner smplx_322 was named."""
+
+
+def find_files(source: Path) -> MotionXFiles:
+    """Walk the whole source once. `UserError` when it holds no motion folder."""
+    if not source.is_dir():
+        raise UserError(f"{source}: no such folder")
+    placed: list[tuple[_Place, str, str]] = []
+    others: set[str] = set()
+    broken: list[Dropped] = []
+    for parts, entry in _walk(source, (), frozenset()):
+        place, name = _place(parts), "/".join((*parts, entry.name))
+        if place is None or entry.name.startswith(".") or not entry.name.endswith(_KINDS[place.kind][1]):
+            others.add(name)
+            continue
+        shown = name.encode("utf-8", "backslashreplace").decode()
+        try:
+            clip_id = "/".join((*place.rest, entry.name.removesuffix(_KINDS[place.kind][1])))
+            check_id(clip_id, shown)
+            if entry.is_symlink():
+                inside(source.joinpath(*parts), entry.name, shown)
+        except UserError as error:
+            broken.append(drop(shown, error))
+            continue
+        placed.append((place, clip_id, name))
+    # `motion_data/` beside an inner `smplx_322/` may hold other representations of the same clips.
+    has_inner = {kind: any(p.kind == kind and p.smplx for p, _, _ in placed) for kind in _KINDS}
+    found = MotionXFiles({kind: {} for kind in _KINDS}, {kind: Counter() for kind in _KINDS}, broken)
+    for place, clip_id, name in placed:
+        kind = place.kind
+        if has_inner[kind] and not place.smplx:
+            others.add(name)
+            continue
+        found.folders[kind][place.root] += 1
+        first = found.by_kind[kind].setdefault(clip_id, name)
+        if first == name:
+            continue
+        if kind == "motion":
+            reason = f"second file for clip id '{clip_id}'; the first is {first}"
+            found.repeated.append(Dropped(source=name, reason=reason))
+        else:
+            found.second[kind] += 1
+    found.others.update(others)
+    if not found.by_kind["motion"]:
+        raise UserError(
+            f"{source}: no Motion-X motion in it; give the folder that holds motion_data/smplx_322/ "
+            f"(or motionx_smplx/, smplx_322/)"
+        )
+    return found
+
+
+def official_id(clip_id: str) -> str:
+    """The id with its subset spelt as in the release: `grab_txt/s1/a` -> `GRAB/s1/a`."""
+    return "/".join(_subset_first(tuple(clip_id.split("/"))))
+
+
+def subset_of(clip_id: str) -> str:
+    """First folder of an id; empty for clips that lie in none."""
+    return clip_id.split("/", 1)[0] if "/" in clip_id else ""
+
+
+def _walk(
+    folder: Path, parts: tuple[str, ...], above: frozenset[str]
+) -> Iterator[tuple[tuple[str, ...], os.DirEntry[str]]]:
+    """Every file below a folder in the order of names, with the folders above it.
+
+    Linked folders are followed down to the subsets (people keep the parts of a release on different disks),
+    but never into a folder that they lie in.
+    """
+    try:
+        with os.scandir(folder) as listed:
+            entries = sorted(listed, key=lambda entry: entry.name)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be listed ({error.strerror})") from None
+    real = os.path.realpath(folder)
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            yield from _walk(folder / entry.name, (*parts, entry.name), above | {real})
+        elif entry.is_symlink() and entry.is_dir():
+            target = os.path.realpath(entry.path)
+            place = _place((*parts, entry.name))
+            if len(place.rest if place else parts) <= 1 and target not in above | {real}:
+                yield from _walk(folder / entry.name, (*parts, entry.name), above | {real})
+        else:
+            yield parts, entry
+
+
+@lru_cache(maxsize=256)
+def _place(parts: tuple[str, ...]) -> _Place | None:
+    """Kind, root and id folders of a path; None for a folder of no kind."""
+    if "__MACOSX" in parts:
+        return None
+    for depth, part in enumerate(parts[:_DEEP]):
+        kind = next((kind for kind, names in _PATTERNS.items() if names.fullmatch(part)), None)
+        if kind is None:
+            by_script = _SCRIPTS.fullmatch(part)
+            if by_script:
+                made: Kind = "motion" if by_script[2].lower() == "motion" else "captions"
+                rest = _subset_first(parts[depth:])
+                return _Place(made, "/".join(parts[: depth + 1]), rest, smplx=made == "motion")
+            continue
+        end, smplx = depth + 1, bool(_SMPLX.fullmatch(part))
+        while end < len(parts) and (_PATTERNS[kind].fullmatch(parts[end]) or _SMPLX.fullmatch(parts[end])):
+            smplx = smplx or bool(_SMPLX.fullmatch(parts[end]))
+            end += 1
+        return _Place(kind, "/".join(parts[:end]), _subset_first(parts[end:]), smplx)
+    return None
+
+
+def _subset_first(parts: tuple[str, ...]) -> tuple[str, ...]:
+    """Folders of an id with the subset's official name."""
+    if not parts:
+        return parts
+    by_script = _SCRIPTS.fullmatch(parts[0])
+    subset = by_script[1] if by_script else parts[0]
+    rest = parts[1:]
+    if subset.lower() == "humanml" and rest[:1] == ("texts",):
+        rest = rest[1:]  # HumanML3D's texts.zip holds a folder of this name
+    return (_CASE.get(subset.lower(), subset), *rest)

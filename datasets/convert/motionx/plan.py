@@ -1,0 +1,345 @@
+"""Motion-X conversion, first step: options, and a plan of what becomes of every file of the source.
+
+Headers and texts are read; motion data is not, but for a few `aist/` clips whose scale is told. Nothing is
+required but the motion: splits, captions, face motion and face texts are taken where they are.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from motionloom.datasets.convert.common.arrays import check_array_header, load_array
+from motionloom.datasets.convert.common.conversion import ConvertConfig, count_licences, digest, drop, limited
+from motionloom.datasets.convert.common.features import frames_after
+from motionloom.datasets.convert.common.files import read_in_threads
+from motionloom.datasets.convert.common.plan import ConversionPlan, Subset, frames_by_split
+from motionloom.datasets.convert.common.splits import (
+    hash_splits,
+    keep_mirrors_together,
+    original_of,
+    read_split_files,
+)
+from motionloom.datasets.convert.motionx.files import (
+    OFFICIAL,
+    MotionXFiles,
+    find_files,
+    official_id,
+    subset_of,
+)
+from motionloom.datasets.convert.motionx.parameters import FACE_WIDTH, RAW, aist_scale
+from motionloom.datasets.convert.motionx.text import HUMANML, read_motionx_captions, read_sentences
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.smpl import SkeletonName
+from motionloom.datasets.schema import Caption, Dropped, Split, UserError
+from motionloom.datasets.shards.index import SPLITS
+
+FPS = 30.0
+LAYOUTS = ("wholebody363", "wholebody313", "body133", "tomato623", "h3d263", "smplx322")
+AIST = "aist"
+MOCAP = ("humanml", "EgoBody", "GRAB")
+"""Subsets whose faces come in files of their own."""
+
+LICENCE = "Motion-X-noncommercial"
+LICENCES = {
+    "humanml": "AMASS-noncommercial",
+    "GRAB": "GRAB-noncommercial",
+    "EgoBody": "EgoBody-noncommercial",
+    "aist": "Motion-X-noncommercial AND AIST++-annotations-CC-BY-4.0",
+    "HAA500": "Motion-X-noncommercial AND HAA500-terms",
+    "humman": "Motion-X-noncommercial AND HuMMan-terms",
+}
+"""Our reading, on the careful side: motion that the user gets from its own site keeps that site's licence,
+all that Motion-X hands out needs its agreement as well, and both count where it has a first owner."""
+
+RELEASED: dict[Split, int] = {"train": 64867, "val": 4046, "test": 12167}
+"""Ids in the published split files."""
+
+_SPLIT_FOLDERS = ("", "split", "splits", "datasets")
+_LOOKED_AT = 8
+"""Clips of `aist/` that the plan reads to tell their scale."""
+_NOTED_FILES = 20
+"""Text files with bad lines that are named one by one."""
+
+
+class MotionXConfig(ConvertConfig):
+    """Options of the Motion-X converter. `source` is the folder that holds motion_data/ and texts/, under
+    any of the names they have had."""
+
+    name: str = "motionx"
+    layout: str = "wholebody363"
+    fps: float = FPS
+    subsets: tuple[str, ...] = ()
+    """Convert only these subsets (`GRAB`, `idea400`, ...); empty means all."""
+    splits: Path | None = None
+    """Folder of train.txt, val.txt, test.txt; else searched at the top of the source, in `split/`, `splits/`
+    and `datasets/`; else 80/5/15 by hash of the id."""
+    body_model: Path | None = None
+    """Your SMPL-X or SMPL-H model (.npz), for joints with each clip's own shape; else a neutral skeleton."""
+    retarget: bool = False
+    """Give every clip the bone lengths of the layout's skeleton (the h3d layouts always do)."""
+    up: Literal["y", "z"] = "y"
+    """Up axis of the source. The release is Y up; `z` is for own files that no script has turned yet."""
+    uncaptioned: Literal["drop", "keep"] = "drop"
+    """What to do with clips that have no usable caption."""
+    frame_texts: bool = False
+    """Add the sentences about single frames (body_texts, hand_texts) as captions of 1/30 s and longer, with
+    source `body` and `hand`. They are many: about one a frame."""
+
+    def motion_layout(self) -> MotionLayout:
+        """The layout of the written shards."""
+        if self.layout not in LAYOUTS:
+            raise UserError(f"layout {self.layout} cannot be made from Motion-X; use {', '.join(LAYOUTS)}")
+        return super().motion_layout()
+
+    @property
+    def skeleton(self) -> SkeletonName:
+        """The skeleton of the layout."""
+        return "smpl22" if self.motion_layout().skeleton_name == "smpl22" else "smplx52"
+
+
+@dataclass(frozen=True)
+class MotionXClip:
+    """A clip of the plan. Paths are relative to the source."""
+
+    id: str
+    path: str
+    split: Split
+    frames: int
+    """At 30 a second."""
+    licence: str
+    texts: tuple[Caption, ...] = ()
+    face_texts: tuple[Caption, ...] = ()
+    face: str | None = None
+    """Face motion to write in."""
+    frame_texts: tuple[tuple[str, str], ...] = ()
+    """(source of the captions, file) of sentences about frames."""
+
+    @property
+    def subset(self) -> str:
+        """The clip's folder in the release."""
+        return subset_of(self.id)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Every file the sample is made of, but for texts."""
+        return (self.path, *([self.face] if self.face else []), *(file for _, file in self.frame_texts))
+
+    def label(self) -> str:
+        """Name of the clip in reports."""
+        return self.path
+
+
+@dataclass(frozen=True)
+class _Scanned:
+    """What the files of one clip say."""
+
+    id: str
+    frames: int = 0
+    texts: tuple[Caption, ...] = ()
+    face_texts: tuple[Caption, ...] = ()
+    face: str | None = None
+    broken: tuple[Dropped, ...] = ()
+    problems: tuple[str, ...] = ()
+
+
+def plan_motionx(
+    config: MotionXConfig, *, workers: int = 1, progress: bool = False
+) -> ConversionPlan[MotionXClip]:
+    """Find every clip and decide what becomes of it, without converting anything."""
+    layout = config.motion_layout()
+    files = find_files(config.source)
+    motion = files.by_kind["motion"]
+    ids = sorted(clip_id for clip_id in motion if _wanted(config, clip_id))
+    if not ids:
+        present = sorted({subset_of(clip_id) for clip_id in motion})
+        raise UserError(f"{config.source}: none of {config.subsets} in it, but {', '.join(present)}")
+    splits, split_files, notes = _read_splits(config, files, ids)
+    scan = partial(_scan, config.source, files)
+    scanned = list(read_in_threads(scan, ids, workers=workers, progress=progress))
+
+    items: list[tuple[Split, MotionXClip]] = []
+    dropped = list(files.repeated)
+    uncaptioned: list[str] = []
+    for found in scanned:
+        if not found.frames:
+            continue  # broken
+        path, split = motion[found.id], splits.get(found.id)
+        licence = config.licence or LICENCES.get(subset_of(found.id), LICENCE)
+        if not found.texts:
+            uncaptioned.append(path)
+        if split is None:
+            reason = "in no split file"
+        elif not found.texts and config.uncaptioned == "drop":
+            reason = "no usable caption"
+        else:
+            reason = config.length_problem(found.frames / FPS) or config.licence_problem(licence)
+        if reason or split is None:
+            dropped.append(Dropped(source=path, reason=reason))
+            continue
+        frame_texts = _frame_texts(files, found.id) if config.frame_texts else ()
+        clip = MotionXClip(
+            found.id, path, split, found.frames, licence, found.texts, found.face_texts, found.face,
+            frame_texts,
+        )  # fmt: skip
+        items.append((split, clip))
+    items = limited(items, MotionXClip.label, config.limit, notes)
+    missing = [clip_id for clip_id in splits if clip_id not in motion]
+    unwanted = len(motion) - len(ids)
+    texts_alone = [clip_id for clip_id in files.by_kind["captions"] if clip_id not in motion]
+    return ConversionPlan(
+        name=f"{config.source.name} -> {config.name}",
+        items=items,
+        frames=frames_by_split((split, frames_after(clip.frames, FPS, layout)) for split, clip in items),
+        found=len(ids) + len(files.repeated),
+        missing=[
+            Dropped(source=clip_id, reason=f"listed in {splits[clip_id]}.txt, but its motion is not here")
+            for clip_id in missing
+        ],
+        uncaptioned=uncaptioned,
+        dropped=dropped,
+        broken=[*files.broken, *(problem for found in scanned for problem in found.broken)],
+        ignored=len(files.others - split_files) + unwanted,
+        notes=[
+            *files.notes(),
+            *notes,
+            *_subset_notes(config, files, scanned),
+            *([f"{unwanted} clips of other subsets are not asked for"] if unwanted else []),
+            *([f"{len(texts_alone)} caption files have no motion"] if texts_alone else []),
+            *_text_notes(scanned),
+        ],
+        subsets=_subsets(motion, missing, items),
+        licences=count_licences([clip.licence for _, clip in items]),
+    )
+
+
+def _wanted(config: MotionXConfig, clip_id: str) -> bool:
+    return not config.subsets or subset_of(clip_id) in config.subsets
+
+
+def _read_splits(
+    config: MotionXConfig, files: MotionXFiles, ids: list[str]
+) -> tuple[dict[str, Split], set[str], list[str]]:
+    """Split of every wanted id, the split files by their names in the source, and notes."""
+    names = [f"{split}.txt" for split in SPLITS]
+    if config.splits is not None:
+        folder: Path | None = config.splits
+        told = "splits: from the folder given"
+    else:
+        found = [name for name in _SPLIT_FOLDERS if any((config.source / name / f).is_file() for f in names)]
+        folder = config.source / found[0] if found else None
+        told = f"splits: {found[0] or '.'}/" if found else ""
+    if folder is None:
+        hashed, notes = hash_splits(ids)
+        return hashed, set(), notes
+    listed, notes = read_split_files(folder)
+    keep_mirrors_together(listed, original_of, folder)
+    splits: dict[str, Split] = {}
+    for clip_id, split in listed.items():
+        official = official_id(clip_id.removesuffix(".npy"))
+        if splits.setdefault(official, split) != split:
+            raise UserError(
+                f"{folder}: '{official}' is in {splits[official]}.txt and {split}.txt; that leaks"
+            )
+    counts = Counter(splits.values())
+    numbers = ", ".join(f"{split} {counts[split]:,} ids of {RELEASED[split]:,}" for split in SPLITS)
+    used = set()
+    if folder.is_relative_to(config.source):
+        inner = folder.relative_to(config.source)
+        used = {(inner / name).as_posix() for name in (*names, "all.txt")}
+    wanted = {clip_id: split for clip_id, split in splits.items() if _wanted(config, clip_id)}
+    return wanted, used, [f"{told}; {numbers} in the release", *notes]
+
+
+def _scan(source: Path, files: MotionXFiles, clip_id: str) -> _Scanned:
+    """Headers and texts of one clip."""
+    label = files.by_kind["motion"][clip_id]
+    broken: list[Dropped] = []
+    problems: list[str] = []
+    try:
+        frames = check_array_header(source / label, width=RAW.dim, name=label)
+    except UserError as error:
+        return _Scanned(clip_id, broken=(drop(label, error),))
+    texts: list[Caption] = []
+    face_texts: list[Caption] = []
+    file = files.by_kind["captions"].get(clip_id)
+    if file is not None:
+        try:
+            texts, wrong = read_motionx_captions(
+                source / file, subset=subset_of(clip_id), seconds=frames / FPS, name=file
+            )
+            problems += [f"{file}: {'; '.join(wrong)}"] if wrong else []
+        except UserError as error:
+            broken.append(drop(file, error))
+    file = files.by_kind["face texts"].get(clip_id)
+    if file is not None:
+        try:
+            face_texts, wrong = read_sentences(source / file, source="face", name=file)
+            problems += [f"{file}: {'; '.join(wrong)}"] if wrong else []
+        except UserError as error:
+            broken.append(drop(file, error))
+    face = files.by_kind["face motion"].get(clip_id)
+    if face is not None:
+        try:
+            check_array_header(source / face, width=FACE_WIDTH, name=face)
+        except UserError as error:
+            broken.append(drop(face, error))
+            face = None
+    return _Scanned(clip_id, frames, tuple(texts), tuple(face_texts), face, tuple(broken), tuple(problems))
+
+
+def _frame_texts(files: MotionXFiles, clip_id: str) -> tuple[tuple[str, str], ...]:
+    found = (("body", files.by_kind["body texts"]), ("hand", files.by_kind["hand texts"]))
+    return tuple((source, table[clip_id]) for source, table in found if clip_id in table)
+
+
+def _subset_notes(config: MotionXConfig, files: MotionXFiles, scanned: list[_Scanned]) -> list[str]:
+    """What single subsets need: HumanML3D's captions, and the scale of the dances."""
+    notes = []
+    humanml = [found for found in scanned if subset_of(found.id) == HUMANML]
+    if humanml and not any(found.texts for found in humanml):
+        notes.append("humanml/ has no captions: unpack HumanML3D's texts.zip as humanml/ beside the others")
+    mocap = [found for found in scanned if subset_of(found.id) in MOCAP and found.frames]
+    faceless = sum(found.face is None for found in mocap)
+    if faceless:
+        notes.append(
+            f"{faceless} of {len(mocap)} clips of {', '.join(MOCAP)} have no face motion file: unless their "
+            f"own columns hold an expression, their face is masked"
+        )
+    dances = [found.id for found in scanned if subset_of(found.id) == AIST and found.frames]
+    states: Counter[str] = Counter()
+    for clip_id in sorted(dances, key=digest)[:_LOOKED_AT]:
+        path = files.by_kind["motion"][clip_id]
+        try:
+            states[aist_scale(load_array(config.source / path, width=RAW.dim, name=path))] += 1
+        except UserError:
+            states["broken"] += 1  # the conversion tells why
+    if states:
+        told = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
+        notes.append(
+            f"aist/: of {states.total()} clips looked at, {told}; raw ones are brought to metres once "
+            f"(/ 94, z negated), each judged by itself"
+        )
+    return notes
+
+
+def _text_notes(scanned: list[_Scanned]) -> list[str]:
+    """Lines of texts that were left out."""
+    wrong = [problem for found in scanned for problem in found.problems]
+    more = [f"... and {len(wrong) - _NOTED_FILES} more text files with lines left out"]
+    return wrong[:_NOTED_FILES] + (more if len(wrong) > _NOTED_FILES else [])
+
+
+def _subsets(
+    motion: Iterable[str], missing: list[str], items: list[tuple[Split, MotionXClip]]
+) -> dict[str, Subset]:
+    found, absent = Counter(map(subset_of, motion)), Counter(map(subset_of, missing))
+    used = Counter(clip.subset for _, clip in items)
+    return {
+        name or "(no folder)": Subset(found[name], used[name], absent[name], OFFICIAL.get(name))
+        for name in sorted(found.keys() | absent.keys())
+    }

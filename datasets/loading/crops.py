@@ -1,0 +1,88 @@
+"""Copying pieces of clips into one normalised, zero-padded batch array: the loader's inner loop.
+
+A window is subtracted and scaled while it is in the processor's cache, straight from the mapped tar into its
+place in the batch: no intermediate array, no tensor per sample. When all columns are wanted, a window is one
+run of memory and is treated as one long row (mean and scale repeated per frame), which halves the time of
+broadcasting over rows.
+
+Columns of a part that a clip does not hold (hands, face) come out as 0, the mean, whatever the file stores.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.reader import require_layout
+
+
+class Crops:
+    """Reads normalised pieces of a dataset's clips, all columns or some (`columns`, ascending, [C])."""
+
+    def __init__(
+        self, dataset: ClipDataset, stats: FeatureStats, columns: NDArray[np.int64] | None = None
+    ) -> None:
+        require_layout(stats.layout, dataset.layout, "feature statistics")
+        chosen = np.arange(dataset.layout.dim) if columns is None else np.asarray(columns)
+        if len(chosen) == 0 or chosen.min() < 0 or chosen.max() >= dataset.layout.dim:
+            raise UserError(f"columns outside layout {dataset.layout.name} (or none of them)")
+        self.dataset = dataset
+        self.width = len(chosen)
+        self.held = dataset.layout.held_columns[:, chosen]
+        """Row b: which of the columns clips hold that hold the bits b, [4, C]."""
+        some = np.asarray(self.held.any(axis=1))
+        self.clips = np.flatnonzero(some[dataset.held])
+        """Clips that hold any of the columns: the others have nothing to give, [n]."""
+        self._lost = [[place for place, _ in _runs(np.flatnonzero(~row))] for row in self.held]
+        self._mean = stats.mean[chosen]
+        self._scale = 1.0 / stats.std[chosen]
+        self._mean_row, self._scale_row = self._mean, self._scale
+        self._runs = _runs(chosen)
+
+    def fill(
+        self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int, held: int
+    ) -> None:
+        """Normalised frames `start .. start + length` of `clip` into `out` [T >= length, C], then zeros.
+
+        `held` are the bits of what the clip holds.
+        """
+        target = out[:length]
+        if self.width == clip.shape[1]:
+            row = target.reshape(-1)  # a view: both are contiguous
+            mean, scale = self._repeated(length)
+            np.subtract(clip[start : start + length].reshape(-1), mean, out=row)
+            np.multiply(row, scale, out=row)
+        else:
+            for source, place in self._runs:
+                np.subtract(clip[start : start + length, source], self._mean[place], out=target[:, place])
+            np.multiply(target, self._scale, out=target)
+        for place in self._lost[held]:
+            target[:, place] = 0.0
+        if length < len(out):
+            out[length:] = 0.0
+
+    def _repeated(self, length: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Mean and scale of `length` frames as one row; kept for the longest length asked for."""
+        size = length * self.width
+        if len(self._mean_row) < size:
+            self._mean_row, self._scale_row = np.tile(self._mean, length), np.tile(self._scale, length)
+        return self._mean_row[:size], self._scale_row[:size]
+
+
+def _runs(columns: NDArray[np.int64]) -> list[tuple[slice, slice]]:
+    """(slice of the clip's columns, slice of the batch's columns) for each run of neighbouring columns."""
+    if len(columns) == 0:
+        return []
+    breaks = np.flatnonzero(np.diff(columns) != 1) + 1
+    edges = [0, *breaks.tolist(), len(columns)]
+    return [(slice(int(columns[a]), int(columns[b - 1]) + 1), slice(a, b)) for a, b in pairwise(edges)]
+
+
+def padded_length(lengths: NDArray[np.int64], multiple: int = 4) -> int:
+    """The longest length, rounded up to what the tokenizers' down-sampling divides."""
+    return -(-int(lengths.max()) // multiple) * multiple

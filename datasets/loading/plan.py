@@ -1,0 +1,124 @@
+"""`BatchPlan`: which items every global batch holds, as a pure function of (seed, batch number).
+
+The order never depends on the number of ranks or loader workers, so a run may stop on two ranks and go on
+with one and still see the same global batches; a loader's whole state is the number of batches consumed.
+Every rank gets the same number of batches by construction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.base.randomness import permutation
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.order import Source, mixed_order, shares, source_order
+
+POOL = 8
+"""Batches sorted by length together. More leave less padding, fewer mix lengths better."""
+
+
+class BatchPlan:
+    """Seeded epochs over `num_items`, cut into global batches of `batch_items`.
+
+    Each epoch is a fresh permutation of all items; a batch never crosses an epoch boundary, so up to
+    `batch_items - 1` items (different ones each epoch) sit an epoch out. With fewer items than one batch, the
+    permutation repeats until the batch is full.
+
+    `sources` say how the items lie. One with shard numbers gives the streamed order (`order.source_order`).
+    Several are mixed by their weights (`order.mixed_order`): an epoch then is as many places as there are
+    items in all sources, rounded down to whole batches, shared out exactly by weight.
+
+    With `lengths` [num_items] a batch holds items of similar length, so that little of it is padding: every
+    `POOL` batches of the order are sorted by length and dealt out again in random order. Shares by weight
+    then hold for such a pool, not for each batch.
+    """
+
+    def __init__(
+        self,
+        num_items: int,
+        batch_items: int,
+        seed: int,
+        lengths: NDArray[np.int64] | None = None,
+        sources: Sequence[Source] = (),
+    ) -> None:
+        if num_items < 1:
+            raise UserError("the batch plan has no items: the split is empty or every clip was filtered out")
+        if batch_items < 1:
+            raise UserError(f"a batch needs at least one item, not {batch_items}")
+        self.num_items = num_items
+        self.batch_items = batch_items
+        self.seed = seed
+        self.lengths = lengths
+        self.sources = tuple(sources) or (Source(0, num_items),)
+        if len(self.sources) > 1:
+            shares(self.sources, self._used)  # too small a weight is refused now, not in a loader worker
+        self._order = lru_cache(maxsize=2)(self._epoch)
+
+    @property
+    def batches_per_epoch(self) -> int:
+        """Global batches in one epoch, at least 1."""
+        return max(1, self.num_items // self.batch_items)
+
+    @property
+    def _used(self) -> int:
+        """Places of an epoch."""
+        return self.batches_per_epoch * self.batch_items
+
+    def batch(self, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(turns, items), both [batch_items], of global batch `k`, `k >= 0`.
+
+        The turn counts how often an item's data set has been gone through before: the epoch, unless data
+        sets are mixed. Random draws for an item are keyed by its turn.
+        """
+        if k < 0:
+            raise IndexError(f"batch numbers start at 0, not {k}")
+        epoch, position = divmod(k, self.batches_per_epoch)
+        order, turns = self._order(epoch)
+        if len(order) < self.batch_items:
+            return np.resize(turns, self.batch_items), np.resize(order, self.batch_items)
+        part = slice(position * self.batch_items, (position + 1) * self.batch_items)
+        return turns[part], order[part]
+
+    def local(self, k: int, rank: int, world: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(turns, items), [batch_items / world]: the rank's part of batch `k`.
+
+        Parts are contiguous: rows gathered in rank order stand as in the batch of a single process.
+        """
+        if self.batch_items % world:
+            raise UserError(
+                f"a global batch of {self.batch_items} clips does not divide over {world} ranks; "
+                f"make the batch size a multiple of the number of ranks"
+            )
+        turns, items = self.batch(k)
+        share = self.batch_items // world
+        part = slice(rank * share, (rank + 1) * share)
+        return turns[part], items[part]
+
+    def _epoch(self, epoch: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        if len(self.sources) == 1:
+            order = source_order(self.sources[0], self.seed, epoch)
+            turns = np.full(len(order), epoch)
+        else:
+            order, turns = mixed_order(self.sources, self._used, self.seed, epoch)
+        if self.lengths is None or len(order) < self.batch_items:
+            return order, turns
+        size, used = self.batch_items, self._used
+        for start in range(0, used, POOL * size):
+            end = min(start + POOL * size, used)
+            by_length = np.argsort(self.lengths[order[start:end]], kind="stable").reshape(-1, size)
+            # The epoch's own number keeps this draw apart from that of the permutation itself.
+            dealt = start + by_length[permutation(len(by_length), self.seed, epoch, start + 1)].ravel()
+            order[start:end], turns[start:end] = order[dealt], turns[dealt]
+        return order, turns
+
+    def __getstate__(self) -> dict[str, Any]:
+        names = ("num_items", "batch_items", "seed", "lengths", "sources")
+        return {name: getattr(self, name) for name in names}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        BatchPlan.__init__(self, **state)

@@ -1,0 +1,210 @@
+"""`FeatureStats`: per-column mean and standard deviation, computed in one pass.
+
+A column counts the clips that hold it: what a clip without hands or face stores there plays no part. A column
+that no clip holds gets mean 0 and standard deviation 1.
+
+`Moments` holds (count, mean, sum of squared deviations) and merges by Chan's formula, so clips, shards and
+workers may be combined in any grouping. Statistics come from the training split only; whoever calls `compute`
+decides that by the dataset it passes.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.progress import track
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+from torch import Tensor
+
+from motionloom.datasets.base.files import atomic_file
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import ClipDataset, in_order
+from motionloom.datasets.shards.reader import require_layout
+
+STD_FLOOR = 1e-4
+"""Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
+
+Values = TypeVar("Values", NDArray[np.float32], Tensor)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Streaming mean and variance of rows, float64, all [D]; `count` is of rows that hold the column."""
+
+    count: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    m2: NDArray[np.float64]
+
+    @staticmethod
+    def none(width: int) -> Moments:
+        """No rows yet."""
+        return Moments(np.zeros(width), np.zeros(width), np.zeros(width))
+
+    @staticmethod
+    def of(rows: NDArray[np.floating], held: NDArray[np.bool_] | None = None) -> Moments:
+        """Of one array [T, D]; `held` [D] says which columns count (all when None)."""
+        mean = rows.mean(axis=0, dtype=np.float64)
+        m2 = np.square(rows - mean).sum(axis=0)
+        count = np.full(len(mean), float(len(rows)))
+        if held is None or held.all():
+            return Moments(count, mean, m2)
+        return Moments(*(np.where(held, values, 0.0) for values in (count, mean, m2)))
+
+    def merge(self, other: Moments) -> Moments:
+        """Of both together."""
+        count = self.count + other.count
+        rows = np.where(count > 0, count, 1.0)
+        delta = other.mean - self.mean
+        mean = self.mean + delta * (other.count / rows)
+        m2 = self.m2 + other.m2 + np.square(delta) * (self.count * other.count / rows)
+        return Moments(count, mean, m2)
+
+    def counted(self, times: float) -> Moments:
+        """As if every row stood there so many times."""
+        return Moments(self.count * times, self.mean, self.m2 * times)
+
+    @property
+    def std(self) -> NDArray[np.float64]:
+        """Population standard deviation, [D]; 0 of a column without rows."""
+        return np.sqrt(self.m2 / np.where(self.count > 0, self.count, 1.0))
+
+
+@dataclass(frozen=True)
+class FeatureStats:
+    """Mean and std, [D] float32, of the columns of a layout."""
+
+    mean: NDArray[np.float32]
+    std: NDArray[np.float32]
+    layout: MotionLayout
+    frames: int = 0
+    """Frames they were computed from."""
+    _tensors: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def normalize(self, values: Values, columns: NDArray[np.int64] | None = None) -> Values:
+        """(values - mean) / std over the last axis; numpy or torch. `columns`: which ones `values` holds."""
+        if isinstance(values, Tensor):
+            mean, std = self._on(values, columns)
+            return (values - mean) / std
+        return (values - self._take(self.mean, columns)) / self._take(self.std, columns)
+
+    def denormalize(self, values: Values, columns: NDArray[np.int64] | None = None) -> Values:
+        """values * std + mean over the last axis; numpy or torch, differentiable."""
+        if isinstance(values, Tensor):
+            mean, std = self._on(values, columns)
+            return values * std + mean
+        return values * self._take(self.std, columns) + self._take(self.mean, columns)
+
+    def save(self, path: Path) -> None:
+        """Write a safetensors file, with the layout in its metadata, atomically."""
+        layout = self.layout
+        about = {
+            "layout": layout.name,
+            "family": layout.family,
+            "fps": repr(layout.fps),
+            "frames": str(self.frames),
+        }
+        with atomic_file(path) as file:
+            file.write(_sorted_header(save({"mean": self.mean, "std": self.std}, metadata=about)))
+
+    @staticmethod
+    def load(path: Path, *, expect: MotionLayout | None = None) -> FeatureStats:
+        """Read what `save` wrote; `UserError` when it is not that or not of the expected layout."""
+        try:
+            with safe_open(path, framework="numpy") as stored:
+                about = stored.metadata() or {}
+                mean, std = stored.get_tensor("mean"), stored.get_tensor("std")
+            layout = MotionLayout.named(about["layout"], fps=float(about["fps"]), family=about["family"])
+            frames = int(about["frames"])
+        except FileNotFoundError:
+            raise UserError(f"{path}: no such file; run the statistics stage") from None
+        except (SafetensorError, OSError, KeyError, ValueError) as error:
+            raise UserError(
+                f"{path}: not a statistics file ({error}); run the statistics stage again"
+            ) from None
+        if mean.shape != (layout.dim,) or std.shape != (layout.dim,) or not (std > 0).all():
+            raise UserError(
+                f"{path}: not {layout.dim} columns with positive std; run the statistics stage again"
+            )
+        if expect is not None:
+            require_layout(layout, expect, str(path))
+        return FeatureStats(mean, std, layout, frames)
+
+    def _on(self, like: Tensor, columns: NDArray[np.int64] | None) -> tuple[Tensor, Tensor]:
+        key = (like.device, like.dtype)
+        if key not in self._tensors:
+            self._tensors[key] = (
+                torch.from_numpy(self.mean).to(like),
+                torch.from_numpy(self.std).to(like),
+            )
+        mean, std = self._tensors[key]
+        if columns is None:
+            return mean, std
+        chosen = torch.as_tensor(columns, device=like.device)
+        return mean[chosen], std[chosen]
+
+    @staticmethod
+    def _take(values: NDArray[np.float32], columns: NDArray[np.int64] | None) -> NDArray[np.float32]:
+        return values if columns is None else values[columns]
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_tensors": {}}
+
+
+def _sorted_header(raw: bytes) -> bytes:
+    """The same safetensors file, its header's keys in order: the library writes metadata in random order."""
+    end = 8 + int.from_bytes(raw[:8], "little")
+    header = json.dumps(json.loads(raw[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + raw[end:]
+
+
+def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -> FeatureStats:
+    """Statistics of every frame of `dataset`, in one pass.
+
+    `group` gives all columns of one feature field the mean of their stds, as HumanML3D does, so that a
+    field's joints keep their relative sizes. In a mix each data set counts as often as its weight has it
+    drawn: with weights equal to the numbers of clips this is the statistics of all clips together.
+    """
+    layout, parts = dataset.layout, dataset.parts()
+    moments = Moments.none(layout.dim)
+    total = sum(weight for _, weight in parts)
+    for part, weight in parts:
+        own = Moments.none(layout.dim)
+        clips = in_order(part, "motion.npy")
+        for i in track(clips, "feature statistics", total=len(part), disable=not progress):
+            own = own.merge(Moments.of(part.motion(i), layout.held_columns[part.held[i]]))
+        times = weight / total * len(dataset) / len(part)
+        moments = moments.merge(own.counted(times) if len(parts) > 1 else own)
+    return from_moments(moments, layout, group=group)
+
+
+def from_moments(moments: Moments, layout: MotionLayout, *, group: bool = False) -> FeatureStats:
+    """Finish moments (merged from wherever) into statistics."""
+    frames = round(moments.count.max())
+    if frames == 0:
+        raise UserError("no frames to compute feature statistics from: the training split is empty")
+    std, counted = moments.std, moments.count > 0
+    if group:
+        for name, _ in layout.fields:
+            field = counted & _columns_of(layout, name)
+            if field.any():
+                std[field] = std[field].mean()
+    std = np.where(counted, np.maximum(std, STD_FLOOR), 1.0)
+    return FeatureStats(moments.mean.astype(np.float32), std.astype(np.float32), layout, frames)
+
+
+def _columns_of(layout: MotionLayout, name: str) -> NDArray[np.bool_]:
+    """Mask [D] of one field."""
+    mask = np.zeros(layout.dim, dtype=np.bool_)
+    mask[layout.slice(name)] = True
+    return mask

@@ -1,0 +1,95 @@
+"""Writing motions for people and tools: npz, BVH, MP4 and the viewer page."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from motionloom.datasets.motion.bvh import write_bvh
+from motionloom.datasets.motion.kinematics import joints_to_rotations
+from motionloom.pipeline.inference.bundle import GeneratedMotion
+from motionloom.pipeline.render.face import synthetic_face_controls
+from motionloom.pipeline.render.video import write_mp4
+from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
+from motionloom.pipeline.store.files import atomic, require_folder
+
+Format = Literal["npz", "bvh", "mp4", "html"]
+FORMATS: tuple[Format, ...] = ("npz", "bvh", "mp4", "html")
+
+
+def file_stem(number: int, caption: str) -> str:
+    """A safe file name: number and the first words of the caption."""
+    words = re.sub(r"[^a-z0-9]+", "-", caption.lower()).strip("-")[:48].strip("-")
+    return f"{number:02d}-{words or 'motion'}"
+
+
+def write_motions(
+    folder: Path, motions: Sequence[GeneratedMotion], formats: Sequence[Format], *, title: str, seed: int
+) -> list[Path]:
+    """Write every motion in every format; the page holds all of them. Returns the paths."""
+    require_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    out: list[Path] = []
+    for number, motion in enumerate(motions):
+        stem = folder / file_stem(number, motion.caption)
+        if "npz" in formats:
+            out.append(write_npz(stem.with_suffix(".npz"), motion, seed))
+        if "bvh" in formats:
+            out.append(write_bvh_of(stem.with_suffix(".bvh"), motion))
+        if "mp4" in formats:
+            path = stem.with_suffix(".mp4")
+            write_mp4(path, motion.joints, motion.layout.skeleton, motion.layout.fps, motion.caption)
+            out.append(path)
+    if "html" in formats:
+        page = folder / "index.html"
+        write_viewer(page, [viewer_motion(m, "generated") for m in motions], title)
+        out.append(page)
+    return out
+
+
+def viewer_motion(motion: GeneratedMotion, label: str, group: str = "") -> ViewerMotion:
+    """A generated motion as the viewer takes it."""
+    return ViewerMotion(
+        joints=motion.joints,
+        fps=motion.layout.fps,
+        parents=motion.layout.skeleton.parents,
+        label=label,
+        caption=motion.caption,
+        group=group,
+        face_controls=None if motion.face is None else synthetic_face_controls(motion.face),
+    )
+
+
+def write_npz(path: Path, motion: GeneratedMotion, seed: int) -> Path:
+    """Joints [T, N, 3] in metres, features, expression, and the facts as one JSON text (no pickle)."""
+    facts = {
+        "caption": motion.caption,
+        "face_caption": motion.face_caption,
+        "fps": motion.layout.fps,
+        "layout": motion.layout.name,
+        "family": motion.layout.family,
+        "skeleton": motion.layout.skeleton_name,
+        "joint_names": list(motion.layout.skeleton.joints),
+        "up": "y",
+        "unit": "m",
+        "seed": seed,
+    }
+    arrays: dict[str, Any] = {"joints": motion.joints.astype(np.float32), "features": motion.features}
+    if motion.face is not None:
+        arrays["face"] = motion.face
+    with atomic(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, metadata=np.array(json.dumps(facts)), **arrays)
+    return path
+
+
+def write_bvh_of(path: Path, motion: GeneratedMotion) -> Path:
+    """Bone rotations fitted to the generated joints, on a skeleton with the motion's own bone lengths."""
+    skeleton = motion.layout.skeleton.with_lengths_of(motion.joints)
+    rotations = joints_to_rotations(motion.joints, skeleton)
+    write_bvh(path, skeleton, rotations, motion.joints[:, 0], motion.layout.fps)
+    return path

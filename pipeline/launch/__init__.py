@@ -1,0 +1,1 @@
+"""Where and in which processes a run executes."""

@@ -1,0 +1,42 @@
+"""The two consoles: results on standard output, errors on standard error."""
+
+from __future__ import annotations
+
+import logging
+import os
+import warnings
+
+from rich.console import Console
+
+from motionloom.pipeline.launch.process import process_rank
+
+
+def make_console() -> Console:
+    """Standard output; silent on every rank but the first, wide enough for tables in a log file."""
+    width = None if os.environ.get("COLUMNS") or os.isatty(1) else 120
+    return Console(quiet=process_rank() > 0, width=width, highlight=False)
+
+
+def quiet_libraries() -> None:
+    """Keep the libraries' chatter out of the way of our own lines."""
+    os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+    os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+    os.environ.setdefault("TRANSFORMERS_NO_ADVISORY_WARNINGS", "1")
+    for name in (
+        "lightning.pytorch",
+        "lightning.fabric",
+        "lightning.fabric.utilities.distributed",
+        "lightning.pytorch.utilities.rank_zero",
+    ):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    for message in (
+        ".*does not have many workers.*",
+        ".*Checkpoint directory.*",
+        ".*litlogger.*",
+        ".*sync_dist.*",
+        ".*LeafSpec.*",
+        ".*ckpt_path.*",
+        ".*dirpath has changed.*",
+        ".*`srun` command is available.*",  # said of every process that srun did not start
+    ):
+        warnings.filterwarnings("ignore", message)

@@ -1,0 +1,103 @@
+"""Where a run executes: accelerator, processes, precision. Not part of any fingerprint.
+
+The global batch belongs to the stage's config, so one process, eight GPUs or two nodes take the same steps.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from typing import Literal
+
+import torch
+from pydantic import Field
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.launch.process import local_rank
+
+
+class Hardware(Config):
+    """Machine settings of a recipe (`hardware:`)."""
+
+    accelerator: Literal["auto", "cpu", "gpu"] = "auto"
+    devices: int = Field(0, ge=0)
+    """Processes on this node; 0 means every visible GPU, or one process on a CPU."""
+    nodes: int = Field(1, ge=1)
+    workers: int = Field(0, ge=0)
+    """Loader worker processes per rank."""
+    convert_workers: int = Field(2, ge=1)
+    """Processes that convert or synthesise shards."""
+    threads: int = Field(0, ge=0)
+    """CPU threads per process; 0 leaves torch's choice."""
+
+    def resolved_accelerator(self) -> Literal["cpu", "gpu"]:
+        """`auto` made concrete."""
+        if self.accelerator == "auto":
+            return "gpu" if torch.cuda.is_available() else "cpu"
+        return self.accelerator
+
+    def device(self) -> torch.device:
+        """Where this process computes what is not training: its own GPU, else the CPU."""
+        if self.resolved_accelerator() == "cpu":
+            return torch.device("cpu")
+        count = torch.cuda.device_count()
+        if count == 0:
+            raise UserError(
+                "hardware.accelerator is gpu and no GPU is here; set it to auto, or give --device cpu"
+            )
+        return torch.device("cuda", local_rank() % count)
+
+    def resolved_devices(self) -> int:
+        """Processes on this node."""
+        if self.devices:
+            return self.devices
+        if "RANK" in os.environ and "LOCAL_WORLD_SIZE" in os.environ:  # torchrun has decided
+            return int(os.environ["LOCAL_WORLD_SIZE"])
+        if self.resolved_accelerator() == "cpu":
+            return 1
+        if torch.cuda.device_count() == 0:
+            raise UserError(
+                "hardware.accelerator is gpu and no GPU is here; set hardware.devices to plan for another "
+                "machine, or hardware.accelerator to auto"
+            )
+        return torch.cuda.device_count()
+
+    def world(self) -> int:
+        """Processes on all nodes."""
+        return self.resolved_devices() * self.nodes
+
+    def lightning_accelerator(self) -> str:
+        """Lightning's name of the accelerator."""
+        return "cuda" if self.resolved_accelerator() == "gpu" else "cpu"
+
+    def backend(self) -> str:
+        """What the processes talk through."""
+        return "nccl" if self.resolved_accelerator() == "gpu" else "gloo"
+
+    def describe(self) -> str:
+        """One readable line about what runs where."""
+        count, nodes = self.resolved_devices(), self.nodes
+        if self.resolved_accelerator() == "gpu":
+            here = torch.cuda.is_available()
+            where = f"{count} x {torch.cuda.get_device_name(0) if here else 'GPU (none is here)'}"
+        else:
+            why = "" if self.accelerator == "cpu" else " (no GPU found)"
+            where = (
+                f"CPU{why}, {count} process{'es' if count > 1 else ''} x {torch.get_num_threads()} threads"
+            )
+        return where + (f", {nodes} nodes" if nodes > 1 else "")
+
+
+def choose_device(choice: str | torch.device) -> torch.device:
+    """`auto` (a GPU if there is one, else the CPU), `cpu`, `cuda` or `cuda:N`."""
+    name = str(choice)
+    if name == "auto":
+        return Hardware().device()
+    match = re.fullmatch(r"cpu|cuda(?::(\d+))?", name)
+    if match is None:
+        raise UserError(f"device '{name}': there is no such choice; take auto, cpu, cuda or cuda:N")
+    count = torch.cuda.device_count()
+    if name != "cpu" and int(match[1] or 0) >= count:
+        here = f"GPUs 0 to {count - 1} are" if count else "no GPU is"
+        raise UserError(f"device '{name}': {here} here; take another, or auto")
+    return torch.device(name)

@@ -1,0 +1,115 @@
+"""The processes of one run: who leads, how the others join and wait for it.
+
+The lead (rank 0) runs every stage and is the only one that writes; the others take part in training stages.
+They start together, before anything is written, so all of them see the same plan. Processes come from
+Lightning's launcher (which repeats the command) or from torchrun or SLURM.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from datetime import timedelta
+
+import torch.distributed as dist
+from lightning.fabric import Fabric
+from lightning.fabric.plugins.environments.cluster_environment import ClusterEnvironment
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
+from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning.fabric.strategies.ddp import DDPStrategy
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import TeamError, srun_tasks
+
+_PATIENCE = timedelta(days=30)
+"""How long the others wait for a stage that only the lead runs; a dead lead ends the wait at once."""
+
+
+@dataclass(frozen=True)
+class Team:
+    """All processes of a run."""
+
+    rank: int = 0
+    world: int = 1
+    waiting: dist.ProcessGroup | None = None
+    """A group of its own, because the training group's collectives must fail early and waiting must not."""
+
+    @staticmethod
+    def start(hardware: Hardware) -> Team:
+        """Launch the other processes, or join them where a launcher has; returns when all are here."""
+        _require_match(hardware)
+        if hardware.world() == 1:
+            return Team()
+        launcher = environment()
+        fabric = Fabric(
+            accelerator=hardware.lightning_accelerator(),
+            devices=hardware.resolved_devices(),
+            num_nodes=hardware.nodes,
+            strategy=DDPStrategy(process_group_backend=hardware.backend()),
+            plugins=[launcher] if launcher else None,
+        )
+        fabric.launch()
+        return Team(fabric.global_rank, fabric.world_size, dist.new_group(backend="gloo", timeout=_PATIENCE))
+
+    @property
+    def leads(self) -> bool:
+        """True in the one process that writes."""
+        return self.rank == 0
+
+    def meet(self) -> None:
+        """Wait until every process is here."""
+        if self.waiting is None:
+            return
+        try:
+            dist.barrier(self.waiting)
+        except RuntimeError as error:
+            raise TeamError(str(error)) from None
+
+
+def environment() -> ClusterEnvironment | None:
+    """Who started this process, where Lightning would be mistaken under SLURM.
+
+    It goes by the job's name and SLURM_NTASKS: it takes a batch script for a task of srun, and waits for the
+    others; and tasks of an srun inside `salloc` for lone processes, which each start all again. Its own
+    requeueing is off: its checkpoint in the current folder would be taken up by any stage that trains there
+    next. Runs resume by themselves.
+    """
+    if "RANK" in os.environ or "SLURM_NTASKS" not in os.environ:
+        return None
+    return SLURMEnvironment(auto_requeue=False) if srun_tasks() > 1 else LightningEnvironment()
+
+
+def _require_match(hardware: Hardware) -> None:
+    """Refuse to train in processes that do not know of each other: each would write the same files."""
+    world, env = hardware.world(), os.environ
+    if "RANK" in env:
+        launched = env.get("WORLD_SIZE")
+        if launched is not None and int(launched) != world:
+            raise UserError(
+                f"the launcher started {launched} processes and the recipe asks for {world}: set "
+                f"hardware.devices (processes on a node) and hardware.nodes to match it"
+            )
+        return
+    devices, nodes, tasks = hardware.resolved_devices(), hardware.nodes, srun_tasks()
+    if tasks == 1:
+        if nodes > 1 and "SLURM_JOB_ID" in env and "NODE_RANK" not in env:
+            raise UserError(
+                f"hardware.nodes is {nodes} and this process is alone in its SLURM job: start it with "
+                f"srun --nodes {nodes} --ntasks-per-node {devices}"
+            )
+        return
+    each, found = env.get("SLURM_NTASKS_PER_NODE"), env.get("SLURM_NNODES")
+    if tasks != world or (each or str(devices)) != str(devices) or (found or str(nodes)) != str(nodes):
+        where = f" on {found} node{'s' if found != '1' else ''}" if found else ""
+        raise UserError(
+            f"srun started {tasks} processes{where} and the recipe asks for {devices} on "
+            f"{nodes} node{'s' if nodes > 1 else ''}: set hardware.devices (processes on a node) and "
+            f"hardware.nodes to match it, and give each process all GPUs of its node (--gpus-per-node, not "
+            f"--gpus-per-task)"
+        )
+    if each is None:
+        raise UserError(
+            f"srun started {tasks} processes without saying how many on a node: start it with "
+            f"srun --nodes {nodes} --ntasks-per-node {devices}"
+        )

@@ -1,0 +1,225 @@
+"""The Python API behind the commands: run a recipe, generate, evaluate, report, export."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
+from motionloom.pipeline.inference.bundle import Bundle, require_run
+from motionloom.pipeline.store.files import require_file_place, require_folder
+from motionloom.pipeline.runs.graph import (
+    Selection,
+    execute,
+    make_plan,
+    plan_table,
+    replaced_trainings,
+    require_fit,
+    selected,
+    stage_folder,
+)
+from motionloom.pipeline.launch.hardware import choose_device
+from motionloom.pipeline.inference.outputs import Format, write_motions
+from motionloom.pipeline.inference.pretrained import write_bundle
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe, nearest
+from motionloom.pipeline.inference.sampling import SamplingConfig
+from motionloom.pipeline.stages.stage import StageContext
+
+
+def run_recipe(
+    recipe: str | Path,
+    out: Path | None = None,
+    *,
+    overrides: Sequence[str] = (),
+    select: Selection | None = None,
+    dry_run: bool = False,
+    replace: bool = False,
+    console: Console,
+) -> Path:
+    """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
+
+    A folder of another recipe is refused without `replace`.
+    """
+    loaded = load_recipe(recipe, overrides)
+    run = out or Path("runs") / loaded.name
+    if dry_run:
+        _say_estimate(loaded, console)  # first: it needs no data, the plan looks at them
+    plan = make_plan(loaded, run, select)
+    todo = [row for row in plan if row.action in {"run", "resume"}]
+    if dry_run:
+        console.print(plan_table(loaded, plan))
+        require_fit(todo, loaded.hardware)
+    if not replace:
+        _require_same_recipe(run, loaded.name)
+    finished, started = replaced_trainings(run, plan)
+    for what, names in (("finished", finished), ("unfinished", started)):
+        if names:
+            console.print(f"[yellow]replaces {what} trainings: {', '.join(names)}[/]")
+    if dry_run:
+        console.print(f"{len(todo)} of {len(plan)} stages would run in {run}")
+        return run
+    chosen = selected(loaded, select or Selection())
+    if not todo and len(chosen) < len(plan):
+        console.print(
+            f"{run}: the selected stages are finished ({len(chosen)} of {len(plan)}), nothing to do"
+        )
+    elif not todo:
+        console.print(f"{run}: all {len(plan)} stages are finished, nothing to do")
+    else:
+        console.print(
+            f"{loaded.name} in {run}: {len(todo)} of {len(plan)} stages to run "
+            f"on {loaded.hardware.describe()}"
+        )
+        execute(loaded, run, plan, console)
+    for row in plan:
+        page = stage_folder(run, row.stage.name) / "report.html"
+        # Not the page of an earlier run with other settings.
+        if row.stage.kind.name == "report" and row.action != "leave" and page.is_file():
+            console.print(f"watch it: {page.resolve()}", soft_wrap=True)
+    return run
+
+
+def _require_same_recipe(run: Path, name: str) -> None:
+    """Never replace the stages of another recipe's run unasked."""
+    path = run / "recipe.yaml"
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return  # it is about to be written anew
+    if isinstance(found, dict) and found.get("name", name) != name:
+        raise UserError(
+            f"{run}: holds a run of recipe '{found['name']}', not '{name}'; choose another folder with "
+            f"--out, or give --replace to go on here: what fits is kept, the rest is made anew"
+        )
+
+
+def _say_estimate(recipe: Recipe, console: Console) -> None:
+    """What the trainings would take, where the recipe says enough."""
+    from motionloom.pipeline.runs.estimate import data_layout, estimate, estimate_table
+
+    if not any(stage.kind.trains for stage in recipe.stages):
+        return
+    try:
+        data_layout(recipe)
+    except UserError as error:
+        console.print(str(error))
+        return
+    console.print(estimate_table(estimate(recipe)))
+
+
+def generate_motions(
+    folder: Path,
+    captions: Sequence[str],
+    *,
+    face_captions: Sequence[str] | None = None,
+    out: Path,
+    formats: str = "npz,bvh,mp4,html",
+    seconds: float | None = None,
+    seed: int = 0,
+    sampling: dict[str, Any] | None = None,
+    device: str = "auto",
+    console: Console,
+) -> list[Path]:
+    """Generate and write; returns the paths. `device`: auto, cpu, cuda or cuda:N."""
+    if not captions:
+        raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
+    wanted = [f.strip() for f in formats.split(",") if f.strip()]
+    for name in wanted:
+        if name not in get_args(Format):
+            raise UserError(f"--format {name}: no such format{nearest(name, get_args(Format))}")
+    if not wanted:
+        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4 or html")
+    # All that needs no model is checked before one is opened.
+    require_words(caption_list(captions))
+    require_seed(seed)
+    require_folder(out)
+    drawing = SamplingConfig.parse(sampling or {}, "sampling")
+    bundle = Bundle.open(folder, choose_device(device))
+    motions = bundle.generate(
+        captions, face_captions=face_captions, seconds=seconds, seed=seed, sampling=drawing, strict=True
+    )
+    paths = write_motions(out, motions, wanted, title=folder.name, seed=seed)  # type: ignore[arg-type]
+    for path in paths:
+        console.print(str(path), soft_wrap=True)
+    return paths
+
+
+def _stage_again(
+    folder: Path, kind: str, console: Console, changes: dict[str, Any], device: str = "auto"
+) -> Path:
+    """Run one evaluating stage of a finished run again, into the run folder itself.
+
+    On `device`: auto is what the recipe's hardware says.
+    """
+    wanted = None if device == "auto" else choose_device(device)
+    recipe = _recipe_of(folder)
+    stage = next((s for s in recipe.stages if s.kind.name == kind), None)
+    if stage is None:
+        raise UserError(f"{folder}: its recipe has no {kind} stage; add one and run it again")
+    given = {name: value for name, value in changes.items() if value is not None}
+    config = stage.kind.config.parse({**stage.config.dump(), **given}, kind)
+    inputs = {role: stage_folder(folder, name) for role, name in stage.inputs.items()}
+    for role, path in inputs.items():
+        if not (path / "artifact.json").is_file():
+            raise UserError(
+                f"{folder}: stage '{path.name}' (role {role}) is not finished; run the recipe first"
+            )
+    require_consistent(folder, (path.name for path in inputs.values()))
+    target = folder / kind
+    target.mkdir(exist_ok=True)
+    context = StageContext(
+        stage.name, recipe.name, config, target, inputs, recipe.seed, recipe.hardware, console, wanted
+    )
+    stage.kind.run(context)
+    return target
+
+
+def evaluate_run(
+    folder: Path,
+    *,
+    clips: int | None = None,
+    repeats: int | None = None,
+    device: str = "auto",
+    console: Console,
+) -> Path:
+    """Figures of a finished run; writes RUN/evaluate/metrics.json."""
+    changes = {"clips": clips, "repeats": repeats}
+    return _stage_again(folder, "evaluate", console, changes, device) / "metrics.json"
+
+
+def report_run(folder: Path, out: Path | None, *, device: str = "auto", console: Console) -> Path:
+    """The page of a finished run; returns its path."""
+    if out is not None:
+        require_file_place(out)
+    page = _stage_again(folder, "report", console, {}, device) / "report.html"
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(page, out)
+        page = out
+    console.print(str(page.resolve()), soft_wrap=True)
+    return page
+
+
+def export_run(folder: Path, out: Path, *, console: Console) -> Path:
+    """Copy what generation needs into one folder."""
+    require_folder(out)
+    if out.exists() and any(out.iterdir()):
+        raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
+    write_bundle(folder, out)
+    size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
+    console.print(
+        f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"', soft_wrap=True
+    )
+    return out
+
+
+def _recipe_of(folder: Path) -> Recipe:
+    require_run(folder)
+    return load_recipe(folder / "recipe.yaml")

@@ -1,0 +1,322 @@
+"""The stage graph: what will run and why, then running it.
+
+A stage's fingerprint covers its kind and version, its full resolved config, the seed, facts about outside
+files and the fingerprints of its inputs. A stage is finished when its folder holds an `artifact.json` with
+that fingerprint and every output it lists. Anything else runs, and whatever stands below it has another
+fingerprint and runs too.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.table import Table
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.training.distributed import alone
+from motionloom.pipeline.store.artifact import Artifact, InputStage
+from motionloom.pipeline.store.files import digest, remove_tree, write_json, write_text
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import process_rank
+from motionloom.pipeline.runs.recipe import Recipe, Stage
+from motionloom.pipeline.stages.stage import StageContext, fingerprint_fields
+from motionloom.pipeline.launch.team import Team
+
+Action = Literal["skip", "run", "resume", "leave"]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which part of the graph to run."""
+
+    first: str | None = None
+    """Run this stage and all below it again."""
+    until: str | None = None
+    """Stop after this stage: only it and what it needs."""
+    only: str | None = None
+    """Just this stage; its inputs must be finished."""
+    force: bool = False
+    """Run the selected stages even if they are finished."""
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """One row of the plan."""
+
+    stage: Stage
+    fingerprint: str
+    action: Action
+    reason: str
+    asked: bool = False
+    """The selection names it to run again (`--from`, `--force`)."""
+
+
+def stage_folder(run: Path, name: str) -> Path:
+    """Where a stage keeps its files."""
+    return run / "stages" / name
+
+
+def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
+    """Decide for every stage, in order, what happens to it."""
+    select = select or Selection()
+    wanted = selected(recipe, select)
+    forced = _descendants(recipe, select.first) if select.first else set()
+    if select.force:
+        forced |= wanted
+    plan: list[PlannedStage] = []
+    rows: dict[str, PlannedStage] = {}
+    for stage in recipe.stages:
+        fingerprint = _fingerprint(recipe, stage, rows)
+        action, reason = _decide(stage, fingerprint, run, rows, forced, select)
+        if stage.name not in wanted and action != "skip":
+            action, reason = "leave", "not selected"
+        rows[stage.name] = PlannedStage(stage, fingerprint, action, reason, stage.name in forced)
+        plan.append(rows[stage.name])
+    if select.only:
+        for role, name in recipe.stage(select.only).inputs.items():
+            if rows[name].action != "skip":
+                raise UserError(
+                    f"--only {select.only}: its input '{role}' ({name}) is not finished; run it first"
+                )
+    return plan
+
+
+def selected(recipe: Recipe, select: Selection) -> set[str]:
+    """Names of the stages that may run; refuses selections that contradict each other."""
+    first, until, only = select.first, select.until, select.only
+    for name in (first, until, only):
+        if name is not None:
+            recipe.stage(name)
+    for option, name in (("--from", first), ("--until", until)):
+        if only and name and name != only:
+            raise UserError(f"--only {only} runs that stage alone: leave {option} {name} out")
+    if first and until and first not in _ancestors(recipe, until):
+        raise UserError(
+            f"--from {first} --until {until}: '{until}' does not need '{first}', so there is nothing between "
+            f"them; leave one out"
+        )
+    if first and select.force and not only:
+        raise UserError(
+            f"--from {first} runs that stage and those below it again, --force all that are selected: leave "
+            f"one out"
+        )
+    if only:
+        return {only}
+    return _ancestors(recipe, until) if until else {stage.name for stage in recipe.stages}
+
+
+def replaced_trainings(run: Path, plan: Sequence[PlannedStage]) -> tuple[list[str], list[str]]:
+    """Trainings that the plan deletes though nobody asked for it by name: finished ones, and started ones."""
+    finished, started = [], []
+    for row in plan:
+        folder = stage_folder(run, row.stage.name)
+        if not row.stage.kind.trains or row.action != "run" or row.asked:
+            continue
+        if Artifact.find(folder) is not None:
+            finished.append(row.stage.name)
+        elif (folder / "checkpoints").is_dir():
+            started.append(row.stage.name)
+    return finished, started
+
+
+def _fingerprint(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> str:
+    external = stage.kind.external(stage.config) if stage.kind.external else None
+    return digest(
+        {
+            "kind": stage.kind.name,
+            "version": stage.kind.version,
+            "seed": recipe.seed,
+            "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
+            "external": external,
+            "inputs": {role: rows[name].fingerprint for role, name in stage.inputs.items()},
+        }
+    )
+
+
+def _decide(
+    stage: Stage,
+    fingerprint: str,
+    run: Path,
+    rows: dict[str, PlannedStage],
+    forced: set[str],
+    select: Selection,
+) -> tuple[Action, str]:
+    folder = stage_folder(run, stage.name)
+    artifact = Artifact.find(folder)
+    if stage.name in forced:
+        return "run", "forced" if select.force else f"from {select.first}"
+    if artifact is None:
+        started = folder / "started.json"
+        if started.is_file() and json.loads(started.read_text())["fingerprint"] == fingerprint:
+            return "resume", "started earlier, not finished"
+        return "run", "never run" if not started.is_file() else "settings changed before it finished"
+    if artifact.fingerprint != fingerprint:
+        return "run", _difference(artifact, stage, rows)
+    gone = artifact.missing(folder)
+    if gone:
+        return "run", f"output {gone} is gone or has another size"
+    above = [name for name in stage.inputs.values() if rows[name].action == "run" and name in forced]
+    if above:
+        return "run", f"below {above[0]}"
+    return "skip", "finished"
+
+
+def _difference(artifact: Artifact, stage: Stage, rows: dict[str, PlannedStage]) -> str:
+    if artifact.kind != stage.kind.name or artifact.version != stage.kind.version:
+        return f"{artifact.kind} v{artifact.version} is now {stage.kind.name} v{stage.kind.version}"
+    changes = list(_changed_fields(artifact.config, stage.config.dump()))
+    if changes:
+        more = f" (+{len(changes) - 1} more)" if len(changes) > 1 else ""
+        return f"changed: {changes[0]}{more}"
+    for role, name in stage.inputs.items():
+        old = artifact.inputs.get(role)
+        if old is None or old.fingerprint != rows[name].fingerprint:
+            return f"input {name} changed"
+    return "seed or source files changed"
+
+
+def _changed_fields(old: Any, new: Any, prefix: str = "") -> Iterator[str]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            yield from _changed_fields(old.get(key), new.get(key), f"{prefix}.{key}" if prefix else key)
+    elif old != new:
+        yield f"{prefix} {old} -> {new}"
+
+
+def _ancestors(recipe: Recipe, name: str) -> set[str]:
+    out, todo = set(), [name]
+    while todo:
+        current = todo.pop()
+        out.add(current)
+        todo += list(recipe.stage(current).inputs.values())
+    return out
+
+
+def _descendants(recipe: Recipe, name: str) -> set[str]:
+    out = {name}
+    for stage in recipe.stages:
+        if out & set(stage.inputs.values()):
+            out.add(stage.name)
+    return out
+
+
+def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
+    """The plan as a table for people."""
+    table = Table(title=f"{recipe.name}: {len(plan)} stages", title_justify="left")
+    for column in ("stage", "kind", "action", "why", "from"):
+        table.add_column(column, overflow="fold")
+    colours = {"run": "yellow", "resume": "cyan", "skip": "green", "leave": "dim"}
+    for row in plan:
+        colour = colours[row.action]
+        inputs = ", ".join(dict.fromkeys(row.stage.inputs.values()))
+        table.add_row(row.stage.name, row.stage.kind.name, f"[{colour}]{row.action}[/]", row.reason, inputs)
+    return table
+
+
+def require_fit(rows: Sequence[PlannedStage], hardware: Hardware) -> None:
+    """Refuse, before anything runs, stages whose settings cannot run on this hardware."""
+    for row in rows:
+        try:
+            row.stage.config.require_fit(hardware)
+        except UserError as error:
+            raise UserError(f"stage {row.stage.name}: {error}") from None
+
+
+def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
+    """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment.
+
+    With several processes each calls this with the same plan: the lead runs and writes everything, the others
+    only take part in training stages and return after the last one.
+    """
+    todo = [row for row in plan if row.action in {"run", "resume"}]
+    trained = [row for row in todo if row.stage.kind.trains]
+    require_fit(todo, recipe.hardware)
+    leads = process_rank() == 0
+    if not leads:
+        todo = trained
+    with _lock(run, needed=leads):
+        team = Team.start(recipe.hardware) if trained else Team()
+        if leads:
+            write_text(run / "recipe.yaml", recipe.to_yaml())
+            for row in plan:
+                if row.action == "skip" and row.stage.kind.settle is not None:
+                    row.stage.kind.settle(row.stage.config, stage_folder(run, row.stage.name))
+        for row in todo:
+            stage, folder = row.stage, stage_folder(run, row.stage.name)
+            begin = time.perf_counter()
+            if leads:
+                place = f"{plan.index(row) + 1}/{len(plan)}"
+                console.print(f"[bold]\\[{place}] {stage.name}[/] ({stage.kind.summary})")
+                _prepare(folder, row)
+            context = StageContext(
+                name=stage.name,
+                recipe=recipe.name,
+                config=stage.config,
+                folder=folder,
+                inputs={role: stage_folder(run, name) for role, name in stage.inputs.items()},
+                seed=recipe.seed,
+                hardware=recipe.hardware,
+                console=console,
+            )
+            if stage.kind.trains:
+                team.meet()
+                stage.kind.run(context)
+            else:
+                with alone():
+                    stage.kind.run(context)
+            if leads:
+                seconds = time.perf_counter() - begin
+                write_json(folder / "timing.json", {"seconds": round(seconds, 2)})
+                _artifact(recipe, row, plan).finish(folder)
+                console.print(f"    finished in {seconds:.1f} s")
+    return [row.stage.name for row in todo]
+
+
+def _prepare(folder: Path, row: PlannedStage) -> None:
+    """An empty folder, or the one a killed run left, marked with what is being made in it."""
+    if row.action == "run":
+        remove_tree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "started.json", {"fingerprint": row.fingerprint})
+
+
+def _artifact(recipe: Recipe, row: PlannedStage, plan: Sequence[PlannedStage]) -> Artifact:
+    stage = row.stage
+    fingerprints = {p.stage.name: p.fingerprint for p in plan}
+    return Artifact(
+        stage=stage.name,
+        kind=stage.kind.name,
+        version=stage.kind.version,
+        fingerprint=row.fingerprint,
+        seed=recipe.seed,
+        config=stage.config.dump(),
+        inputs={r: InputStage(stage=n, fingerprint=fingerprints[n]) for r, n in stage.inputs.items()},
+    )
+
+
+@contextmanager
+def _lock(run: Path, needed: bool) -> Iterator[None]:
+    """One writer a run folder; the lock goes with the process, so a kill leaves none behind."""
+    if not needed:
+        yield
+        return
+    run.mkdir(parents=True, exist_ok=True)
+    with (run / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(
+                f"{run}: another motionloom process is working on this run; wait for it or stop it"
+            ) from None
+        file.write(str(os.getpid()))
+        file.flush()
+        yield

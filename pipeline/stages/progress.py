@@ -1,0 +1,136 @@
+"""What a person sees while a stage trains, and the log that a killed run continues without a gap."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+from lightning.pytorch.callbacks import Callback
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from motionloom.models.training.stage_module import LOG_EVERY
+
+_LINE_EVERY_SECONDS = 15.0
+
+
+def bar(console: Console) -> Progress:
+    """A progress bar on a terminal; silent elsewhere (callers print lines there)."""
+    return Progress(
+        TextColumn("    {task.description:<18}"),
+        BarColumn(bar_width=36),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=console,
+        disable=not console.is_terminal,
+        transient=False,
+    )
+
+
+class StepProgress(Callback):
+    """Steps done of all steps, loss and speed: a bar on a terminal, a line every 15 s elsewhere."""
+
+    def __init__(self, name: str, steps: int, console: Console) -> None:
+        self.name, self.steps, self.console = name, steps, console
+        self.progress: Progress | None = None
+        self.began = self.printed = time.monotonic()
+        self.first = 0
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Open the bar at the resumed step."""
+        self.began = self.printed = time.monotonic()
+        self.first = trainer.global_step
+        if not trainer.is_global_zero:
+            return
+        if self.first:
+            self.console.print(f"    resuming {self.name} at step {self.first} of {self.steps}")
+        self.progress = bar(self.console)
+        self.progress.start()
+        self.task = self.progress.add_task(self.name, total=self.steps, completed=self.first, note="")
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Move the bar, or print a line now and then."""
+        if self.progress is None:
+            return
+        step, now = trainer.global_step, time.monotonic()
+        shown = self.console.is_terminal
+        if not shown and now - self.printed < _LINE_EVERY_SECONDS and step < self.steps:
+            return
+        speed = (step - self.first) / max(1e-9, now - self.began)
+        note = f"loss {float(trainer.callback_metrics.get('loss', 0.0)):.4f}  {speed:.1f} steps/s"
+        if shown:
+            self.progress.update(self.task, completed=step, note=note)
+        else:
+            self.printed = now
+            self.console.print(f"    {self.name}: step {step}/{self.steps}  {note}")
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Close the bar."""
+        if self.progress is not None:
+            self.progress.stop()
+
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
+        """Close the bar so that the error is readable."""
+        if self.progress is not None:
+            self.progress.stop()
+
+
+class MetricLog(Callback):
+    """`metrics.jsonl`: one row every 10 steps and one per validation.
+
+    Rows are kept in memory and in the checkpoint, and the file is rewritten at checkpoints, so after a kill
+    the log holds each step once.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "metrics.jsonl"
+        self.rows: list[dict[str, float]] = []
+
+    def state_dict(self) -> dict[str, Any]:
+        """Rows so far, as text (plain types only in checkpoints)."""
+        return {"rows": json.dumps(self.rows)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Rows up to the checkpoint."""
+        self.rows = json.loads(state_dict["rows"])
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Take a row every 10 steps."""
+        step = trainer.global_step
+        if step % LOG_EVERY == 0 and (not self.rows or self.rows[-1]["step"] < step):
+            self._take(trainer, "train/")
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Take a row of validation figures."""
+        if not trainer.sanity_checking:
+            self._take(trainer, "val/")
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Bring the file up to the checkpoint."""
+        self._write(trainer)
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Bring the file up to the end."""
+        self._write(trainer)
+
+    def _take(self, trainer: L.Trainer, prefix: str) -> None:
+        values = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith(prefix)}
+        if values:
+            self.rows.append({"step": trainer.global_step, **values})
+
+    def _write(self, trainer: L.Trainer) -> None:
+        if trainer.is_global_zero:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = self.path.with_name(".metrics.jsonl.tmp")
+            temporary.write_text("".join(json.dumps(row, sort_keys=True) + "\n" for row in self.rows))
+            temporary.replace(self.path)

@@ -1,0 +1,304 @@
+"""One training run of a stage: Lightning's Trainer, the loader, checkpoints, logs, exact resume.
+
+A Lightning "epoch" is here a *chunk* of `checkpoint_every` steps. Checkpoints are written at chunk ends only,
+the batch of step k is a pure function of (seed, k) and every step seeds its own random draws, so a resumed
+run repeats the undisturbed one bit for bit and the loader's whole state is the step number.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Iterator, Sized
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy, Strategy
+from pydantic import Field
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.models.layers.transformer import Transformer
+from motionloom.models.training.sharding import make_whole
+from motionloom.models.training.stage_module import OptimConfig, StageModule
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import TeamError
+from motionloom.pipeline.launch.team import environment
+from motionloom.pipeline.stages.progress import MetricLog, StepProgress
+from motionloom.pipeline.stages.stage import RUNTIME, StageConfig, StageContext
+
+_KEPT = 2
+"""Checkpoints kept: the newest, and one more in case that is torn."""
+
+
+class TrainConfig(Config):
+    """Length and arithmetic of one training run."""
+
+    steps: int = Field(1000, ge=1)
+    """Optimizer steps."""
+    batch_size: int = Field(256, ge=1)
+    """Global batch, over all processes and accumulated parts."""
+    accumulate: int = Field(1, ge=1)
+    """Parts the batch of a step is cut into, to need less memory; the gradient is the mean of theirs.
+
+    Equal to the whole batch where a loss is a mean over samples and the parts hold equally many real frames
+    or tokens. Two things cannot be: a contrastive loss sees the negatives of its own part only, and a learnt
+    codebook is updated with every part (an average and resets over smaller batches). More processes instead
+    of more parts change neither.
+    """
+    precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
+    strategy: Literal["ddp", "fsdp"] = Field("ddp", json_schema_extra=RUNTIME)
+    """What several processes hold: each the whole network (`ddp`), or each a part of the weights, gradients
+    and optimizer state (`fsdp`: gpt stages, for networks that do not fit; not with compile or 16-mixed).
+    One process holds all; the results are the same."""
+    compile: bool = False
+    """Compile networks and losses with torch.compile, as one graph."""
+    checkpoint_activations: bool = Field(False, json_schema_extra=RUNTIME)
+    """Keep only the borders of transformer blocks for the backward pass and compute the rest again there:
+    less memory, about a third more time, the same figures."""
+    checkpoint_every: int = Field(100, ge=1, json_schema_extra=RUNTIME)
+    """Steps between checkpoints; what a kill can cost."""
+    validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
+    """Steps between validations, rounded up to checkpoints; 0 turns them off."""
+
+    def local_batch(self, world: int) -> int:
+        """Items a process reads at once; the global batch must divide evenly."""
+        parts = world * self.accumulate
+        if self.batch_size % parts:
+            raise UserError(
+                f"train.batch_size {self.batch_size} does not divide by {world} processes x accumulate "
+                f"{self.accumulate}; make it a multiple of {parts}"
+            )
+        return self.batch_size // parts
+
+
+class TrainedStageConfig(StageConfig):
+    """Base of the configs of stages that train."""
+
+    shardable: ClassVar[bool] = False
+    """Whether `train.strategy: fsdp` can cut the network: it must be used through `forward` alone."""
+
+    optim: OptimConfig = OptimConfig()
+    train: TrainConfig = TrainConfig()
+
+    def require_fit(self, hardware: Hardware) -> None:
+        """The global batch must divide over the processes, and FSDP suit the network and the arithmetic."""
+        self.train.local_batch(hardware.world())
+        if self.train.strategy == "fsdp":
+            self._require_shardable()
+
+    def _require_shardable(self) -> None:
+        if not self.shardable:
+            raise UserError(
+                "train.strategy fsdp is for gpt stages: the other networks fit on every GPU, and learnt "
+                "codebooks must be whole on every process; set train.strategy: ddp"
+            )
+        if self.train.compile:
+            raise UserError(
+                "train.compile makes one graph and train.strategy fsdp gathers weights between the blocks; "
+                "set one of them back"
+            )
+        if self.train.precision == "16-mixed":
+            raise UserError("train.strategy fsdp has no gradient scaler; set train.precision: bf16-mixed")
+
+
+class ChunkSampler(Sampler[int]):
+    """Batch numbers of one chunk, from the number that `start` tells when the chunk begins."""
+
+    def __init__(self, start: Callable[[], int], count: int) -> None:
+        self.start, self.count = start, count
+
+    def __iter__(self) -> Iterator[int]:
+        first = self.start()
+        return iter(range(first, first + self.count))
+
+    def __len__(self) -> int:
+        return self.count
+
+
+BatchSource = Callable[[int, int, int], Dataset[Any]]
+"""(items per global micro-batch, rank, world) -> dataset; item k is this rank's batch of micro-step k."""
+
+EvalSource = Callable[[], Dataset[Any]]
+"""Sized dataset of all validation batches: every process reads the same, so the figures depend on no rank."""
+
+
+def fit(
+    context: StageContext,
+    module: StageModule,
+    config: TrainConfig,
+    train: BatchSource,
+    validation: EvalSource | None,
+    grad_clip: float,
+) -> None:
+    """Train `module` for `config.steps`, resuming from the newest good checkpoint in the stage's folder."""
+    hardware = context.hardware
+    if hardware.threads:
+        torch.set_num_threads(hardware.threads)
+    chunk = min(config.checkpoint_every, config.steps)
+    data = _Data(train, validation, config, chunk, hardware)
+    checkpoints = ModelCheckpoint(
+        dirpath=context.folder / "checkpoints",
+        filename="{step:08d}",
+        monitor="step",
+        mode="max",
+        save_top_k=_KEPT,
+        save_on_train_epoch_end=True,
+        enable_version_counter=False,  # a torn file is written again under its own name
+    )
+    validate = max(1, -(-config.validate_every // chunk)) if config.validate_every and validation else None
+    if hardware.resolved_accelerator() == "gpu":
+        hardware.device()  # refuses in one sentence where there is no GPU
+    trainer = L.Trainer(
+        default_root_dir=context.folder,
+        plugins=environment(),
+        accelerator=hardware.lightning_accelerator(),
+        devices=hardware.resolved_devices(),
+        num_nodes=hardware.nodes,
+        strategy=_strategy(hardware, config),
+        precision=config.precision,
+        max_steps=config.steps,
+        accumulate_grad_batches=config.accumulate,
+        gradient_clip_val=grad_clip or None,
+        check_val_every_n_epoch=validate or 1,
+        limit_val_batches=1.0 if validate else 0,
+        num_sanity_val_steps=0,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        callbacks=[
+            checkpoints,
+            ResumeBetweenChunks(),
+            MetricLog(context.folder),
+            StepProgress(context.name, config.steps, context.console),
+        ],
+    )
+    prepare_module(module, config)
+    if config.compile:
+        module.compile_losses()
+    newest = newest_checkpoint(context.folder / "checkpoints")
+    net = module.net
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
+    except SystemExit:  # Lightning's answer to Ctrl-C
+        raise KeyboardInterrupt from None
+    except RuntimeError as error:
+        if "by peer" in str(error):  # how the backends report a connection that broke
+            raise TeamError(str(error)) from None
+        raise
+    if module.net is not net:  # the strategy has trained a sharded copy
+        make_whole(module.net, net)
+        module.net = net
+    if trainer.is_global_zero:
+        for path in sorted((context.folder / "checkpoints").glob("*.ckpt"))[:-_KEPT]:
+            path.unlink()  # Lightning forgets the checkpoint that a killed run was resumed from
+
+
+def prepare_module(module: StageModule, config: TrainConfig) -> None:
+    """Apply the settings that concern how the network computes."""
+    module.fused = config.precision != "16-mixed"
+    for part in module.modules():
+        if isinstance(part, Transformer):
+            part.checkpointed = config.checkpoint_activations
+
+
+class ResumeBetweenChunks(Callback):
+    """Makes a resumed run begin the chunk behind its checkpoint.
+
+    Lightning would go back into the finished epoch and, where that did not end with a validation, train one
+    more batch in it: the steps of all later validations and checkpoints would move.
+    """
+
+    def on_load_checkpoint(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Mark the epoch as over and no batch of the next as taken."""
+        loop = checkpoint["loops"]["fit_loop"]
+        for progress in (loop["epoch_progress"]["total"], loop["epoch_progress"]["current"]):
+            progress["completed"] = progress["processed"]
+        batches = loop["epoch_loop.batch_progress"]
+        batches["current"] = dict.fromkeys(batches["current"], 0)
+        batches["is_last_batch"] = False
+
+
+class _Data(L.LightningDataModule):
+    def __init__(
+        self,
+        train: BatchSource,
+        validation: EvalSource | None,
+        config: TrainConfig,
+        chunk: int,
+        hardware: Hardware,
+    ) -> None:
+        super().__init__()
+        self.train, self.validation = train, validation
+        self.config, self.chunk, self.hardware = config, chunk, hardware
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        trainer = cast(L.Trainer, self.trainer)
+        micro = self.config.batch_size // self.config.accumulate
+        dataset = self.train(micro, trainer.global_rank, trainer.world_size)
+        parts = self.config.accumulate
+        sampler = ChunkSampler(lambda: trainer.global_step * parts, self.chunk * parts)
+        return _loader(dataset, sampler, self.hardware)
+
+    def val_dataloader(self) -> DataLoader[Any] | list[Any]:
+        if self.validation is None:
+            return []
+        dataset = self.validation()
+        return _loader(dataset, range(len(cast(Sized, dataset))), self.hardware)
+
+
+def _loader(dataset: Dataset[Any], sampler: Any, hardware: Hardware) -> DataLoader[Any]:
+    workers = hardware.workers
+    return DataLoader(
+        dataset,
+        batch_size=None,
+        sampler=sampler,
+        num_workers=workers,
+        pin_memory=hardware.resolved_accelerator() == "gpu",
+        persistent_workers=False,
+        multiprocessing_context="spawn" if workers else None,
+    )
+
+
+def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
+    if hardware.world() == 1:
+        return "auto"
+    if config.strategy == "fsdp":
+        return ModelParallelStrategy(
+            data_parallel_size=hardware.world(),
+            tensor_parallel_size=1,
+            # One file with everything, as DDP writes it: a run may be resumed with the other strategy.
+            save_distributed_checkpoint=False,
+            process_group_backend=hardware.backend(),
+        )
+    return DDPStrategy(
+        process_group_backend=hardware.backend(),
+        # The quantizers keep codebooks equal themselves; rank 0's copy must not overwrite them mid-step.
+        forward_sync_buffers=False,
+    )
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint that loads; a torn one is passed over."""
+    for path in sorted(folder.glob("*.ckpt"), reverse=True):
+        try:
+            torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:  # a torn file fails in many ways, all of which mean the same
+            warnings.warn(f"{path}: cannot be read ({type(error).__name__}), passed over", stacklevel=2)
+            continue
+        return path
+    return None
+
+
+def read_metrics(folder: Path) -> list[dict[str, float]]:
+    """Rows of a stage's `metrics.jsonl`."""
+    path = folder / "metrics.jsonl"
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines()]

@@ -1,0 +1,109 @@
+"""Opening what earlier stages made: shards, statistics, text cache."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from motionloom.datasets.loading.mix import MixedDataset
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.schema import Caption, Config, Manifest
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.reader import ShardDataset, read_manifest
+from motionloom.datasets.shards.reading import CacheConfig, Reading
+from motionloom.datasets.shards.store import open_store
+from motionloom.datasets.text.cache import TextCache
+
+SHARDS = "shards"
+REFERENCE = "reference.json"
+READER = "reader.json"
+
+
+class DataPart(Config):
+    """One data set of a mix."""
+
+    path: str
+    """Folder with `manifest.json`, or a URL (`s3://`, `https://`, `http://`)."""
+    weight: float = Field(gt=0, allow_inf_nan=False)
+    """Share of the batches, relative to the other data sets."""
+
+
+class Reference(Config):
+    """`reference.json` of a data stage whose shards lie elsewhere."""
+
+    parts: list[DataPart]
+    order: Literal["global", "streamed"]
+    shards_per_group: int
+
+
+class Reader(Config):
+    """`reader.json` beside it: what the recipe says now about how to read, which changes no result."""
+
+    mode: Literal["indexed", "streamed"]
+    cache: CacheConfig
+
+
+def open_split(folder: Path, split: str, *, training: bool = False) -> ClipDataset:
+    """One split of a data stage.
+
+    `training` says that batches are drawn from it by a plan: only then does the streaming reader serve, as
+    the other stages visit clips in orders of their own.
+    """
+    if not (folder / REFERENCE).is_file():
+        return ShardDataset.open(folder / SHARDS, split)
+    reference = Reference.load_json(folder / REFERENCE)
+    reader = Reader.load_json(folder / READER)
+    reading = Reading(
+        mode=reader.mode if training else "indexed",
+        order=reference.order,
+        shards_per_group=reference.shards_per_group,
+        cache=reader.cache,
+    )
+    opened = [
+        (ShardDataset.open(part.path, split, reading=reading), part.weight)
+        for part, manifest in zip(reference.parts, _manifests(folder), strict=True)
+        if split in _held(manifest)
+    ]
+    return opened[0][0] if len(opened) == 1 else MixedDataset(opened)
+
+
+def splits_of(folder: Path) -> list[str]:
+    """Splits that hold at least one clip, of any data set."""
+    held = set().union(*map(_held, _manifests(folder)))
+    return [split for split in ("train", "val", "test") if split in held]
+
+
+def held_out(folder: Path, *, prefer: str = "val") -> str:
+    """A split for validation: the preferred one, else the other held-out one, else train."""
+    splits = splits_of(folder)
+    other = "test" if prefer == "val" else "val"
+    return next(split for split in (prefer, other, "train") if split in splits)
+
+
+def _manifests(folder: Path) -> list[Manifest]:
+    if not (folder / REFERENCE).is_file():
+        return [read_manifest(open_store(folder / SHARDS))[0]]
+    parts = Reference.load_json(folder / REFERENCE).parts
+    cache = Reader.load_json(folder / READER).cache
+    return [read_manifest(open_store(part.path, cache))[0] for part in parts]
+
+
+def _held(manifest: Manifest) -> set[str]:
+    return {shard.split for shard in manifest.shards if shard.samples}
+
+
+def open_stats(folder: Path) -> FeatureStats:
+    """Statistics of a stats stage."""
+    return FeatureStats.load(folder / "stats.safetensors")
+
+
+def open_text(folder: Path) -> TextCache:
+    """Cache of a text stage."""
+    return TextCache.open(folder / "cache")
+
+
+def captions_of(dataset: ClipDataset, index: int, *, face: bool) -> list[Caption]:
+    """Body or face captions of a clip."""
+    return dataset.face_texts(index) if face else dataset.texts(index)

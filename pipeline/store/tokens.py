@@ -1,0 +1,202 @@
+"""Motion tokens on disk, and the batches the GPTs train on.
+
+One `tokens-SPLIT.safetensors` per split: for each stream the codes of all clips end to end, and where each
+clip begins, counted in groups of four frames. Written once by the `tokens` stage, never re-encoded by a GPT.
+
+A clip that lacks a part which the tokenizer models (hands, face) has codes, but some of them say what was
+never recorded: clips that lack nothing are marked (`whole`). Which codes of the others a GPT may learn,
+`pipeline/stages/gpt_data.py` says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.order import Source
+from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences, stream_names
+from motionloom.pipeline.store.files import atomic
+
+Codes = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class TokenStore:
+    """Codes of every clip of a split. `groups[i]` is the length of clip i in groups."""
+
+    codes: Codes
+    starts: NDArray[np.int64]
+    per_group: Mapping[str, int]
+    whole: NDArray[np.bool_]
+    """Clips that hold all the columns the tokenizer models, [n]."""
+
+    @property
+    def groups(self) -> NDArray[np.int64]:
+        """Length of each clip in groups."""
+        return np.diff(self.starts)
+
+    def clip(self, index: int, first: int = 0, count: int | None = None) -> Codes:
+        """Codes of (a part of) a clip: per stream int64 [count * per_group]."""
+        begin = int(self.starts[index]) + first
+        end = int(self.starts[index + 1]) if count is None else begin + count
+        return {name: flat[begin * n : end * n] for (name, flat), n in self._streams()}
+
+    def whole_clips(self) -> TokenStore:
+        """The store of the clips in `whole` alone, in order."""
+        return self.of(self.whole)
+
+    def of(self, chosen: NDArray[np.bool_]) -> TokenStore:
+        """The store of the `chosen` [n] clips alone, in order."""
+        if chosen.all():
+            return self
+        codes = {}
+        for (name, flat), n in self._streams():
+            codes[name] = flat[torch.from_numpy(np.repeat(chosen, self.groups * n))]
+        starts = np.concatenate([[0], np.cumsum(self.groups[chosen])]).astype(np.int64)
+        return TokenStore(codes, starts, self.per_group, self.whole[chosen])
+
+    def _streams(self) -> list[tuple[tuple[str, Tensor], int]]:
+        return [((name, flat), self.per_group[name]) for name, flat in self.codes.items()]
+
+    def save(self, path: Path) -> None:
+        """Write the store."""
+        tensors = {f"codes.{name}": flat.to(torch.int32) for name, flat in self.codes.items()}
+        tensors["starts"] = torch.from_numpy(self.starts)
+        tensors["whole"] = torch.from_numpy(self.whole)
+        with atomic(path) as temporary:
+            temporary.write_bytes(save(tensors))
+
+    @staticmethod
+    def load(path: Path, per_group: Mapping[str, int]) -> TokenStore:
+        """Read a store; its streams must be the tokenizer's."""
+        if not path.is_file():
+            raise UserError(f"{path}: no tokens; run the tokens stage for this split")
+        tensors = load_file(path)
+        codes = {k.removeprefix("codes."): v.long() for k, v in tensors.items() if k.startswith("codes.")}
+        if set(codes) != set(per_group):
+            raise UserError(f"{path}: holds streams {sorted(codes)}, the tokenizer has {sorted(per_group)}")
+        if "whole" not in tensors:
+            raise UserError(f"{path}: written by an older version; run the tokens stage again")
+        return TokenStore(codes, tensors["starts"].numpy(), per_group, tensors["whole"].numpy())
+
+
+class TokenCaption(NamedTuple):
+    """A caption and the groups of its clip that it is about."""
+
+    row: int
+    """Its row in the list of all captions."""
+    first: int
+    end: int
+    """The group behind the last."""
+
+
+@dataclass(frozen=True)
+class HeldTokens:
+    """Which tokens and columns of n clips were recorded, by the bits of `ClipMeta.held`."""
+
+    bits: Tensor
+    """int64 [n]."""
+    streams: Tensor
+    """bool [4, K]: row b, streams of clips that hold the bits b."""
+    columns: Tensor
+    """bool [4, C]: the same for the tokenizer's columns."""
+
+    def known(self, items: list[int], batch: TokenSequence, ends: Tensor) -> Tensor:
+        """Bool [B, L]: false at codes of streams that the clips `items` [B] lack; `ends` int64 [K]."""
+        recorded = self.streams[self.bits[items]].gather(1, batch.kinds)
+        return recorded | (batch.tokens == ends[batch.kinds])
+
+
+@dataclass(frozen=True)
+class TokenBatches(Dataset[dict[str, Any]]):
+    """Batch k of token sequences and text priors; a pure function of (seed, k).
+
+    In training a rank's share of an endless order, with one caption drawn for each clip; else the clips in
+    order, all of them on every rank, with their first captions. A sequence is the stretch that its caption is
+    about, and ends where that ends.
+    """
+
+    store: TokenStore
+    captions: list[list[TokenCaption]]
+    """The captions of each clip; their rows are rows of `prior`."""
+    prior: Tensor
+    """Text embeddings [n, E]."""
+    similarity: Tensor
+    """sBERT embeddings of the same captions [n, S]: which negatives of the alignment loss to leave out."""
+    pattern: tuple[str, ...]
+    ends: Mapping[str, int]
+    max_groups: int
+    batch_size: int
+    seed: int
+    rank: int = 0
+    world: int = 1
+    training: bool = True
+    sources: tuple[Source, ...] = ()
+    """Data sets and their weights, when several are mixed."""
+    latents: Tensor | None = None
+    """TMA's embeddings of the same captions [n, Z], for an alignment loss where `prior` is something else."""
+    held: HeldTokens | None = None
+    """Which tokens of the clips were recorded; None = all. Batches then also hold "known" bool [B, L] and
+    "held" bool [B, C]."""
+
+    @cached_property
+    def _plan(self) -> BatchPlan:
+        spans = [sum(caption.end - caption.first for caption in own) // len(own) for own in self.captions]
+        lengths = np.minimum(np.array(spans), self.max_groups)
+        return BatchPlan(len(self.captions), self.batch_size, self.seed, lengths, self.sources)
+
+    def __len__(self) -> int:
+        return -(-len(self.captions) // self.batch_size)
+
+    def __getitem__(self, k: int) -> dict[str, Any]:
+        if self.training:
+            turns, items = self._plan.local(k, self.rank, self.world)
+        else:
+            items = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
+            turns = np.zeros(len(items), dtype=np.int64)
+        rows, sequences = [], []
+        for item, turn in zip(items.tolist(), turns.tolist(), strict=True):
+            rng = np.random.default_rng([self.seed, turn, item])
+            choice = int(rng.integers(len(self.captions[item]))) if self.training else 0
+            caption = self.captions[item][choice]
+            rows.append(caption.row)
+            sequences.append(self._sequence(item, caption, rng))
+        batch = pad_sequences(sequences)
+        more = {} if self.latents is None else {"tma_text": self.latents[rows]}
+        if self.held is not None:
+            ends = torch.tensor([self.ends[name] for name in stream_names(self.pattern)])
+            more["known"] = self.held.known(items.tolist(), batch, ends)
+            more["held"] = self.held.columns[self.held.bits[items]]
+        return {
+            "tokens": batch.tokens,
+            "kinds": batch.kinds,
+            "length": batch.length,
+            "text": self.prior[rows],
+            "similarity": self.similarity[rows],
+            **more,
+        }
+
+    def _sequence(self, item: int, caption: TokenCaption, rng: np.random.Generator) -> TokenSequence:
+        """One row; a stretch that is longer than the block gives a random part without its end."""
+        first, groups = caption.first, caption.end - caption.first
+        if groups <= self.max_groups:
+            return self._row(self.store.clip(item, first, groups), closed=True)
+        if self.training:
+            first += int(rng.integers(groups - self.max_groups + 1))
+        return self._row(self.store.clip(item, first, self.max_groups), closed=False)
+
+    def _row(self, codes: Codes, *, closed: bool) -> TokenSequence:
+        batched = {name: row[None] for name, row in codes.items()}
+        return interleave(batched, self.pattern, ends=self.ends if closed else None)

@@ -1,0 +1,79 @@
+"""Trained networks on disk: `model.safetensors`, and `model.json` with all that building them needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from pydantic import Field
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.store.files import atomic, write_json
+
+Fact = TypeVar("Fact")
+
+
+class LayoutFacts(Config):
+    """What `MotionLayout.named` needs to give the same layout again."""
+
+    name: str
+    fps: float
+    family: str
+
+    @staticmethod
+    def of(layout: MotionLayout) -> LayoutFacts:
+        """The facts of a layout."""
+        return LayoutFacts(name=layout.name, fps=layout.fps, family=layout.family)
+
+    def layout(self) -> MotionLayout:
+        """The layout again."""
+        return MotionLayout.named(self.name, fps=self.fps, family=self.family)  # type: ignore[arg-type]
+
+
+class ModelFacts(Config):
+    """`model.json`."""
+
+    kind: str
+    config: dict[str, Any]
+    layout: LayoutFacts
+    extra: dict[str, Any] = Field(default_factory=dict)
+
+    def fact(self, folder: Path, key: str, kind: type[Fact]) -> Fact:
+        """A fact in `extra`, of the kind it must be."""
+        value = self.extra.get(key)
+        if not isinstance(value, kind):
+            missing = "is required" if key not in self.extra else f"= {value!r:.60} is no {kind.__name__}"
+            raise UserError(
+                f"{folder / 'model.json'}: key 'extra.{key}' {missing}; run or export the stage again"
+            )
+        return value
+
+
+def save_model(folder: Path, net: torch.nn.Module, facts: ModelFacts) -> None:
+    """Write weights and facts; the facts last."""
+    state = {k: v.detach().contiguous().cpu() for k, v in net.state_dict().items()}
+    with atomic(folder / "model.safetensors") as temporary:
+        temporary.write_bytes(save(state))
+    write_json(folder / "model.json", facts.dump())
+
+
+def load_facts(folder: Path) -> ModelFacts:
+    """Facts of the network in a folder."""
+    return ModelFacts.load_json(folder / "model.json")
+
+
+def load_weights(folder: Path, net: torch.nn.Module) -> None:
+    """Fill `net`; a file that does not fit is refused by name."""
+    path = folder / "model.safetensors"
+    try:
+        net.load_state_dict(load_file(path))
+    except (FileNotFoundError, SafetensorError, RuntimeError) as error:
+        why = " ".join(str(error).split())[:300]
+        raise UserError(
+            f"{path}: cannot load these weights; were they made by another version? Run the stage that made "
+            f"them again ({why})"
+        ) from None

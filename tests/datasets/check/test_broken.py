@@ -1,0 +1,193 @@
+"""Every file of the broken set gets the verdict that its EXPECT.md demands, through what users can call."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.check.files import FileRules, Verdict, check_file, check_folder
+from motionloom.datasets.check.foreign import inspect_tar
+from motionloom.datasets.convert.common.arrays import load_array
+from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
+from motionloom.datasets.convert.common.splits import read_split_files
+from motionloom.datasets.convert.humanml3d.convert import HumanMl3dConfig, prepare_humanml3d
+from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.schema import UserError
+
+OK = None
+REJECTED: dict[str, tuple[str, ...] | None] = {
+    # file -> words that the refusal must hold, or OK
+    "npy/truncated.npy": ("truncated", "15456", "10261"),
+    "npy/truncated_header.npy": ("header",),
+    "npy/empty_file.npy": ("empty",),
+    "npy/nan.npy": ("nan", "frame 5", "column 10"),
+    "npy/inf.npy": ("inf", "frame 3", "column 309"),
+    "npy/wrong_dims_321.npy": ("322", "321"),
+    "npy/transposed.npy": ("[T, 322]", "[322, 12]"),
+    "npy/one_dim.npy": ("[T, 322]", "[322]"),
+    "npy/three_dim.npy": ("[T, 322]", "[1, 12, 322]"),
+    "npy/zero_length.npy": ("zero length",),
+    "npy/huge_values.npy": ("absurd", "frame"),
+    "npy/object_dtype.npy": ("object",),
+    "npy/complex_dtype.npy": ("complex64", "float32"),
+    "npy/big_endian.npy": OK,
+    "npy/fortran_order.npy": OK,
+    "npy/control_ok.npy": OK,
+    "aist/gBR_sBM_cAll_d04_mBR0_ch66_malicious.pkl": ("refused", "io.open"),
+    "aist/missing_key.pkl": ("smpl_scaling",),
+    "aist/length_mismatch.pkl": ("9", "8"),
+    "aist/zero_scaling.pkl": ("smpl_scaling", "0"),
+    "aist/truncated.pkl": ("cut short",),
+    "shards/control_ok.tar": OK,
+    "shards/truncated.tar": ("truncated", "'000001", "last whole key is '000000'"),
+    "shards/no_end_blocks.tar": OK,
+    "shards/path_traversal.tar": ("../../PWNED_tar.txt", "/tmp/PWNED_abs.txt", "path traversal"),
+    "shards/symlink_member.tar": ("000009.motion.npy", "link", "never followed"),
+    "shards/duplicate_keys.tar": ("duplicate key '000000'",),
+    "shards/duplicate_member.tar": ("000000.motion.npy", "twice", "duplicate member"),
+    "shards/split_sample.tar": ("'000000'", "do not stand together", "missing field"),
+    "shards/missing_field.tar": ("key '000001' has no json",),
+    "shards/bad_json.tar": ("'000000.json'", "not valid JSON"),
+    "shards/not_a_tar.tar": ("not a tar",),
+    "shards/zero_bytes.tar": ("empty", "0 bytes"),
+    "bvh/control_ok.bvh": OK,
+    "bvh/missing_frames.bvh": ("10", "6 found"),
+    "bvh/extra_frames.bvh": ("4", "6 found"),
+    "bvh/wrong_channel_count.bvh": ("frame 3", "127", "132"),
+    "bvh/declared_channels_mismatch.bvh": ("CHANNELS 3", "6"),
+    "bvh/not_a_number.bvh": ("1.#QNAN",),
+    "bvh/frame_time_zero.bvh": ("Frame Time", "0"),
+    "bvh/no_motion.bvh": ("MOTION",),
+    "bvh/unbalanced_braces.bvh": ("braces",),
+    "bvh/non_utf8.bvh": ("not UTF-8", "line"),
+    "bvh/crlf_bom.bvh": OK,
+    "texts/bad_timestamps.txt": ("line 1", "line 2", "line 3", "line 4", "no usable text"),
+    "texts/nan_tags.txt": OK,
+    "texts/too_few_fields.txt": ("line 1", "line 2", "fields"),
+    "texts/extra_hash.txt": OK,
+    "texts/empty_caption.txt": ("no usable text",),
+    "texts/empty_file.txt": ("no usable text",),
+    "texts/non_utf8.txt": ("not UTF-8", "byte 25"),
+    "wav/zero_samples.wav": ("0 samples",),
+    "wav/truncated.wav": ("cut short", "1600", "16000"),
+    "wav/sample_rate_zero.wav": ("sample rate 0",),
+    "wav/not_riff.wav": ("not a WAV",),
+    "wav/float_nan.wav": ("NaN",),
+    "splits/duplicate_ids.txt": OK,
+    "splits/missing_file_id.txt": OK,
+    "splits/overlap_train.txt": OK,
+    "splits/overlap_test.txt": OK,
+    "splits/traversal_id.txt": ("../../../../etc/passwd",),
+    "splits/crlf_blank.txt": OK,
+}
+RULES = FileRules(seconds=10.0)
+
+
+@pytest.fixture(autouse=True)
+def untouched(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Runs in an empty folder, and fails if any payload ran or anything was written."""
+    here = tmp_path / "cwd"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    broken = shared / "data" / "broken"
+    before = sorted(broken.rglob("*"))
+    yield here
+    assert not list(here.iterdir()), "reading wrote something"
+    assert not list(Path("/tmp").glob("PWNED_*")) and not list(tmp_path.rglob("PWNED_*"))
+    assert sorted(broken.rglob("*")) == before
+
+
+@pytest.fixture
+def broken(shared: Path) -> Path:
+    return shared / "data" / "broken"
+
+
+def test_the_table_has_every_file(broken: Path) -> None:
+    there = {str(path.relative_to(broken)) for path in broken.rglob("*") if path.is_file()}
+    assert there - {"EXPECT.md"} == set(REJECTED) and len(REJECTED) == 62
+
+
+@pytest.mark.parametrize("name", REJECTED)
+def test_verdict(broken: Path, name: str) -> None:
+    verdict = check_file(broken / name, RULES)  # no exception of any class
+    words = REJECTED[name]
+    assert verdict.ok == (words is OK), verdict
+    assert str(verdict).startswith(f"{broken / name}: ")
+    for word in words or ("ok",):
+        assert word in str(verdict)
+
+
+def test_a_folder_is_checked_file_by_file(broken: Path) -> None:
+    verdicts = list(check_folder(broken, RULES))
+    assert len(verdicts) == 62
+    assert {str(v.path.relative_to(broken)) for v in verdicts if v.ok} == {
+        name for name, words in REJECTED.items() if words is OK
+    }
+
+
+def test_valid_files_hold_what_the_control_holds(broken: Path) -> None:
+    control = load_array(broken / "npy/control_ok.npy", width=322)
+    for name in ("big_endian", "fortran_order"):
+        np.testing.assert_array_equal(load_array(broken / f"npy/{name}.npy", width=322), control)
+    clip, same = read_bvh(broken / "bvh/control_ok.bvh"), read_bvh(broken / "bvh/crlf_bom.bvh")
+    np.testing.assert_array_equal(clip.values, same.values)
+    assert clip.joints == same.joints
+
+
+def test_shards_are_counted_and_noted(broken: Path) -> None:
+    assert inspect_tar(broken / "shards/control_ok.tar").samples == 3
+    unfinished = inspect_tar(broken / "shards/no_end_blocks.tar")
+    assert unfinished.samples == 3 and "closing zero blocks" in unfinished.notes[0]
+    assert inspect_tar(broken / "shards/truncated.tar").samples == 1
+
+
+def test_caption_files(broken: Path) -> None:
+    (nan,), none = read_humanml_captions(broken / "texts/nan_tags.txt", seconds=10.0)
+    assert (nan.start, nan.end, none) == (0.0, None, [])
+    (hash_mark,), _ = read_humanml_captions(broken / "texts/extra_hash.txt", seconds=10.0)
+    assert hash_mark.text == "a person does move #3"
+    assert hash_mark.tokens == ["a/DET", "person/NOUN", "do/VERB", "move/NOUN"]
+    plain = check_file(broken / "texts/too_few_fields.txt", FileRules(texts="plain"))
+    assert plain.ok and plain.what == "2 captions"
+
+
+def split_folder(tmp_path: Path, **files: Path) -> Path:
+    folder = tmp_path / "split_folder"
+    folder.mkdir()
+    for split, path in files.items():
+        shutil.copy(path, folder / f"{split}.txt")
+    return folder
+
+
+def test_split_files(broken: Path, tmp_path: Path) -> None:
+    ids, notes = read_split_files(split_folder(tmp_path, train=broken / "splits/crlf_blank.txt"))
+    assert (list(ids), notes) == (["900001", "900002"], [])
+    again = check_file(broken / "splits/duplicate_ids.txt")
+    assert again.what == "2 ids" and "'900001'" in again.notes[0] and "line 3" in again.notes[0]
+
+
+def test_splits_that_overlap_are_an_error(broken: Path, tmp_path: Path) -> None:
+    folder = split_folder(
+        tmp_path, train=broken / "splits/overlap_train.txt", test=broken / "splits/overlap_test.txt"
+    )
+    with pytest.raises(UserError, match=r"'900002' is also in train\.txt"):
+        read_split_files(folder)
+    verdicts: list[Verdict] = list(check_folder(folder))
+    assert [verdict.ok for verdict in verdicts] == [False, True, True]
+    assert "900002" in str(verdicts[0])
+
+
+def test_ids_without_files_count_as_missing(broken: Path, shared: Path, tmp_path: Path) -> None:
+    source = tmp_path / "HumanML3D"
+    for part in ("new_joint_vecs", "texts"):
+        shutil.copytree(shared / "data/layouts/humanml3d" / part, source / part)
+    shutil.copy(broken / "splits/missing_file_id.txt", source / "train.txt")
+    plan = prepare_humanml3d(HumanMl3dConfig(source=source)).plan
+    assert [drop.source for drop in plan.missing] == ["123456"]
+    assert [clip.id for _, clip in plan.items] == ["900001"]
+    with pytest.raises(UserError, match="strict"):
+        plan.require_whole()

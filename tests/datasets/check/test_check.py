@@ -1,0 +1,336 @@
+"""`check` beyond checksums: ranges, captions, sound, duplicates and leaks; and shards that others wrote."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import tarfile
+from array import array
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.check.dataset import CheckReport, check, examine
+from motionloom.datasets.check.duplicates import ClipTable, _runs
+from motionloom.datasets.check.files import FileRules, check_file, check_folder
+from motionloom.datasets.check.findings import LISTED, Findings
+from motionloom.datasets.check.foreign import inspect_tar
+from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
+from motionloom.datasets.motion.canonical import canonicalize, mirror
+from motionloom.datasets.motion.features import encode
+from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
+from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.shards.writer import write_dataset
+
+LAYOUT = MotionLayout.named("body133")
+
+
+def walk(seed: int, frames: int = 40) -> np.ndarray:
+    """Joints [T, 22, 3] of a swaying figure that nothing else resembles."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0, 4, frames)[:, None, None]
+    waves = rng.uniform(0.02, 0.08, (3, 1, 22, 3)) * np.sin(
+        rng.uniform(0.5, 3, (3, 1, 22, 3)) * t + rng.uniform(0, 6, (3, 1, 22, 3))
+    )
+    joints = LAYOUT.skeleton.rest_joints + waves.sum(axis=0)
+    joints[:, :, 2] += np.linspace(0, 1.5, frames)[:, None]
+    return canonicalize(joints)
+
+
+def features(seed: int, frames: int = 40) -> np.ndarray:
+    return encode(walk(seed, frames), LAYOUT)
+
+
+@dataclass(frozen=True)
+class Made:
+    """What becomes of one clip of a test set."""
+
+    id: str
+    split: Split = "train"
+    motion: np.ndarray = field(default_factory=lambda: features(0))
+    mirror_of: str | None = None
+    texts: tuple[Caption, ...] = (Caption(text="a person sways"),)
+    licence: str = "CC0"
+    more: dict[str, Any] = field(default_factory=dict)
+
+
+def convert(made: Made) -> Sample:
+    meta = LAYOUT.clip_meta(
+        made.id, source="made", split=made.split, frames=len(made.motion), licence=made.licence,
+        mirror_of=made.mirror_of,
+    )  # fmt: skip
+    return Sample(meta, made.motion, texts=list(made.texts), **made.more)
+
+
+def report_on(root: Path, *clips: Made) -> CheckReport:
+    write_dataset(
+        root, [(clip.split, clip) for clip in clips], convert, name="made", layout=LAYOUT, licence="CC0",
+        converter="test", converter_version=1, options={}, progress=False, describe=lambda clip: clip.id,
+        strict=True,
+    )  # fmt: skip
+    return examine(root)
+
+
+def test_a_sound_set_has_neither_errors_nor_warnings(tmp_path: Path) -> None:
+    clips = [Made(f"c{k}", "test" if k % 3 == 0 else "train", features(k, 40 + k)) for k in range(6)]
+    report = report_on(tmp_path, *clips)
+    assert (report.errors, report.warnings) == ([], [])
+    assert (report.clips, report.frames) == (6, sum(len(clip.motion) for clip in clips))
+    assert check(tmp_path) == []
+
+
+def test_the_same_motion_twice(tmp_path: Path) -> None:
+    report = report_on(
+        tmp_path,
+        Made("a"),
+        Made("b"),
+        Made("c", "test"),
+        Made("other", motion=features(1)),
+        Made("x", "val", features(2)),
+    )
+    assert report.warning_kinds == {"same motion": 1}
+    assert report.error_kinds == {"same motion in two splits": 1}
+    assert "'c' has the same motion as" in str(report.errors[0])
+    assert "which is in split 'train', not 'test'" in str(report.errors[0])
+
+
+def test_a_mirror_image_that_does_not_say_so(tmp_path: Path) -> None:
+    image = encode(canonicalize(mirror(walk(0), LAYOUT.skeleton)), LAYOUT)
+    jittered = (features(1).astype(np.float64) * (1 + 1e-6)).astype(np.float32)
+    jittered[:, LAYOUT.slice("root_height")] = features(1)[:, LAYOUT.slice("root_height")]
+    report = report_on(
+        tmp_path,
+        Made("a"),
+        Made("image", "test", image),
+        Made("b", motion=features(1)),
+        Made("b2", "val", jittered),
+    )
+    said = " ".join(map(str, report.errors))
+    assert report.error_kinds == {"same recording in two splits": 2}
+    assert "'image' is the mirror image of 'a'" in said and "'b2' is the same recording as 'b'" in said
+    same_split = report_on(tmp_path / "same", Made("a"), Made("image", "train", image))
+    assert (same_split.errors, same_split.warnings) == ([], [])
+
+
+def test_mirror_images_stay_in_the_split_of_their_family(tmp_path: Path) -> None:
+    report = report_on(
+        tmp_path,
+        Made("a"),
+        Made("Ma", "test", features(1), mirror_of="a"),
+        Made("Mb", "train", features(2), mirror_of="b"),
+        Made("Mb2", "test", features(3), mirror_of="b"),
+        Made("Mc", "train", features(4), mirror_of="gone"),
+    )
+    said = sorted(problem.message for problem in report.errors)
+    assert said == [
+        "mirrors 'a', which is in split 'train', not 'test'",
+        "mirrors 'b', as 'Mb' does in split 'train', not 'test'",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "word"),
+    [("root_height", 90.0, "root_height[0] is 90 at frame 3"), ("velocities", 25.0, "is 500 m/s at frame 3")],
+)
+def test_absurd_values_are_errors(tmp_path: Path, name: str, value: float, word: str) -> None:
+    motion = features(0)
+    motion[3, LAYOUT.slice(name).start] = value
+    report = report_on(tmp_path, Made("a", motion=motion), Made("b", motion=features(1)))
+    assert word in str(report.errors[0]) and "wrong unit, scale or layout" in str(report.errors[0])
+    assert "'000000-00000" in report.errors[0].where
+
+
+def test_glitches_are_warnings(tmp_path: Path) -> None:
+    motion = features(0)
+    motion[3, LAYOUT.slice("velocities").start + 5] = -5.0
+    report = report_on(tmp_path, Made("a", motion=motion))
+    assert report.errors == []
+    assert "velocities[5] is -100 m/s at frame 3; at most 40 is sensible" in str(report.warnings[0])
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_every_layout_has_limits(name: str) -> None:
+    layout = MotionLayout.named(name)
+    limits = human_limits(layout)
+    assert limits.shape == (layout.dim,) and (limits > 0).all()
+    motion = np.zeros((5, layout.dim), np.float32)
+    assert beyond(motion, layout, limits) == ""
+    motion[2, -1] = -2 * limits[-1]
+    assert "at frame 2" in beyond(motion, layout, limits)
+    assert beyond(motion, layout, limits, ABSURD) == ""
+
+
+@pytest.mark.parametrize(
+    ("captions", "error", "warning"),
+    [
+        ((), "", "no captions"),
+        ((Caption(text="a"), Caption(text=" \t")), "caption 2 is empty", ""),
+        ((Caption(text="a", start=1.0, end=0.5),), "ends at 0.5 s, not after its start", ""),
+        ((Caption(text="a", start=-1.0),), "has the times -1.0", ""),
+        ((Caption(text="a", start=2.0, end=3.0),), "starts at 2 s, the clip ends at 2.00 s", ""),
+        ((Caption(text="a", start=0.0, end=2.6),), "", "ends at 2.6 s, the clip at 2.00 s"),
+        ((Caption(text="a", start=0.5, end=2.4),), "", ""),
+    ],
+)
+def test_captions(tmp_path: Path, captions: tuple[Caption, ...], error: str, warning: str) -> None:
+    report = report_on(tmp_path, Made("a", texts=captions), Made("b", motion=features(1)))
+    assert len(report.errors) == (2 if error else 0)  # a bad clip also breaks the shard's frame count
+    assert len(report.warnings) == bool(warning)
+    assert error in " ".join(map(str, report.errors)) and warning in " ".join(map(str, report.warnings))
+
+
+def test_sound_and_its_features(tmp_path: Path) -> None:
+    sound = {"wav": (np.zeros(800, np.float32), 8000), "audio": np.zeros((4, 438), np.float32)}
+    assert report_on(tmp_path / "good", Made("a", more=sound)).errors == []
+    other = {"audio": np.zeros((4, 35), np.float32)}
+    report = report_on(tmp_path / "mixed", Made("a", more=sound), Made("b", "val", features(1), more=other))
+    assert "35 columns, that of" in str(report.errors[0])
+    silent = {"wav": (np.zeros(0, np.float32), 8000)}
+    report = report_on(tmp_path / "silent", Made("a", more=silent), Made("b", motion=features(1)))
+    assert "audio.flac" in str(report.errors[0])
+
+
+def test_licences_and_splits_are_told(tmp_path: Path) -> None:
+    report = report_on(
+        tmp_path, Made("a", "test", licence="CC-BY-4.0"), Made("b", "test", features(1), licence=" ")
+    )
+    assert report.warning_kinds == {"licence": 2, "no licence": 1, "no training split": 1}
+    assert "'CC-BY-4.0' is not in the manifest" in " ".join(map(str, report.warnings))
+
+
+def test_findings_are_bounded_and_counted() -> None:
+    findings = Findings()
+    for k in range(LISTED + 500):
+        findings.error("NaN", f"clip {k}", "NaN")
+        findings.warn("odd", f"clip {k}", "odd")
+    for listed in (findings.all_errors("root"), findings.all_warnings("root")):
+        assert len(listed) == LISTED + 1 and str(listed[-1]).startswith("root: 500 more: ")
+
+
+def test_a_million_clips_fit(tmp_path: Path) -> None:
+    table = ClipTable(tmp_path, [], LAYOUT)
+    meta = convert(Made("a")).meta
+    for row in range(100):
+        table.add(0, row, meta, features(0))
+    assert len(table) == 100
+    assert sum(len(v) * v.itemsize for v in vars(table).values() if isinstance(v, array)) == 40 * 100
+    values = array("Q", range(200_000))
+    values[150_000] = values[7]
+    assert list(_runs(values)) == [[7, 150_000]]
+    assert list(_runs(array("Q"))) == [] and list(_runs(array("Q", [0, 0, 0]))) == [[0, 1, 2]]
+
+
+# ---- shards without a manifest
+
+
+def npy(values: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
+
+
+MOTION = npy(np.zeros((4, 133), np.float32))
+
+
+def tar(path: Path, *members: tuple[str, bytes], kind: bytes = tarfile.REGTYPE) -> Path:
+    with tarfile.open(path, "w") as archive:
+        for name, content in members:
+            info = tarfile.TarInfo(name)
+            info.size, info.type = len(content), kind
+            archive.addfile(info, io.BytesIO(content))
+    return path
+
+
+def sample(key: str, motion: bytes = MOTION) -> tuple[tuple[str, bytes], ...]:
+    return (f"{key}.motion.npy", motion), (f"{key}.json", b"{}")
+
+
+def test_strange_but_good_shards(tmp_path: Path) -> None:
+    for number, key in enumerate(("./000", "walks/fast/000", "ä" * 120)):
+        report = inspect_tar(tar(tmp_path / f"{number}.tar", *sample(key), ("README", b"x")), LAYOUT)
+        assert (report.samples, report.problems) == (1, []) and "README" in report.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("members", "word"),
+    [
+        (sample("a", npy(np.array([object()]))), "not a readable array"),
+        (sample("a", MOTION[:-4]), "not a readable array"),
+        (sample("a", npy(np.full((4, 133), np.nan, np.float32))), "nan at frame 0, column 0"),
+        (sample("a", npy(np.zeros((4, 263), np.float32))), "263 columns, layout body133 has 133"),
+        (sample("a", npy(np.full((4, 133), 5e4, np.float32))), "wrong unit"),
+        (sample("a", npy(np.zeros((4, 133), np.int64))), "int64"),
+        (sample("a", npy(np.zeros((0, 133), np.float32))), "T >= 1"),
+        (sample("a\\b"), "path traversal"),
+        (sample("C:/a"), "path traversal"),
+        ((("x.json", b"[" * 100_000),), "not valid JSON"),
+        ((), "holds no samples"),
+    ],
+)
+def test_bad_foreign_shards(tmp_path: Path, members: tuple[tuple[str, bytes], ...], word: str) -> None:
+    report = inspect_tar(tar(tmp_path / "x.tar", *members), LAYOUT)
+    assert word in " ".join(report.problems) and report.samples == 0
+
+
+def test_cut_joined_and_packed_shards(tmp_path: Path) -> None:
+    path = tar(tmp_path / "x.tar", *sample("a"), *sample("b"))
+    whole = path.read_bytes()
+    for cut in range(512, len(whole) - 10240, 700):
+        path.write_bytes(whole[:cut])
+        report = inspect_tar(path)  # wherever it is cut, a shard is refused or whole samples are left
+        assert report.problems or (report.samples == 1 and report.notes)
+    path.write_bytes(whole + whole)
+    assert "two archives in one file" in " ".join(inspect_tar(path).problems)
+    header = whole.index(b"b.motion.npy")
+    path.write_bytes(whole[:header] + b"damage" * 20 + whole[header + 120 :])
+    assert "are no tar entries" in " ".join(inspect_tar(path).problems)
+    path.write_bytes(gzip.compress(whole))
+    assert "gzip" in inspect_tar(path).problems[0]
+    for kind in (tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE, tarfile.CHRTYPE):
+        assert "plain files" in inspect_tar(tar(path, ("a.motion.npy", b""), kind=kind)).problems[0]
+
+
+# ---- single files
+
+
+def test_layouts_of_arrays(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.zeros((40, 263), np.float32))
+    assert "--layout h3d263" in str(check_file(path))
+    assert check_file(path, FileRules(layout="h3d263")).ok
+    np.save(path, walk(0).astype(np.float32))
+    assert "--layout joints22" in str(check_file(path))
+    assert check_file(path, FileRules(layout="joints22")).ok
+    np.save(path, 100 * walk(0))
+    assert "is the length unit right?" in str(check_file(path, FileRules(layout="joints22")))
+    np.save(path, np.full((4, 322), 7.0, np.float32))
+    assert check_file(path).ok and "beyond what a person can do" in check_file(path).notes[0]
+
+
+def test_files_that_nothing_reads(tmp_path: Path) -> None:
+    (tmp_path / "a.fbx").write_bytes(b"")
+    (tmp_path / "folder.npy").mkdir()
+    with pytest.raises(UserError, match=r"nothing here reads '\.fbx' files; known: \.tar"):
+        check_file(tmp_path / "a.fbx")
+    assert "not a plain file" in str(check_file(tmp_path / "folder.npy"))
+    assert "no such file" in str(check_file(tmp_path / "none.npy"))
+    assert list(check_folder(tmp_path)) == []
+    for wrong in ({"texts": "verse"}, {"layout": "smpl76"}):
+        with pytest.raises(UserError, match=r"humanml|smplx322"):
+            FileRules(**wrong)
+
+
+def test_split_lists_are_known_by_name(tmp_path: Path) -> None:
+    for name in ("train", "test"):
+        (tmp_path / f"{name}.txt").write_text(f"clip-{name}\n")
+    assert [str(v).partition(": ")[2] for v in check_folder(tmp_path)] == [
+        "ok, splits train, test: 2 ids, none in two",
+        "ok, 1 ids",
+        "ok, 1 ids",
+    ]
+    (tmp_path / "train.txt").write_text("\n")
+    assert "no ids" in str(check_file(tmp_path / "train.txt"))

@@ -1,0 +1,206 @@
+"""AIST++ pickles: numbers come out, nothing else happens."""
+
+from __future__ import annotations
+
+import pickle
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.convert.aistpp.pickle_reader import load_aist_pickle, read_aist_motion
+from motionloom.datasets.schema import UserError
+
+
+def annotation(frames: int = 5, **changes: Any) -> dict[str, Any]:
+    rng = np.random.default_rng(0)
+    data = {
+        "smpl_loss": np.float64(0.25),
+        "smpl_poses": rng.normal(size=(frames, 72)).astype(np.float32),
+        "smpl_scaling": np.array([93.5], np.float32),
+        "smpl_trans": rng.normal(size=(frames, 3)).astype(np.float32),
+    }
+    return {key: value for key, value in (data | changes).items() if value is not None}
+
+
+def saved(folder: Path, data: object, protocol: int = 4) -> Path:
+    path = folder / "a.pkl"
+    path.write_bytes(pickle.dumps(data, protocol=protocol))
+    return path
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4])
+def test_every_protocol_gives_the_same_numbers(tmp_path: Path, protocol: int) -> None:
+    data = annotation(smpl_poses=np.asfortranarray(annotation()["smpl_poses"]))
+    path = saved(tmp_path, data, protocol)
+    motion = read_aist_motion(path)
+    assert np.array_equal(motion.poses, data["smpl_poses"])
+    assert np.array_equal(motion.trans, data["smpl_trans"])
+    assert motion.scaling == 93.5
+    assert np.allclose(motion.metres(), data["smpl_trans"] / 93.5)
+    assert load_aist_pickle(path)["smpl_loss"] == 0.25
+
+
+def test_big_endian_and_old_numpy_names(tmp_path: Path) -> None:
+    data = annotation()
+    path = saved(tmp_path, data | {"smpl_trans": data["smpl_trans"].astype(">f8")}, 2)
+    raw = path.read_bytes()
+    assert raw.count(b"numpy._core.multiarray")
+    path.write_bytes(raw.replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
+    motion = read_aist_motion(path)
+    assert np.array_equal(motion.trans, data["smpl_trans"])
+    assert motion.trans.dtype == np.float32
+
+
+def test_the_real_annotation(shared: Path) -> None:
+    motion = read_aist_motion(shared / "data/layouts/aistpp/motions/gBR_sBM_cAll_d04_mBR0_ch01.pkl")
+    assert (motion.poses.shape, motion.trans.shape) == ((720, 72), (720, 3))
+    assert motion.scaling == pytest.approx(93.78, abs=0.01)
+    assert 1.0 < motion.metres()[:, 1].min() < motion.metres()[:, 1].max() < 2.5
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("gBR_sBM_cAll_d04_mBR0_ch66_malicious", "refused, the file asks for 'io.open'"),
+        ("missing_key", "no key 'smpl_scaling'"),
+        ("length_mismatch", "9 frames of smpl_poses, but 8 of smpl_trans"),
+        ("zero_scaling", "smpl_scaling is 0"),
+        ("truncated", "cut short or damaged"),
+    ],
+)
+def test_broken_annotations(
+    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=rf"{name}\.pkl: .*{reason}"):
+        read_aist_motion(shared / f"data/broken/aist/{name}.pkl")
+    assert not list(tmp_path.iterdir())  # no PWNED file, nothing at all
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"smpl_poses": None}, "no key 'smpl_poses'"),
+        ({"smpl_poses": np.zeros((5, 24, 3), np.float32)}, r"smpl_poses is \[5, 24, 3\], not \[T, 72\]"),
+        ({"smpl_poses": np.zeros((0, 72), np.float32)}, "smpl_poses is"),
+        ({"smpl_trans": np.full((5, 3), np.nan)}, "NaN or infinity in smpl_trans at frame 0, column 0"),
+        ({"smpl_trans": np.full((5, 3), 1e9)}, "beyond 1000 m"),
+        ({"smpl_poses": np.full((5, 72), 1e6)}, "beyond 100 rad"),
+        ({"smpl_scaling": np.array([np.inf])}, "smpl_scaling is inf"),
+        ({"smpl_scaling": np.array([-93.0])}, "smpl_scaling is -93"),
+        ({"smpl_scaling": np.array([1.0, 2.0])}, "2 values"),
+        ({"smpl_scaling": "93"}, "not an array of numbers"),
+        ({"smpl_trans": np.array([["a"] * 3] * 5)}, "array type"),
+        ({"smpl_trans": np.empty((5, 3), object)}, "array type"),
+        ({"smpl_trans": np.zeros((5, 3), complex)}, "array type"),
+        ({"smpl_trans": np.zeros(5, [("x", "f4")])}, "array type"),
+    ],
+)
+def test_values_that_are_no_motion(tmp_path: Path, changes: dict[str, Any], reason: str) -> None:
+    with pytest.raises(UserError, match=rf"a\.pkl: .*{reason}"):
+        read_aist_motion(saved(tmp_path, annotation(**changes)))
+
+
+class Call:
+    """Pickles as a call of anything."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.reduced = (function, arguments)
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        return self.reduced
+
+
+def test_no_other_global_is_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import builtins
+    import codecs
+    import os
+
+    monkeypatch.chdir(tmp_path)
+    attacks = [
+        (Call(os.system, "touch PWNED"), "system'"),
+        (Call(builtins.eval, "open('PWNED', 'w')"), r"'builtins\.eval'"),
+        (Call(np.load, "a.pkl"), "'numpy.load'"),
+        (Call(np.zeros, 10**12), "'numpy.zeros'|multiarray.zeros"),
+        (Call(bytearray, 2**40), r"'builtins\.bytearray'"),
+        (Call(codecs.encode, b"x", "zlib_codec"), r"_codecs\.encode with 'zlib_codec'"),
+        (Path("x"), "pathlib"),
+        ({1, 2}, "pickle instruction EMPTY_SET"),
+    ]
+    for attack, reason in attacks:
+        path = saved(tmp_path, annotation(extra=attack))
+        with pytest.raises(UserError, match=rf"a\.pkl: refused, .*({reason})"):
+            read_aist_motion(path)
+        assert [found.name for found in tmp_path.iterdir()] == ["a.pkl"]
+
+
+def test_memory_is_bound_by_the_file(tmp_path: Path) -> None:
+    path = saved(tmp_path, annotation(), 2)
+    raw = path.read_bytes()
+    # The shape of smpl_trans claims 2**31 - 1 frames.
+    shape = b"K\x05K\x03\x86"
+    assert raw.count(shape) == 1
+    path.write_bytes(raw.replace(shape, b"J\xff\xff\xff\x7fK\x03\x86"))
+    with pytest.raises(UserError, match="bytes instead of 257698037"):
+        read_aist_motion(path)
+    path.write_bytes(b"\x80\x02}r\xff\xff\xff\xff.")  # LONG_BINPUT: room for 2**32 memo entries
+    with pytest.raises(UserError, match="memo place"):
+        read_aist_motion(path)
+    path.write_bytes(b"\x80\x04\x8d" + struct.pack("<Q", 2**62) + b"x.")
+    with pytest.raises(UserError, match="cut short or damaged"):
+        read_aist_motion(path)
+    path.write_bytes(b"\x80\x02" + b"N" * 2000 + b".")
+    with pytest.raises(UserError, match="more than 1000 pickle instructions"):
+        read_aist_motion(path)
+
+
+def test_allowed_names_cannot_be_changed_or_misused(tmp_path: Path) -> None:
+    path = tmp_path / "a.pkl"
+    streams = {
+        # BUILD on the stand-in of a function
+        b"cnumpy._core.multiarray\n_reconstruct\n}b.": "change a function",
+        b"cnumpy\nndarray\n(I4\ntR.": "call of numpy.ndarray",
+        b"cnumpy._core.multiarray\n_reconstruct\n(I1\n(I0\ntS'b'\ntR.": "another class",
+        b"(S'a'\ncnumpy._core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntRd.": "not filled",
+        b"(I1\nI2\nd.": "not a dict of named values",
+        b"(" + b"cnumpy\ndtype\n(S'f4'\ntR" * 65 + b"l.": "more than 64 arrays",
+        b"ios\nsystem\n(S'touch PWNED'\nt.": "instruction INST",
+    }
+    for raw, reason in streams.items():
+        path.write_bytes(raw)
+        with pytest.raises(UserError, match=rf"a\.pkl: refused, .*{reason}"):
+            load_aist_pickle(path)
+
+
+def test_any_cut_or_flipped_byte_is_an_error_or_other_numbers(tmp_path: Path) -> None:
+    path = saved(tmp_path, annotation(frames=1), 4)
+    raw = path.read_bytes()
+    for size in range(len(raw)):
+        path.write_bytes(raw[:size])
+        with pytest.raises(UserError, match=r"a\.pkl: "):
+            read_aist_motion(path)
+    rng = np.random.default_rng(1)
+    for _ in range(400):
+        flipped = bytearray(raw)
+        flipped[rng.integers(len(raw))] ^= 1 << rng.integers(8)
+        path.write_bytes(flipped)
+        try:
+            motion = read_aist_motion(path)
+        except UserError as error:
+            assert "a.pkl: " in str(error)
+        else:
+            assert motion.poses.shape == (1, 72)
+
+
+def test_other_things_than_annotations(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such file"):
+        read_aist_motion(tmp_path / "absent.pkl")
+    path = saved(tmp_path, [1, 2])
+    with pytest.raises(UserError, match="holds a list, not a dict of named"):
+        read_aist_motion(path)
+    path.write_bytes(b"")
+    with pytest.raises(UserError, match="0 bytes"):
+        read_aist_motion(path)

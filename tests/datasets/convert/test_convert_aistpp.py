@@ -1,0 +1,385 @@
+"""AIST++: what is in the fixture comes out, in metres, in time, with its music; what is broken does not."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+
+from motionloom.datasets.check.dataset import check
+from motionloom.datasets.convert.aistpp.convert import AistppConfig, prepare_aistpp
+from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
+from motionloom.datasets.convert.aistpp.plan import MOTION_LICENCE, MUSIC_LICENCE, plan_aistpp
+from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.motion.canonical import canonicalize
+from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
+from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.shards.reader import ShardDataset
+
+REAL = "gBR_sBM_cAll_d04_mBR0_ch01"
+IGNORED = "gBR_sBM_cAll_d04_mBR0_ch08"
+TEST = "gHO_sBM_cAll_d99_mHO9_ch01"
+LISTED = "gBR_sBM_cAll_d04_mBR0_ch99"  # in the val split, without a file
+
+
+@pytest.fixture(scope="module")
+def fixture(shared: Path) -> Path:
+    return shared / "data/layouts/aistpp"
+
+
+@pytest.fixture
+def source(fixture: Path, tmp_path: Path) -> Path:
+    """A copy to break."""
+    folder = tmp_path / "aist"
+    shutil.copytree(fixture, folder)
+    for path in [folder, *folder.rglob("*")]:
+        path.chmod(0o755 if path.is_dir() else 0o644)
+    return folder
+
+
+def save_motion(folder: Path, name: str, frames: int = 120, **changes: Any) -> None:
+    """A figure that stands still and turns a little."""
+    poses = np.zeros((frames, 72), np.float32)
+    poses[:, 1] = np.linspace(0, 1, frames)
+    data = {
+        "smpl_loss": 0.0,
+        "smpl_poses": poses,
+        "smpl_scaling": np.array([90.0], np.float32),
+        "smpl_trans": np.tile(np.float32([10, 90, -20]), (frames, 1)),
+    }
+    (folder / "motions" / f"{name}.pkl").write_bytes(pickle.dumps(data | changes, protocol=2))
+
+
+def silent(source: Path, **options: Any) -> AistppConfig:
+    return AistppConfig(source=source, music="none", **options)
+
+
+def convert(config: AistppConfig, out: Path, **options: Any) -> Manifest:
+    return run_conversion(prepare_aistpp(config), out, progress=False, **options)
+
+
+def clip_of(out: Path, split: str, clip_id: str) -> tuple[ShardDataset, int]:
+    reader = ShardDataset.open(out, split)
+    return reader, next(i for i in range(len(reader)) if reader.meta(i).id == clip_id)
+
+
+def real_joints(fixture: Path, body: BodyModel) -> np.ndarray:
+    motion = read_aist_motion(fixture / f"motions/{REAL}.pkl")
+    return smpl_joints(motion.poses.reshape(-1, 24, 3)[:, :22], motion.metres(), body)
+
+
+# ---- motion
+
+
+def test_real_file_equals_the_golden_joints(shared: Path, fixture: Path) -> None:
+    """The golden joints come from another program with another skeleton.
+
+    Its bones are what its joints say in one frame, turned back; all 150 frames must then agree.
+    """
+    with np.load(shared / "golden/t1_humanml3d_A.npz", allow_pickle=False) as golden:
+        expected = golden["aist__joints"].astype(np.float64)
+    motion = read_aist_motion(fixture / f"motions/{REAL}.pkl")
+    poses = motion.poses.reshape(-1, 24, 3)[::3, :22][:150].astype(np.float64)
+    skeleton = Skeleton.named("smpl22")
+    world, rest = [rodrigues(poses[0, 0])], np.zeros((22, 3))
+    for joint, parent in enumerate(skeleton.parents[1:], start=1):
+        world.append(world[parent] @ rodrigues(poses[0, joint]))
+        rest[joint] = rest[parent] + world[parent].T @ (expected[0, joint] - expected[0, parent])
+    body = BodyModel(skeleton, rest, np.zeros((22, 3, 0)), {})
+    joints = smpl_joints(poses, motion.metres()[::3][:150], body)
+    assert np.abs(joints - expected).max() < 5e-5
+
+
+def rodrigues(vector: np.ndarray) -> np.ndarray:
+    angle = np.linalg.norm(vector)
+    x, y, z = vector / angle
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0, 60.0])
+def test_joints_and_parameters_tell_the_same_motion(fixture: Path, tmp_path: Path, fps: float) -> None:
+    body = BodyModel.neutral("smpl22")
+    wanted = canonicalize(real_joints(fixture, body)[:: round(60 / fps)])
+    frames = len(wanted)
+    for layout in ("body133", "smpl75", "h3d263"):
+        out = tmp_path / layout
+        manifest = convert(silent(fixture, layout=layout, fps=fps), out)
+        assert check(out) == []
+        assert (manifest.layout, manifest.fps) == (layout, fps)
+        reader, i = clip_of(out, "train", REAL)
+        motion = reader.motion(i)
+        if layout == "smpl75":
+            assert motion.shape == (frames, 75)
+            angles = motion[:, 3:].reshape(frames, 24, 3)
+            joints = smpl_joints(angles[:, :22].astype(float), motion[:, :3].astype(float), body)
+            assert np.linalg.norm(angles, axis=-1).max() <= np.pi + 1e-5
+            assert abs(joints[..., 1].min()) < 1e-5
+            assert np.abs(joints[0, 0, [0, 2]]).max() < 1e-6
+            assert np.abs(joints - wanted).max() < 1e-5
+        elif layout == "body133":
+            joints = decode(motion, MotionLayout.named(layout, fps=fps))
+            assert np.abs(joints - wanted).max() < 1e-4
+        else:
+            assert motion.shape == (frames - 1, 263)
+
+
+def test_layouts_that_need_fingers_are_refused(fixture: Path) -> None:
+    with pytest.raises(UserError, match="wholebody313 cannot be made from AIST"):
+        prepare_aistpp(silent(fixture, layout="wholebody313"))
+
+
+# ---- plan
+
+
+def test_plan_of_the_fixture(fixture: Path) -> None:
+    plan = plan_aistpp(AistppConfig(source=fixture))
+    assert [(split, clip.id) for split, clip in plan.items] == [("train", REAL), ("test", TEST)]
+    assert plan.frames == {"train": 240, "val": 0, "test": 60}
+    assert plan.found == 3
+    assert [(d.source, d.reason) for d in plan.dropped] == [(f"motions/{IGNORED}.pkl", "on the ignore list")]
+    assert [d.source for d in plan.missing] == ["motions/gBR_sBM_cAll_d04_mBR0_ch99.pkl"]
+    assert plan.broken == []
+    assert plan.ignored == 4  # keypoints3d, cameras, two lists of official_splits
+    assert plan.subsets["crossmodal train"].expected == 980
+    assert plan.subsets["crossmodal val"].missing == 1
+    assert plan.licences == {MUSIC_LICENCE: 2}
+    with pytest.raises(UserError, match="ch99"):
+        plan.require_whole()
+
+
+def test_official_lists_are_read_whole(fixture: Path) -> None:
+    plan = plan_aistpp(silent(fixture, splits=fixture / "official_splits"))
+    notes = plan.notes
+    told = {split: plan.subsets[f"crossmodal {split}"] for split in ("train", "val", "test")}
+    assert {split: subset.expected for split, subset in told.items()} == {"train": 980, "val": 20, "test": 20}
+    # 28 of the 980 are on the ignore list of the release.
+    assert {split: subset.missing for split, subset in told.items()} == {"train": 952, "val": 0, "test": 20}
+    assert any(note.startswith("28 sequences of the split files are on the ignore list") for note in notes)
+    assert plan.items == []
+    assert sum(d.reason == "in no split file" for d in plan.dropped) == 2
+    assert "no crossmodal_val.txt beside the other split files" in plan.notes
+
+
+def test_ignore_list_with_suffixes_and_unlisted_sequences(source: Path) -> None:
+    (source / "ignore_list.txt").write_text(f"\n{REAL}.json \r\n\n{IGNORED}.pkl")
+    save_motion(source, "gPO_sFM_cAll_d10_mPO0_ch01")
+    plan = plan_aistpp(silent(source))
+    assert {d.source.split("/")[1]: d.reason for d in plan.dropped} == {
+        f"{REAL}.pkl": "on the ignore list",
+        f"{IGNORED}.pkl": "on the ignore list",
+        "gPO_sFM_cAll_d10_mPO0_ch01.pkl": "in no split file",
+    }
+    assert len(plan_aistpp(silent(source, unlisted="hash")).items) == 2
+    shutil.rmtree(source / "splits")
+    plan = plan_aistpp(silent(source))
+    assert len(plan.items) == 2
+    assert "no split files: split 80/5/15 by a hash of the music" in plan.notes
+
+
+def test_a_sequence_in_two_splits_and_names_that_leave_the_folder(source: Path) -> None:
+    (source / "splits/crossmodal_val.txt").write_text(f"{TEST}\n")
+    with pytest.raises(UserError, match=f"crossmodal_test.txt: '{TEST}' is also in crossmodal_val.txt"):
+        plan_aistpp(silent(source))
+    (source / "splits/crossmodal_val.txt").write_text("../../etc/passwd\n")
+    with pytest.raises(UserError, match="not a plain relative name"):
+        plan_aistpp(silent(source))
+
+
+def test_shared_music_is_noted(source: Path) -> None:
+    name = "gHO_sBM_cAll_d98_mHO9_ch02"
+    save_motion(source, name)
+    with (source / "splits/crossmodal_train.txt").open("a") as file:
+        file.write(f"\n{name}\n")
+    plan = plan_aistpp(AistppConfig(source=source))
+    assert "1 pieces of music are in train and in test: mHO9" in plan.notes
+
+
+def test_missing_folders_are_named(source: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no motions/ in it"):
+        plan_aistpp(AistppConfig(source=tmp_path))
+    shutil.rmtree(source / "wavs")
+    with pytest.raises(UserError, match="no such folder of music; give --music-folder"):
+        plan_aistpp(AistppConfig(source=source))
+    plan = plan_aistpp(AistppConfig(source=source, music="optional"))
+    assert len(plan.items) == 2
+    assert plan.licences == {MOTION_LICENCE: 2}
+    assert "2 sequences have no music" in plan.notes
+
+
+def test_licences_can_be_filtered(fixture: Path) -> None:
+    plan = plan_aistpp(AistppConfig(source=fixture, allow_licence=(MOTION_LICENCE,)))
+    assert plan.items == []
+    assert all("is not allowed" in d.reason for d in plan.dropped if "ignore" not in d.reason)
+    assert len(plan_aistpp(silent(fixture, allow_licence=(MOTION_LICENCE,))).items) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("gBR_sBM_cAll_d04_mBR0_ch66_malicious", "asks for 'io.open'"),
+        ("missing_key", "no key 'smpl_scaling'"),
+        ("length_mismatch", "9 frames of smpl_poses, but 8 of smpl_trans"),
+        ("zero_scaling", "smpl_scaling is 0"),
+        ("truncated", "cut short"),
+    ],
+)
+def test_broken_annotations_are_left_out(
+    shared: Path, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str
+) -> None:
+    work = tmp_path / "cwd"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    shutil.copy(shared / f"data/broken/aist/{name}.pkl", source / f"motions/{LISTED}.pkl")
+    manifest = convert(silent(source), tmp_path / "out")
+    (told,) = (d for d in manifest.dropped if LISTED in d.source)
+    assert told.source == f"motions/{LISTED}.pkl"
+    assert reason in told.reason
+    assert sum(shard.samples for shard in manifest.shards) == 2
+    assert list(work.iterdir()) == []
+    assert not list(tmp_path.rglob("PWNED*"))
+    with pytest.raises(UserError, match=LISTED):
+        convert(silent(source), tmp_path / "strict", strict=True)
+
+
+def test_wrong_units_and_strange_names_are_left_out(source: Path, tmp_path: Path) -> None:
+    jump = np.zeros((120, 3), np.float32)
+    jump[60] = 900
+    save_motion(source, LISTED, smpl_trans=jump)
+    save_motion(source, "somebody")
+    manifest = convert(silent(source), tmp_path / "out")
+    reasons = {d.source: d.reason for d in manifest.dropped}
+    assert "moves at" in reasons[f"motions/{LISTED}.pkl"]
+    assert "not an AIST++ name" in reasons["motions/somebody.pkl"]
+
+
+# ---- music
+
+
+def test_music_goes_with_the_motion(fixture: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    manifest = convert(AistppConfig(source=fixture, fps=60.0, sound_rate=8000, caption_genre=True), out)
+    assert check(out) == []
+    assert manifest.audio is not None
+    assert str(tmp_path) not in str(manifest.dump()) and str(fixture) not in str(manifest.dump())
+    reader, i = clip_of(out, "train", REAL)
+    audio, wav = reader.audio(i), reader.wav(i)
+    assert audio is not None and wav is not None
+    assert reader.motion(i).shape[0] == 720
+    assert audio.shape == (720, 438)
+    music, rate = soundfile.read(fixture / "wavs/mBR0.wav", dtype="float32")
+    assert (wav[1], rate) == (8000, 8000)
+    assert np.array_equal(wav[0], music)
+    assert [caption.text for caption in reader.texts(i)] == ["a dancer performs break dance"]
+    # The click track has 80 beats a minute: the onsets lie where the clicks are.
+    onset = audio[:, 52]
+    times = np.flatnonzero(onset > 0.5 * onset.max()) / 60
+    assert np.abs((times + 0.375) % 0.75 - 0.375).max() < 0.06
+
+
+def test_twenty_frames_and_an_offset(source: Path, tmp_path: Path) -> None:
+    save_motion(source, LISTED, frames=240)
+    whole, late = tmp_path / "whole", tmp_path / "late"
+    convert(AistppConfig(source=source, sound_rate=8000), whole)
+    convert(AistppConfig(source=source, sound_rate=8000, music_offset=1.5), late)
+    for out in (whole, late):
+        reader, i = clip_of(out, "val", LISTED)
+        assert reader.motion(i).shape[0] == 80
+        audio, wav = reader.audio(i), reader.wav(i)
+        assert audio is not None and wav is not None
+        assert audio.shape == (80, 438)
+        assert len(wav[0]) == 4 * 8000
+        if out is whole:
+            first, sound = audio, wav[0]
+        else:
+            assert np.array_equal(audio[:50], first[30:])
+            assert np.array_equal(wav[0][:20000], sound[12000:])
+    # 1.5 s later, the long clip finds 1.5 s of music too little.
+    manifest = Manifest.load_json(late / "manifest.json")
+    assert any("12.00 s of motion, but 10.50 s of music" in d.reason for d in manifest.dropped)
+
+
+def test_published_rate_of_features_beside_slower_motion(fixture: Path, tmp_path: Path) -> None:
+    slow, fast = tmp_path / "slow", tmp_path / "fast"
+    convert(AistppConfig(source=fixture, fps=20.0, audio_fps=60.0, sound_rate=0), slow)
+    convert(AistppConfig(source=fixture, fps=60.0, sound_rate=0), fast)
+    reader, i = clip_of(slow, "train", REAL)
+    other, j = clip_of(fast, "train", REAL)
+    assert reader.motion(i).shape[0] == 240
+    assert reader.wav(i) is None
+    assert reader.manifest.audio == other.manifest.audio
+    assert np.array_equal(reader.audio(i), other.audio(j))
+    with pytest.raises(UserError, match="whole number of Hz"):
+        prepare_aistpp(AistppConfig(source=fixture, fps=23.976))
+
+
+def test_lengths_that_differ_are_cut_or_left_out(source: Path) -> None:
+    music, rate = soundfile.read(source / "wavs/mBR0.wav", dtype="float32")
+    soundfile.write(source / "wavs/mBR0.wav", music[: round(11.3 * rate)], rate, subtype="FLOAT")
+    plan = plan_aistpp(AistppConfig(source=source))
+    clip = next(clip for _, clip in plan.items if clip.id == REAL)
+    assert (clip.frames, clip.used) == (720, 678)
+    assert plan.frames["train"] == 226
+    assert "1 sequences end with their music, at most 1 s early" in plan.notes
+    soundfile.write(source / f"wavs/{REAL}.wav", music[: round(10.9 * rate)], rate)  # its own comes first
+    plan = plan_aistpp(AistppConfig(source=source))
+    assert any("12.00 s of motion, but 10.90 s of music" in d.reason for d in plan.dropped)
+
+
+def test_stereo_music_of_a_sequence(source: Path, tmp_path: Path) -> None:
+    save_motion(source, LISTED, frames=60)
+    path = source / f"wavs/{LISTED}.wav"
+    shutil.copy(source / "wavs/synthetic_stereo24.wav", path)
+    plan = plan_aistpp(AistppConfig(source=source, max_music_gap=0.5))
+    assert any("1.00 s of motion, but 0.25 s of music" in d.reason for d in plan.dropped)
+    stereo, rate = soundfile.read(path, dtype="float32")
+    long = np.tile(stereo, (10, 1))
+    soundfile.write(path, long, rate, subtype="PCM_24")
+    manifest = convert(AistppConfig(source=source, audio_features=False, sound_rate=rate), tmp_path / "out")
+    assert any("music of their own that goes on for more than 1 s" in note for note in manifest.notes)
+    reader, i = clip_of(tmp_path / "out", "val", LISTED)
+    wav = reader.wav(i)
+    assert reader.audio(i) is None and wav is not None
+    assert len(wav[0]) == rate
+    assert np.abs(wav[0] - long.mean(axis=1)[:rate]).max() < 2**-14
+
+
+@pytest.mark.parametrize("name", ["truncated", "zero_samples", "sample_rate_zero", "not_riff"])
+def test_broken_music_is_named_and_its_dances_left_out(
+    shared: Path, source: Path, tmp_path: Path, name: str
+) -> None:
+    shutil.copy(shared / f"data/broken/wav/{name}.wav", source / "wavs/mHO9.wav")
+    manifest = convert(AistppConfig(source=source, audio_features=False), tmp_path / "out")
+    told = {d.source: d.reason for d in manifest.dropped}
+    assert "no readable music" in told[f"motions/{TEST}.pkl"]
+    assert "wavs/mHO9.wav" in told
+    assert str(tmp_path) not in str(told)
+    with pytest.raises(UserError, match=r"mHO9\.wav"):
+        convert(AistppConfig(source=source), tmp_path / "strict", strict=True)
+
+
+def test_nan_within_music_is_found_when_it_is_read(source: Path, tmp_path: Path) -> None:
+    music, rate = soundfile.read(source / "wavs/mHO9.wav", dtype="float32")
+    music[12345] = np.nan
+    soundfile.write(source / "wavs/mHO9.wav", music, rate, subtype="FLOAT")
+    manifest = convert(AistppConfig(source=source, audio_features=False), tmp_path / "out")
+    told = {d.source: d.reason for d in manifest.dropped}
+    assert told[f"motions/{TEST}.pkl"].endswith("wavs/mHO9.wav: NaN or infinity at sample 12345")
+
+
+def test_workers_do_not_change_a_byte(fixture: Path, tmp_path: Path) -> None:
+    config = AistppConfig(source=fixture, layout="smpl75")
+    for workers in (1, 2):
+        convert(config, tmp_path / str(workers), workers=workers, clips_per_shard=1)
+    names = sorted(path.name for path in (tmp_path / "1").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "2").iterdir())
+    for name in names:
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()

@@ -1,0 +1,339 @@
+"""AMASS conversion: made-up clips in the published form, and files that are broken."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from motionloom.datasets.convert.amass.convert import AmassConfig, prepare_amass
+from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.common.smpl_npz import read_motion, read_motion_header
+from motionloom.datasets.convert.common.splits import hash_split
+from motionloom.datasets.motion.canonical import heading
+from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+
+
+@pytest.mark.parametrize("fps", [60.0, 100.0, 120.0, 150.0, 250.0, 59.94])
+def test_every_frame_rate_gives_the_same_motion(amass: ModuleType, fps: float, tmp_path: Path) -> None:
+    amass.save(tmp_path / "in/KIT/3/walk_poses.npz", **amass.walk(fps))
+    manifest = amass.make(tmp_path / "in", tmp_path / "out")
+    (motion,) = amass.features(tmp_path / "out").values()
+    joints = decode(motion, MotionLayout.named("body133"))
+    wanted = amass.expected_joints(20.0)[: len(joints)]
+    assert len(joints) in (60, 61)
+    # Linear interpolation between 60 Hz frames bends an arc by less than 0.2 mm.
+    np.testing.assert_allclose(joints, wanted, atol=3e-4)
+    assert (manifest.layout, manifest.fps, manifest.licence) == ("body133", 20.0, "AMASS-noncommercial")
+
+
+def test_the_figure_stands_upright_walks_forward_and_turns_left(amass: ModuleType, tmp_path: Path) -> None:
+    amass.save(tmp_path / "in/KIT/3/walk_poses.npz", **amass.walk(120.0))
+    amass.make(tmp_path / "in", tmp_path / "out")
+    layout = MotionLayout.named("body133")
+    (motion,) = amass.features(tmp_path / "out").values()
+    joints = decode(motion, layout)
+    names = layout.skeleton
+    assert joints[0, names.index("head"), 1] > 1.4 and abs(joints[:, :, 1].min()) < 1e-5
+    assert joints[0, names.index("left_wrist"), 0] > 0.3  # left is +X when facing +Z
+    seconds = (len(joints) - 1) / 20
+    turned = heading(joints, 20.0)
+    assert turned[-1] - turned[0] == pytest.approx(amass.TURN * seconds, abs=1e-3)
+    assert joints[1, 0, 2] / (1 / 20) == pytest.approx(amass.SPEED, rel=0.02)  # first step: straight ahead
+    angle = amass.TURN * seconds
+    path = amass.SPEED / amass.TURN * np.array([1 - math.cos(angle), math.sin(angle)])  # an arc to the left
+    np.testing.assert_allclose(joints[-1, 0, [0, 2]], path, atol=2e-3)
+    assert joints[:, names.index("left_ankle"), 1].min() > joints[:, names.index("right_ankle"), 1].max()
+
+
+def test_smplh_smplx_and_parts_agree_and_fingers_come_from_the_hands(
+    amass: ModuleType, tmp_path: Path
+) -> None:
+    clip = amass.walk(120.0)
+    source = tmp_path / "in"
+    amass.save(source / "CMU/01/h_poses.npz", **clip)
+    amass.save(source / "CMU/01/x_stageii.npz", **amass.as_smplx(clip))
+    amass.save(source / "CMU/01/parts_stageii.npz", **amass.in_parts(clip))
+    amass.save(source / "CMU/01/still_poses.npz", **amass.walk(120.0, hands=False))
+    amass.save(source / "CMU/01/body_poses.npz", **(clip | {"poses": clip["poses"][:, :72]}))
+    manifest = amass.make(source, tmp_path / "out", layout="wholebody313", fps=30)
+    made = amass.features(tmp_path / "out")
+    assert sorted(made) == [f"CMU/01/{n}" for n in ("h_poses", "parts_stageii", "still_poses", "x_stageii")]
+    np.testing.assert_array_equal(made["CMU/01/h_poses"], made["CMU/01/x_stageii"])
+    np.testing.assert_array_equal(made["CMU/01/h_poses"], made["CMU/01/parts_stageii"])
+    layout = MotionLayout.named("wholebody313")
+    joints = decode(made["CMU/01/h_poses"], layout)
+    np.testing.assert_allclose(joints, amass.expected_joints(30.0, joints=52), atol=3e-4)
+    assert amass.meta_of(tmp_path / "out", "CMU/01/h_poses")[0].has_hands
+    assert not amass.meta_of(tmp_path / "out", "CMU/01/still_poses")[0].has_hands
+    assert amass.reasons(manifest) == {
+        "CMU/01/body_poses.npz": "SMPL without finger rotations; layout wholebody313 has fingers"
+    }
+
+
+def test_float32_and_compressed_files_and_the_h3d_layout(amass: ModuleType, tmp_path: Path) -> None:
+    clip = amass.walk(60.0)
+    single = {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in clip.items()}
+    amass.save(tmp_path / "in/A/b/double_poses.npz", **clip)
+    np.savez_compressed(tmp_path / "in/A/b/single_poses.npz", **single)
+    amass.make(tmp_path / "in", tmp_path / "out", layout="h3d263")
+    made = amass.features(tmp_path / "out")
+    assert made["A/b/double_poses"].shape == (60, 263)
+    np.testing.assert_allclose(made["A/b/double_poses"], made["A/b/single_poses"], atol=1e-4)
+
+
+def test_bones_come_from_the_body_model_of_the_gender(amass: ModuleType, tmp_path: Path) -> None:
+    clip = amass.walk(60.0)
+    betas = {"betas": np.array([2.0, 9.0])}  # the model has one shape value
+    amass.save(tmp_path / "in/A/b/f_poses.npz", **(clip | betas))
+    amass.save(tmp_path / "in/A/b/m_poses.npz", **(clip | betas | {"gender": np.array(b"male")}))
+    amass.save(tmp_path / "in/A/b/n_poses.npz", **(clip | {"gender": np.array("unknown")}))
+    amass.save(tmp_path / "in/A/b/x_stageii.npz", **amass.as_smplx(clip))
+    models = {
+        "body_model_female": amass.body_model(tmp_path / "models/female/model.npz", 52, 0.9),
+        "body_model_male": amass.body_model(tmp_path / "models/male/model.npz", 52, 1.1),
+    }
+    manifest = amass.make(tmp_path / "in", tmp_path / "out", **models)
+    made = amass.features(tmp_path / "out")
+    own = amass.expected_joints(20.0)
+    for clip_id, scale in (("A/b/f_poses", 1.0), ("A/b/m_poses", 1.2)):
+        joints = decode(made[clip_id], MotionLayout.named("body133"))
+        bone = np.linalg.norm(joints[:, 4] - joints[:, 1], axis=-1)
+        np.testing.assert_allclose(bone, scale * np.linalg.norm(own[0, 4] - own[0, 1]), rtol=1e-4)
+    left_out = amass.reasons(manifest)
+    assert "no body model for gender 'neutral'" in left_out["A/b/n_poses.npz"]
+    assert "SMPL-X parameters, but the body model is SMPL-H" in left_out["A/b/x_stageii.npz"]
+    assert manifest.options["bodies"]["female"]["file"] == "model.npz"
+    assert str(tmp_path) not in json.dumps(manifest.dump())
+    whole = amass.body_model(tmp_path / "models/x.npz", 55, 1.0)
+    manifest = amass.make(tmp_path / "in", tmp_path / "x", body_model=whole)
+    assert manifest.options["bodies"]["neutral"]["kind"] == "SMPL-X"
+    assert list(amass.features(tmp_path / "x")) == ["A/b/x_stageii"]
+
+
+def test_without_a_body_model_the_manifest_says_so(amass: ModuleType, tmp_path: Path) -> None:
+    amass.save(tmp_path / "in/A/b/c_poses.npz", **amass.walk(60.0))
+    manifest = amass.make(tmp_path / "in", tmp_path / "out")
+    assert manifest.options["bodies"]["neutral"]["kind"] == "neutral skeleton"
+    assert any("No body model" in note for note in manifest.notes)
+
+
+def test_plan_accounts_for_every_file(amass: ModuleType, tmp_path: Path) -> None:
+    source = tmp_path / "in"
+    clip = amass.walk(60.0)
+    amass.save(source / "KIT/3/good_poses.npz", **clip)
+    amass.save(source / "KIT/3/short_poses.npz", **amass.walk(60.0, seconds=0.5))
+    amass.save(source / "CMU/01/01_01_poses.npz", **clip)
+    amass.save(source / "CMU/01/shape.npz", betas=clip["betas"])
+    amass.save(source / "CMU/01/neutral_stagei.npz", betas=clip["betas"])
+    (source / "CMU/LICENSE.txt").write_text("terms")
+    (source / "CMU/02").mkdir()
+    (source / "CMU/02/cut_poses.npz").write_bytes((source / "CMU/01/01_01_poses.npz").read_bytes()[:-50])
+    (source / "CMU/elsewhere").symlink_to(tmp_path)
+    (source / "CMU/02/link_poses.npz").symlink_to(tmp_path / "outside.npz")
+    amass.save(tmp_path / "outside.npz", **clip)
+    plan = prepare_amass(AmassConfig(source=source)).plan
+    assert plan.found == 4 and plan.ignored == 3
+    assert [clip.id for _, clip in plan.items] == ["CMU/01/01_01_poses", "KIT/3/good_poses"]
+    assert {d.source: d.reason for d in plan.dropped} == {"KIT/3/short_poses.npz": "0.52 s, shorter than 1 s"}
+    broken = {d.source: d.reason for d in plan.broken}
+    assert sorted(broken) == ["CMU/02/cut_poses.npz", "CMU/02/link_poses.npz", "CMU/elsewhere"]
+    assert broken["CMU/02/cut_poses.npz"] == "not an .npz file, or cut off"
+    assert "leaves in/" in broken["CMU/02/link_poses.npz"] and "not followed" in broken["CMU/elsewhere"]
+    assert {n: (s.found, s.used, s.missing, s.expected) for n, s in plan.subsets.items()} == {
+        "CMU": (2, 1, 0, None),
+        "KIT": (2, 1, 0, None),
+    }
+    assert plan.licences == {"AMASS-noncommercial": 2}
+    assert sum(plan.frames.values()) == 2 * 61
+
+
+def test_plan_reads_no_motion(amass: ModuleType, tmp_path: Path) -> None:
+    """A clip whose data are damaged is planned by its headers and dropped when it is converted."""
+    clip = amass.walk(60.0)
+    amass.save(tmp_path / "in/A/b/good_poses.npz", **clip)
+    path = amass.save(tmp_path / "in/A/b/bad_poses.npz", **clip)
+    data = bytearray(path.read_bytes())
+    data[1000] ^= 0xFF  # inside `poses`
+    path.write_bytes(data)
+    assert len(prepare_amass(AmassConfig(source=tmp_path / "in")).plan.items) == 2
+    manifest = amass.make(tmp_path / "in", tmp_path / "out")
+    assert "array 'poses' is damaged" in amass.reasons(manifest)["A/b/bad_poses.npz"]
+    assert list(amass.features(tmp_path / "out")) == ["A/b/good_poses"]
+
+
+class Boom:
+    """A pickle that would make a file."""
+
+    def __reduce__(self) -> Any:
+        return (Path.touch, (Path("PWNED_amass"),))
+
+
+BROKEN: list[tuple[dict[str, Any], str]] = [
+    ({"poses": None}, "no array 'poses', nor root_orient and pose_body; there is betas, gender"),
+    ({"trans": None}, "no array 'trans'; there are"),
+    ({"mocap_framerate": None}, "no mocap_framerate and no mocap_frame_rate in it; set source_fps"),
+    ({"mocap_framerate": np.array(0.0)}, "mocap_framerate is 0.0, not a number of frames a second"),
+    ({"mocap_framerate": np.array(math.nan)}, "mocap_framerate is nan"),
+    ({"mocap_framerate": np.array("fast")}, "'mocap_framerate' has type <U4, not numbers"),
+    ({"poses": np.zeros((181, 155))}, "poses is [T, 155]; SMPL has 72 columns, SMPL-H 156, SMPL-X 165"),
+    ({"poses": np.zeros((156,))}, "poses is [156], not [T, D]"),
+    ({"poses": np.zeros((1, 181, 156))}, "poses is [1, 181, 156], not [T, D]"),
+    ({"poses": np.zeros((181, 156), dtype=complex)}, "poses holds complex128, not floats"),
+    ({"poses": np.zeros((0, 156)), "trans": np.zeros((0, 3))}, "no frames"),
+    ({"trans": np.zeros((180, 3))}, "180 frames of trans, but 181 frames of poses"),
+    ({"trans": np.zeros((181, 2))}, "trans is [181, 2], not [T, 3]"),
+    ({"betas": np.zeros((2, 3, 4))}, "betas is [2, 3, 4], not one shape [B]"),
+    ({"betas": np.arange(20.0).reshape(2, 10)}, "betas change during the clip (2 rows)"),
+    ({"poses": "nan"}, "poses is nan at frame 9, column 30; not a number"),
+    ({"trans": "inf"}, "trans is inf at frame 9, column 1; not a number"),
+    ({"poses": "huge"}, "poses is 1e+06 at frame 9, column 30; at most 100 is sensible"),
+    ({"trans": "jump"}, "moves at"),
+    ({"gender": np.array([Boom()], dtype=object)}, "'gender' holds Python objects (a pickle)"),
+    ({"poses": np.array([[Boom()]], dtype=object)}, "'poses' holds Python objects (a pickle)"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BROKEN, ids=[message[:40] for _, message in BROKEN])
+def test_broken_clips_are_left_out_with_their_reason(
+    amass: ModuleType, change: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    bad: dict[str, Any] = amass.walk(60.0)
+    for key, value in change.items():
+        bad[key] = bad[key].copy()
+        if value is None:
+            del bad[key]
+        elif isinstance(value, str):
+            column = 30 if key == "poses" else 1
+            bad[key][9, column] = {"nan": math.nan, "inf": math.inf, "huge": 1e6, "jump": 50.0}[value]
+        else:
+            bad[key] = value
+    amass.save(tmp_path / "in/A/b/good_poses.npz", **amass.walk(60.0))
+    amass.save(tmp_path / "in/A/b/bad_poses.npz", **bad)
+    manifest = amass.make(tmp_path / "in", tmp_path / "out")
+    (reason,) = amass.reasons(manifest).values()
+    assert message in reason and str(tmp_path) not in reason
+    assert list(amass.features(tmp_path / "out")) == ["A/b/good_poses"]
+    assert not (tmp_path / "PWNED_amass").exists()
+    with pytest.raises(UserError, match=r"bad_poses\.npz"):
+        conversion = prepare_amass(AmassConfig(source=tmp_path / "in"))
+        run_conversion(conversion, tmp_path / "strict", strict=True, progress=False)
+
+
+def test_stated_sizes_are_not_believed(amass: ModuleType, tmp_path: Path) -> None:
+    """A header that asks for terabytes, and one that is larger than the limit, cost nothing."""
+    amass.save(tmp_path / "in/A/b/good_poses.npz", **amass.walk(60.0))
+    path = tmp_path / "in/A/b/bomb_poses.npz"
+    text = b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000, 156), }"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        start = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little")
+        archive.writestr("poses.npy", start + text + bytes(99))
+        for name, values in amass.walk(60.0).items():
+            if name != "poses":
+                buffer = io.BytesIO()
+                np.save(buffer, values)
+                archive.writestr(f"{name}.npy", buffer.getvalue())
+    manifest = amass.make(tmp_path / "in", tmp_path / "out")
+    assert "of shape [10000000000, 156] needs" in amass.reasons(manifest)["A/b/bomb_poses.npz"]
+
+
+def test_pickled_extras_do_not_matter(amass: ModuleType, tmp_path: Path) -> None:
+    amass.save(tmp_path / "in/A/b/c_stageii.npz", markers_latent_vids=np.array({"a": 1}, dtype=object),
+         **amass.as_smplx(amass.walk(60.0)))  # fmt: skip
+    amass.make(tmp_path / "in", tmp_path / "out")
+    assert list(amass.features(tmp_path / "out")) == ["A/b/c_stageii"]
+
+
+def test_source_fps_and_up_override_the_file(amass: ModuleType, tmp_path: Path) -> None:
+    clip = amass.walk(60.0)
+    upright = clip["poses"].reshape(-1, 52, 3).copy()
+    flat = Rotation.from_rotvec([-math.pi / 2, 0, 0])
+    upright[:, 0] = (flat * Rotation.from_rotvec(upright[:, 0])).as_rotvec()
+    changed = {"poses": upright.reshape(-1, 156), "trans": flat.apply(clip["trans"]),
+               "mocap_framerate": np.array(30.0)}  # fmt: skip
+    amass.save(tmp_path / "in/A/b/c_poses.npz", **(clip | changed))
+    amass.make(tmp_path / "in", tmp_path / "out", up="y", source_fps=60)
+    (motion,) = amass.features(tmp_path / "out").values()
+    joints = decode(motion, MotionLayout.named("body133"))
+    np.testing.assert_allclose(joints, amass.expected_joints(20.0), atol=3e-4)
+
+
+def test_captions_splits_and_missing_clips(amass: ModuleType, tmp_path: Path) -> None:
+    source = tmp_path / "in"
+    for name in ("a", "b", "c"):
+        amass.save(source / f"KIT/3/{name}_poses.npz", **amass.walk(60.0))
+    rows = [
+        {"id": "first", "file": "KIT/3/a_poses.npz", "captions": ["walks to the left"]},
+        {"id": "KIT/3/b_poses", "captions": ["walks"], "split": "val"},
+        {"id": "gone", "file": "KIT/3/gone_poses.npz", "captions": ["sits"]},
+    ]
+    captions = tmp_path / "captions.jsonl"
+    captions.write_text("\n".join(map(json.dumps, rows)))
+    manifest = amass.make(source, tmp_path / "out", captions=captions)
+    meta, texts = amass.meta_of(tmp_path / "out", "first")
+    assert (meta.source, meta.split) == ("KIT/3/a_poses.npz", hash_split("first"))
+    assert [caption.text for caption in texts] == ["walks to the left"]
+    assert amass.meta_of(tmp_path / "out", "KIT/3/b_poses")[0].split == "val"
+    assert amass.reasons(manifest) == {
+        "KIT/3/gone_poses.npz": "clip 'gone' is listed, but not here",
+        "KIT/3/c_poses.npz": "no captions",
+    }
+    (tmp_path / "splits").mkdir()
+    (tmp_path / "splits/train.txt").write_text("KIT/3/c_poses\nlost\n")
+    options = {"captions": captions, "splits": tmp_path / "splits", "uncaptioned": "keep"}
+    manifest = amass.make(source, tmp_path / "out2", **options)
+    assert list(amass.features(tmp_path / "out2")) == ["KIT/3/c_poses"]
+    assert amass.reasons(manifest)["lost.npz"] == "clip 'lost' is listed, but not here"
+    assert amass.reasons(manifest)["KIT/3/a_poses.npz (first)"] == "in no split file"
+
+
+def test_options_that_exclude_each_other(tmp_path: Path) -> None:
+    for options, message in (
+        ({"mirror": True}, "need humanml_index"),
+        ({"humanml_index": "i.csv", "captions": "c.jsonl"}, "exclude each other"),
+    ):
+        with pytest.raises(UserError, match=message):
+            AmassConfig.parse({"source": str(tmp_path), **options}, "options")
+    for layout in ("wholebody363", "smplx322"):
+        with pytest.raises(UserError, match="cannot be made from AMASS"):
+            prepare_amass(AmassConfig(source=tmp_path, layout=layout))
+    with pytest.raises(UserError, match=r"no \.npz file with motion in it"):
+        prepare_amass(AmassConfig(source=tmp_path))
+    with pytest.raises(UserError, match="no such folder"):
+        prepare_amass(AmassConfig(source=tmp_path / "none"))
+
+
+def test_licence_limit_and_lengths(amass: ModuleType, tmp_path: Path) -> None:
+    for i in range(5):
+        amass.save(tmp_path / f"in/A/b/{i}_poses.npz", **amass.walk(60.0, seconds=1.5))
+    plan = prepare_amass(AmassConfig(source=tmp_path / "in", limit=2)).plan
+    assert len(plan.items) == 2 and "limited to 2 of 5 clips" in plan.notes
+    plan = prepare_amass(AmassConfig(source=tmp_path / "in", allow_licence=("CC0",))).plan
+    assert not plan.items and "licence 'AMASS-noncommercial' is not allowed" in plan.dropped[0].reason
+    plan = prepare_amass(AmassConfig(source=tmp_path / "in", max_seconds=1.0)).plan
+    assert "longer than 1 s" in plan.dropped[0].reason
+    manifest = amass.make(tmp_path / "in", tmp_path / "out", licence="mine")
+    assert manifest.licences == {"mine": 5}
+
+
+def test_reading_one_clip(amass: ModuleType, tmp_path: Path) -> None:
+    path = amass.save(tmp_path / "a.npz", **amass.as_smplx(amass.walk(60.0)))
+    header = read_motion_header(path, "a")
+    assert (header.frames, header.fps, header.kind, header.gender, header.hands) == (
+        181, 60.0, "SMPL-X", "female", True,
+    )  # fmt: skip
+    motion = read_motion(path, "a", hands=True, frames=slice(10, 30))
+    assert motion.rotations.shape == (20, 52, 3) and motion.trans.shape == (20, 3)
+    np.testing.assert_array_equal(motion.rotations.reshape(20, 156), amass.walk(60.0)["poses"][10:30])
+    np.testing.assert_array_equal(motion.betas, amass.walk(60.0)["betas"])

@@ -1,0 +1,400 @@
+"""BVH conversion: real clips, folders and archives, broken inputs, and bytes that no worker count changes."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import shutil
+import tarfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.base.lock import LOCK_FILE
+from motionloom.datasets.convert.bvh.convert import BvhClips, BvhConfig, plan_bvh, prepare_bvh
+from motionloom.datasets.convert.common.archives import Batch
+from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
+from motionloom.datasets.convert.common.splits import hash_split
+from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.motion.canonical import canonicalize, resample
+from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joint_map import JointMap
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Manifest, Split, UserError
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.tasks import Part
+from motionloom.datasets.shards.writer import WORK_FOLDER
+
+NAMES = (
+    "bow_active",
+    "bow_childish",
+    "bow_chimpira",
+    "bow_angry",
+    "bow_feminine",
+    "bow_giant",
+    "dash_normal",
+)
+
+
+@pytest.fixture(scope="module")
+def clips(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of seven real clips (one of 0.67 s) with their lines of captions.jsonl."""
+    folder = tmp_path_factory.mktemp("clips")
+    (folder / "dataset-1").mkdir()
+    wanted = {f"dataset-1/dataset-1_{name}_001.bvh" for name in NAMES}
+    with tarfile.open(shared / "data/bandai/dataset-1.tar.xz", "r|*") as archive:
+        for member in archive:
+            file = archive.extractfile(member) if member.name in wanted else None
+            if file is not None:
+                (folder / "dataset-1" / Path(member.name).name).write_bytes(file.read())
+    lines = (shared / "data/bandai/captions.jsonl").read_text().splitlines()
+    kept = [line for line in lines if json.loads(line)["file"] in wanted]
+    (folder / "captions.jsonl").write_text("\n".join(kept))
+    shutil.copy(shared / "data/bandai/joint_map.json", folder)
+    return folder
+
+
+@pytest.fixture
+def copy(clips: Path, tmp_path: Path) -> Path:
+    """The same, free to change."""
+    return Path(shutil.copytree(clips, tmp_path / "source"))
+
+
+def config(folder: Path, **changes: Any) -> BvhConfig:
+    given: dict[str, Any] = {
+        "source": folder,
+        "joint_map": folder / "joint_map.json",
+        "captions": folder / "captions.jsonl",
+        "name": "bandai",
+        "licence": "CC-BY-NC-4.0",
+    }
+    return BvhConfig(**(given | changes))
+
+
+def convert(given: BvhConfig, out: Path, *, workers: int = 1, **options: Any) -> Manifest:
+    prepared = prepare_bvh(given, workers=workers, scan=out / SCAN_FILE)
+    return run_conversion(prepared, out, workers=workers, progress=False, **options)
+
+
+def bytes_of(folder: Path) -> dict[str, str]:
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.iterdir())}
+
+
+def reasons(manifest: Manifest) -> dict[str, str]:
+    return {drop.source.rsplit("/", 1)[-1]: drop.reason for drop in manifest.dropped}
+
+
+def clip_file(folder: Path, name: str) -> Path:
+    return folder / "dataset-1" / f"dataset-1_{name}_001.bvh"
+
+
+def test_clips_become_samples_with_captions_split_and_licence(clips: Path, tmp_path: Path) -> None:
+    manifest = convert(config(clips), tmp_path / "out")
+    assert manifest.licence == "CC-BY-NC-4.0"
+    assert (manifest.layout, manifest.family, manifest.fps) == ("body133", "exact", 20.0)
+    assert reasons(manifest) == {"dataset-1_dash_normal_001.bvh": "0.67 s, shorter than 1 s"}
+    assert {s.split: s.samples for s in manifest.shards} == {"train": 3, "val": 1, "test": 2}
+    assert str(clips) not in json.dumps(manifest.dump())
+    assert [p.name for p in (tmp_path / "out").iterdir() if p.name.startswith(".")] == [".scan.json"]
+    rows = {row["id"]: row for row in map(json.loads, (clips / "captions.jsonl").read_text().splitlines())}
+    splits: tuple[Split, ...] = ("train", "val", "test")
+    for split in splits:
+        dataset = ShardDataset.open(tmp_path / "out", split)
+        for i, clip_id in enumerate(dataset.ids):
+            row = rows[clip_id]
+            assert row["split"] == split
+            assert [c.text for c in dataset.texts(i)] == row["captions"]
+            meta = dataset.meta(i)
+            assert (meta.source, meta.licence, meta.has_hands) == (row["file"], "CC-BY-NC-4.0", False)
+            assert abs(len(dataset.motion(i)) - row["frames"] * 20 / 30) < 1.5
+
+
+def test_features_are_those_of_the_clip(clips: Path, tmp_path: Path) -> None:
+    convert(config(clips), tmp_path / "out")
+    dataset = ShardDataset.open(tmp_path / "out", "val")
+    motion = read_bvh(clip_file(clips, "bow_childish"))
+    joints = JointMap.load(clips / "joint_map.json").apply(motion)
+    expected = canonicalize(resample(joints, 30.0, 20.0))
+    got = decode(np.array(dataset.motion(0)), MotionLayout.named("body133"))
+    np.testing.assert_allclose(got, expected, atol=1e-4)
+    assert expected[..., 1].min() == pytest.approx(0, abs=1e-9)
+
+
+def test_worker_count_changes_no_byte(copy: Path, tmp_path: Path) -> None:
+    pack(copy, 2)
+    outs = [tmp_path / "one", tmp_path / "two"]
+    for workers, out in enumerate(outs, start=1):
+        convert(config(copy), out, workers=workers, clips_per_shard=2)
+    assert bytes_of(outs[0]) == bytes_of(outs[1])
+    assert len(list(outs[0].glob("*.tar"))) == 4
+
+
+def test_archives_give_the_same_features_as_files(copy: Path, tmp_path: Path) -> None:
+    convert(config(copy), tmp_path / "loose")
+    pack(copy, 3)
+    manifest = convert(config(copy), tmp_path / "packed")
+    assert sum(s.samples for s in manifest.shards) == 6
+    for split in ("train", "val", "test"):
+        loose, packed = (
+            ShardDataset.open(tmp_path / kind, split)  # type: ignore[arg-type]
+            for kind in ("loose", "packed")
+        )
+        theirs = {clip_id: packed.motion(i) for i, clip_id in enumerate(packed.ids)}
+        for i, clip_id in enumerate(loose.ids):
+            np.testing.assert_array_equal(loose.motion(i), theirs[clip_id])
+
+
+def test_a_killed_run_resumes_to_the_same_bytes(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pack(copy, 3)
+    convert(config(copy), tmp_path / "whole")
+    real, calls = BvhClips.features, []
+
+    def dies(*args: Any) -> Any:
+        calls.append(args)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    monkeypatch.setattr(BvhClips, "features", dies)
+    with pytest.raises(KeyboardInterrupt):
+        convert(config(copy), tmp_path / "out")
+    assert len(list((tmp_path / "out" / WORK_FOLDER).glob("*.json"))) == 2
+    convert(config(copy), tmp_path / "out")
+    assert len(calls) == 5 + 2  # two archives were kept, only the third one's clips are made again
+    assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "whole")
+
+
+def test_a_finished_conversion_reads_nothing_again(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pack(copy, 2)
+    first = convert(config(copy), tmp_path / "out")
+    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")}
+
+    def never(*_: Any) -> Any:
+        raise AssertionError("an archive was read again")
+
+    monkeypatch.setattr(Batch, "read", never)
+    assert convert(config(copy), tmp_path / "out") == first
+    assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")} == before
+
+
+def test_a_clip_by_itself_is_the_same_sample(copy: Path, tmp_path: Path) -> None:
+    pack(copy, 2)
+    prepared = prepare_bvh(config(copy))
+    run_conversion(prepared, tmp_path / "out", progress=False)
+    dataset = ShardDataset.open(tmp_path / "out", "val")
+    (clip,) = [item for split, item in prepared.plan.items if split == "val"]
+    sample = prepared.convert(clip)
+    assert not isinstance(sample, list)
+    np.testing.assert_array_equal(sample.motion, dataset.motion(0))
+    assert (sample.meta, sample.texts) == (dataset.meta(0), dataset.texts(0))
+    seconds = prepared.estimated(2).seconds_needed
+    assert seconds is not None and 0 < seconds < 60
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_parts_and_one_last_run_give_the_same_bytes(copy: Path, tmp_path: Path, count: int) -> None:
+    pack(copy, 3)
+    (copy / "broken.bvh").write_text("HIERARCHY\nMOTION\nFrames: 60\nFrame Time: 0.033333\n1 2 3\n")
+    given = config(copy, uncaptioned="keep")
+    whole = convert(given, tmp_path / "whole", clips_per_shard=2)
+    out = tmp_path / "out"
+    with pytest.raises(UserError, match=r"features of \d batches are missing"):
+        run_part(given, out, Part(0, count))
+    for index in reversed(range(count)):
+        made = run_part(given, out, Part(index, count, "features"))
+        assert made.shards == []
+    names = [s.name for index in range(count) for s in run_part(given, out, Part(index, count)).shards]
+    assert sorted(names) == sorted(shard.name for shard in whole.shards)
+    assert not (out / "manifest.json").exists()
+    assert convert(given, out, clips_per_shard=2) == whole
+    assert bytes_of(out) == bytes_of(tmp_path / "whole")
+    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    for step in ("features", "shards"):  # all is there: nothing is made, and the manifest stays
+        run_part(given, out, Part(0, count, step))  # type: ignore[arg-type]
+    (out / LOCK_FILE).unlink()  # parts leave it, the last run takes it away
+    assert {path.name: path.stat().st_mtime_ns for path in out.iterdir()} == before
+
+
+def run_part(given: BvhConfig, out: Path, part: Part) -> Manifest:
+    prepared = prepare_bvh(given, scan=out / SCAN_FILE)
+    return run_conversion(prepared, out, clips_per_shard=2, progress=False, part=part)
+
+
+def test_changed_file_and_changed_option_are_not_reused(copy: Path, tmp_path: Path) -> None:
+    first = convert(config(copy), tmp_path / "out")
+    path = clip_file(copy, "bow_childish")
+    path.write_text(path.read_text().replace("Frame Time:\t0.0333333", "Frame Time:\t0.05"))
+    second = convert(config(copy), tmp_path / "out")
+    frames = [{s.split: s.frames for s in m.shards}["val"] for m in (first, second)]
+    assert frames == [65, 98]
+    with pytest.raises(UserError, match=r"finished with other options \(fps 20.0 -> 10.0\)"):
+        convert(config(copy, fps=10.0), tmp_path / "out")
+    (tmp_path / "out" / "manifest.json").unlink()
+    third = convert(config(copy, fps=10.0), tmp_path / "out")
+    assert {s.split: s.frames for s in third.shards}["val"] == 49
+
+
+def test_broken_files_are_reported_and_skipped(copy: Path, shared: Path, tmp_path: Path) -> None:
+    for path in (shared / "data/broken/bvh").glob("*.bvh"):
+        shutil.copy(path, copy)
+    given = config(copy, uncaptioned="keep", min_seconds=0)
+    plan = plan_bvh(given)
+    assert len(plan.broken) == 2  # frame_time_zero, no_motion: the header alone shows it
+    manifest = convert(given, tmp_path / "out")
+    told = reasons(manifest)
+    assert "10 frames, 6 found" in told["missing_frames.bvh"]
+    assert "is not UTF-8" in told["non_utf8.bvh"]
+    assert not any(name in told for name in ("control_ok.bvh", "crlf_bom.bvh"))
+    assert len(told) == 9
+    assert all("broken/bvh" not in reason and str(copy) not in reason for reason in told.values())
+    with pytest.raises(UserError, match="strict"):
+        convert(given, tmp_path / "strict", strict=True)
+
+
+def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> None:
+    shutil.copy(clip_file(copy, "bow_angry"), copy / "again.bvh")
+    extra = clip_file(copy, "bow_giant").read_text() + "\n"
+    (copy / "unknown.bvh").write_text(extra)
+    clip_file(copy, "bow_active").unlink()
+    (copy / "notes.txt").touch()
+    plan = plan_bvh(config(copy))
+    assert plan.found == 8
+    assert plan.counts() == {"train": 3, "val": 1, "test": 1}
+    assert plan.frames["val"] == 65
+    assert [d.source for d in plan.missing] == ["dataset-1/dataset-1_bow_active_001.bvh"]
+    assert plan.uncaptioned == ["again.bvh", "unknown.bvh"]
+    assert plan.ignored == 3
+    told = Counter(d.reason.split(",")[0] for d in plan.dropped)
+    assert told == {"same bytes as dataset-1/dataset-1_bow_angry_001.bvh": 1, "no captions": 1, "0.67 s": 1}
+    assert "8" in {str(cell) for column in plan.table().columns for cell in column.cells}
+    kept = plan_bvh(config(copy, captions=None))
+    assert any("same bytes as" in d.reason for d in kept.dropped)
+    with pytest.raises(UserError, match="strict"):
+        plan.require_whole()
+
+
+def test_expected_frames_are_the_written_ones(clips: Path, tmp_path: Path) -> None:
+    for layout in ("body133", "h3d263"):
+        given = config(clips, layout=layout, fps=20.0)
+        manifest = convert(given, tmp_path / layout)
+        assert {s.split: s.frames for s in manifest.shards} == plan_bvh(given).frames
+
+
+def test_splits_come_from_files_then_captions_then_hash(copy: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "splits"
+    folder.mkdir()
+    ids = [f"dataset-1_{name}_001" for name in NAMES]
+    (folder / "train.txt").write_bytes(("\r\n".join(ids[:3]) + "\r\n\r\n").encode())
+    (folder / "test.txt").write_text("\n".join([*ids[3:5], ids[3], "nobody"]))
+    plan = plan_bvh(config(copy, splits=folder))
+    assert plan.counts() == {"train": 3, "val": 0, "test": 2}
+    assert [d.source for d in plan.missing] == ["nobody"]
+    assert any("listed twice" in note for note in plan.notes)
+    assert sum(d.reason == "in no split file" for d in plan.dropped) == 2
+    hashed = plan_bvh(config(copy, captions=None))
+    assert all(split == hash_split(clip.id) for split, clip in hashed.items)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("{", "captions.jsonl:8: not valid JSON"),
+        ('{"id": "a"}', "captions.jsonl:8: key 'captions' is required"),
+        ('{"id": "../a", "captions": []}', "captions.jsonl:8: clip id '../a'"),
+        ('{"id": "dataset-1_bow_angry_001", "captions": []}', "has a line already"),
+        ('{"id": "a", "captions": [], "split": "dev"}', "key 'split' = 'dev'"),
+    ],
+)
+def test_bad_caption_lines_are_named(copy: Path, line: str, message: str) -> None:
+    with (copy / "captions.jsonl").open("a") as file:
+        file.write("\n" + line)
+    with pytest.raises(UserError, match=message):
+        plan_bvh(config(copy))
+
+
+def test_archive_members_are_labels_never_paths(clips: Path, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    source.mkdir()
+    data = clip_file(clips, "bow_angry").read_bytes()
+    other = clip_file(clips, "bow_giant").read_bytes()
+    with tarfile.open(source / "bad.tar.gz", "w:gz") as archive:
+        for name in ("../../PWNED_bvh.bvh", "/tmp/PWNED_abs.bvh"):
+            add(archive, name, data)
+        link = tarfile.TarInfo("link.bvh")
+        link.type, link.linkname = tarfile.SYMTYPE, "/etc/hostname"
+        archive.addfile(link)
+        add(archive, "./good.bvh", other)
+    given = config(clips, source=source, captions=None)
+    manifest = convert(given, tmp_path / "out")
+    assert sum(s.samples for s in manifest.shards) == 1
+    assert Counter("plain relative name" in d.reason for d in manifest.dropped) == {True: 2}
+    assert not list(tmp_path.rglob("PWNED*")) and not Path("/tmp/PWNED_abs.bvh").exists()
+
+
+def test_damaged_archive_keeps_what_came_before(copy: Path, tmp_path: Path) -> None:
+    pack(copy, 1, suffix="tar")
+    path = copy / "part0.tar"
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * 0.6)])
+    manifest = convert(config(copy), tmp_path / "out")
+    told = reasons(manifest)
+    assert "damaged archive after" in told["part0.tar"]
+    assert 0 < sum(s.samples for s in manifest.shards) < 6
+    assert sum("listed, but its file is not in the source" in r for r in told.values()) > 0
+    with pytest.raises(UserError, match="damaged archive"):
+        convert(config(copy), tmp_path / "strict", strict=True)
+
+
+def test_wrong_unit_and_wrong_map_are_explained(copy: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"measures .* is the length unit right\? \(read with unit 'm'"):
+        convert(config(copy, unit="m"), tmp_path / "out")
+    data = json.loads((copy / "joint_map.json").read_text())
+    data["smpl22"][0][2] = "Pelvis"
+    (copy / "joint_map.json").write_text(json.dumps(data))
+    with pytest.raises(UserError, match="no joint 'Pelvis'"):
+        convert(config(copy), tmp_path / "out")
+
+
+def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
+    layout = MotionLayout.named("body133")
+    convert(config(copy, retarget=True, limit=2), tmp_path / "out")
+    total = 0
+    for split in ("train", "val", "test"):
+        if not list((tmp_path / "out").glob(f"*-{split}-*.tar")):
+            continue
+        dataset = ShardDataset.open(tmp_path / "out", split)  # type: ignore[arg-type]
+        total += len(dataset)
+        joints = decode(np.array(dataset.motion(0)), layout)
+        shin = np.linalg.norm(joints[:, 7] - joints[:, 4], axis=-1)
+        np.testing.assert_allclose(shin, np.linalg.norm(layout.skeleton.offsets[7]), atol=1e-3)
+    assert total == 2
+    (tmp_path / "nothing").mkdir()
+    with pytest.raises(UserError, match=r"no \.bvh file"):
+        plan_bvh(config(copy, source=tmp_path / "nothing"))
+    with pytest.raises(UserError, match="no such file or folder"):
+        plan_bvh(config(copy, source=tmp_path / "none"))
+    with pytest.raises(UserError, match="cannot be made from joints"):
+        convert(config(copy, layout="wholebody363"), tmp_path / "face")
+
+
+def pack(folder: Path, parts: int, suffix: str = "tar.xz") -> None:
+    """Move the clips of `folder` into `parts` archives."""
+    files = sorted((folder / "dataset-1").glob("*.bvh"))
+    for part in range(parts):
+        with tarfile.open(folder / f"part{part}.{suffix}", "w:xz" if suffix == "tar.xz" else "w") as archive:
+            for path in files[part::parts]:
+                add(archive, f"dataset-1/{path.name}", path.read_bytes())
+    shutil.rmtree(folder / "dataset-1")
+
+
+def add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+    member = tarfile.TarInfo(name)
+    member.size = len(data)
+    archive.addfile(member, io.BytesIO(data))

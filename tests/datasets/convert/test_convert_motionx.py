@@ -1,0 +1,352 @@
+"""Motion-X conversion: the layout fixture, repairs of columns, dirt, and equal bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from motionx_clips import (
+    BOW,
+    CHAT,
+    DANCE,
+    FACES,
+    HUMANML,
+    MIRRORED,
+    MOTION,
+    MUG,
+    TEXTS,
+    TURN,
+    WAVE,
+    config,
+    planned,
+)
+from numpy.typing import NDArray
+
+from motionloom.datasets.check.dataset import check
+from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.motionx.convert import (
+    convert_clip,
+    parameters_to_joints,
+    prepare_motionx,
+    read_parameters,
+)
+from motionloom.datasets.convert.motionx.parameters import (
+    aist_scale,
+    resample_parameters,
+    scale_aist,
+    with_face,
+)
+from motionloom.datasets.convert.motionx.plan import plan_motionx
+from motionloom.datasets.motion.canonical import facing, mirror
+from motionloom.datasets.motion.features import decode, face_of
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.smpl import BodyModel
+from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.shards.sample import Sample
+
+
+@pytest.fixture
+def fixture(shared: Path) -> Path:
+    return shared / "data/layouts/motionx"
+
+
+def sample(folder: Path, clip_id: str, **changes: Any) -> Sample:
+    given = config(folder, **changes)
+    body = BodyModel.neutral(given.skeleton)
+    return convert_clip(given, body, planned(folder, **changes)[clip_id])
+
+
+def convert(folder: Path, out: Path, *, workers: int = 1, **changes: Any) -> Manifest:
+    return run_conversion(prepare_motionx(config(folder, **changes)), out, workers=workers, progress=False)
+
+
+def rewrite(path: Path, change: Callable[[NDArray[Any]], NDArray[Any] | None]) -> None:
+    """Change an array file, in place or by the array returned."""
+    values = np.load(path)
+    made = change(values)
+    np.save(path, values if made is None else made)
+
+
+def joints_of(made: Sample) -> NDArray[np.float64]:
+    return decode(made.motion, MotionLayout.named(made.meta.layout, fps=made.meta.fps))
+
+
+# The whole way
+
+
+def test_fixture_converts(fixture: Path, tmp_path: Path) -> None:
+    manifest = convert(fixture, tmp_path / "out")
+    assert check(tmp_path / "out") == []
+    assert {s.split: s.samples for s in manifest.shards} == {"train": 5, "val": 1, "test": 2}
+    assert (manifest.layout, manifest.family, manifest.fps) == ("wholebody363", "exact", 30.0)
+    assert manifest.options["body_model"]["kind"] == "neutral skeleton"
+    assert str(fixture) not in manifest.model_dump_json()
+    assert manifest.licences["AMASS-noncommercial"] == 2
+    assert any("captions: texts/semantic_labels/ (8 files)" in note for note in manifest.notes)
+    assert manifest.dropped == []
+
+
+def test_workers_and_places_give_the_same_bytes(copy: Path, fixture: Path, tmp_path: Path) -> None:
+    convert(fixture, tmp_path / "one")
+    convert(copy, tmp_path / "two", workers=2)
+    one, two = (
+        {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted((tmp_path / name).iterdir())}
+        for name in ("one", "two")
+    )
+    assert one == two
+
+
+@pytest.mark.parametrize(
+    ("layout", "width", "lost"),
+    [("wholebody313", 313, 0), ("body133", 133, 0), ("tomato623", 623, 1), ("h3d263", 263, 1)],
+)
+def test_layouts(fixture: Path, layout: str, width: int, lost: int) -> None:
+    made = sample(fixture, WAVE, layout=layout)
+    assert made.motion.shape == (50 - lost, width)
+    assert not made.meta.has_face
+    assert made.meta.has_hands == (made.meta.skeleton == "smplx52")
+    whole = sample(fixture, WAVE)
+    if layout == "wholebody313":
+        np.testing.assert_array_equal(made.motion, whole.motion[:, :313])
+    plan = plan_motionx(config(fixture, layout=layout))
+    assert plan.frames["val"] == 44 - lost
+
+
+def test_layouts_that_cannot_be_made(fixture: Path) -> None:
+    with pytest.raises(UserError, match="smpl75 cannot be made from Motion-X; use wholebody363"):
+        prepare_motionx(config(fixture, layout="smpl75"))
+
+
+def test_raw_layout_keeps_the_columns(fixture: Path) -> None:
+    made = sample(fixture, WAVE, layout="smplx322")
+    np.testing.assert_array_equal(made.motion, np.load(fixture / MOTION / f"{WAVE}.npy"))
+    assert (made.meta.family, made.meta.has_face, made.meta.has_hands) == ("raw", True, True)
+
+
+# Directions
+
+
+def test_walking_is_forward_and_left_is_left(fixture: Path) -> None:
+    joints = joints_of(sample(fixture, TURN))
+    root = joints[-1, 0] - joints[0, 0]
+    assert root[2] > 1.3
+    assert abs(root[0]) < 0.5
+    angle = np.degrees(facing(joints))
+    assert abs(angle[0]) < 0.01
+    assert 25 < angle[-1] < 35  # 30 degrees in the parameters; positive is to the left
+    assert joints[..., 1].min() == pytest.approx(0.0, abs=1e-4)
+
+
+def test_waving_hand_is_the_right_one(fixture: Path) -> None:
+    made = sample(fixture, WAVE)
+    joints, skeleton = joints_of(made), MotionLayout.named("wholebody363").skeleton
+    rise = np.ptp(joints[..., 1], axis=0)
+    assert rise[skeleton.index("right_wrist")] > 5 * rise[skeleton.index("left_wrist")]
+    assert joints[0, skeleton.index("left_wrist"), 0] > joints[0, skeleton.index("right_wrist"), 0]
+
+
+def test_mirrored_clip_is_the_mirror_image(fixture: Path) -> None:
+    plain, mirrored = sample(fixture, HUMANML), sample(fixture, MIRRORED)
+    assert (plain.meta.mirror_of, mirrored.meta.mirror_of) == (None, HUMANML)
+    assert plain.meta.split == mirrored.meta.split == "train"
+    skeleton = MotionLayout.named("wholebody363").skeleton
+    np.testing.assert_allclose(joints_of(mirrored), mirror(joints_of(plain), skeleton), atol=1e-5)
+
+
+# Face and hands
+
+
+def test_face_motion_is_stretched_and_written_in(fixture: Path) -> None:
+    made = sample(fixture, HUMANML)
+    own = np.load(fixture / MOTION / f"{HUMANML}.npy")
+    face = np.load(fixture / FACES / f"{HUMANML}.npy")
+    assert not own[:, 159:209].any()
+    assert face.shape == (72, 153)
+    wanted = torch.nn.functional.interpolate(torch.from_numpy(face).T[None], size=50, mode="linear")
+    shown = face_of(made.motion, MotionLayout.named("wholebody363"))
+    np.testing.assert_allclose(shown, wanted[0].T.numpy()[:, 3:53], atol=1e-6)
+    assert made.meta.has_face
+    raw = sample(fixture, HUMANML, layout="smplx322").motion
+    np.testing.assert_allclose(raw[:, 156:309], wanted[0].T.numpy(), atol=1e-6)
+
+
+def test_grab_keeps_its_jaw(copy: Path) -> None:
+    path = copy / FACES / f"{MUG}.npy"
+    path.parent.mkdir(parents=True)
+    np.save(path, np.full((44, 153), 0.5, dtype=np.float32))
+    own = np.load(copy / MOTION / f"{MUG}.npy")
+    raw = sample(copy, MUG, layout="smplx322").motion
+    np.testing.assert_array_equal(raw[:, 156:159], own[:, 156:159])
+    assert (raw[:, 159:309] == 0.5).all()
+    assert (with_face(own.astype(np.float64), np.ones((3, 153)), keep_jaw=False)[:, 156:309] == 1.0).all()
+
+
+def test_absent_face_and_hands_are_masked(copy: Path) -> None:
+    shutil.rmtree(copy / "face_motion_data")
+    made = sample(copy, HUMANML)
+    assert not made.meta.has_face
+    assert not face_of(made.motion, MotionLayout.named("wholebody363")).any()
+    assert any("4 of 4 clips of humanml" in note for note in plan_motionx(config(copy)).notes)
+
+    def no_hands(values: NDArray[Any]) -> None:
+        values[:, 66:156] = 0
+
+    rewrite(copy / MOTION / f"{CHAT}.npy", no_hands)
+    made = sample(copy, CHAT)
+    assert (made.meta.has_hands, made.meta.has_face) == (False, True)
+
+
+def test_broken_face_file_leaves_the_clip(copy: Path) -> None:
+    np.save(copy / FACES / f"{HUMANML}.npy", np.zeros((72, 152), np.float32))
+    plan = plan_motionx(config(copy))
+    assert [d.source for d in plan.broken] == [f"{FACES}/{HUMANML}.npy"]
+    assert "expected [T, 153], found [72, 152]" in plan.broken[0].reason
+    assert not sample(copy, HUMANML).meta.has_face
+    with pytest.raises(UserError, match=r"found \[72, 152\]"):
+        plan.require_whole()
+
+
+# aist
+
+
+def test_dances_are_scaled_exactly_once(copy: Path) -> None:
+    path = copy / MOTION / f"{DANCE}.npy"
+    once = sample(copy, DANCE)
+    joints = joints_of(once)
+    assert 4.0 < joints[-1, 0, 2] < 4.4  # forward, in metres
+    assert any("1 raw" in note for note in plan_motionx(config(copy)).notes)
+
+    def script(values: NDArray[Any]) -> None:
+        values[:, 309:312] /= 94
+        values[:, 311] *= -1
+
+    rewrite(path, script)
+    assert any("1 scaled" in note for note in plan_motionx(config(copy)).notes)
+    np.testing.assert_allclose(sample(copy, DANCE).motion, once.motion, atol=1e-5)
+    values = np.load(path).astype(np.float64)
+    np.testing.assert_array_equal(scale_aist(values), values)
+
+    rewrite(path, script)
+    assert aist_scale(np.load(path)) == "twice"
+    with pytest.raises(UserError, match="run twice"):
+        sample(copy, DANCE)
+
+
+def test_only_dances_are_scaled(copy: Path) -> None:
+    """Far walks of other subsets stay as they are."""
+
+    def far(values: NDArray[Any]) -> None:
+        values[:, 309] += 60.0
+
+    before = sample(copy, WAVE).motion
+    rewrite(copy / MOTION / f"{WAVE}.npy", far)
+    np.testing.assert_allclose(sample(copy, WAVE).motion, before, atol=1e-5)
+
+
+def test_frame_texts_are_an_option(copy: Path) -> None:
+    assert {c.source for c in sample(copy, WAVE).texts} == {"motionx"}
+    path = copy / f"texts/body_texts/{WAVE}.json"
+    path.write_text(json.dumps({"0": "arms down", "1": "arms down", "3": "arms up", "500": "past the end"}))
+    made = [c for c in sample(copy, WAVE, frame_texts=True).texts if c.source == "body"]
+    assert [(c.text, c.start, c.end) for c in made] == [
+        ("arms down", 0.0, 2 / 30),
+        ("arms up", 3 / 30, 4 / 30),
+    ]
+    assert any(c.source == "hand" for c in sample(copy, WAVE, frame_texts=True).texts)
+    for broken in ("[1]", "{", '{"a": "b"}', '{"1": 2}', "[" * 100_000):
+        path.write_text(broken)
+        with pytest.raises(UserError, match=f"texts/body_texts/{WAVE}"):
+            sample(copy, WAVE, frame_texts=True)
+
+
+# Dirt
+
+
+def test_dirty_clips_are_dropped_with_reasons(copy: Path, shared: Path, tmp_path: Path) -> None:
+    def nan(values: NDArray[Any]) -> None:
+        values[7, 40] = np.nan
+
+    def jump(values: NDArray[Any]) -> None:
+        values[10:, 309] += 5.0
+
+    rewrite(copy / MOTION / f"{WAVE}.npy", nan)
+    rewrite(copy / MOTION / f"{BOW}.npy", jump)
+    rewrite(copy / MOTION / f"{MUG}.npy", lambda values: values[:, :321])
+    shutil.copy(shared / "data/broken/npy/truncated.npy", copy / MOTION / f"{CHAT}.npy")
+    shutil.copy(shared / "data/broken/npy/object_dtype.npy", copy / MOTION / f"{TURN}.npy")
+    manifest = convert(copy, tmp_path / "out")
+    reasons = {Path(d.source).stem: d.reason for d in manifest.dropped}
+    assert len(reasons) == 5
+    assert "nan at frame 7, column 40" in reasons[Path(WAVE).name]
+    assert "150 m/s" in reasons[Path(BOW).name]
+    assert "found [44, 321]" in reasons[Path(MUG).name]
+    assert "truncated array" in reasons[Path(CHAT).name]
+    assert "object array" in reasons[Path(TURN).name]
+    assert sum(s.samples for s in manifest.shards) == 3
+    assert check(tmp_path / "out") == []
+    assert not list(Path.cwd().glob("PWNED*"))
+
+
+def test_float64_gives_the_features_of_float32(copy: Path) -> None:
+    assert np.load(copy / MOTION / f"{TURN}.npy").dtype == np.float64
+    before = sample(copy, TURN).motion
+    rewrite(copy / MOTION / f"{TURN}.npy", lambda values: values.astype(np.float32))
+    np.testing.assert_allclose(sample(copy, TURN).motion, before, atol=1e-5)
+
+
+def test_changed_files_are_noticed(copy: Path) -> None:
+    before = prepare_motionx(config(copy)).options["source_sha256"]
+    assert prepare_motionx(config(copy)).options["source_sha256"] == before
+    (copy / TEXTS / f"{WAVE}.txt").write_text("somebody waves")
+    assert prepare_motionx(config(copy)).options["source_sha256"] != before
+
+
+def test_resampled_parameters_turn_evenly(fixture: Path) -> None:
+    """20 from 30 fps: every second output frame is an input frame, and joints stay near those in between."""
+    values = read_parameters(config(fixture), planned(fixture)[WAVE])
+    slow = resample_parameters(values, 30.0, 20.0)
+    assert len(slow) == 33
+    body = BodyModel.neutral("smplx52")
+    fast_joints, joints = parameters_to_joints(values, body), parameters_to_joints(slow, body)
+    np.testing.assert_allclose(joints[::2], fast_joints[::3], atol=1e-9)
+    between = (fast_joints[1:-1:3] + fast_joints[2::3]) / 2
+    assert np.abs(joints[1::2] - between[: len(joints[1::2])]).max() < 0.01
+
+
+def test_body_model_gives_shapes(fixture: Path, tmp_path: Path) -> None:
+    """A made-up SMPL-X model: the neutral joints as vertices, one shape value that scales all of them."""
+    neutral = BodyModel.neutral("smplx52")
+    parents = list(neutral.skeleton.parents)
+    tree = [p if p < 22 else p + 3 for p in parents[:22]] + [15, 15, 15]
+    tree += [p if p < 22 else p + 3 for p in parents[22:]]
+    rest = neutral.rest_joints()
+    points = np.concatenate([rest[:22], rest[[15, 15, 15]], rest[22:]])
+    shapes = np.zeros((55, 3, 10))
+    shapes[:, :, 0] = 0.1 * points
+    path = tmp_path / "model.npz"
+    np.savez(path, J_regressor=np.eye(55), v_template=points, shapedirs=shapes,
+             kintree_table=np.array([tree, range(55)]))  # fmt: skip
+    conversion = prepare_motionx(config(fixture, body_model=path))
+    assert conversion.options["body_model"]["kind"] == "SMPL-X"
+    assert str(tmp_path) not in json.dumps(conversion.options)
+    clip = planned(fixture)[BOW]
+    made = conversion.convert(clip)
+    assert isinstance(made, Sample)
+    beta = float(np.median(np.load(fixture / MOTION / f"{BOW}.npy")[:, 312]))
+    skeleton = neutral.skeleton
+    knee, ankle = skeleton.index("left_knee"), skeleton.index("left_ankle")
+    bones = [
+        np.linalg.norm(joints[0, ankle] - joints[0, knee])
+        for joints in (joints_of(made), joints_of(sample(fixture, BOW)))
+    ]
+    assert bones[0] / bones[1] == pytest.approx(1 + 0.1 * beta, abs=1e-4)
+    assert beta != 0
+    with pytest.raises(UserError, match=r"none\.npz"):
+        prepare_motionx(config(fixture, body_model=tmp_path / "none.npz"))

@@ -1,0 +1,286 @@
+"""Batches: whole local batches, pure functions of (seed, step), the same for any number of ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from motionloom.datasets.loading.batches import CaptionBatch, CaptionBatches, EvalBatches, WindowBatches
+from motionloom.datasets.loading.spans import frame_span
+from motionloom.datasets.loading.statistics import FeatureStats, compute
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.text.cache import TextCache
+from motionloom.datasets.text.encoder import EncodedText
+
+
+class WordLengths:
+    """A text encoder in three lines: one token per word, all its values the word's length."""
+
+    name = "word-lengths"
+    dim = 4
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        words = [caption.split() for caption in captions]
+        tokens = np.zeros((len(words), max(map(len, words)), 4), dtype=np.float32)
+        mask = np.zeros(tokens.shape[:2], dtype=bool)
+        for i, row in enumerate(words):
+            tokens[i, : len(row)] = np.array([len(word) for word in row])[:, None]
+            mask[i, : len(row)] = True
+        return EncodedText(np.full((len(words), 4), 0.5, dtype=np.float32), tokens, mask)
+
+
+@pytest.fixture(scope="module")
+def train(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> ShardDataset:
+    root = tmp_path_factory.mktemp("data")
+    made.write(root, count=100)
+    return ShardDataset.open(root, "train")
+
+
+@pytest.fixture(scope="module")
+def stats(train: ShardDataset) -> FeatureStats:
+    return compute(train)
+
+
+@pytest.fixture(scope="module")
+def text(train: ShardDataset, tmp_path_factory: pytest.TempPathFactory) -> TextCache:
+    captions = [caption.text for i in range(len(train)) for caption in train.texts(i) + train.face_texts(i)]
+    return TextCache.build(tmp_path_factory.mktemp("text"), captions, WordLengths(), progress=False)
+
+
+def test_windows_are_pieces_of_clips(train: ShardDataset, stats: FeatureStats) -> None:
+    batches = WindowBatches(train, stats, window=32, batch_size=24, windows_per_clip=4, seed=3)
+    normal = [stats.normalize(train.motion(i)) for i in range(len(train))]
+    starts = set()
+    for k in range(12):
+        batch = batches[k]
+        assert batch["motion"].shape == (24, 32, 133) and batch["motion"].dtype == torch.float32
+        assert batch["length"].dtype == torch.int64
+        _, clips = batches.plan.batch(k)
+        for row in range(24):
+            motion, length = batch["motion"][row].numpy(), int(batch["length"][row])
+            clip = normal[clips[row // 4]]
+            assert length == min(len(clip), 32)
+            fits = [
+                start
+                for start in range(len(clip) - length + 1)
+                if np.allclose(clip[start : start + length], motion[:length], atol=1e-5)
+            ]
+            assert len(fits) == 1
+            starts.add(fits[0] / max(1, len(clip) - length))
+            assert (motion[length:] == 0).all()
+    assert min(starts) == 0 and max(starts) == 1, "first and last window of a clip must be reachable"
+    assert len(starts) > 50
+
+
+def test_windows_are_the_same_in_any_order_and_epochs_differ(
+    train: ShardDataset, stats: FeatureStats
+) -> None:
+    def build(seed: int = 3) -> WindowBatches:
+        return WindowBatches(train, stats, window=16, batch_size=20, windows_per_clip=2, seed=seed)
+
+    forward = [batch["motion"] for batch in map(build().__getitem__, range(15))]
+    late = build()
+    for k in (14, 0, 7):
+        assert torch.equal(late[k]["motion"], forward[k])
+    assert not torch.equal(forward[0], forward[6]) and not torch.equal(forward[0], build(4)[0]["motion"])
+
+
+@pytest.mark.parametrize("world", [2, 3, 6])
+def test_any_number_of_ranks_sees_the_same_global_batch(
+    train: ShardDataset, stats: FeatureStats, text: TextCache, world: int
+) -> None:
+    def windows(rank: int, of: int) -> WindowBatches:
+        return WindowBatches(
+            train, stats, window=16, batch_size=24, windows_per_clip=2, seed=1, rank=rank, world=of
+        )
+
+    def captions(rank: int, of: int) -> CaptionBatches:
+        return CaptionBatches(
+            train, stats, text, batch_size=12, max_frames=40, min_frames=8, seed=1, rank=rank, world=of
+        )
+
+    for k in (0, 4, 9):
+        parts = [windows(rank, world)[k]["motion"] for rank in range(world)]
+        assert torch.equal(torch.cat(parts), windows(0, 1)[k]["motion"])
+        whole = captions(0, 1)[k]
+        parts_c = [captions(rank, world)[k] for rank in range(world)]
+        assert torch.equal(torch.cat([part["index"] for part in parts_c]), whole["index"])
+        assert torch.equal(torch.cat([part["length"] for part in parts_c]), whole["length"])
+        assert [caption for part in parts_c for caption in part["caption"]] == whole["caption"]
+        for part, motion in zip(parts_c, whole["motion"].chunk(world), strict=True):
+            longest = int(part["length"].max())
+            assert torch.equal(part["motion"][:, :longest], motion[:, :longest])
+
+
+def test_loader_workers_change_nothing_and_a_run_resumes_anywhere(
+    train: ShardDataset, stats: FeatureStats
+) -> None:
+    batches = WindowBatches(train, stats, window=16, batch_size=8, seed=1)
+    want = [batches[k]["motion"] for k in range(6)]
+    for workers, start in ((0, 0), (0, 3), (2, 2)):
+        loader = DataLoader(batches, batch_size=None, sampler=range(start, 6), num_workers=workers)
+        got = [batch["motion"] for batch in loader]
+        assert len(got) == 6 - start
+        for one, other in zip(got, want[start:], strict=True):
+            assert torch.equal(one, other)
+
+
+def test_columns_are_what_indexing_gives(train: ShardDataset, stats: FeatureStats) -> None:
+    whole = WindowBatches(train, stats, window=16, batch_size=8, seed=1)[0]["motion"]
+    for columns in (np.array([4]), np.arange(4, 67), np.array([0, 1, 5, 6, 7, 132])):
+        some = WindowBatches(train, stats, window=16, batch_size=8, seed=1, columns=columns)[0]["motion"]
+        assert torch.equal(some, whole[..., columns])
+    with pytest.raises(UserError, match="columns outside layout"):
+        WindowBatches(train, stats, window=16, batch_size=8, columns=np.array([133]))
+
+
+def test_caption_batches(train: ShardDataset, stats: FeatureStats, text: TextCache) -> None:
+    batches = CaptionBatches(train, stats, text, batch_size=16, max_frames=40, min_frames=8, seed=5)
+    spans_seen: set[tuple[int, str]] = set()
+    for k in range(20):
+        batch = batches[k]
+        length = batch["length"].numpy()
+        assert batch["motion"].shape[1] % 4 == 0
+        assert 0 <= batch["motion"].shape[1] - length.max() < 4
+        for row, (clip, caption) in enumerate(zip(batch["index"].tolist(), batch["caption"], strict=True)):
+            found = {item.text: item for item in train.texts(clip)}[caption]
+            first, end = frame_span(found, train.layout.fps, int(train.frames[clip]))
+            assert length[row] == min(end - first, 40)
+            normal = stats.normalize(train.motion(clip)[first:end])
+            motion = batch["motion"][row].numpy()
+            fits = [
+                s
+                for s in range(len(normal) - length[row] + 1)
+                if np.allclose(normal[s : s + length[row]], motion[: length[row]], atol=1e-5)
+            ]
+            assert len(fits) == 1
+            assert (motion[length[row] :] == 0).all()
+            spans_seen.add((clip, caption))
+            words = [len(word) for word in caption.split()]
+            assert batch["text_tokens"][row, :, 0][batch["text_mask"][row]].tolist() == words
+            assert (batch["text_tokens"][row][~batch["text_mask"][row]] == 0).all()
+        assert batch["sentence"].shape == (16, 4) and batch["text_mask"].dtype == torch.bool
+        assert batch["text_tokens"].dtype == torch.float32
+    both = [clip for clip in range(len(train)) if len({c for i, c in spans_seen if i == clip}) == 2]
+    assert len(both) > 10, "both captions of a clip must be drawn in time"
+
+
+def test_short_stretches_give_way_to_long_ones(
+    train: ShardDataset, stats: FeatureStats, text: TextCache
+) -> None:
+    batches = CaptionBatches(train, stats, text, batch_size=16, max_frames=60, min_frames=20, seed=5)
+    for k in range(5):
+        batch = batches[k]
+        assert all("walks" in caption for caption in batch["caption"]), "the other stretch has ten frames"
+        assert (batch["length"] >= 20).all()
+
+
+def test_face_batches_take_face_captions_and_columns(
+    train: ShardDataset, stats: FeatureStats, text: TextCache
+) -> None:
+    with_face = set(np.flatnonzero(train.has("face_texts.json")).tolist())
+    assert 0 < len(with_face) < len(train)
+    columns = np.arange(10, 20)
+    batches = CaptionBatches(
+        train, stats, text, batch_size=8, max_frames=40, min_frames=8, face=True, columns=columns
+    )
+    for k in range(8):
+        batch = batches[k]
+        assert set(batch["caption"]) == {"happy"} and set(batch["index"].tolist()) <= with_face
+        assert batch["motion"].shape[2] == 10
+    with pytest.raises(UserError, match="layout body133 has no field 'face'"):
+        CaptionBatches(train, stats, text, batch_size=8, max_frames=40, min_frames=8, face=True)
+
+
+@pytest.mark.parametrize("world", [1, 2, 4])
+def test_evaluation_sees_every_clip_once_in_order(
+    train: ShardDataset, stats: FeatureStats, text: TextCache, world: int
+) -> None:
+    clips: list[int] = []
+    ranks = [
+        EvalBatches(train, stats, text, batch_size=16, max_frames=40, min_frames=25, rank=rank, world=world)
+        for rank in range(world)
+    ]
+    for k in range(len(ranks[0])):
+        parts = [batches[k] for batches in ranks]
+        assert len({len(part["index"]) for part in parts}) == 1, "ranks must have equal shares"
+        valid = torch.stack([part["valid"] for part in parts], dim=1).flatten()
+        index = torch.stack([part["index"] for part in parts], dim=1).flatten()
+        clips += index[valid].tolist()
+        for part in parts:
+            for row, clip in enumerate(part["index"].tolist()):
+                assert part["caption"][row] == train.texts(clip)[0].text
+                length = int(part["length"][row])
+                assert length == min(40, train.frames[clip])
+                np.testing.assert_allclose(
+                    part["motion"][row, :length].numpy(),
+                    stats.normalize(train.motion(clip)[:length]),
+                    atol=1e-5,
+                )
+    assert clips == np.flatnonzero(train.frames >= 25).tolist()
+    without = EvalBatches(train, stats, batch_size=16, max_frames=40)
+    assert sum(int(without[k]["valid"].sum()) for k in range(len(without))) == len(train)
+    assert "sentence" not in without[0]
+    with pytest.raises(IndexError):
+        without[len(without)]
+
+
+class Likeness(WordLengths):
+    """Another encoder, of another width."""
+
+    name = "likeness"
+    dim = 3
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        sentence = np.eye(3, dtype=np.float32)[[len(caption) % 3 for caption in captions]]
+        return EncodedText(sentence, sentence[:, None], np.ones((len(captions), 1), dtype=bool))
+
+
+def test_batches_hold_the_embeddings_that_say_what_is_alike(
+    train: ShardDataset, stats: FeatureStats, text: TextCache, tmp_path: Path
+) -> None:
+    def batch_of(cache: TextCache) -> CaptionBatch:
+        return CaptionBatches(train, stats, cache, batch_size=8, max_frames=40, min_frames=8)[0]
+
+    plain = batch_of(text)
+    assert torch.equal(plain["similarity"], plain["sentence"]), "one encoder for both"
+    captions = list(text.captions_by_key().values())
+    TextCache.build(tmp_path / "similarity", captions, Likeness(), progress=False)
+    batch = batch_of(TextCache.build(tmp_path, captions, WordLengths(), progress=False))
+    assert torch.equal(batch["sentence"], plain["sentence"])
+    wanted = np.eye(3)[[len(caption) % 3 for caption in batch["caption"]]]
+    np.testing.assert_array_equal(batch["similarity"].numpy(), wanted)
+
+
+def test_caption_stretches_in_frames() -> None:
+    def span(start: float, end: float | None) -> tuple[int, int]:
+        return frame_span(Caption(text="", start=start, end=end), 20.0, 100)
+
+    assert span(0, None) == (0, 100)
+    assert span(1, 3) == (20, 60)
+    assert span(1, None) == (20, 100)
+    assert span(4, 99) == (80, 100)
+    assert span(0, 0) == (0, 100), "an empty stretch means the whole clip"
+    assert span(7, 9) == (0, 100), "so does one outside the clip"
+
+
+def test_mistakes_are_named(train: ShardDataset, stats: FeatureStats, text: TextCache) -> None:
+    with pytest.raises(UserError, match="no multiple of windows_per_clip 3"):
+        WindowBatches(train, stats, window=16, batch_size=8, windows_per_clip=3)
+    with pytest.raises(UserError, match="does not divide over 3 ranks"):
+        WindowBatches(train, stats, window=16, batch_size=8, world=3)
+    with pytest.raises(UserError, match="lower min_frames"):
+        CaptionBatches(train, stats, text, batch_size=8, max_frames=2000, min_frames=1000)
+    with pytest.raises(UserError, match="need 1 <= min_frames"):
+        CaptionBatches(train, stats, text, batch_size=8, max_frames=20, min_frames=30)
+    other = MotionLayout.named("body133", fps=30.0)
+    with pytest.raises(UserError, match=r"feature statistics: holds layout body133 .exact, 30 fps"):
+        WindowBatches(train, FeatureStats(stats.mean, stats.std, other), window=16, batch_size=8)

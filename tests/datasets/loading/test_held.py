@@ -1,0 +1,193 @@
+"""Hands and faces that a clip does not hold: masked, whatever its file stores there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from text_samples import OneToken
+
+from motionloom.datasets.check.dataset import check
+from motionloom.datasets.loading.batches import CaptionBatches, EvalBatches, WindowBatches
+from motionloom.datasets.loading.mix import MixedDataset
+from motionloom.datasets.loading.statistics import STD_FLOOR, FeatureStats, Moments, compute, from_moments
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import FACE, HANDS, UserError
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.reading import Reading
+from motionloom.datasets.text.cache import TextCache
+
+GARBAGE = (0.0, 30.0)
+
+
+@pytest.fixture(scope="module")
+def made() -> ModuleType:
+    """Clips of which some lack hands or a face."""
+    import held_samples
+
+    return held_samples
+
+
+@pytest.fixture(scope="module")
+def roots(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The same data set with zeros and with garbage in the columns that clips do not hold."""
+    return [made.write(tmp_path_factory.mktemp("held"), garbage) for garbage in GARBAGE]
+
+
+@pytest.fixture(scope="module")
+def text(roots: list[Path], tmp_path_factory: pytest.TempPathFactory) -> TextCache:
+    captions = {c.text for d in openings(roots[0], "mixed") for i in range(len(d)) for c in d.texts(i)}
+    return TextCache.build(tmp_path_factory.mktemp("text"), [*captions, "happy"], OneToken(), progress=False)
+
+
+def openings(root: Path, *kinds: str) -> list[ClipDataset]:
+    def opened(split: str = "train", **reading: Any) -> ShardDataset:
+        return ShardDataset.open(root, split, reading=Reading(**reading))
+
+    known: dict[str, ClipDataset] = {
+        "indexed": opened(),
+        "streamed": opened(mode="streamed", order="streamed", shards_per_group=2),
+        "mixed": MixedDataset([(opened(), 1.0), (opened("test"), 2.0)]),
+    }
+    return [known[kind] for kind in kinds or known]
+
+
+def test_columns_of_each_part() -> None:
+    layout = MotionLayout.named("wholebody363")
+    held = layout.held_columns
+    assert held.shape == (4, 363) and held[3].all()
+    assert np.flatnonzero(~held[FACE]).tolist() == layout.part("hand").tolist()
+    assert np.flatnonzero(~held[HANDS]).tolist() == layout.part("face").tolist()
+    assert np.flatnonzero(held[0]).tolist() == layout.part("body").tolist()
+    assert MotionLayout.named("body133").held_columns.all()
+
+
+def test_the_index_says_what_the_metadata_says(roots: list[Path], made: ModuleType) -> None:
+    for dataset in openings(roots[1]):
+        assert [dataset.meta(i).held for i in range(len(dataset))] == dataset.held.tolist()
+        assert set(dataset.held.tolist()) == {0, 1, 2, 3}
+    assert not [problem for problem in check(roots[1]) if "index" in str(problem)]
+
+
+def test_check_finds_an_index_that_disagrees(made: ModuleType, tmp_path: Path) -> None:
+    root = made.write(tmp_path)
+    path = next(root.glob("*train-000000.index.json"))
+    index = json.loads(path.read_bytes())
+    index["clips"][2]["held"] ^= HANDS
+    path.write_text(json.dumps(index))
+    assert any("has_hands or has_face is not what the index says" in str(p) for p in check(root))
+
+
+def slow_statistics(dataset: ClipDataset) -> tuple[np.ndarray, np.ndarray]:
+    """Column by column, over the frames of the clips that hold it."""
+    mean, std = np.zeros(dataset.layout.dim), np.ones(dataset.layout.dim)
+    for column in range(dataset.layout.dim):
+        rows = [
+            dataset.motion(i)[:, column].astype(np.float64)
+            for i in range(len(dataset))
+            if dataset.layout.held_columns[dataset.meta(i).held, column]
+        ]
+        if rows:
+            mean[column], std[column] = np.concatenate(rows).mean(), np.concatenate(rows).std()
+    return mean, std
+
+
+def test_statistics_are_of_the_clips_that_hold_a_column(roots: list[Path]) -> None:
+    found = [compute(openings(root, "indexed")[0]) for root in roots]
+    mean, std = slow_statistics(openings(roots[1], "indexed")[0])
+    np.testing.assert_allclose(found[1].mean, mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found[1].std, std, rtol=1e-5)
+    for root_stats in zip(*((s.mean, s.std) for s in found), strict=True):
+        np.testing.assert_array_equal(*root_stats)
+    assert found[0].frames == int(openings(roots[0], "indexed")[0].frames.sum())
+    mixed = [compute(openings(root, "mixed")[0], group=True) for root in roots]
+    np.testing.assert_array_equal(mixed[0].mean, mixed[1].mean)
+    np.testing.assert_array_equal(mixed[0].std, mixed[1].std)
+
+
+def test_a_part_that_no_clip_holds_has_mean_zero_and_std_one(made: ModuleType, tmp_path: Path) -> None:
+    dataset = ShardDataset.open(made.write(tmp_path, 9.0, held=(HANDS, 0)), "train")
+    face, group = dataset.layout.part("face"), compute(dataset, group=True)
+    for stats in (compute(dataset), group):
+        assert (stats.mean[face] == 0).all() and (stats.std[face] == 1).all()
+        assert (stats.std[: face[0]] > STD_FLOOR).all() and (stats.std[: face[0]] != 1).all()
+    with pytest.raises(UserError, match="no clip of split 'train' holds hands or a face"):
+        WindowBatches(dataset, group, window=8, batch_size=4)
+    with pytest.raises(UserError, match="no clip of split 'train' has captions, the hands or face"):
+        EvalBatches(dataset, group, batch_size=4, max_frames=16, columns=face)
+    WindowBatches(dataset, group, window=8, batch_size=4, columns=dataset.layout.part("bodyhand"))
+
+
+def test_moments_with_gaps_merge_in_any_grouping() -> None:
+    rng = np.random.default_rng(0)
+    parts = [(rng.standard_normal((n, 3)) + 5, rng.random(3) < 0.5) for n in (4, 1, 9, 3, 7)]
+    left = right = Moments.none(3)
+    for rows, held in parts:
+        left = left.merge(Moments.of(rows, held))
+    for rows, held in reversed(parts):
+        right = Moments.of(rows, held).merge(right)
+    for column in range(3):
+        rows = np.concatenate([rows[:, column] for rows, held in parts if held[column]] or [np.zeros(0)])
+        for moments in (left, right):
+            assert moments.count[column] == len(rows)
+            if len(rows):
+                np.testing.assert_allclose(moments.mean[column], rows.mean())
+                np.testing.assert_allclose(moments.std[column], rows.std(), atol=1e-12)
+    layout = MotionLayout.named("body133")
+    assert from_moments(Moments.of(rng.standard_normal((5, 133))), layout).frames == 5
+
+
+def batches_of(dataset: ClipDataset, stats: FeatureStats, text: TextCache, **kind: Any) -> list[Any]:
+    spans: dict[str, Any] = {"max_frames": 20, "min_frames": 4}
+    return [
+        WindowBatches(dataset, stats, window=16, batch_size=6, windows_per_clip=2, seed=1, **kind),
+        CaptionBatches(dataset, stats, text, batch_size=4, seed=1, **spans, **kind),
+        EvalBatches(dataset, stats, text, batch_size=4, **spans, **kind),
+        EvalBatches(dataset, stats, batch_size=4, max_frames=16, **kind),
+    ]
+
+
+@pytest.mark.parametrize("part", ["all", "bodyhand", "hand", "face", "body"])
+def test_garbage_changes_no_batch(roots: list[Path], text: TextCache, part: str) -> None:
+    stats = compute(openings(roots[0], "indexed")[0])
+    layout = stats.layout
+    columns = layout.part(part)  # type: ignore[arg-type]
+    for clean, dirty in zip(openings(roots[0]), openings(roots[1]), strict=True):
+        pairs = zip(
+            batches_of(clean, stats, text, columns=columns),
+            batches_of(dirty, stats, text, columns=columns),
+            strict=True,
+        )
+        for one, other in pairs:
+            for k in range(min(len(one), 5)):
+                a, b = one[k], other[k]
+                assert a.keys() == b.keys()
+                for name in ("motion", "length", "held"):
+                    assert torch.equal(a[name], b[name]), name
+                assert a["held"].shape == (len(a["motion"]), len(columns)) and a["held"].any(1).all()
+                assert (a["motion"].masked_select(~a["held"][:, None]) == 0).all()
+                assert part not in ("hand", "face") or a["held"].all()
+                if "index" in a:
+                    want = layout.held_columns[clean.held[a["index"].numpy()]][:, columns]
+                    np.testing.assert_array_equal(a["held"].numpy(), want)
+
+
+def test_clips_without_a_face_are_never_drawn_for_it(roots: list[Path], text: TextCache) -> None:
+    stats = compute(openings(roots[0], "indexed")[0])
+    for dataset in openings(roots[1]):
+        with_face = np.flatnonzero(dataset.held & FACE).tolist()
+        assert 0 < len(with_face) < len(dataset)
+        face = dataset.layout.part("face")
+        windows = WindowBatches(dataset, stats, window=16, batch_size=6, columns=face)
+        captions = CaptionBatches(dataset, stats, text, batch_size=4, max_frames=20, min_frames=4, face=True)
+        held_out = EvalBatches(dataset, stats, text, batch_size=4, max_frames=20, face=True)
+        drawn = {int(i) for k in range(8) for i in windows.clips[windows.plan.batch(k)[1]]}
+        assert drawn <= set(with_face) and len(drawn) > len(with_face) / 2
+        assert {int(i) for k in range(8) for i in captions[k]["index"]} <= set(with_face)
+        assert [int(i) for k in range(len(held_out)) for i in held_out[k]["index"]] == with_face

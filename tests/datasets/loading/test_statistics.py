@@ -1,0 +1,110 @@
+"""Feature statistics: one pass equals two, merges in any grouping, HumanML3D's groups, saved with layout."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from motionloom.datasets.loading.statistics import STD_FLOOR, FeatureStats, Moments, compute, from_moments
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.reader import ShardDataset
+
+
+@pytest.fixture(scope="module")
+def train(root: Path) -> ShardDataset:
+    return ShardDataset.open(root, "train")
+
+
+def test_one_pass_equals_two(train: ShardDataset) -> None:
+    rows = np.concatenate([train.motion(i) for i in range(len(train))]).astype(np.float64)
+    stats = compute(train)
+    np.testing.assert_allclose(stats.mean, rows.mean(axis=0), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(stats.std, rows.std(axis=0), rtol=1e-6)
+    assert stats.frames == len(rows) and stats.layout == train.layout
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(0, 9), min_size=1, max_size=8), st.integers(0, 2**31), st.floats(-1e4, 1e4))
+def test_moments_merge_in_any_grouping(sizes: list[int], seed: int, offset: float) -> None:
+    rng = np.random.default_rng(seed)
+    parts = [rng.standard_normal((size, 3)) + offset for size in sizes if size]
+    left, right = Moments.none(3), Moments.none(3)
+    for part in parts:
+        left = left.merge(Moments.of(part))
+    for part in reversed(parts):
+        right = Moments.of(part).merge(right)
+    rows = np.concatenate([*parts, np.zeros((0, 3))])
+    assert (left.count == len(rows)).all() and (right.count == len(rows)).all()
+    if len(rows):
+        for moments in (left, right):
+            np.testing.assert_allclose(moments.mean, rows.mean(axis=0), rtol=1e-10)
+            np.testing.assert_allclose(moments.std, rows.std(axis=0), rtol=1e-7, atol=1e-9)
+
+
+def test_grouping_averages_stds_per_field_as_humanml3d_does() -> None:
+    layout = MotionLayout.named("h3d263")
+    rows = np.random.default_rng(0).standard_normal((50, 263)) * np.arange(1, 264)
+    std = from_moments(Moments.of(rows), layout, group=True).std
+    plain = rows.std(axis=0)
+    for start, end in ((0, 1), (1, 3), (3, 4), (4, 67), (67, 193), (193, 259), (259, 263)):
+        np.testing.assert_allclose(std[start:end], plain[start:end].mean(), rtol=1e-6)
+
+
+def test_still_columns_are_floored_and_no_frames_refused() -> None:
+    layout = MotionLayout.named("body133")
+    stats = from_moments(Moments.of(np.full((10, 133), 3.0)), layout)
+    assert (stats.std == np.float32(STD_FLOOR)).all() and (stats.mean == 3).all()
+    with pytest.raises(UserError, match="no frames"):
+        from_moments(Moments.none(133), layout)
+
+
+def test_normalize_and_back_numpy_and_torch(train: ShardDataset) -> None:
+    stats = compute(train)
+    motion = train.motion(0)
+    there = stats.normalize(motion)
+    assert there.dtype == np.float32
+    np.testing.assert_allclose(stats.denormalize(there), motion, atol=1e-5)
+    tensor = torch.from_numpy(motion.copy())
+    np.testing.assert_allclose(stats.normalize(tensor).numpy(), there, atol=1e-6)
+    torch.testing.assert_close(stats.denormalize(stats.normalize(tensor)), tensor)
+    assert stats.normalize(tensor.double()).dtype == torch.float64
+    columns = train.layout.part("body")[5:40:3]
+    np.testing.assert_array_equal(stats.normalize(motion[:, columns], columns), there[:, columns])
+    torch.testing.assert_close(
+        stats.normalize(tensor[:, columns], columns), stats.normalize(tensor)[:, columns]
+    )
+    again = pickle.loads(pickle.dumps(stats))
+    np.testing.assert_array_equal(again.normalize(motion), there)
+
+
+def test_saved_statistics_know_their_layout(train: ShardDataset, tmp_path: Path) -> None:
+    stats = compute(train)
+    stats.save(tmp_path / "stats.safetensors")
+    loaded = FeatureStats.load(tmp_path / "stats.safetensors", expect=train.layout)
+    np.testing.assert_array_equal(loaded.mean, stats.mean)
+    np.testing.assert_array_equal(loaded.std, stats.std)
+    assert loaded.layout == stats.layout and loaded.frames == stats.frames
+    with pytest.raises(UserError, match=r"holds layout body133 .* expects h3d263"):
+        FeatureStats.load(tmp_path / "stats.safetensors", expect=MotionLayout.named("h3d263"))
+    with pytest.raises(UserError, match="no such file; run the statistics stage"):
+        FeatureStats.load(tmp_path / "none.safetensors")
+    (tmp_path / "stats.safetensors").write_bytes(b"broken")
+    with pytest.raises(UserError, match="not a statistics file"):
+        FeatureStats.load(tmp_path / "stats.safetensors")
+
+
+def test_groups_agree_with_humanml3d(shared: Path) -> None:
+    features = np.load(shared / "golden/t1_humanml3d_A.npz", allow_pickle=False)
+    golden = np.load(shared / "golden/t1_meanstd_A.npz", allow_pickle=False)
+    rows = np.concatenate([features["h3d012314__feat263"], features["aist__feat263"]])
+    layout = MotionLayout.named("h3d263")
+    stats = from_moments(Moments.of(rows), layout, group=True)
+    np.testing.assert_allclose(stats.mean, golden["mean263"], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(stats.std, golden["std263"], rtol=1e-5, atol=1e-6)

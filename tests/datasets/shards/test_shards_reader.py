@@ -1,0 +1,317 @@
+"""Reading shards: zero-copy views, refusals that name shard and key, and a million clips opened quickly."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import subprocess
+import sys
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.check.dataset import check
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Manifest, ShardInfo, UserError
+from motionloom.datasets.shards import access
+from motionloom.datasets.shards.index import ClipEntry, ShardIndex, SplitIndex, index_path, save_index
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.sample import MEMBERS, npy_bytes
+from motionloom.datasets.shards.tar import scan_tar
+
+
+@pytest.fixture
+def root(made: ModuleType, tmp_path: Path) -> Path:
+    made.write(tmp_path / "data")
+    return tmp_path / "data"
+
+
+def test_every_member_comes_back(made: ModuleType, root: Path) -> None:
+    for split, count in (("train", 36), ("val", 12), ("test", 12)):
+        dataset = ShardDataset.open(root, split, expect=made.LAYOUT)
+        assert len(dataset) == len(dataset.ids) == count
+        for i in range(count):
+            number = int(dataset.ids[i].rpartition("-")[2])
+            want = made.clip(number, split)
+            motion = dataset.motion(i)
+            np.testing.assert_array_equal(motion, want.motion)
+            assert motion.dtype == np.float32 and not motion.flags.writeable and motion.base is not None
+            assert dataset.frames[i] == len(motion) == dataset.meta(i).frames
+            assert dataset.meta(i) == want.meta
+            assert dataset.texts(i) == want.texts and dataset.face_texts(i) == want.face_texts
+            audio, sound = dataset.audio(i), dataset.wav(i)
+            assert (audio is None) == (want.audio is None) and (sound is None) == (want.wav is None)
+            if audio is not None:
+                np.testing.assert_array_equal(audio, want.audio)
+            if sound is not None:
+                np.testing.assert_allclose(sound[0], want.wav[0], atol=2**-15)
+                assert sound[1] == 8000
+
+
+def test_few_shards_stay_open_and_views_survive(
+    made: ModuleType, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(access, "OPEN_SHARDS", 2)
+    dataset = ShardDataset.open(root, "train")
+    views = [dataset.motion(i) for i in range(36)]
+    assert len(dataset._access.maps) == 2
+    for i, view in enumerate(views):
+        np.testing.assert_array_equal(view, made.clip_motion(int(dataset.ids[i].rpartition("-")[2])))
+
+
+def test_pickled_dataset_reads_on(root: Path) -> None:
+    dataset = ShardDataset.open(root, "val")
+    dataset.motion(0)
+    sent = pickle.dumps(dataset)
+    assert len(sent) < 1000
+    np.testing.assert_array_equal(pickle.loads(sent).motion(5), dataset.motion(5))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "said"),
+    [
+        (
+            MotionLayout.named("h3d263"),
+            "layout body133 .exact, 20 fps., the config expects h3d263 .h3d, 20 fps.",
+        ),
+        (MotionLayout.named("body133", family="h3d"), "expects body133 .h3d, 20 fps."),
+        (MotionLayout.named("body133", fps=30.0), "expects body133 .exact, 30 fps."),
+    ],
+)
+def test_another_layout_is_refused_naming_both(root: Path, wanted: MotionLayout, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        ShardDataset.open(root, "train", expect=wanted)
+
+
+def test_damage_is_named(root: Path) -> None:
+    assert check(root) == []
+    shard = root / "made-train-000002.tar"
+    content = shard.read_bytes()
+    shard.write_bytes(content[:-10240])
+    with pytest.raises(UserError, match=r"made-train-000002\.tar: .* truncated or changed"):
+        ShardDataset.open(root, "train")
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 4
+    shard.write_bytes(flipped)
+    ShardDataset.open(root, "train")
+    with pytest.raises(UserError, match=r"made-train-000002\.tar: the sha256"):
+        ShardDataset.open(root, "train", verify=True)
+    assert any("sha256" in problem.message for problem in check(root))
+    shard.unlink()
+    with pytest.raises(UserError, match=r"made-train-000002\.tar: the shard is missing"):
+        ShardDataset.open(root, "train")
+    assert any(problem.where == "made-train-000002.tar" for problem in check(root))
+    shard.write_bytes(content)
+    (root / "manifest.json").unlink()
+    with pytest.raises(UserError, match=r"no manifest\.json, so the conversion is unfinished"):
+        ShardDataset.open(root, "train")
+
+
+def test_a_forged_index_cannot_lead_outside_a_shard(root: Path) -> None:
+    path = root / "index.npz"
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    for name, row, value in (
+        ("train.offsets", (3, 4), 2**40),
+        ("train.data", (3,), -5),
+        ("train.frames", (3,), 10**6),
+        ("train.sizes", (3, 4), 2**31),
+        ("train.id_ends", (3,), 10**9),
+        ("train.itemsize", (3,), 8),
+    ):
+        forged = {key: values.copy() for key, values in arrays.items()}
+        forged[name][row] = value
+        np.savez(path, **forged)
+        with pytest.raises(UserError, match=r"index\.npz"):
+            ShardDataset.open(root, "train")
+        assert check(root)
+    np.savez(path, **{**arrays, "train.frames": np.array([object()] * 36)})
+    with pytest.raises(UserError, match="not a readable index"):
+        ShardDataset.open(root, "train")
+    path.write_bytes(b"no zip")
+    with pytest.raises(UserError, match="not a readable index"):
+        ShardDataset.open(root, "train")
+
+
+def test_a_manifest_cannot_name_files_elsewhere(root: Path) -> None:
+    path = root / "manifest.json"
+    data = json.loads(path.read_text())
+    data["shards"][0]["name"] = "../made-train-000000.tar"
+    path.write_text(json.dumps(data))
+    with pytest.raises(UserError, match="is not the name of a shard"):
+        ShardDataset.open(root, "train")
+
+
+def entry(name: str, content: bytes = b"{}", kind: bytes = tarfile.REGTYPE) -> tuple[tarfile.TarInfo, bytes]:
+    info = tarfile.TarInfo(name)
+    info.type = kind
+    info.linkname = "/etc/passwd" if kind != tarfile.REGTYPE else ""
+    info.size = len(content) if kind == tarfile.REGTYPE else 0
+    return info, content
+
+
+OBJECTS = io.BytesIO()
+np.save(OBJECTS, np.array([{}]), allow_pickle=True)
+
+
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [
+        ([entry("../a.meta.json")], "is a path"),
+        ([entry("/a.meta.json")], "is a path"),
+        ([entry("a\\b.meta.json")], "is a path"),
+        ([entry("a.meta.json", kind=tarfile.SYMTYPE)], "is a link"),
+        ([entry("a.meta.json", kind=tarfile.LNKTYPE)], "is a link"),
+        ([entry("a.meta.json", kind=tarfile.DIRTYPE)], "folder"),
+        ([entry("a.evil.pkl")], "not a known member"),
+        ([entry("a.meta.json"), entry("a.meta.json")], "appears twice"),
+        ([entry("a.meta.json"), entry("b.meta.json"), entry("a.motion.npy")], "do not stand together"),
+        ([entry("a.meta.json")], "key 'a' has no motion.npy"),
+    ],
+)
+def test_hostile_tars_are_refused(
+    tmp_path: Path, entries: list[tuple[tarfile.TarInfo, bytes]], said: str
+) -> None:
+    path = tmp_path / "x-train-000000.tar"
+    with tarfile.open(path, "w") as archive:
+        for info, content in entries:
+            archive.addfile(info, io.BytesIO(content))
+    with pytest.raises(UserError, match=said) as raised:
+        scan_tar(path)
+    assert path.name in str(raised.value)
+
+
+def rewrite(shard: Path, change: Callable[[str, bytes], bytes]) -> None:
+    """Replace members of a shard in place."""
+    with tarfile.open(shard) as archive:
+        members = [(info, archive.extractfile(info).read()) for info in archive]
+    with tarfile.open(shard, "w", format=tarfile.USTAR_FORMAT) as archive:
+        for info, content in members:
+            content = change(info.name, content)
+            info.size = len(content)
+            archive.addfile(info, io.BytesIO(content))
+
+
+def test_check_names_shard_and_key(made: ModuleType, root: Path) -> None:
+    shard = root / "made-val-000000.tar"
+    bad = np.full((90, 133), np.inf, dtype=np.float32)
+    changes: dict[str, Callable[[bytes], bytes]] = {
+        "000000-000000.motion.npy": lambda raw: npy_bytes(bad[: np.load(io.BytesIO(raw)).shape[0]]),
+        "000000-000001.motion.npy": lambda raw: OBJECTS.getvalue(),
+        "000000-000002.texts.json": lambda raw: b'[{"txt": "walks"}]',
+        "000000-000003.meta.json": lambda raw: raw.replace(b'"split":"val"', b'"split":"test"'),
+        "000000-000004.meta.json": lambda raw: b"{",
+    }
+    rewrite(shard, lambda name, raw: changes[name](raw) if name in changes else raw)
+    said = {problem.where: problem.message for problem in check(root) if "'" in problem.where}
+    assert "NaN or infinity in row 0" in said[f"{shard.name}: '000000-000000'"]
+    assert "object values" in said[f"{shard.name}: '000000-000001'"]
+    assert "unknown key 'txt'" in said[f"{shard.name}: '000000-000002'"]
+    assert "'test'" in said[f"{shard.name}: '000000-000003'"]
+    assert f"{shard.name}: '000000-000004'" in said
+
+
+def test_check_finds_leaks_between_splits(made: ModuleType, root: Path) -> None:
+    train = ShardDataset.open(root, "train").ids[0].encode()
+
+    def change(name: str, raw: bytes) -> bytes:
+        if name == "000000-000000.meta.json":
+            return json.dumps({**json.loads(raw), "id": train.decode()}).encode()
+        if name == "000000-000001.meta.json":
+            return json.dumps({**json.loads(raw), "mirror_of": train.decode()}).encode()
+        return raw
+
+    rewrite(root / "made-val-000000.tar", change)
+    messages = [str(problem) for problem in check(root)]
+    assert any(f"id '{train.decode()}' is of split 'train' also" in message for message in messages)
+    assert any(f"mirrors '{train.decode()}', which is in split 'train', not 'val'" in m for m in messages)
+
+
+OPEN = """
+import sys, time
+from pathlib import Path
+from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.shards.reader import ShardDataset
+def peak_kib():
+    return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+before = peak_kib()
+start = time.process_time()
+dataset = ShardDataset.open(sys.argv[1], "train")
+plan = BatchPlan(len(dataset), 256, seed=0)
+plan.batch(77)
+print(len(dataset), time.process_time() - start, (peak_kib() - before) / 1024)
+"""
+
+
+def test_a_million_clips_in_ten_thousand_shards_open_in_a_second(made: ModuleType, tmp_path: Path) -> None:
+    """The index alone is real; the shards are sparse files, as none may be opened."""
+    shards, per_shard, frames, width = 10_000, 100, 100, made.LAYOUT.dim
+    size = frames * width * 4 + 128
+    step = -(-(size + 1024) // 512) * 512
+    clips = [
+        ClipEntry(
+            key=f"000000-{j:06d}",
+            id=f"source-{j:019d}",
+            held=j % 4,
+            frames=frames,
+            motion_data=j * step + 1024 + 128,
+            motion_itemsize=4,
+            members={"motion.npy": (j * step + 1024, size), "meta.json": (j * step + 512, 400)},
+        )
+        for j in range(per_shard)
+    ]
+    one = SplitIndex.build([ShardIndex(fingerprint="", shard=None, clips=clips, dropped=[])])
+    arrays = {name: np.concatenate([getattr(one, name)] * shards) for name in one.__dataclass_fields__}
+    arrays["id_ends"] = np.cumsum(np.tile(np.diff(one.id_ends, prepend=0), shards))
+    save_index(tmp_path, {"train": SplitIndex(**arrays)})
+    listed = []
+    for number in range(shards):
+        name = f"big-train-{number:06d}.tar"
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(per_shard * step)
+        listed.append(
+            ShardInfo(
+                name=name,
+                split="train",
+                samples=per_shard,
+                frames=per_shard * frames,
+                bytes=per_shard * step,
+                sha256="0" * 64,
+            )
+        )
+    manifest = Manifest(
+        name="big",
+        layout="body133",
+        family="exact",
+        fps=20.0,
+        skeleton="smpl22",
+        licence="CC0",
+        converter="none",
+        converter_version=1,
+        options={},
+        shards=listed,
+    )
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest.dump()))
+    runs = []
+    for _ in range(3):
+        out = subprocess.run(
+            [sys.executable, "-c", OPEN, str(tmp_path)], capture_output=True, text=True, check=True
+        ).stdout.split()
+        runs.append((float(out[1]), float(out[2])))
+        assert int(out[0]) == 1_000_000
+    seconds, mebibytes = min(runs)
+    print(f"10^6 clips: {seconds:.2f} s, {mebibytes:.0f} MiB")
+    assert seconds <= 1.0, f"{seconds:.2f} s"
+    assert mebibytes <= 200, f"{mebibytes:.0f} MiB"
+
+
+def test_index_names_stay_the_format(made: ModuleType, root: Path) -> None:
+    assert MEMBERS == ("audio.flac", "audio.npy", "face_texts.json", "meta.json", "motion.npy", "texts.json")
+    assert index_path(root / "made-val-000000.tar").name == "made-val-000000.index.json"
+    with np.load(root / "index.npz") as stored:
+        assert {name.partition(".")[0] for name in stored} == {"train", "val", "test"}

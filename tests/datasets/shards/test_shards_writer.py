@@ -1,0 +1,300 @@
+"""Shards: byte-identical for any worker count and after any kill, readable by WebDataset, manifest last."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.base.lock import LOCK_FILE, folder_lock
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.tasks import Part
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def test_any_number_of_workers_writes_the_same_bytes(made: ModuleType, tmp_path: Path) -> None:
+    convert = made.Convert(drop=(3, 17), bad=(8,))
+    for workers in (1, 2, 3):
+        made.write(tmp_path / str(workers), convert=convert, workers=workers)
+    first = digests(tmp_path / "1")
+    assert (
+        len(first) == 2 * (5 + 2 + 2) + 2
+    )  # 36, 12 and 12 clips at 8 a shard, an index each; index and manifest
+    assert digests(tmp_path / "2") == first
+    assert digests(tmp_path / "3") == first
+
+
+def test_manifest_and_drops(made: ModuleType, tmp_path: Path) -> None:
+    manifest = made.write(tmp_path, convert=made.Convert(drop=(3,), bad=(8,)))
+    reasons = {drop.source: drop.reason for drop in manifest.dropped}
+    assert reasons == {"3": "on the ignore list", "8": "RuntimeError: unreadable"}
+    for shard in manifest.shards:
+        content = (tmp_path / shard.name).read_bytes()
+        assert (shard.bytes, shard.sha256) == (len(content), hashlib.sha256(content).hexdigest())
+    assert sum(shard.samples for shard in manifest.shards) == 58
+    assert json.loads((tmp_path / "manifest.json").read_text())["shards"][0]["samples"] == 8
+    with pytest.raises(UserError, match=r"^8: RuntimeError: unreadable"):
+        made.write(tmp_path / "strict", convert=made.Convert(drop=(3,), bad=(8,)), strict=True)
+
+
+def test_strict_stops_a_pool_too(made: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"^8: RuntimeError"):
+        made.write(tmp_path, convert=made.Convert(bad=(8,)), strict=True, workers=2)
+    assert not (tmp_path / "manifest.json").exists()
+
+
+def test_webdataset_reads_the_same_contents(made: ModuleType, tmp_path: Path) -> None:
+    import webdataset
+
+    made.write(tmp_path)
+    dataset = ShardDataset.open(tmp_path, "train")
+    names = [str(tmp_path / shard.name) for shard in dataset.manifest.shards if shard.split == "train"]
+    pipeline = webdataset.WebDataset(names, shardshuffle=False).decode()
+    seen = list(pipeline)
+    assert len(seen) == len(dataset) == 36
+    assert len({sample["__key__"] for sample in seen}) == 36
+    for i, sample in enumerate(seen):
+        assert sample["meta.json"]["id"] == dataset.ids[i]
+        np.testing.assert_array_equal(sample["motion.npy"], dataset.motion(i))
+        assert sample["texts.json"] == [caption.dump() for caption in dataset.texts(i)]
+        assert ("face_texts.json" in sample) == bool(dataset.has("face_texts.json")[i])
+
+
+def test_clips_are_shuffled_over_shards_by_the_seed(made: ModuleType, tmp_path: Path) -> None:
+    made.write(tmp_path / "a", seed=0)
+    made.write(tmp_path / "b", seed=1)
+    one, other = (ShardDataset.open(tmp_path / name, "train").ids for name in "ab")
+    in_order = [f"clip-ä-{i}" for split, i in made.items(60) if split == "train"]
+    assert sorted(one) == sorted(other) == sorted(in_order)
+    assert one != other and one != in_order
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import shard_samples as made
+if __name__ == "__main__":
+    out, mark = Path(sys.argv[1]), Path(sys.argv[2])
+    at, workers, parent = (int(value) for value in sys.argv[3:])
+    made.write(out, convert=made.Convert(kill_at=at, mark=mark, kill_parent=bool(parent)), workers=workers)
+"""
+
+
+@pytest.mark.parametrize(("workers", "kill_parent"), [(1, False), (2, False), (2, True)])
+def test_killed_and_run_again_gives_the_same_bytes(
+    made: ModuleType, tmp_path: Path, workers: int, kill_parent: bool
+) -> None:
+    made.write(tmp_path / "whole")
+    want = digests(tmp_path / "whole")
+    script = tmp_path / "convert.py"
+    script.write_text(SCRIPT.format(tests=str(Path(__file__).parents[2] / "helpers")))
+    out = tmp_path / "killed"
+    told = [out, tmp_path / "mark", 26, workers, int(kill_parent)]
+    command = [sys.executable, str(script), *map(str, told)]
+    first = subprocess.run(command, capture_output=True, text=True)
+    assert first.returncode != 0 and (tmp_path / "mark").exists()
+    assert not (out / "manifest.json").exists()
+    if workers == 2 and not kill_parent:
+        assert "a conversion worker was killed" in first.stderr
+    if kill_parent:
+        time.sleep(0.5)
+        assert not [p for p in Path("/proc").glob("[0-9]*/environ") if same_tree(p, script)]
+    kept = {path.name: path.stat().st_mtime_ns for path in finished_shards(out)}
+    assert subprocess.run(command, capture_output=True).returncode == 0
+    assert digests(out) == want
+    for name, changed in kept.items():
+        assert (out / name).stat().st_mtime_ns == changed, "a finished shard was written again"
+
+
+def finished_shards(out: Path) -> list[Path]:
+    """Tars whose index is there too; a worker may be killed between the two."""
+    return [path for path in out.glob("*.tar") if path.with_suffix(".index.json").exists()]
+
+
+def same_tree(environ: Path, script: Path) -> bool:
+    """Whether a live process was started for our script."""
+    try:
+        return str(script) in (environ.parent / "cmdline").read_text()
+    except OSError:
+        return False
+
+
+def test_damaged_or_differently_made_shards_are_not_kept(made: ModuleType, tmp_path: Path) -> None:
+    made.write(tmp_path / "a")
+    want = digests(tmp_path / "a")
+    shard = tmp_path / "a" / "made-train-000001.tar"
+    content = bytearray(shard.read_bytes())
+    content[5000] ^= 1
+    shard.write_bytes(content)
+    made.write(tmp_path / "a")
+    assert digests(tmp_path / "a") == want
+
+    (tmp_path / "a" / "manifest.json").unlink()  # as if it had not been finished
+    made.write(tmp_path / "a", count=40)
+    made.write(tmp_path / "b", count=40)
+    assert digests(tmp_path / "a") == digests(tmp_path / "b"), "shards of the longer plan must go"
+
+
+def test_a_finished_set_is_not_replaced_by_one_with_other_options(made: ModuleType, tmp_path: Path) -> None:
+    made.write(tmp_path, options={"size": 60, "source_sha256": "a", "more": [1]})
+    want = digests(tmp_path)
+    with pytest.raises(UserError, match=r"finished with other options \(more \[1\] -> null; size 60 -> 4\)"):
+        made.write(tmp_path, count=4, options={"size": 4, "source_sha256": "a"})
+    assert digests(tmp_path) == want
+    made.write(tmp_path, options={"size": 60, "source_sha256": "a", "more": (1,)})
+    assert digests(tmp_path) == want
+    made.write(tmp_path, options={"size": 60, "source_sha256": "b", "more": [1]})  # the source has changed
+    assert digests(tmp_path) != want
+
+
+def test_rejections_name_the_fix(made: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="use letters, digits"):
+        made.write(tmp_path, name="a.b/c")
+    with pytest.raises(UserError, match="no clip survived"):
+        made.write(tmp_path / "none", convert=made.Convert(drop=tuple(range(60))))
+    made.write(tmp_path)
+    with pytest.raises(UserError, match="holds dataset 'made', not 'other'"):
+        made.write(tmp_path, name="other")
+    with pytest.raises(UserError, match="again in made-"):
+        made.write(tmp_path / "twice", convert=lambda i: made.clip(0))
+
+
+def test_bad_samples_are_dropped_with_the_reason(made: ModuleType, tmp_path: Path) -> None:
+    def convert(i: int) -> object:
+        sample = made.clip(i)
+        motion = sample.motion.copy()
+        if i == 5:
+            motion[7, 3] = np.nan
+        if i == 6:
+            motion = motion[:, :100]
+        return type(sample)(sample.meta, motion, sample.texts)
+
+    manifest = made.write(tmp_path, convert=convert)
+    reasons = {drop.source: drop.reason for drop in manifest.dropped}
+    assert reasons == {
+        "5": "ValueError: motion: NaN or infinity in row 7",
+        "6": "ValueError: motion is [26, 100], layout body133 wants [T >= 1, 133]",
+    }
+
+
+def test_one_item_may_give_many_clips_and_float16(made: ModuleType, tmp_path: Path) -> None:
+    def convert(i: int) -> object:
+        sample = made.clip(i)
+        mirrored = sample.meta.model_copy(update={"id": f"M{sample.meta.id}", "mirror_of": sample.meta.id})
+        return [sample, type(sample)(mirrored, -sample.motion, sample.texts)]
+
+    made.write(tmp_path, convert=convert, motion_type="float16")
+    dataset = ShardDataset.open(tmp_path, "val")
+    assert len(dataset) == 24
+    assert dataset.motion(0).dtype == np.float32
+    number = int(dataset.ids[0].rpartition("-")[2])
+    np.testing.assert_array_equal(
+        dataset.motion(0), made.clip_motion(number).astype(np.float16).astype(np.float32)
+    )
+    np.testing.assert_array_equal(dataset.motion(1), -dataset.motion(0))
+    assert dataset.meta(1).mirror_of == dataset.ids[0] and dataset.meta(1).split == "val"
+
+
+def test_a_second_writer_is_refused(made: ModuleType, tmp_path: Path) -> None:
+    def convert(i: int) -> object:
+        with pytest.raises(UserError, match="another conversion is writing here"):
+            made.write(tmp_path)
+        return made.clip(i)
+
+    made.write(tmp_path, count=5, convert=convert)
+
+
+@pytest.mark.parametrize("count", [1, 2, 20])
+def test_parts_in_any_order_and_one_last_run_give_the_same_bytes(
+    made: ModuleType, tmp_path: Path, count: int
+) -> None:
+    convert = made.Convert(drop=(3, 17), bad=(8,))
+    whole = made.write(tmp_path / "whole", convert=convert)
+    out = tmp_path / "out"
+    parts = [made.write(out, convert=convert, part=Part(k, count)) for k in reversed(range(count))]
+    assert sorted(s.name for part in parts for s in part.shards) == sorted(s.name for s in whole.shards)
+    assert sum(len(part.dropped) for part in parts) == 3
+    assert not (out / "manifest.json").exists() and not (out / "index.npz").exists()
+    kept = {path.name: path.stat().st_mtime_ns for path in out.glob("*.tar")}
+    assert made.write(out, convert=convert) == whole
+    assert digests(out) == digests(tmp_path / "whole")
+    assert {name: (out / name).stat().st_mtime_ns for name in kept} == kept
+
+
+def test_the_last_run_makes_what_parts_have_not_and_verifies_the_rest(
+    made: ModuleType, tmp_path: Path
+) -> None:
+    made.write(tmp_path / "whole")
+    out = tmp_path / "out"
+    made.write(out, part=Part(0, 3))
+    made.write(out, part=Part(2, 3))
+    shard = out / "made-train-000002.tar"
+    content = bytearray(shard.read_bytes())
+    content[5000] ^= 1
+    shard.write_bytes(content)
+    made.write(out)
+    assert digests(out) == digests(tmp_path / "whole")
+
+
+def test_parts_work_at_once_and_leave_each_others_files(made: ModuleType, tmp_path: Path) -> None:
+    stranger = tmp_path / ".made-train-000001.tar.0123456789abcdef.tmp"
+
+    def convert(i: int) -> object:
+        stranger.touch()
+        made.write(tmp_path, part=Part(1, 2))  # another part, while this one writes
+        with pytest.raises(UserError, match="another conversion is writing here"):
+            made.write(tmp_path)
+        return made.clip(i)
+
+    made.write(tmp_path, convert=convert, part=Part(0, 2))
+    assert stranger.exists(), "a part must not clean up: the file may be another part's"
+    made.write(tmp_path)
+    assert not stranger.exists() and not (tmp_path / LOCK_FILE).exists()
+
+
+def test_a_part_is_refused_while_a_whole_run_writes(made: ModuleType, tmp_path: Path) -> None:
+    def convert(i: int) -> object:
+        with pytest.raises(UserError, match="another conversion is writing here"):
+            made.write(tmp_path, part=Part(0, 2))
+        return made.clip(i)
+
+    made.write(tmp_path, count=5, convert=convert)
+    with pytest.raises(UserError, match="parts are numbered from 0 to 1"):
+        Part(2, 2)
+
+
+def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path: Path) -> None:
+    for _ in range(3):
+        with folder_lock(tmp_path):
+            assert (tmp_path / LOCK_FILE).exists()
+        assert not (tmp_path / LOCK_FILE).exists()
+    with folder_lock(tmp_path, shared=True):
+        (tmp_path / LOCK_FILE).unlink()
+        with folder_lock(tmp_path, shared=True), pytest.raises(UserError), folder_lock(tmp_path):
+            pass
+
+
+def test_a_file_system_without_locks_is_written_with_a_warning(
+    made: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with pytest.warns(UserWarning, match="this file system has no locks"):
+        made.write(tmp_path, count=5)
+    assert (tmp_path / "manifest.json").exists()

@@ -1,0 +1,279 @@
+"""Remote data: only allowed schemes, retries, clear refusals, and a cache that processes share."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from torch.utils.data import DataLoader
+
+from motionloom.datasets.loading.batches import WindowBatches
+from motionloom.datasets.loading.statistics import compute
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards import retry
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.reading import CacheConfig, Reading
+from motionloom.datasets.shards.store import LocalStore, open_store
+
+
+@pytest.fixture(autouse=True)
+def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "FIRST_PAUSE", 0.001)
+
+
+def reading(tmp_path: Path, gigabytes: float = 1.0) -> Reading:
+    return Reading(cache=CacheConfig(folder=str(tmp_path / "cache"), gigabytes=gigabytes))
+
+
+def same(one: ShardDataset, other: ShardDataset) -> None:
+    assert one.ids == other.ids and np.array_equal(one.frames, other.frames)
+    for i in range(len(one)):
+        np.testing.assert_array_equal(one.motion(i), other.motion(i))
+        assert one.texts(i) == other.texts(i) and one.face_texts(i) == other.face_texts(i)
+        assert one.meta(i) == other.meta(i)
+        assert np.array_equal(one.audio(i), other.audio(i))
+        for a, b in zip(one.wav(i) or (), other.wav(i) or (), strict=True):
+            assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "pipe:touch PWNED_store",
+        "pipe:touch PWNED_store|",
+        "simplecache::s3://b/c",
+        "gs://bucket/x",
+        "hf://datasets/x",
+        "ssh://host/x",
+        "python:x",
+        "PIPE:touch PWNED_store",
+        "memory://x",
+    ],
+)
+def test_other_schemes_are_refused_before_anything_opens(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(UserError, match=r"file:, http:, https:, s3: and folders, not from"):
+        ShardDataset.open(place, "train")
+    assert not list(tmp_path.iterdir())
+
+
+def test_urls_that_carry_more_than_a_place_are_refused() -> None:
+    for place in ("https://me:secret@host/data", "s3://key:secret@bucket/data"):
+        with pytest.raises(UserError, match="credentials belong in the environment") as raised:
+            open_store(place)
+        assert "secret" not in str(raised.value)
+    for place in ("https://host/data?token=1", "https://host/data#x", "s3://bucket/../other", "s3:///data"):
+        with pytest.raises(UserError, match=r"without '\?', '#' and '\.\.'"):
+            open_store(place)
+    with pytest.raises(UserError, match="file:///folder"):
+        open_store("file://host/share")
+    with pytest.raises(UserError, match="file:///folder"):
+        open_store("file:data")
+
+
+def test_file_urls_are_folders(root: Path) -> None:
+    assert isinstance(open_store(f"file://{root}"), LocalStore)
+    same(ShardDataset.open(f"file://{root}", "val"), ShardDataset.open(root, "val"))
+
+
+def test_a_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    with pytest.raises(UserError, match=r"needs s3fs; pip install 'motionloom\[remote\]'"):
+        ShardDataset.open("s3://bucket/data", "train", reading=reading(tmp_path))
+
+
+@pytest.mark.parametrize("gigabytes", [1.0, 0.0])
+def test_a_web_server_gives_what_the_folder_gives(
+    loopback: ModuleType, root: Path, tmp_path: Path, gigabytes: float
+) -> None:
+    with loopback.web(root) as (url, seen):
+        for split in ("train", "val"):
+            remote = ShardDataset.open(url, split, reading=reading(tmp_path, gigabytes))
+            assert not any(".tar" in line for line in seen), "opening reads no shard"
+            same(remote, ShardDataset.open(root, split))
+            seen[:] = [line for line in seen if split not in line]
+        cached = sorted(path.suffix for path in (tmp_path / "cache").iterdir() if path.is_file())
+        assert cached.count(".tar") == (7 if gigabytes else 0) and cached.count(".npz") == 1
+        again = ShardDataset.open(url, "train", reading=reading(tmp_path, gigabytes))
+        seen.clear()
+        sent = pickle.dumps(again)
+        assert len(sent) < 1000
+        copy = pickle.loads(sent)
+        copy.motion(0)
+        assert len(seen) == (0 if gigabytes else 1), "a worker opens from the cache"
+
+
+def test_window_batches_and_statistics_are_the_same(loopback: ModuleType, root: Path, tmp_path: Path) -> None:
+    local = ShardDataset.open(root, "train")
+    stats = compute(local)
+    want = [WindowBatches(local, stats, window=16, batch_size=8, seed=1)[k]["motion"] for k in range(4)]
+    with loopback.web(root) as (url, seen):
+        for gigabytes in (0.0, 1.0):
+            remote = ShardDataset.open(url, "train", reading=reading(tmp_path, gigabytes))
+            assert np.array_equal(compute(remote).mean, stats.mean)
+            batches = WindowBatches(remote, stats, window=16, batch_size=8, seed=1)
+            seen.clear()
+            for workers, context in ((0, None), (1, "spawn") if gigabytes else (2, "fork")):
+                loader = DataLoader(
+                    batches, batch_size=None, sampler=range(4), num_workers=workers,
+                    multiprocessing_context=context,
+                )  # fmt: skip
+                got = [batch["motion"] for batch in loader]
+                assert all(np.array_equal(a, b) for a, b in zip(got, want, strict=True))
+            ranged = [line for line in seen if ".tar bytes=" in line]
+            assert bool(ranged) == (gigabytes == 0)
+
+
+def test_an_s3_bucket_behind_a_bad_network(
+    loopback: ModuleType, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    with loopback.bucket(root, every=6) as (environment, network):
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        for gigabytes in (1.0, 0.0):
+            remote = ShardDataset.open("s3://shards/made", "val", reading=reading(tmp_path, gigabytes))
+            same(remote, ShardDataset.open(root, "val"))
+        assert network.failures >= 10
+        network.every = 0
+        for place in ("s3://no-such-bucket/x", "s3://shards/other"):
+            with pytest.raises(UserError, match=r"no manifest\.json"):
+                ShardDataset.open(place, "val", reading=reading(tmp_path))
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            monkeypatch.delenv(name)
+        monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
+        with pytest.raises(UserError, match="credentials"):
+            ShardDataset.open("s3://shards/made", "val", reading=reading(tmp_path))
+
+
+def test_every_passing_failure_is_tried_again(loopback: ModuleType, root: Path, tmp_path: Path) -> None:
+    failures = 0
+
+    def bad(request: BaseHTTPRequestHandler, number: int) -> bool:
+        nonlocal failures
+        if number % 3 == 2:
+            return False
+        failures += 1
+        loopback.fail(request, number % 4)
+        return True
+
+    for gigabytes in (1.0, 0.0):
+        with loopback.web(root, answer=bad) as (url, _):
+            remote = ShardDataset.open(url, "val", reading=reading(tmp_path / str(gigabytes), gigabytes))
+            same(remote, ShardDataset.open(root, "val"))
+    assert failures > 50
+
+
+def test_what_will_not_pass_is_said_at_once(
+    loopback: ModuleType, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    status = 403
+
+    def refuse(request: BaseHTTPRequestHandler, number: int) -> bool:
+        request.send_error(status)
+        return True
+
+    with loopback.web(root, answer=refuse) as (url, seen):
+        for status, said in (
+            (401, "refuses access; set the credentials in the environment"),
+            (403, "refuses access; set the credentials in the environment"),
+            (404, r"no manifest\.json, so the conversion is unfinished"),
+            (400, "HTTP 400"),
+        ):
+            seen.clear()
+            with pytest.raises(UserError, match=said):
+                ShardDataset.open(url, "train", reading=reading(tmp_path))
+            assert len(seen) == 1, f"{status} is no reason to try again"
+        for status in (429, 500, 502, 503):
+            seen.clear()
+            with pytest.raises(UserError, match=f"{status}.*tried 8 times"):
+                ShardDataset.open(url, "train", reading=reading(tmp_path))
+            assert len(seen) == retry.ATTEMPTS
+    with pytest.raises(UserError, match=r"127\.0\.0\.1.*tried 8 times"):
+        ShardDataset.open(url, "train", reading=reading(tmp_path))
+    monkeypatch.setattr(retry, "ATTEMPTS", 1)
+    with pytest.raises(UserError, match=r"manifest\.json: .*tried 1 times"):
+        ShardDataset.open("http://nowhere.invalid/x", "train", reading=reading(tmp_path))
+
+
+def test_pauses_grow_and_leave_the_runs_random_numbers_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "FIRST_PAUSE", 1.0)
+    pauses: list[float] = []
+    monkeypatch.setattr(retry.time, "sleep", pauses.append)
+    import random
+
+    before = random.getstate()
+
+    def down() -> None:
+        raise ConnectionResetError("reset")
+
+    with pytest.raises(UserError, match="x: reset"):
+        retry.persist("x", down)
+    assert random.getstate() == before
+    wholes = [1, 2, 4, 8, 15, 15, 15]
+    assert all(whole / 2 <= pause <= whole for pause, whole in zip(pauses, wholes, strict=True))
+    with pytest.raises(ZeroDivisionError):
+        retry.persist("x", lambda: 1 // 0)
+
+
+def test_damage_on_the_server_is_named(loopback: ModuleType, root: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "data"
+    copy.mkdir()
+    for path in root.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    shard = copy / "made-val-000000.tar"
+    whole = shard.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 4
+    for content, said in ((bytes(flipped), "sha256 is not the manifest's"), (whole[:-10240], "truncated")):
+        shard.write_bytes(content)
+        with loopback.web(copy) as (url, _), pytest.raises(UserError, match=rf"val-000000\.tar: .*{said}"):
+            ShardDataset.open(url, "val", reading=reading(tmp_path)).motion(0)
+    assert not [
+        path for path in (tmp_path / "cache").iterdir() if "part" in path.name or path.suffix == ".tar"
+    ]
+    shard.write_bytes(whole[:5000])
+    with loopback.web(copy) as (url, _), pytest.raises(UserError, match=r"000000\.tar: .*HTTP 416|truncated"):
+        ShardDataset.open(url, "val", reading=reading(tmp_path, 0)).motion(7)
+    shard.write_bytes(whole)
+    (copy / "index.npz").write_bytes((copy / "index.npz").read_bytes()[:-400])
+    with loopback.web(copy) as (url, _), pytest.raises(UserError, match=r"index\.npz: not a readable index"):
+        ShardDataset.open(url, "val", reading=reading(tmp_path / "other"))
+
+
+def test_a_manifest_that_changes_while_in_use_is_refused(
+    loopback: ModuleType, root: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "data"
+    copy.mkdir()
+    for path in root.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    with loopback.web(copy) as (url, _):
+        places = (copy, url)
+        sent = [pickle.dumps(ShardDataset.open(p, "val", reading=reading(tmp_path))) for p in places]
+        manifest = copy / "manifest.json"
+        manifest.write_text(manifest.read_text().replace('"CC0"', '"CC1"'))
+        with pytest.raises(UserError, match="changed while the data set was in use"):
+            pickle.loads(sent[0])
+        pickle.loads(sent[1]).motion(0)  # has its own copy
+        for path in (tmp_path / "cache").glob("*.manifest.json"):
+            path.unlink()
+        with pytest.raises(UserError, match="changed while the data set was in use"):
+            pickle.loads(sent[1])
+
+
+def test_a_server_without_ranges_serves_whole_shards_only(
+    loopback: ModuleType, root: Path, tmp_path: Path
+) -> None:
+    with loopback.web(root, ranges=False) as (url, _):
+        same(ShardDataset.open(url, "val", reading=reading(tmp_path)), ShardDataset.open(root, "val"))
+        with pytest.raises(UserError, match=r"ignores byte ranges; let the cache keep shards"):
+            ShardDataset.open(url, "val", reading=reading(tmp_path, 0)).motion(0)

@@ -1,0 +1,368 @@
+"""Text encoders (MiniLM from the installed package, tiny local models) and the caption cache."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.text import build as build_module
+from motionloom.datasets.text.build import build_text_cache
+from motionloom.datasets.text.cache import TextCache, key_of
+from motionloom.datasets.text.encoder import EncodedText, SentenceEncoder, load_text_encoder
+
+CAPTIONS = [
+    "a person walks forward",
+    "a man walks ahead slowly, then turns left and waves with his right hand",
+    "someone plays the piano",
+    "jump",
+    "une personne marche",
+    "",
+]
+
+
+@pytest.fixture(scope="module")
+def minilm() -> SentenceEncoder:
+    encoder = load_text_encoder("minilm")
+    assert isinstance(encoder, SentenceEncoder)
+    return encoder
+
+
+def test_minilm_embeds_meaning(minilm: SentenceEncoder) -> None:
+    out = minilm.encode(CAPTIONS)
+    assert minilm.dim == 384 and minilm.name.startswith("minilm:")
+    assert out.sentence.shape == (6, 384) and out.tokens.shape[::2] == (6, 384)
+    assert out.sentence.dtype == out.tokens.dtype == np.float32 and out.mask.dtype == np.bool_
+    np.testing.assert_allclose(np.linalg.norm(out.sentence, axis=1), 1, atol=1e-5)
+    likeness = out.sentence @ out.sentence.T
+    assert likeness[0, 1] > 0.5 > 0.3 > likeness[0, 2]
+    # [CLS] a person walks forward [SEP]
+    assert out.mask.sum(axis=1)[0] == 6
+    assert (out.tokens[~out.mask] == 0).all() and np.abs(out.tokens[out.mask]).sum(axis=1).min() > 0
+
+
+def test_sentence_is_the_mean_of_the_tokens(minilm: SentenceEncoder) -> None:
+    """MiniLM pools by the mean: an independent way to its sentence embedding."""
+    out = minilm.encode(CAPTIONS)
+    mean = (out.tokens * out.mask[..., None]).sum(axis=1) / out.mask.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(out.sentence, mean / np.linalg.norm(mean, axis=1, keepdims=True), atol=1e-5)
+
+
+def test_a_caption_does_not_depend_on_its_batch(minilm: SentenceEncoder) -> None:
+    together = minilm.encode(CAPTIONS)
+    for i, caption in enumerate(CAPTIONS):
+        alone = minilm.encode([caption])
+        np.testing.assert_allclose(alone.sentence[0], together.sentence[i], atol=2e-6)
+        np.testing.assert_allclose(alone.tokens[0], together.tokens[i][together.mask[i]], atol=2e-5)
+
+
+def test_folders_that_are_no_models_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"not a sentence-transformers or transformers model .*'minilm'"):
+        load_text_encoder(str(tmp_path))
+    (tmp_path / "modules.json").write_text("[]")
+    with pytest.raises(UserError, match="not a readable text model"):
+        load_text_encoder(str(tmp_path))
+
+
+def tiny_vocabulary(folder: Path) -> Path:
+    words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", "a", "person", "walks", "jump", "someone", "left"]
+    (folder / "vocab.txt").write_text("\n".join(words))
+    return folder / "vocab.txt"
+
+
+def tiny_distilbert(folder: Path, seed: int = 0) -> Path:
+    from transformers import BertTokenizerFast, DistilBertConfig, DistilBertModel
+
+    torch.manual_seed(seed)
+    config = DistilBertConfig(vocab_size=11, dim=16, n_layers=2, n_heads=2, hidden_dim=32)
+    DistilBertModel(config).save_pretrained(folder / "model")
+    BertTokenizerFast(vocab=str(tiny_vocabulary(folder))).save_pretrained(folder / "model")
+    return folder / "model"
+
+
+def test_a_plain_bert_like_folder_works(tmp_path: Path) -> None:
+    from transformers import DistilBertModel
+
+    tiny_distilbert(tmp_path)
+    encoder = load_text_encoder(str(tmp_path / "model"))
+    out = encoder.encode(["a person walks", "jump"])
+    assert encoder.dim == 16 and out.tokens.shape == (2, 5, 16)
+    assert out.mask.sum(axis=1).tolist() == [5, 3]
+    model = DistilBertModel.from_pretrained(tmp_path / "model").eval()
+    with torch.no_grad():
+        want = model(torch.tensor([[2, 8, 3]])).last_hidden_state[0].numpy()  # [CLS] jump [SEP]
+    np.testing.assert_allclose(out.tokens[1, :3], want, atol=1e-5)
+    alone = encoder.encode(["jump"])
+    np.testing.assert_allclose(alone.tokens[0], want, atol=1e-5)
+    np.testing.assert_allclose(alone.sentence[0], out.sentence[1], atol=1e-5)
+    tiny_distilbert(tmp_path, seed=1)
+    assert load_text_encoder(str(tmp_path / "model")).name != encoder.name, "other weights, other name"
+
+
+def tiny_clip(folder: Path) -> Path:
+    from transformers import CLIPTextConfig, CLIPTextModelWithProjection, CLIPTokenizerFast
+
+    letters = [*"abcdefghijklmnopqrstuvwxyz", *(f"{c}</w>" for c in "abcdefghijklmnopqrstuvwxyz")]
+    vocabulary = {word: i for i, word in enumerate([*letters, "<|startoftext|>", "<|endoftext|>"])}
+    (folder / "vocab.json").write_text(json.dumps(vocabulary))
+    (folder / "merges.txt").write_text("#version: 0.2\n")
+    end = vocabulary["<|endoftext|>"]
+    torch.manual_seed(0)
+    model = CLIPTextModelWithProjection(
+        CLIPTextConfig(
+            vocab_size=len(vocabulary),
+            hidden_size=16,
+            intermediate_size=32,
+            num_hidden_layers=2,
+            num_attention_heads=2,
+            projection_dim=16,
+            max_position_embeddings=12,
+            bos_token_id=end - 1,
+            eos_token_id=end,
+            pad_token_id=end,
+        )
+    ).eval()
+    model.save_pretrained(folder / "clip")
+    CLIPTokenizerFast(vocab=str(folder / "vocab.json"), merges=str(folder / "merges.txt")).save_pretrained(
+        folder / "clip"
+    )
+    return folder / "clip"
+
+
+def test_clip_folders_work(tmp_path: Path) -> None:
+    from transformers import CLIPTextModelWithProjection
+
+    encoder = load_text_encoder(str(tiny_clip(tmp_path)))
+    model = CLIPTextModelWithProjection.from_pretrained(tmp_path / "clip").eval()
+    out = encoder.encode(["abc", "a b", "abcdefghijklmnopqrstuvwxyz"])
+    assert encoder.dim == 16 and out.mask.sum(axis=1).tolist() == [5, 4, 12]
+    alone = encoder.encode(["abc"])
+    np.testing.assert_allclose(alone.tokens[0], out.tokens[0, :5], atol=1e-5)
+    np.testing.assert_allclose(alone.sentence[0], out.sentence[0], atol=1e-5)
+    ids = torch.tensor([[52, 0, 1, 28, 53]])  # start, a, b, c</w>, end
+    with torch.no_grad():
+        want = model(input_ids=ids)
+    np.testing.assert_allclose(alone.tokens[0], want.last_hidden_state[0].numpy(), atol=1e-5)
+    np.testing.assert_allclose(
+        alone.sentence, torch.nn.functional.normalize(want.text_embeds).numpy(), atol=1e-5
+    )
+
+
+class Counting:
+    """Random but fixed vectors per caption; remembers what it was asked."""
+
+    def __init__(self, name: str = "counting", dim: int = 6) -> None:
+        self.name, self.dim = name, dim
+        self.asked: list[str] = []
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        self.asked += captions
+        mask = np.arange(max(len(c) % 7 + 2 for c in captions))[None] < [[len(c) % 7 + 2] for c in captions]
+        tokens = np.stack([self._vectors(c, mask.shape[1]) for c in captions]) * mask[..., None]
+        return EncodedText(tokens[:, 0].astype(np.float32), tokens.astype(np.float32), mask)
+
+    def _vectors(self, caption: str, count: int) -> np.ndarray:
+        seed = int.from_bytes(hashlib.md5(caption.encode()).digest()[:4], "big")
+        return np.random.default_rng(seed).standard_normal((count, self.dim))
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def test_cache_gives_back_what_the_encoder_said(tmp_path: Path) -> None:
+    captions = [f"caption {'x' * (i % 11)} {i}" for i in range(300)]
+    encoder = Counting()
+    cache = TextCache.build(tmp_path, captions * 2, encoder, progress=False)
+    assert len(cache) == len(encoder.asked) == 300 and cache.dim == 6
+    asked = [captions[i] for i in (7, 250, 7, 0)]
+    want = encoder.encode(asked)
+    tokens, mask = cache.tokens(asked)
+    assert tokens.dtype == np.float32
+    np.testing.assert_array_equal(mask, want.mask)
+    np.testing.assert_allclose(tokens, want.tokens, atol=2e-3)
+    np.testing.assert_array_equal(cache.sentence(asked), want.sentence)
+    sent = pickle.dumps(cache)
+    assert len(sent) < 1000
+    np.testing.assert_array_equal(pickle.loads(sent).tokens(asked)[0], tokens)
+
+
+def test_same_captions_same_bytes_whatever_their_order(tmp_path: Path, minilm: SentenceEncoder) -> None:
+    captions = [f"{caption} {i}" for i in range(25) for caption in CAPTIONS]
+    TextCache.build(tmp_path / "a", captions, minilm, progress=False)
+    TextCache.build(tmp_path / "b", [*reversed(captions), *captions], minilm, progress=False)
+    assert digests(tmp_path / "a") == digests(tmp_path / "b")
+
+
+def test_only_new_captions_are_encoded(tmp_path: Path) -> None:
+    first = [f"caption {i}" for i in range(50)]
+    TextCache.build(tmp_path / "a", first, Counting(), progress=False)
+    encoder = Counting()
+    TextCache.build(tmp_path / "a", first[:10], encoder, progress=False)
+    assert encoder.asked == []
+    more = [f"caption {i}" for i in range(40, 70)]
+    cache = TextCache.build(tmp_path / "a", more, encoder, progress=False)
+    assert sorted(encoder.asked) == sorted(more[10:]) and len(cache) == 70
+    TextCache.build(tmp_path / "b", first + more, Counting(), progress=False)
+    assert digests(tmp_path / "a") == digests(tmp_path / "b")
+    other = Counting(name="another")
+    assert len(TextCache.build(tmp_path / "a", more, other, progress=False)) == 30
+    assert sorted(other.asked) == sorted(more)
+
+
+def test_refusals_say_to_run_the_text_stage(tmp_path: Path) -> None:
+    cache = TextCache.build(tmp_path, ["jump"], Counting(), progress=False)
+    with pytest.raises(
+        UserError, match=r"caption 'fly' is not in the text cache .* run the text stage again"
+    ):
+        cache.tokens(["jump", "fly"])
+    (tmp_path / "tokens.npy").write_bytes((tmp_path / "tokens.npy").read_bytes()[:-3])
+    with pytest.raises(UserError, match="run the text stage again"):
+        TextCache.open(tmp_path)
+    rebuilt = TextCache.build(tmp_path, ["jump"], Counting(), progress=False)
+    assert len(rebuilt) == 1, "a damaged cache is made again"
+    (tmp_path / "cache.json").unlink()
+    with pytest.raises(UserError, match="no finished text cache here; run the text stage"):
+        TextCache.open(tmp_path)
+    with pytest.raises(UserError, match="no captions"):
+        TextCache.build(tmp_path, [], Counting(), progress=False)
+
+
+WORDS = ["a", "person", "walks", "jump", "someone", "left"]
+
+
+def phrases(count: int) -> list[str]:
+    """Different captions of 1 to 12 words."""
+    rng = np.random.default_rng(0)
+    return [" ".join(rng.choice(WORDS, 1 + i % 11)) + f" {i}" for i in range(count)]
+
+
+@pytest.mark.parametrize("kind", ["clip", pytest.param("distilbert", marks=pytest.mark.slow)])
+def test_same_bytes_for_any_number_of_workers(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build_module, "PART", 16)
+    monkeypatch.setattr(build_module, "PARTS_A_WORKER", 1)
+    model = str(tiny_distilbert(tmp_path) if kind == "distilbert" else tiny_clip(tmp_path))
+    captions = phrases(100)
+    caches = [build_text_cache(tmp_path / str(n), captions, model, workers=n, progress=False) for n in (1, 2)]
+    assert digests(tmp_path / "1") == digests(tmp_path / "2")
+    assert len(caches[0]) == 100 and not (tmp_path / "1" / "parts").exists()
+    TextCache.build(tmp_path / "3", captions, load_text_encoder(model), progress=False)
+    assert digests(tmp_path / "1") == digests(tmp_path / "3")
+    encoder = load_text_encoder(model)
+    for caption in captions[::17]:
+        alone = encoder.encode([caption])
+        tokens, mask = caches[1].tokens([caption])
+        np.testing.assert_array_equal(mask, alone.mask)
+        np.testing.assert_allclose(tokens, alone.tokens, atol=5e-3)
+        np.testing.assert_allclose(caches[1].sentence([caption]), alone.sentence, atol=1e-5)
+
+
+def test_an_interrupted_build_keeps_its_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build_module, "PART", 16)
+    captions = phrases(100)
+
+    class Stops(Counting):
+        def encode(self, captions: Sequence[str]) -> EncodedText:
+            if len(self.asked) > 50:
+                raise KeyboardInterrupt
+            return super().encode(captions)
+
+    stopped = Stops()
+    with pytest.raises(KeyboardInterrupt):
+        TextCache.build(tmp_path / "a", captions, stopped, progress=False)
+    with pytest.raises(UserError, match="no finished text cache"):
+        TextCache.open(tmp_path / "a")
+    parts = sorted((tmp_path / "a" / "parts").iterdir())
+    assert len(parts) >= 2
+    damaged, kept = parts[0], len(stopped.asked)
+    with np.load(damaged, allow_pickle=False) as arrays:
+        lost = len(arrays["lengths"])
+    damaged.write_bytes(damaged.read_bytes()[:-40])
+    rest = Counting()
+    TextCache.build(tmp_path / "a", captions, rest, progress=False)
+    assert len(rest.asked) == 100 - kept + lost, "finished parts are kept, a damaged one is made again"
+    TextCache.build(tmp_path / "b", captions, Counting(), progress=False)
+    assert digests(tmp_path / "a") == digests(tmp_path / "b")
+
+
+def test_parts_of_other_captions_or_encoders_are_not_taken(tmp_path: Path) -> None:
+    """What a killed run left for another caption set or encoder is ignored and removed."""
+    folder = tmp_path / "a"
+    TextCache.build(folder, ["jump"], Counting(), progress=False)
+    for name in ("counting", "another"):
+        kept = Counting(name=name)
+        (part,) = build_module._parts([key_of("fly")], {key_of("fly"): "fly"}, tmp_path, name)
+        build_module._encode_part(part, kept)
+        (folder / "parts").mkdir()
+        part.path.rename(folder / "parts" / part.path.name)
+        fresh = Counting()
+        assert len(TextCache.build(folder, ["jump", "fly", name], fresh, progress=False)) >= 3
+        assert sorted(fresh.asked) == sorted({"fly", name} if name == "counting" else {name})
+        assert not (folder / "parts").exists()
+
+
+def test_a_killed_build_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SIGKILL between two parts; the second run asks only for what is missing."""
+    script = f"""
+import sys, time
+sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[2] / "helpers")!r}]
+from pathlib import Path
+import test_text_cache as t
+t.build_module.PART = 16
+class Slow(t.Counting):
+    def encode(self, captions):
+        if len(self.asked) > 40:
+            print(len(self.asked), flush=True)
+            time.sleep(60)
+        return super().encode(captions)
+t.TextCache.build(Path({str(tmp_path / "a")!r}), t.phrases(100), Slow(), progress=False)
+"""
+    process = subprocess.Popen([sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    done = int(process.stdout.readline())
+    process.kill()
+    process.communicate()
+    rest = Counting()
+    monkeypatch.setattr(build_module, "PART", 16)
+    TextCache.build(tmp_path / "a", phrases(100), rest, progress=False)
+    TextCache.build(tmp_path / "b", phrases(100), Counting(), progress=False)
+    assert len(rest.asked) == 100 - done
+    assert digests(tmp_path / "a") == digests(tmp_path / "b")
+
+
+@pytest.mark.slow
+def test_many_captions_are_not_held_in_memory(tmp_path: Path) -> None:
+    """40 000 captions of 6 to 12 tokens of 256 numbers are 180 MB; the build adds far less."""
+    script = f"""
+import resource, sys
+import numpy as np
+from pathlib import Path
+from motionloom.datasets.text.build import build_with_encoder
+from motionloom.datasets.text.encoder import EncodedText
+class Wide:
+    name, dim = "wide", 256
+    def encode(self, captions):
+        mask = np.arange(12)[None] < [[6 + len(c) % 7] for c in captions]
+        values = np.ones((len(captions), 12, 256), dtype=np.float32) * mask[..., None]
+        return EncodedText(values[:, 0], values, mask)
+build_with_encoder(Path({str(tmp_path / "few")!r}), ["a", "b"], Wide(), progress=False)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+captions = (f"caption {{i}}" for i in range(40000))
+cache = build_with_encoder(Path({str(tmp_path / "many")!r}), captions, Wide(), False)
+assert len(cache) == 40000
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+    done = subprocess.run([sys.executable, "-P", "-c", script], check=True, capture_output=True, text=True)
+    assert (tmp_path / "many" / "tokens.npy").stat().st_size > 150e6
+    assert int(done.stdout) * 1024 < 80e6

@@ -1,0 +1,96 @@
+"""The denoiser: schedules against public tables, masking, guidance, learning a toy, batched sampling."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.models.diffusion.module import DiffusionModule
+from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.sampling import sample_motions
+from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
+from motionloom.models.training.stage_module import OptimConfig
+
+SMALL = DiffusionConfig(dim=32, ff=64, layers=2, heads=2, dropout=0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "config"),
+    [
+        ("mdm_cosine", ScheduleConfig()),
+        ("ude_linear", ScheduleConfig(betas="linear", predicts="epsilon")),
+    ],
+)
+def test_schedule_equals_public_tables(shared: Path, name: str, config: ScheduleConfig) -> None:
+    golden = np.load(shared / "golden" / "t9_diffusion_A.npz", allow_pickle=False)
+    noiser = config.noiser()
+    np.testing.assert_allclose(noiser.betas, golden[f"{name}__betas"], rtol=2e-5, atol=1e-7)
+    np.testing.assert_allclose(noiser.alphas_cumprod, golden[f"{name}__alphas_cumprod"], rtol=5e-4, atol=1e-7)
+    x0, eps, t = (torch.from_numpy(golden[key]) for key in ("x0", "eps", "t"))
+    np.testing.assert_allclose(noiser.add_noise(x0, eps, t), golden[f"{name}__x_t"], atol=2e-5)
+    # The mean of one reverse step: diffusers adds noise, so its own noise is taken off again.
+    noiser.set_timesteps(config.steps)
+    for row, step in enumerate(t.tolist()):
+        x_t = torch.from_numpy(golden[f"{name}__x_t"][row : row + 1])
+        out = torch.from_numpy(golden["model_out"][row : row + 1])
+        taken = noiser.step(out, step, x_t, generator=torch.Generator().manual_seed(0)).prev_sample
+        if step > 0:
+            drawn = torch.randn(x_t.shape, generator=torch.Generator().manual_seed(0))
+            taken = taken - golden[f"{name}__post_var"][row] ** 0.5 * drawn
+        np.testing.assert_allclose(taken[0], golden[f"{name}__p_mean"][row], rtol=1e-3, atol=2e-3)
+
+
+def test_padding_plays_no_part() -> None:
+    torch.manual_seed(0)
+    net = MotionDiffusion(SMALL, 5, 7).eval()
+    x, text = torch.randn(1, 12, 5), torch.randn(1, 7)
+    step, told = torch.tensor([30]), torch.tensor([True])
+    mask = torch.arange(12)[None] < 8
+    padded = net(x, step, text, mask, told)
+    alone = net(x[:, :8], step, text, mask[:, :8], told)
+    torch.testing.assert_close(padded[:, :8], alone, atol=1e-5, rtol=1e-5)
+    assert (padded[:, 8:] == 0).all()
+
+
+def test_hidden_text_has_no_influence() -> None:
+    torch.manual_seed(0)
+    net = MotionDiffusion(SMALL, 5, 7).eval()
+    x, mask, step = torch.randn(1, 12, 5), torch.ones(1, 12, dtype=torch.bool), torch.tensor([30])
+    for told, same in ((False, True), (True, False)):
+        pair = [net(x, step, torch.randn(1, 7) * 3, mask, torch.tensor([told])) for _ in range(2)]
+        assert torch.allclose(*pair, atol=1e-6) is same
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
+def test_learns_which_motion_a_text_means(sampler: Sampler) -> None:
+    """Two texts, two constant motions: each text must give its own."""
+    torch.manual_seed(0)
+    net = MotionDiffusion(SMALL, 3, 2)
+    module = DiffusionModule(net, OptimConfig(lr=3e-3), seed=0, max_steps=150)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
+    text = torch.eye(2).repeat(16, 1)
+    motion = (text[:, :1] * 2 - 1)[:, None].expand(-1, 8, 3) * torch.tensor([1.0, -1.0, 0.5])
+    batch = {"motion": motion, "length": torch.full((32,), 8), "sentence": text}
+    module.train()
+    for _ in range(150):
+        optimizer.zero_grad()
+        module.losses(batch)["loss"].backward()
+        optimizer.step()
+    made = sample_motions(net, torch.eye(2), [8, 8], seeds=[1, 2], sampler=sampler, steps=20, guidance=2.0)
+    for found, wanted in zip(made, motion[:2], strict=True):
+        assert (found - wanted).abs().mean() < 0.35  # the other text's motion is 1.67 away
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
+def test_a_motion_does_not_depend_on_its_batch(sampler: Sampler) -> None:
+    torch.manual_seed(0)
+    net = MotionDiffusion(SMALL, 5, 7)
+    text = torch.randn(3, 7)
+    together = sample_motions(net, text, [8, 12, 8], seeds=[4, 5, 6], sampler=sampler, steps=5)
+    for row, frames in enumerate([8, 12, 8]):
+        alone = sample_motions(net, text[row : row + 1], [frames], seeds=[4 + row], sampler=sampler, steps=5)
+        torch.testing.assert_close(together[row], alone[0], atol=1e-4, rtol=1e-4)
+        assert together[row].shape == (frames, 5)

@@ -1,0 +1,310 @@
+"""The GPT's network and losses: grammar, cache, padding, alignment, frozen neighbours."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.losses import corrupt, cross_entropy, soft_codes
+from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.tokenizer.base import Stream
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import H2VQConfig
+from motionloom.models.training.stage_module import OptimConfig
+
+PATTERN = ("body", "body", "hand")
+STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
+ENDS = {"body": 7, "hand": 5}
+TINY = GptConfig(
+    layers=2, dim=32, heads=4, ff=64, block_size=30, dropout=0.0, attention_dropout=0.0, pkeep=1.0
+)
+
+
+@pytest.fixture
+def gpt() -> InterleavedGPT:
+    torch.manual_seed(0)
+    return InterleavedGPT(TINY, STREAMS, PATTERN, text_dim=6).eval()
+
+
+def sequences(groups: list[int], seed: int = 0) -> TokenSequence:
+    generator = torch.Generator().manual_seed(seed)
+    most = max(groups)
+    codes = {
+        s.name: torch.randint(0, s.num_codes, (len(groups), most * s.per_group), generator=generator)
+        for s in STREAMS
+    }
+    return interleave(codes, PATTERN, ends=ENDS, groups=torch.tensor(groups))
+
+
+@torch.no_grad()
+def test_only_legal_tokens_have_logits(gpt: InterleavedGPT) -> None:
+    seq = sequences([2, 3])
+    logits = gpt(seq.tokens, seq.kinds, torch.randn(2, 6))
+    assert logits.shape == (2, 11, 8)
+    legal = torch.isfinite(logits)
+    body, body_or_end = {*range(7)}, {*range(8)}
+    hand = {*range(5)}
+    group = [body_or_end, body, hand]
+    expected = [[*group * 2, body_or_end, {5}], [*group * 3, body_or_end, {5}]]
+    for row, sets in enumerate(expected):
+        for position, allowed in enumerate(sets):
+            assert set(legal[row, position].nonzero()[:, 0].tolist()) == allowed, (row, position)
+
+
+@torch.no_grad()
+def test_cached_equals_uncached(gpt: InterleavedGPT) -> None:
+    seq, text = sequences([4, 4]), torch.randn(2, 6)
+    full = gpt(seq.tokens, seq.kinds, text)
+    x = torch.cat([gpt.embed_text(text), gpt.embed(seq.tokens[:, :-1], seq.kinds[:, :-1])], dim=1)
+    legal = gpt.legal(seq.tokens, seq.kinds)
+    for chunks in ([1] * 14, [5, 1, 1, 4, 3], [14]):
+        cache, parts = gpt.stack.cache(14), []
+        for piece in x.split(chunks, dim=1):
+            parts.append(gpt.hidden(piece, cache))
+        assert cache.length == 14
+        cached = gpt.logits(torch.cat(parts, dim=1), seq.kinds, legal)
+        torch.testing.assert_close(cached, full, rtol=1e-5, atol=1e-5)
+    with pytest.raises(ValueError, match="holds 14 positions, 15 were asked"):
+        gpt.hidden(x[:, :1], cache)
+
+
+@torch.no_grad()
+def test_batch_of_mixed_lengths_equals_one_at_a_time(gpt: InterleavedGPT) -> None:
+    seq, text = sequences([1, 5, 3]), torch.randn(3, 6)
+    together = gpt(seq.tokens, seq.kinds, text)
+    for row in range(3):
+        n = int(seq.length[row])
+        alone = gpt(seq.tokens[row : row + 1, :n], seq.kinds[row : row + 1, :n], text[row : row + 1])
+        torch.testing.assert_close(alone[0], together[row, :n], rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_cached_batch_of_mixed_lengths_equals_each_alone_uncached(gpt: InterleavedGPT) -> None:
+    seq, text = sequences([1, 5, 3]), torch.randn(3, 6)
+    x = torch.cat([gpt.embed_text(text), gpt.embed(seq.tokens[:, :-1], seq.kinds[:, :-1])], dim=1)
+    cache = gpt.stack.cache(x.shape[1])
+    hidden = torch.cat([gpt.hidden(piece, cache) for piece in x.split(1, dim=1)], dim=1)
+    cached = gpt.logits(hidden, seq.kinds, gpt.legal(seq.tokens, seq.kinds))
+    for row in range(3):
+        n = int(seq.length[row])
+        alone = gpt(seq.tokens[row : row + 1, :n], seq.kinds[row : row + 1, :n], text[row : row + 1])
+        torch.testing.assert_close(cached[row, :n], alone[0], rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_causal_and_conditional(gpt: InterleavedGPT) -> None:
+    seq, text = sequences([4]), torch.randn(1, 6)
+    full = gpt(seq.tokens, seq.kinds, text)
+    other = seq.tokens.clone()
+    other[0, 6] = (other[0, 6] + 1) % 7
+    changed = gpt(other, seq.kinds, text)
+    torch.testing.assert_close(changed[:, :7], full[:, :7])
+    finite = torch.isfinite(full)
+    assert (changed[finite] - full[finite]).abs()[:].max() > 1e-4
+    moved = gpt(seq.tokens, seq.kinds, text + 1)
+    assert (moved[0, 0] - full[0, 0])[:7].abs().max() > 1e-4
+    null = gpt(seq.tokens, seq.kinds, text, drop_text=torch.tensor([True]))
+    null_other = gpt(seq.tokens, seq.kinds, text + 1, drop_text=torch.tensor([True]))
+    torch.testing.assert_close(null, null_other)
+
+
+def test_cross_entropy_equals_token_by_token(gpt: InterleavedGPT) -> None:
+    seq = sequences([2, 4, 1])
+    logits = gpt(seq.tokens, seq.kinds, torch.randn(3, 6))
+    total, count = 0.0, 0
+    for row in range(3):
+        for position in range(int(seq.length[row]) - 1):  # the hand's End after the body's End is certain
+            values = [v for v in logits[row, position].tolist() if v != float("-inf")]
+            norm = torch.logsumexp(torch.tensor(values, dtype=torch.float64), 0).item()
+            total += norm - logits[row, position, seq.tokens[row, position]].item()
+            count += 1
+    loss = cross_entropy(logits, seq.tokens)
+    assert loss.item() == pytest.approx(total / count, rel=1e-5)
+    loss.backward()
+    assert all(torch.isfinite(p.grad).all() for p in gpt.parameters() if p.grad is not None)
+
+
+def test_corruption_stays_in_the_stream() -> None:
+    seq = sequences([8] * 200)
+    ends = torch.tensor([7, 5])
+    torch.manual_seed(0)
+    out = corrupt(seq.tokens, seq.kinds, ends, 0.5)
+    code = (seq.tokens != PAD) & (seq.tokens != ends[seq.kinds])
+    assert torch.equal(out[~code], seq.tokens[~code])
+    assert (out[code] < ends[seq.kinds][code]).all()
+    assert (out[code] >= 0).all()
+    for kind, size in enumerate((7, 5)):
+        here = code & (seq.kinds == kind)
+        assert set(out[here].tolist()) == set(range(size))
+        # Half are redrawn, and a redraw hits the old code once in `size`.
+        changed = (out[here] != seq.tokens[here]).float().mean().item()
+        assert changed == pytest.approx(0.5 * (1 - 1 / size), abs=0.04)
+    assert torch.equal(corrupt(seq.tokens, seq.kinds, ends, 1.0), seq.tokens)
+
+
+def test_paper_config_has_228_million_parameters() -> None:
+    config = GptConfig()
+    assert (config.layers, config.dim, config.heads, config.ff, config.block_size) == (
+        18,
+        1024,
+        16,
+        4096,
+        150,
+    )
+    assert config.dropout == 0.1
+    with torch.device("meta"):
+        gpt = InterleavedGPT(config, (Stream("body", 512, 2), Stream("hand", 512, 1)), PATTERN, 256)
+    assert sum(p.numel() for p in gpt.parameters()) == pytest.approx(228e6, rel=0.015)
+    assert gpt.max_groups == 49
+
+
+def test_too_long_and_unknown_streams_are_refused(gpt: InterleavedGPT) -> None:
+    seq = sequences([10])
+    with pytest.raises(UserError, match="block_size 30"):
+        gpt(seq.tokens, seq.kinds, torch.randn(1, 6))
+    with pytest.raises(UserError, match="names \\['face'\\]"):
+        InterleavedGPT(TINY, STREAMS, ("body", "face"), 6)
+
+
+# --- alignment
+# -------------------------------------------------------------------------------------------------------
+
+LAYOUT = MotionLayout.named("wholebody313")
+
+
+def align_module(**loss: float) -> tuple[GptModule, dict[str, torch.Tensor]]:
+    torch.manual_seed(0)
+    tokenizer = build_tokenizer(H2VQConfig(width=16, depth=1, code_dim=8, num_codes=9), LAYOUT)
+    for book in tokenizer.codebooks().values():
+        book.codebook.normal_()
+    tma = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 313, 10)
+    net = InterleavedGPT(TINY, tokenizer.streams, tokenizer.pattern, text_dim=16)
+    module = GptModule(
+        net,
+        OptimConfig(),
+        seed=0,
+        max_steps=10,
+        loss=GptLossConfig(**loss),
+        tokenizer=tokenizer,
+        tma=tma,
+    )
+    codes = {s.name: torch.randint(0, 9, (4, 5 * s.per_group)) for s in tokenizer.streams}
+    seq = interleave(codes, tokenizer.pattern, ends=net.num_codes, groups=torch.tensor([5, 2, 3, 4]))
+    batch = {**seq._asdict(), "text": torch.randn(4, 16), "similarity": torch.eye(4)}
+    return module, batch
+
+
+def test_alignment_reaches_every_code_head() -> None:
+    """With the cross-entropy left out, the gradient of L_align alone moves both heads and both codebooks'
+    embeddings.
+    """
+    module, batch = align_module()
+    values = module.losses(batch)
+    assert values["loss"].item() == pytest.approx(
+        values["ce"].item() + 0.1 * values["align"].item(), rel=1e-5
+    )
+    values["align"].backward()
+    for head in module.net.heads:
+        gradient = head.weight.grad
+        assert torch.isfinite(gradient).all()
+        assert gradient[:-1].abs().max() > 0
+        assert gradient[-1].abs().max() == 0  # End is no part of the decoded motion
+    assert module.net.text_in.weight.grad.abs().max() > 0
+
+
+def test_alignment_on_known_logits_decodes_the_codes() -> None:
+    module, batch = align_module()
+    net = module.net
+    logits = torch.full((4, batch["tokens"].shape[1], net.vocabulary), -50.0)
+    logits.scatter_(2, batch["tokens"].clamp(min=0)[..., None], 50.0)
+    groups = torch.tensor([5, 2, 3, 4])
+    for sample in (True, False):
+        weights = soft_codes(net, logits, groups, temperature=1.0, sample=sample)
+        for kind, name in enumerate(net.names):
+            for row in range(4):
+                real = batch["tokens"][row, : 3 * groups[row]]
+                mine = real[batch["kinds"][row, : 3 * groups[row]] == kind]
+                assert torch.equal(weights[name][row, : len(mine)].argmax(-1), mine)
+            torch.testing.assert_close(weights[name].sum(-1), torch.ones(weights[name].shape[:2]))
+    tokenizer = module.tokenizer.module
+    codes = {name: w.argmax(-1) for name, w in weights.items()}
+    torch.testing.assert_close(
+        tokenizer.decode_soft(weights, 4 * groups), tokenizer.decode(codes, 4 * groups), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_alignment_teaches_nothing_where_the_text_was_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    module, batch = align_module()
+    module.net.config = TINY.model_copy(update={"condition_dropout": 0.5})
+    seen: dict[str, torch.Tensor] = {}
+    forward = module.net.forward
+
+    def watched(*args: torch.Tensor, **named: torch.Tensor) -> torch.Tensor:
+        logits = forward(*args, **named)
+        logits.retain_grad()
+        seen.update(logits=logits, dropped=named["drop_text"])
+        return logits
+
+    monkeypatch.setattr(module.net, "forward", watched)
+    module.train()
+    torch.manual_seed(1)
+    module.losses(batch)["align"].backward()
+    moved = seen["logits"].grad.abs().sum((1, 2)) > 0
+    assert torch.equal(moved, ~seen["dropped"])
+    assert 0 < moved.sum() < len(moved), "both kinds are in the batch"
+
+
+def test_frozen_neighbours_cannot_change() -> None:
+    module, batch = align_module()
+    tokenizer, tma = module.tokenizer._module, module.tma._module
+    before = {k: v.clone() for k, v in [*tokenizer.state_dict().items(), *tma.state_dict().items()]}
+    module.train()
+    assert not tokenizer.training and not tma.training
+    assert not any(p.requires_grad for p in [*tokenizer.parameters(), *tma.parameters()])
+    assert set(module.state_dict()) == {f"net.{k}" for k in module.net.state_dict()}
+    optimizer = module.configure_optimizers()["optimizer"]
+    tuned = {id(p) for group in optimizer.param_groups for p in group["params"]}
+    assert tuned == {id(p) for p in module.net.parameters()}
+    for _ in range(2):
+        optimizer.zero_grad()
+        module.losses(batch)["loss"].backward()
+        optimizer.step()
+    after = dict([*tokenizer.state_dict().items(), *tma.state_dict().items()])
+    assert all(torch.equal(after[k], v) for k, v in before.items())
+
+
+def test_alignment_can_be_off() -> None:
+    module, batch = align_module(align_weight=0.0)
+    assert module.tokenizer is None
+    values = module.losses(batch)
+    assert set(values) == {"loss", "ce", "accuracy_body", "accuracy_hand"}
+    assert values["loss"] is values["ce"]
+
+
+def test_every_parameter_gets_a_gradient() -> None:
+    """DDP waits for all of them: the null text too, when no sample happens to lose its text."""
+    module, batch = align_module(align_weight=0.0)
+    module.losses(batch)["loss"].backward()
+    assert [name for name, p in module.net.named_parameters() if p.grad is None] == []
+
+
+def test_hand_over_is_checked() -> None:
+    module, batch = align_module()
+    tokenizer, tma = module.tokenizer._module, module.tma._module
+    keywords = {"seed": 0, "max_steps": 1}
+    with pytest.raises(UserError, match="needs a trained tokenizer"):
+        GptModule(module.net, OptimConfig(), **keywords)
+    with pytest.raises(UserError, match="not the tokenizer's"):
+        wrong = InterleavedGPT(TINY, STREAMS, PATTERN, 16)
+        GptModule(wrong, OptimConfig(), tokenizer=tokenizer, tma=tma, **keywords)
+    with pytest.raises(UserError, match="313 columns to a TMA of 133"):
+        small = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 133, 10)
+        GptModule(module.net, OptimConfig(), tokenizer=tokenizer, tma=small, **keywords)
+    wide = {**batch, "text": torch.randn(4, 16), "tma_text": torch.randn(4, 12)}
+    with pytest.raises(UserError, match="width 16"):
+        module.losses(wide)

@@ -1,0 +1,208 @@
+"""Sampling: grammar, lengths, seeds, filters, guidance; and a toy grammar learnt and sampled right."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.gpt.sampling import draw, filter_logits, generate, sample_seeds
+from motionloom.models.gpt.tokens import interleave
+from motionloom.models.tokenizer.base import Stream
+from motionloom.models.training.stage_module import OptimConfig
+
+PATTERN = ("body", "body", "hand")
+STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
+TINY = GptConfig(layers=2, dim=32, heads=4, ff=64, block_size=30, dropout=0.0, attention_dropout=0.0)
+
+
+@pytest.fixture
+def gpt() -> InterleavedGPT:
+    torch.manual_seed(0)
+    gpt = InterleavedGPT(TINY, STREAMS, PATTERN, text_dim=6)
+    for head in gpt.heads:
+        torch.nn.init.normal_(head.weight, std=0.5)  # peaked, so that a mixed-up draw would show
+    return gpt
+
+
+def rows_equal(one: object, row: int, many: object, at: int) -> bool:
+    groups = int(one.groups[row])
+    if groups != int(many.groups[at]):
+        return False
+    return all(
+        torch.equal(
+            one.codes[s.name][row, : groups * s.per_group], many.codes[s.name][at, : groups * s.per_group]
+        )
+        for s in STREAMS
+    )
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_alone_equals_in_a_batch(gpt: InterleavedGPT, scale: float) -> None:
+    text = torch.randn(7, 6)
+    seeds = sample_seeds(3, 7)
+    together = generate(gpt, text, seed=3, cfg_scale=scale)
+    again = generate(gpt, text, seed=seeds, cfg_scale=scale)
+    assert torch.equal(together.groups, again.groups)
+    assert len(set(together.groups.tolist())) > 1
+    for row in range(7):
+        alone = generate(gpt, text[row : row + 1], seed=[seeds[row]], cfg_scale=scale)
+        assert rows_equal(alone, 0, together, row)
+    chunk = generate(gpt, text[4:], seed=seeds[4:], cfg_scale=scale, max_groups=gpt.max_groups)
+    assert all(rows_equal(chunk, row, together, row + 4) for row in range(3))
+    other = generate(gpt, text, seed=4, cfg_scale=scale)
+    assert not all(rows_equal(other, row, together, row) for row in range(7))
+    assert sample_seeds(3, 2) == seeds[:2]
+
+
+def test_free_lengths_keep_the_grammar(gpt: InterleavedGPT) -> None:
+    gpt.train()
+    out = generate(gpt, torch.randn(40, 6), seed=0)
+    assert gpt.training
+    assert gpt.max_groups == 9
+    assert out.groups.min() >= 1
+    assert out.groups.max() <= 9
+    for stream in STREAMS:
+        codes = out.codes[stream.name]
+        assert codes.shape == (40, int(out.groups.max()) * stream.per_group)
+        assert (codes >= 0).all()
+        assert (codes < stream.num_codes).all()
+        behind = torch.arange(codes.shape[1])[None] >= stream.per_group * out.groups[:, None]
+        assert (codes[behind] == 0).all()
+    assert generate(gpt, torch.randn(40, 6), max_groups=2).groups.max() == 2
+
+
+def test_requested_lengths_are_kept(gpt: InterleavedGPT) -> None:
+    groups, text, seeds = torch.tensor([1, 9, 4, 9, 2]), torch.randn(5, 6), sample_seeds(1, 5)
+    out = generate(gpt, text, groups=groups, seed=1)
+    assert torch.equal(out.groups, groups)
+    for row in range(5):
+        mine = slice(row, row + 1)
+        assert rows_equal(generate(gpt, text[mine], groups=groups[mine], seed=seeds[mine]), 0, out, row)
+    for wrong in ([0, 1, 1, 1, 1], [1, 1, 1, 1, 10]):
+        with pytest.raises(UserError, match="1 to 9 groups"):
+            generate(gpt, torch.randn(5, 6), groups=torch.tensor(wrong))
+    with pytest.raises(UserError, match="1 to 9 groups"):
+        generate(gpt, torch.randn(5, 6), max_groups=10)
+
+
+def test_cached_sampling_equals_greedy_without_cache(gpt: InterleavedGPT) -> None:
+    text = torch.randn(3, 6)
+    out = generate(gpt, text, groups=torch.tensor([4, 4, 4]), temperature=0)
+    tokens = torch.zeros(3, 12, dtype=torch.int64)
+    kinds = gpt.slots.repeat(4).expand(3, -1)
+    with torch.no_grad():
+        for i in range(12):
+            logits = gpt.eval()(tokens, kinds, text)[:, i]
+            logits = logits.scatter(1, gpt.ends[kinds[:, i]][:, None], -torch.inf)
+            tokens[:, i] = logits.argmax(-1)
+    expected = tokens.view(3, 4, 3)
+    assert torch.equal(out.codes["body"], expected[:, :, :2].flatten(1))
+    assert torch.equal(out.codes["hand"], expected[:, :, 2])
+
+
+def test_guidance_mixes_the_two_distributions(gpt: InterleavedGPT) -> None:
+    text = torch.randn(50, 6)
+    groups = torch.full((50,), 1)
+    with torch.no_grad():
+        gpt.eval()
+        kinds, tokens = torch.zeros(50, 1, dtype=torch.int64), torch.zeros(50, 1, dtype=torch.int64)
+        on = gpt(tokens, kinds, text)[:, 0, :7]
+        off = gpt(tokens, kinds, text, drop_text=torch.ones(50, dtype=torch.bool))[:, 0, :7]
+    for scale in (0.0, 1.0, 3.0):
+        out = generate(gpt, text, groups=groups, temperature=0, cfg_scale=scale)
+        assert torch.equal(out.codes["body"][:, 0], (off + scale * (on - off)).argmax(-1))
+
+
+def test_draws_follow_the_distribution() -> None:
+    logits = torch.tensor([0.5, -torch.inf, 2.0, 1.0, -1.0]).expand(20_000, -1)
+    uniform = (torch.arange(20_000, dtype=torch.float64) + 0.5) / 20_000
+    for temperature in (1.0, 0.5):
+        share = torch.bincount(draw(logits, uniform, temperature=temperature), minlength=5) / 20_000
+        torch.testing.assert_close(share, (logits[0] / temperature).softmax(-1), rtol=0, atol=1e-4)
+    ends = torch.tensor([0.0, 1 - 2**-53], dtype=torch.float64)
+    assert draw(torch.tensor([[-torch.inf, 1.0, 1.0, -torch.inf]] * 2), ends).tolist() == [1, 2]
+
+
+def test_top_k_and_top_p() -> None:
+    logits = torch.tensor([[0.4, 0.1, 0.3, 0.2]]).log()
+
+    def kept(**settings: float) -> set[int]:
+        return set(torch.isfinite(filter_logits(logits, **settings))[0].nonzero()[:, 0].tolist())
+
+    assert kept(top_k=2) == {0, 2}
+    assert kept(top_k=9) == {0, 1, 2, 3}
+    assert kept(top_p=0.3) == {0}
+    assert kept(top_p=0.65) == {0, 2}
+    assert kept(top_p=0.75) == {0, 2, 3}
+    assert kept(top_p=1.0) == {0, 1, 2, 3}
+    assert kept(top_k=2, top_p=0.5) == {0}
+
+
+def test_bad_settings_are_refused(gpt: InterleavedGPT) -> None:
+    text = torch.randn(2, 6)
+    for settings, message in (
+        ({"temperature": -1.0}, "temperature"),
+        ({"top_k": 0}, "top_k"),
+        ({"top_p": 0.0}, "top_p"),
+        ({"seed": [1]}, "1 seeds were given for 2 texts"),
+    ):
+        with pytest.raises(UserError, match=message):
+            generate(gpt, text, **settings)
+    plain = InterleavedGPT(TINY.model_copy(update={"condition_dropout": 0.0}), STREAMS, PATTERN, 6)
+    with pytest.raises(UserError, match="condition_dropout"):
+        generate(plain, text, cfg_scale=2.0)
+
+
+def grammar(word: int, length: int) -> tuple[list[int], list[int]]:
+    """Body codes count up by word + 1 from word; a hand code is the sum of its group's two body codes modulo
+    5.
+    """
+    body = [(word + i * (word + 1)) % 7 for i in range(2 * length)]
+    return body, [(body[2 * i] + body[2 * i + 1]) % 5 for i in range(length)]
+
+
+def test_learns_a_toy_grammar() -> None:
+    """Text names a word and a length: sampled freely, codes and the place of End must be those of the
+    grammar.
+    """
+    torch.manual_seed(0)
+    pairs = [(word, length) for word in range(3) for length in (2, 4, 5)]
+    text = torch.stack([torch.cat([torch.eye(3)[w], torch.eye(6)[n]]) for w, n in pairs])
+    codes = {"body": torch.zeros(9, 10, dtype=torch.int64), "hand": torch.zeros(9, 5, dtype=torch.int64)}
+    for row, (word, length) in enumerate(pairs):
+        body, hand = grammar(word, length)
+        codes["body"][row, : 2 * length] = torch.tensor(body)
+        codes["hand"][row, :length] = torch.tensor(hand)
+    groups = torch.tensor([length for _, length in pairs])
+    seq = interleave(codes, PATTERN, ends={"body": 7, "hand": 5}, groups=groups)
+    net = InterleavedGPT(TINY.model_copy(update={"pkeep": 0.95}), STREAMS, PATTERN, text_dim=9)
+    module = GptModule(net, OptimConfig(), seed=0, max_steps=300, loss=GptLossConfig(align_weight=0))
+    optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
+    batch = {**seq._asdict(), "text": text}
+    for _ in range(300):
+        optimizer.zero_grad()
+        module.losses(batch)["loss"].backward()
+        optimizer.step()
+    module.eval()
+    with torch.no_grad():
+        values = module.losses(batch)
+    assert values["ce"] < 0.1
+    assert values["accuracy_body"] > 0.97
+    assert values["accuracy_hand"] > 0.97
+    for settings in (
+        {"temperature": 0},
+        {"top_p": 0.8, "seed": 5},
+        {"top_p": 0.8, "cfg_scale": 1.5, "seed": 6},
+    ):
+        out = generate(net, text, **settings)
+        assert torch.equal(out.groups, groups), settings
+        assert torch.equal(out.codes["body"], codes["body"])
+        assert torch.equal(out.codes["hand"], codes["hand"])
+
+
+def test_bfloat16_weights_sample(gpt: InterleavedGPT) -> None:
+    out = generate(gpt.to(torch.bfloat16), torch.randn(3, 6), groups=torch.tensor([2, 3, 1]), seed=0)
+    assert out.groups.tolist() == [2, 3, 1]

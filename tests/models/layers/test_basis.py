@@ -1,0 +1,183 @@
+"""The coordinates of the tokenizers: fingers as bones, the root louder, and back again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import roma
+import torch
+
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.models.layers.basis import Basis
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.stage_module import OptimConfig
+from motionloom.pipeline.evaluation.figures import local_joints
+
+LAYOUT = MotionLayout.named("wholebody363")
+RNG = np.random.default_rng(0)
+STD = RNG.uniform(0.1, 2.0, LAYOUT.dim).astype(np.float32)
+MEAN = RNG.standard_normal(LAYOUT.dim).astype(np.float32)
+WHOLE = MotionLayout.named("wholebody313")
+
+
+def basis_of(part: Part = "bodyhand", root_gain: float = 5.0, finger_gain: float = 2.0) -> Basis:
+    columns = LAYOUT.part(part)
+    basis = Basis(LAYOUT, columns, root_gain=root_gain, finger_gain=finger_gain)
+    basis.learn(MEAN[columns], STD[columns])
+    return basis
+
+
+@pytest.mark.parametrize("part", ["bodyhand", "all"])
+def test_out_is_the_inverse_of_in(part: Part) -> None:
+    basis = basis_of(part)
+    x = torch.from_numpy(RNG.standard_normal((2, 7, len(LAYOUT.part(part))))).float()
+    torch.testing.assert_close(basis.leave(basis.enter(x)), x, rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(basis.enter(basis.leave(x)), x, rtol=1e-5, atol=1e-4)
+
+
+def test_zero_is_the_mean() -> None:
+    basis, x = basis_of(), torch.zeros(1, 4, 313)
+    torch.testing.assert_close(basis.enter(x), x, rtol=0, atol=1e-5)
+    torch.testing.assert_close(basis.leave(x), x, rtol=0, atol=1e-5)
+
+
+def at(joint: int, field: str = "positions") -> slice:
+    """Columns of a joint; the root has no position."""
+    first = WHOLE.slice(field).start + 3 * (joint - (field == "positions"))
+    return slice(first, first + 3)
+
+
+def test_fingers_are_bones_and_the_rest_stays() -> None:
+    columns, basis = LAYOUT.part("bodyhand"), basis_of()
+    x = RNG.standard_normal((2, 5, len(columns))).astype(np.float32)
+    seen = basis.enter(torch.from_numpy(x)).numpy()
+    zero = basis._bent(torch.zeros(len(columns))).reshape(30, 3).numpy()
+    real = x * STD[columns] + MEAN[columns]
+    joints = local_joints(real, WHOLE)
+    velocities = (real - MEAN[columns])[..., WHOLE.slice("velocities")].reshape(2, 5, 52, 3)
+    speeds = STD[columns][WHOLE.slice("velocities")].reshape(52, 3)
+    for joint in range(22, 52):
+        parent = LAYOUT.skeleton.parents[joint]
+        bone = joints[..., joint, :] - joints[..., parent, :]
+        read = seen[..., at(joint)] * np.linalg.norm(LAYOUT.skeleton.offsets[joint]) / 2 + zero[joint - 22]
+        if parent < 22:
+            np.testing.assert_allclose(read, bone, rtol=1e-4, atol=1e-3)
+        else:
+            lengths = [np.linalg.norm(value, axis=-1) for value in (read, bone)]
+            np.testing.assert_allclose(*lengths, rtol=1e-4, atol=1e-3)
+        want = (velocities[..., joint, :] - velocities[..., parent, :]) / speeds[joint]
+        np.testing.assert_allclose(seen[..., at(joint, "velocities")], want, rtol=1e-4, atol=1e-3)
+    body = np.searchsorted(columns, LAYOUT.part("body"))
+    np.testing.assert_allclose(seen[..., body[:4]], 5 * x[..., body[:4]])
+    np.testing.assert_array_equal(seen[..., body[4:]], x[..., body[4:]])
+
+
+def test_turning_a_wrist_leaves_the_shape_of_its_hand() -> None:
+    basis, columns = basis_of(), LAYOUT.part("bodyhand")
+    skeleton, turn = LAYOUT.skeleton, roma.random_rotmat(6).numpy()
+    features = np.tile(RNG.standard_normal(len(columns)), (6, 1))
+    rest = skeleton.rest_joints + 0.01 * RNG.standard_normal((52, 3))
+    for joint in range(37, 52):  # the right hand, about its wrist
+        features[:, at(joint)] = rest[21] + turn @ (rest[joint] - rest[21])
+    features[:, at(21)] = rest[21]
+    x = torch.from_numpy((features - MEAN[columns]) / STD[columns]).float()
+    seen = basis.enter(x).numpy()
+    for joint in range(37, 52):
+        spread = np.abs(seen[..., at(joint)] - seen[:1, at(joint)]).max()
+        assert (spread < 1e-3) if skeleton.parents[joint] != 21 else (spread > 0.1)
+
+
+def test_moving_an_arm_leaves_its_fingers() -> None:
+    basis, x = basis_of(), torch.zeros(1, 1, 313)
+    moved = x.clone()
+    for joint in [20, *range(22, 37)]:  # the left wrist and its fingers
+        column = at(joint).start
+        moved[..., column] = 0.05 / float(STD[column])
+    changed = (basis.enter(moved) - basis.enter(x)).abs() > 1e-5
+    assert changed[0, 0].nonzero()[:, 0].tolist() == [at(20).start]
+
+
+def test_without_gains_nothing_changes_and_nothing_is_saved() -> None:
+    basis, x = basis_of(root_gain=1.0, finger_gain=0.0), torch.randn(1, 4, 313)
+    assert torch.equal(basis.enter(x), x) and torch.equal(basis.leave(x), x) and not basis.state_dict()
+
+
+SIZES = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8, "reset_below": 0.1}
+
+
+@pytest.mark.parametrize("config", [H2VQConfig, RvqConfig])
+def test_a_tokenizer_with_gains_gives_the_papers_features(config: type[H2VQConfig | RvqConfig]) -> None:
+    torch.manual_seed(0)
+    settings = config.model_validate({**SIZES, "root_gain": 5.0, "finger_gain": 2.0})
+    net = build_tokenizer(settings, LAYOUT)
+    net.basis.learn(MEAN[LAYOUT.part("bodyhand")], STD[LAYOUT.part("bodyhand")])
+    x, length = torch.randn(2, 16, 313), torch.tensor([16, 8])
+    x[1, 8:] = 0
+    codes = net.eval().encode(x, length)
+    out = net(x, length)
+    recon = net.features(out.written, length)
+    torch.testing.assert_close(net.decode(codes, length), recon, rtol=1e-4, atol=1e-4)
+    assert not recon[1, 8:].any(), "padding stays zero"
+    again = build_tokenizer(settings, LAYOUT)
+    again.load_state_dict(net.state_dict())
+    torch.testing.assert_close(again.eval().decode(codes, length), recon, rtol=1e-4, atol=1e-4)
+
+
+def test_the_loss_is_of_what_is_seen() -> None:
+    torch.manual_seed(0)
+    config = H2VQConfig.model_validate({**SIZES, "root_gain": 3.0, "finger_gain": 2.0})
+    net = build_tokenizer(config, LAYOUT)
+    net.basis.learn(MEAN[LAYOUT.part("bodyhand")], STD[LAYOUT.part("bodyhand")])
+    module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms()).eval()
+    x = torch.randn(2, 8, 313)
+    held = torch.from_numpy(LAYOUT.held_columns[[3, 0]])[:, LAYOUT.part("bodyhand")]
+    batch = {"motion": x, "length": torch.tensor([8, 8]), "held": held}
+    values = module.losses(batch)
+    error = (net.basis.enter(net.features(net(x, held=held).written)) - net.basis.enter(x)).square()
+    want = error[held[:, None].expand_as(error)].mean()
+    torch.testing.assert_close(values["recon"], want)
+    garbage = {**batch, "motion": torch.where(held[:, None], x, 7.0)}
+    torch.testing.assert_close(module.losses(garbage), values, rtol=0, atol=0)
+
+
+def test_hand_codes_read_the_shape_and_body_codes_the_turn() -> None:
+    torch.manual_seed(0)
+    net = build_tokenizer(H2VQConfig.model_validate({**SIZES, "num_codes": 256, "finger_gain": 2.0}), LAYOUT)
+    net.basis.learn(np.zeros(313), np.full(313, 0.05))
+    x = torch.randn(4, 16, 313)
+    net(x)  # the first batch makes the codebooks
+    seen = net.eval().basis.enter(x)
+    turned, bent = seen.clone(), seen.clone()
+    turned[..., net.basis.knuckles] = 5.0 * seen[..., net.basis.knuckles].flip(1)
+    bent[..., net.basis.bent] *= -3.0
+
+    def moved(coordinates: torch.Tensor, stream: str) -> float:
+        """Share of code vectors that change; twins of a vector among the first codes are one."""
+        book = net.codebooks()[stream]
+        before, after = (book.vectors(net.encode(f)[stream]) for f in (x, net.basis.leave(coordinates)))
+        return float(((before - after).abs().amax(-1) > 1e-3).float().mean())
+
+    assert moved(seen, "body") == 0 and moved(seen, "hand") == 0
+    assert moved(turned, "hand") == 0 and moved(turned, "body") > 0.3
+    assert moved(bent, "hand") > 0.3
+
+
+@pytest.mark.parametrize("part", ["body", "hand", "face"])
+def test_fingers_alone_are_refused(part: Part) -> None:
+    with pytest.raises(UserError, match="finger_gain"):
+        basis_of(part)
+
+
+@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
+def test_autocast_leaves_the_coordinates_in_float32(half: torch.dtype) -> None:
+    basis = basis_of()
+    x = torch.randn(2, 8, 313, generator=torch.Generator().manual_seed(0))
+    seen = basis.enter(x)
+    back = basis.leave(seen)
+    with torch.autocast("cpu", dtype=half):
+        assert torch.equal(basis.enter(x), seen)
+        assert torch.equal(basis.leave(seen), back)
+        assert basis.leave(seen.to(half)).dtype == torch.float32

@@ -1,0 +1,131 @@
+"""TMA's network and Lightning module: masks, shapes, strides, and that it learns to retrieve."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from motionloom.models.tma.module import TmaModule
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.training.stage_module import OptimConfig
+
+TINY = TmaConfig(latent=32, ff=64, layers=2, heads=2, dropout=0.0, attention_dropout=0.0)
+
+
+@pytest.fixture
+def net() -> Tma:
+    torch.manual_seed(0)
+    return Tma(TINY, motion_dim=6, text_dim=5).eval()
+
+
+@torch.no_grad()
+def test_padding_changes_nothing(net: Tma) -> None:
+    motion, tokens = torch.randn(3, 10, 6), torch.randn(3, 7, 5)
+    length, words = torch.tensor([10, 4, 7]), torch.tensor([7, 2, 1])
+    mask = torch.arange(7)[None] < words[:, None]
+    mu, logvar = net.encode_motion(motion, length)
+    text_mu, _ = net.encode_text(tokens, mask)
+    decoded = net.decode(mu, length, 10)
+    for i in range(3):
+        n, s = int(length[i]), int(words[i])
+        alone = net.encode_motion(motion[i : i + 1, :n], length[i : i + 1])
+        torch.testing.assert_close(alone[0][0], mu[i], rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(alone[1][0], logvar[i], rtol=1e-5, atol=1e-5)
+        text = net.encode_text(tokens[i : i + 1, :s], mask[i : i + 1, :s])
+        torch.testing.assert_close(text[0][0], text_mu[i], rtol=1e-5, atol=1e-5)
+        frames = net.decode(mu[i : i + 1], length[i : i + 1], n)
+        torch.testing.assert_close(frames[0], decoded[i, :n], rtol=1e-5, atol=1e-5)
+        assert (decoded[i, n:] == 0).all()
+
+
+@torch.no_grad()
+def test_order_of_frames_matters(net: Tma) -> None:
+    motion, length = torch.randn(1, 10, 6), torch.tensor([10])
+    mu, _ = net.encode_motion(motion, length)
+    back, _ = net.encode_motion(motion.flip(1), length)
+    assert (mu - back).abs().max() > 1e-3
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("stride", [2, 3])
+def test_frame_stride_sees_every_nth_frame_only(stride: int) -> None:
+    torch.manual_seed(0)
+    net = Tma(TINY.model_copy(update={"frame_stride": stride}), 6, 5).eval()
+    full = Tma(TINY, 6, 5).eval()
+    full.load_state_dict(net.state_dict())
+    motion, length = torch.randn(2, 11, 6), torch.tensor([11, 5])
+    strided, frames = net.strided(motion, length)
+    assert frames.tolist() == [-(-11 // stride), -(-5 // stride)]
+    torch.testing.assert_close(net.encode_motion(motion, length)[0], full.encode_motion(strided, frames)[0])
+    z = torch.randn(2, 32)
+    torch.testing.assert_close(net.decode(z, length, 11), full.decode(z, frames, strided.shape[1]))
+
+
+def test_wrong_widths_are_refused(net: Tma) -> None:
+    with pytest.raises(ValueError, match="6 motion features, got 4"):
+        net.encode_motion(torch.zeros(1, 8, 4), torch.tensor([8]))
+    with pytest.raises(ValueError, match="5 text features, got 4"):
+        net.encode_text(torch.zeros(1, 8, 4), torch.ones(1, 8, dtype=torch.bool))
+
+
+def test_paper_config() -> None:
+    config = TmaConfig()
+    assert (config.latent, config.ff, config.layers, config.heads, config.frame_stride) == (
+        256,
+        1024,
+        6,
+        4,
+        1,
+    )
+    with torch.device("meta"):
+        count = sum(p.numel() for p in Tma(config, 313, 384).parameters())
+    per_layer = 4 * 256 * 256 + 2 * 256 * 1024
+    assert count == pytest.approx(3 * 6 * per_layer, rel=0.05)
+
+
+def toy_batch(seed: int, size: int = 32) -> dict[str, torch.Tensor]:
+    """Frequency, amplitude and drift of a curve are named by three "words"; 4 x 2 x 4 = 32 captions, one per
+    row.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    kind = torch.arange(size)
+    words = torch.stack([kind % 4, 4 + kind // 4 % 2, 6 + kind // 8], dim=1)
+    length = torch.randint(12, 17, (size,), generator=generator)
+    time = torch.arange(16)[None, :, None] / 16
+    phase = 0.2 * torch.rand(size, 1, 3, generator=generator)
+    rate = (1 + kind % 4)[:, None, None]
+    curve = (1 + kind // 4 % 2)[:, None, None] * torch.sin(6.28 * rate * time + phase)
+    drift = (kind // 8)[:, None, None] * time.expand(size, 16, 3)
+    motion = torch.cat([curve, drift], dim=2) + 0.05 * torch.randn(size, 16, 6, generator=generator)
+    motion = motion * (torch.arange(16)[None] < length[:, None])[..., None]
+    tokens = torch.eye(10)[words]
+    return {
+        "motion": motion,
+        "length": length,
+        "text_tokens": tokens,
+        "text_mask": torch.ones(size, 3, dtype=torch.bool),
+        "similarity": torch.eye(size),
+    }
+
+
+def test_learns_to_retrieve() -> None:
+    """Held-out noise and phases of 32 captions: chance is 1/32."""
+    torch.manual_seed(0)
+    net = Tma(TINY, motion_dim=6, text_dim=10)
+    module = TmaModule(net, OptimConfig(lr=2e-3), seed=0, max_steps=150)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=2e-3)
+    for step in range(150):
+        loss = module.losses(toy_batch(step))["loss"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    module.eval()
+    batch = toy_batch(10_000)
+    with torch.no_grad():
+        values = module.losses(batch)
+        text, _ = net.encode_text(batch["text_tokens"], batch["text_mask"])
+        motion, _ = net.encode_motion(batch["motion"], batch["length"])
+    similar = torch.nn.functional.normalize(text, dim=1) @ torch.nn.functional.normalize(motion, dim=1).T
+    top1 = (similar.argmax(1) == torch.arange(32)).float().mean().item()
+    assert top1 > 0.6, values
+    assert values["rec_motion"] < 0.15, values  # a mean pose gives 0.4

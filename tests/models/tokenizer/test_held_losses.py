@@ -1,0 +1,185 @@
+"""Columns that a clip does not hold change no loss, gradient or codebook, whatever stands in them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.diffusion.module import DiffusionModule
+from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig
+from motionloom.models.tma.module import TmaModule
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import (
+    AnyTokenizerConfig,
+    FsqConfig,
+    H2VQConfig,
+    RvqConfig,
+    SeparateConfig,
+    VqConfig,
+)
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.stage_module import OptimConfig, StageModule
+
+LAYOUT = MotionLayout.named("wholebody363")
+SMALL: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "velocity_weight": 0.5}
+BOOK: dict[str, Any] = {**SMALL, "num_codes": 8, "reset_below": 0.1}
+CONFIGS: dict[str, AnyTokenizerConfig] = {
+    "h2vq": H2VQConfig(**BOOK),
+    "separate": SeparateConfig(**BOOK),
+    "vq all": VqConfig(**BOOK, part="all"),
+    "rvq bodyhand": RvqConfig(**BOOK, part="bodyhand"),
+    "fsq": FsqConfig(**SMALL, steps=(4, 4)),
+}
+HELD = [3, 1, 2, 0]
+LENGTH = torch.tensor([16, 12, 16, 9])
+
+
+def module_of(config: AnyTokenizerConfig) -> TokenizerModule:
+    torch.manual_seed(0)
+    net = build_tokenizer(config, LAYOUT)
+    return TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms())
+
+
+def batch_of(columns: Tensor, held: list[int], garbage: float = 0.0) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(5)
+    motion = torch.randn(len(held), 16, len(columns), generator=generator)
+    mask = torch.from_numpy(LAYOUT.held_columns[held])[:, columns]
+    motion = torch.where(mask[:, None], motion, garbage * (1 + motion))
+    return {"motion": motion, "length": LENGTH[: len(held)], "held": mask}
+
+
+def trained(module: StageModule, batches: list[dict[str, Tensor]]) -> tuple[list[dict], list, dict]:
+    """Losses of each batch, gradients of the last, and all weights and buffers after it."""
+    losses = []
+    for batch in batches:
+        module.zero_grad()
+        torch.manual_seed(3)
+        values = module.losses(batch)
+        values["loss"].backward()
+        losses.append({k: v.detach().clone() for k, v in values.items()})
+    return losses, [p.grad for p in module.parameters()], module.state_dict()
+
+
+def same(one: Any, other: Any) -> None:
+    torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("kind", list(CONFIGS))
+def test_garbage_in_missing_columns_changes_nothing(kind: str) -> None:
+    runs = []
+    for garbage in (0.0, 50.0):
+        module = module_of(CONFIGS[kind])
+        columns = module.net.columns
+        batches = [batch_of(columns, held, garbage) for held in (HELD, [1, 2, 0, 0], HELD[::-1])]
+        runs.append((*trained(module, batches), module.net.encode(**encode_arguments(batches[0]))))
+    same(*runs)
+    assert all(grad is not None for grad in runs[0][1])
+
+
+def encode_arguments(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {"x": batch["motion"], "length": batch["length"], "held": batch["held"]}
+
+
+@pytest.mark.parametrize("kind", list(CONFIGS))
+def test_all_held_is_the_same_as_not_told(kind: str) -> None:
+    runs = []
+    for told in (True, False):
+        module = module_of(CONFIGS[kind])
+        batch = batch_of(module.net.columns, [3, 3, 3, 3])
+        if not told:
+            del batch["held"]
+        runs.append(trained(module, [batch, batch]))
+    same(*runs)
+
+
+@pytest.mark.parametrize("kind", ["h2vq", "separate"])
+def test_hand_codes_learn_from_clips_with_hands_alone(kind: str) -> None:
+    """The hand codebook after a mixed batch is that after the clips with hands by themselves."""
+    books = []
+    for rows in ([0, 1, 2, 3], [0, 1]):
+        module = module_of(CONFIGS[kind])
+        batch = batch_of(module.net.columns, [3, 1, 2, 0])
+        part = {name: value[rows] for name, value in batch.items()}
+        for _ in range(3):
+            out = module.net(part["motion"], part["length"], part["held"])
+        assert out.codes["hand"].max() < 8
+        books.append((module.net.codebooks()["hand"].codebook, out.metrics["penalty_hand"]))
+    torch.testing.assert_close(*books)
+
+
+@pytest.mark.parametrize("kind", ["h2vq", "separate"])
+def test_a_batch_without_hands_teaches_the_hands_nothing(kind: str) -> None:
+    module = module_of(CONFIGS[kind])
+    columns = module.net.columns
+    trained(module, [batch_of(columns, HELD)])
+    book = module.net.codebooks()["hand"]
+    before = {k: v.clone() for k, v in book.state_dict().items() if k != "draws"}  # type: ignore[attr-defined]
+    losses, _, _ = trained(module, [batch_of(columns, [0, 2, 0])])
+    after = {k: v for k, v in book.state_dict().items() if k != "draws"}  # type: ignore[attr-defined]
+    torch.testing.assert_close(after, before, rtol=1e-6, atol=0)
+    assert losses[0]["resets_hand"] == 0 and losses[0]["penalty_hand"] == 0
+    for name, parameter in module.net.named_parameters():
+        if "hand_encoder" in name or "encoders.hand" in name or "decoders.hand" in name:
+            assert (parameter.grad == 0).all(), name
+
+
+def test_decoding_knows_of_no_hands_as_training_does() -> None:
+    net = module_of(CONFIGS["h2vq"]).net
+    batch = batch_of(net.columns, HELD)
+    net(batch["motion"], batch["length"], batch["held"])
+    net.eval()
+    out = net(batch["motion"], batch["length"], batch["held"])
+    decoded = net.decode(out.codes, batch["length"], batch["held"])
+    torch.testing.assert_close(decoded, net.features(out.written, batch["length"]), rtol=1e-4, atol=1e-5)
+
+
+def test_a_quantizer_waits_for_its_first_vectors() -> None:
+    torch.manual_seed(0)
+    book = EmaQuantizer(QuantizerConfig(num_codes=4, dim=3, reset_below=0.5))
+    before = book.codebook.clone()
+    z = torch.randn(2, 8, 3)
+    out = book(z, torch.zeros(2, 8, dtype=torch.bool))
+    assert torch.equal(book.codebook, before) and out.penalty == 0 and out.metrics["resets"] == 0
+    for _ in range(4):
+        book(z)
+    rows = z.reshape(-1, 3)
+    assert (torch.cdist(book.codebook, rows).min(1).values < 1).all(), "random codes are replaced"
+
+
+def captioned(held: list[int], columns: Tensor) -> dict[str, Tensor]:
+    size = len(held)
+    torch.manual_seed(2)
+    return batch_of(columns, held) | {
+        "text_tokens": torch.randn(size, 3, 6),
+        "text_mask": torch.ones(size, 3, dtype=torch.bool),
+        "sentence": torch.randn(size, 6),
+        "similarity": torch.eye(size, 6),
+    }
+
+
+@pytest.mark.parametrize("kind", ["tma", "diffusion"])
+def test_missing_columns_are_not_reconstructed(kind: str) -> None:
+    columns = torch.from_numpy(LAYOUT.part("bodyhand"))
+    torch.manual_seed(0)
+    module: StageModule
+    if kind == "tma":
+        net = Tma(TmaConfig(latent=8, ff=8, layers=1, heads=2, dropout=0, attention_dropout=0), 313, 6)
+        module, bias = TmaModule(net, OptimConfig(), seed=0, max_steps=1), net.motion_decoder.out.bias
+    else:
+        denoiser = MotionDiffusion(DiffusionConfig(dim=8, ff=8, layers=1, heads=2), 313, 6)
+        module = DiffusionModule(denoiser, OptimConfig(), seed=0, max_steps=1)
+        bias = next(p for p in denoiser.parameters() if p.shape == (313,))
+    hand = torch.from_numpy(LAYOUT.part("hand"))
+    losses, _, _ = trained(module, [captioned([0, 2, 0, 2], columns)])
+    assert bias.grad is not None and (bias.grad[hand] == 0).all() and bias.grad[:60].abs().min() > 0
+    told = captioned([3, 3, 3, 3], columns)
+    whole, _, _ = trained(module, [told])
+    del told["held"]
+    same(trained(module, [told])[0], whole)
+    assert torch.isfinite(losses[0]["loss"]) and losses[0]["loss"] != whole[0]["loss"]

@@ -1,0 +1,167 @@
+"""Tokenizer losses against slow references, and that training learns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import H2VQConfig, Recon, RvqConfig, VqConfig
+from motionloom.models.tokenizer.losses import reconstruction_loss, tokenizer_loss, velocity_loss
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.stage_module import OptimConfig, StageModule
+
+LAYOUT = MotionLayout.named("wholebody363")
+TINY: dict[str, Any] = {"width": 32, "depth": 1, "code_dim": 16, "num_codes": 32}
+
+
+def slow_error(a: Tensor, b: Tensor, kind: Recon) -> list[float]:
+    out = []
+    for d in (a - b).flatten().tolist():
+        out.append(d * d if kind == "l2" else (0.5 * d * d if abs(d) < 1 else abs(d) - 0.5))
+    return out
+
+
+@pytest.mark.parametrize("kind", ["l2", "smooth_l1"])
+def test_losses_equal_a_slow_reference(kind: Recon) -> None:
+    torch.manual_seed(0)
+    a, b = 2 * torch.randn(3, 6, 2), torch.randn(3, 6, 2)
+    length = torch.tensor([6, 2, 1])
+    still, moving = [], []
+    for i, n in enumerate(length.tolist()):
+        still += slow_error(a[i, :n], b[i, :n], kind)
+        if n > 1:
+            moving += slow_error(a[i, 1:n] - a[i, : n - 1], b[i, 1:n] - b[i, : n - 1], kind)
+    recon, velocity = reconstruction_loss(a, b, length, kind), velocity_loss(a, b, length, kind)
+    assert recon.item() == pytest.approx(sum(still) / len(still), rel=1e-5)
+    assert velocity.item() == pytest.approx(sum(moving) / len(moving), rel=1e-5)
+    full = reconstruction_loss(a, b, None, kind)
+    assert full.item() == pytest.approx(sum(slow_error(a, b, kind)) / a.numel(), rel=1e-5)
+    assert reconstruction_loss(a, b, torch.full((3,), 6), kind).item() == pytest.approx(full.item())
+
+
+def test_total_is_the_weighted_sum() -> None:
+    a, b, penalty = torch.randn(2, 8, 3), torch.randn(2, 8, 3), torch.tensor(4.0)
+    terms = tokenizer_loss(a, b, penalty, None, alpha=0.5, recon="l2", velocity_weight=2.0)
+    assert set(terms) == {"loss", "recon", "commit", "velocity"}
+    torch.testing.assert_close(terms["loss"], terms["recon"] + 2 * terms["velocity"] + 0.5 * penalty)
+    plain = tokenizer_loss(a, b, penalty, None, alpha=0.02, recon="l2", velocity_weight=0.0)
+    assert set(plain) == {"loss", "recon", "commit"}
+    torch.testing.assert_close(plain["loss"], (a - b).square().mean() + 0.08)
+
+
+class Waves(Dataset[dict[str, Tensor]]):
+    """Whole batches of sinusoids; one pace and phase per clip drive every column, as a gait drives a body."""
+
+    def __init__(self, columns: Tensor, batches: int, seed: int) -> None:
+        self.columns, self.batches, self.seed = columns, batches, seed
+        generator = torch.Generator().manual_seed(0)  # the same body for every seed
+        self.shift = torch.rand(363, generator=generator) * 6.28
+        self.size = 0.5 + torch.rand(363, generator=generator)
+
+    def __len__(self) -> int:
+        return self.batches
+
+    def __getitem__(self, k: int) -> dict[str, Tensor]:
+        generator = torch.Generator().manual_seed(self.seed * 1000 + k)
+        pace = 0.15 + 0.15 * torch.rand(32, 1, 1, generator=generator)
+        start = 6.28 * torch.rand(32, 1, 1, generator=generator)
+        length = torch.where(torch.arange(32) % 4 == 0, 18, 32)
+        motion = self.size * torch.sin(pace * torch.arange(32.0)[:, None] + start + self.shift)
+        motion = motion.masked_fill((torch.arange(32) >= length[:, None])[..., None], 0.0)
+        return {"motion": motion[..., self.columns], "length": length}
+
+
+CONFIGS = [H2VQConfig(**TINY), VqConfig(**TINY), RvqConfig(**TINY, part="face")]
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda c: c.kind)
+def test_training_beats_the_mean(config: H2VQConfig | VqConfig | RvqConfig) -> None:
+    """120 steps leave under 5 % of the held-out variance unexplained (measured: 1.4 to 1.8 %)."""
+    torch.manual_seed(0)
+    net = build_tokenizer(config, LAYOUT)
+    module = TokenizerModule(net, OptimConfig(lr=2e-3), seed=1, max_steps=120, **config.loss_terms())
+    trainer = L.Trainer(
+        max_steps=120,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(module, DataLoader(Waves(net.columns, 120, seed=1), batch_size=None))
+    held_out = Waves(net.columns, 1, seed=2)[0]
+    module.eval()
+    with torch.no_grad():
+        values = module.losses(held_out)
+    mean = torch.zeros_like(held_out["motion"])  # the data has mean zero
+    ratio = values["recon"] / reconstruction_loss(mean, held_out["motion"], held_out["length"], "l2")
+    assert ratio < 0.05
+    streams = {s.name for s in net.streams}
+    metrics = {f"{m}_{s}" for m in ("perplexity", "usage", "dead", "resets", "penalty") for s in streams}
+    assert set(values) == {"loss", "recon", "commit"} | metrics
+    assert all(v.shape == () for v in values.values())
+    assert all(values[f"perplexity_{s}"] > 4 for s in streams)
+
+
+def test_same_seed_same_weights() -> None:
+    config = RvqConfig(**TINY, part="face")
+    states = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        net = build_tokenizer(config, LAYOUT)
+        module = TokenizerModule(net, OptimConfig(), seed=1, max_steps=5, **config.loss_terms())
+        trainer = L.Trainer(max_steps=5, accelerator="cpu", logger=False, enable_checkpointing=False,
+                            enable_progress_bar=False, enable_model_summary=False)  # fmt: skip
+        trainer.fit(module, DataLoader(Waves(net.columns, 5, seed=1), batch_size=None))
+        states.append(net.state_dict())
+    assert all(torch.equal(v, states[1][k]) for k, v in states[0].items())
+
+
+class Counting(StageModule):
+    """A loss that grows by one a batch."""
+
+    def __init__(self) -> None:
+        super().__init__(torch.nn.Linear(1, 1), OptimConfig(), seed=0, max_steps=20)
+        self.batches = 0
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        self.batches += 1
+        return {"loss": self.net(torch.zeros(1)).sum() * 0 + self.batches}
+
+
+class Rows(L.Callback):
+    """What the module logs, by step."""
+
+    def __init__(self) -> None:
+        self.rows: dict[int, float] = {}
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        if "train/loss" in trainer.callback_metrics:
+            self.rows.setdefault(trainer.global_step, float(trainer.callback_metrics["train/loss"]))
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_a_row_of_the_log_is_the_mean_since_the_last(parts: int) -> None:
+    rows = Rows()
+    trainer = L.Trainer(
+        max_steps=20,
+        accumulate_grad_batches=parts,
+        accelerator="cpu",
+        logger=False,
+        callbacks=[rows],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    batches = [{"length": torch.ones(1)} for _ in range(20 * parts)]
+    trainer.fit(Counting(), DataLoader(batches, batch_size=None))
+    assert rows.rows[10] == pytest.approx(np.mean(range(1, 10 * parts + 1)))
+    assert rows.rows[20] == pytest.approx(np.mean(range(10 * parts + 1, 20 * parts + 1)))

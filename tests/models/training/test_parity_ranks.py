@@ -1,0 +1,305 @@
+"""Training on two ranks equals training in one process, for every kind of stage, over 20 optimizer steps.
+
+Two gloo processes with half of each batch each, under DDP as the pipeline sets it up, against one process
+with the whole batch: the loss of every step, the last gradients and the weights and codebooks agree to 1e-5.
+Ranks hold different numbers of real frames and tokens, and in one case no hands. Losses with collectives are
+also compiled, as one graph.
+
+The networks that learn are float64. In float32 the order of a sum changes the last bit, and AdamW divides a
+gradient by its own size: where the true gradient is zero (the bias of attention keys, which a softmax
+cancels) it turns that bit into a step of the learning rate. Codebooks, losses and code assignment stay
+float32, as in training.
+Nothing is drawn: there is no dropout, and the networks that sample latents or codes run in evaluation mode,
+or draw by seeds that do not depend on the rank.
+
+The processes run this file as a script.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.diffusion.module import DiffusionModule
+from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.gpt.tokens import interleave
+from motionloom.models.tma.module import TmaLossConfig, TmaModule
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import (
+    AnyTokenizerConfig,
+    FsqConfig,
+    H2VQConfig,
+    RvqConfig,
+    SeparateConfig,
+)
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.distributed import rank, world_size
+from motionloom.models.training.stage_module import OptimConfig, StageModule
+
+STEPS = 20
+BATCH, FRAMES, TEXT = 6, 24, 6
+LAYOUT = MotionLayout.named("wholebody313")
+OPTIM = OptimConfig(lr=1e-3)
+LENGTH = torch.tensor([24, 23, 9, 5, 24, 2])  # 56 real frames on the first rank, 31 on the second
+SMALL: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "velocity_weight": 0.5}
+# Few enough uses that codes are reset, after the first step too.
+BOOK: dict[str, Any] = {**SMALL, "num_codes": 12, "decay": 0.8, "alpha": 0.5, "reset_below": 0.6}
+
+Batches = Callable[[int], dict[str, Tensor]]
+
+
+def motion(step: int, dim: int) -> dict[str, Tensor]:
+    """A moving distribution, so that codes die on the way; behind a clip's end there is rubbish."""
+    generator = torch.Generator().manual_seed(step)
+    values = torch.randn(BATCH, FRAMES, dim, generator=generator, dtype=torch.float64)
+    return {"motion": values + 0.05 * step, "length": LENGTH}
+
+
+def tokenizer(config: AnyTokenizerConfig, handed: tuple[bool, ...] = ()) -> tuple[StageModule, Batches]:
+    """`handed` says which clips of a batch hold hands; all when empty."""
+    net = build_tokenizer(config, LAYOUT)
+    net.basis.learn(
+        np.zeros(net.dim), np.full(net.dim, 0.02)
+    )  # independent noise in every column bends fingers wildly
+    module = TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms())
+    held = torch.ones(BATCH, net.dim, dtype=torch.bool)
+    for row in (row for row, has in enumerate(handed) if not has):
+        held[row, np.searchsorted(net.columns.numpy(), LAYOUT.part("hand"))] = False
+    return module, lambda step: motion(step, net.dim) | ({"held": held} if handed else {})
+
+
+def captions(step: int) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(step)
+    same = [0, 1, 2, 1, 3, 4]  # a caption that both ranks hold
+    return {
+        "text_tokens": torch.randn(BATCH, 4, TEXT, generator=generator, dtype=torch.float64),
+        "text_mask": torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
+        "sentence": torch.eye(TEXT, dtype=torch.float64)[same],
+        "similarity": torch.eye(TEXT, dtype=torch.float64)[same],
+    }
+
+
+def tma() -> tuple[StageModule, Batches]:
+    net = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 20, TEXT)
+    loss = TmaLossConfig(kl=0.1, latent=0.1, contrastive=1.0)  # heavy, so that an error in a term would show
+    module = TmaModule(net, OPTIM, seed=0, max_steps=STEPS, loss=loss)
+    return module.eval(), lambda step: motion(step, 20) | captions(step)
+
+
+def gpt() -> tuple[StageModule, Batches]:
+    book = build_tokenizer(H2VQConfig(width=8, depth=1, code_dim=8, num_codes=9), LAYOUT)
+    for quantizer in book.codebooks().values():
+        quantizer.codebook.normal_()  # spread out, so that the alignment has something to gain
+    aligned = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), LAYOUT.dim, TEXT)
+    config = GptConfig(layers=2, dim=16, heads=2, ff=32, block_size=20)
+    net = InterleavedGPT(config, book.streams, book.pattern, text_dim=16)
+    module = GptModule(
+        net, OPTIM, seed=0, max_steps=STEPS, loss=GptLossConfig(align_weight=1.0),
+        tokenizer=book, tma=aligned,
+    )  # fmt: skip
+
+    def batch(step: int) -> dict[str, Tensor]:
+        generator = torch.Generator().manual_seed(step)
+        codes = {
+            "body": torch.randint(9, (BATCH, 10), generator=generator),
+            "hand": torch.randint(9, (BATCH, 5), generator=generator),
+        }
+        groups = torch.tensor([5, 5, 4, 1, 2, 1])
+        tokens, kinds, _ = interleave(codes, book.pattern, ends=net.num_codes, groups=groups)
+        text = torch.randn(BATCH, 16, generator=generator, dtype=torch.float64)
+        # One clip without hands on the first rank, two on the other.
+        handless = torch.tensor([False, False, True, False, True, True])
+        held = torch.ones(BATCH, LAYOUT.dim, dtype=torch.bool)
+        held[handless.nonzero(), torch.from_numpy(LAYOUT.part("hand"))] = False
+        known = ~(handless[:, None] & (kinds == 1)) | (tokens == 9)
+        told = {"similarity": captions(step)["similarity"], "known": known, "held": held}
+        return {"tokens": tokens, "kinds": kinds, "text": text, **told}
+
+    return module.eval(), batch
+
+
+def gpt_samples() -> tuple[StageModule, Batches]:
+    """L_align on motions that the model draws: each row with its own seed, whatever rank it is on."""
+    module, batch = gpt()
+    assert isinstance(module, GptModule) and module.tokenizer is not None and module.tma is not None
+    still = module.net.config.model_copy(
+        update={"dropout": 0.0, "attention_dropout": 0.0, "condition_dropout": 0.0}
+    )
+    net = InterleavedGPT(still, module.tokenizer.module.streams, module.net.pattern, text_dim=16)
+    drawn = UndrawnGpt(
+        net, OPTIM, seed=0, max_steps=STEPS, loss=GptLossConfig(align_weight=1.0, align_on="samples"),
+        tokenizer=module.tokenizer.module, tma=module.tma.module,
+    )  # fmt: skip
+    return drawn.train(), batch
+
+
+class UndrawnGpt(GptModule):
+    """The seeds of the samples are those of the whole batch, of which each rank takes its part."""
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """As the base class, with the draws replaced."""
+        whole = BATCH * self.loss_config.samples
+        mine = slice(rank() * whole // world_size(), (rank() + 1) * whole // world_size())
+        randint, generator = torch.randint, torch.Generator().manual_seed(0)
+        try:
+            torch.randint = lambda high, _: randint(high, (whole,), generator=generator)[mine]  # type: ignore[assignment]
+            return super().losses(batch)
+        finally:
+            torch.randint = randint
+
+
+def diffusion() -> tuple[StageModule, Batches]:
+    net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2), 20, TEXT)
+    module = Undrawn(net, OPTIM, seed=0, max_steps=STEPS)
+    return module.eval(), lambda step: motion(step, 20) | captions(step)
+
+
+class Undrawn(DiffusionModule):
+    """Time steps and noise are those of the whole batch, of which each rank takes its part."""
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """As the base class, with the draws replaced."""
+        whole = BATCH
+
+        def part(values: Tensor) -> Tensor:
+            size = whole // world_size()
+            return values[rank() * size : (rank() + 1) * size]
+
+        randint, randn_like = torch.randint, torch.randn_like
+        generator = torch.Generator().manual_seed(0)
+        try:
+            torch.randint = lambda low, high, size, **_: part(  # type: ignore[assignment]
+                randint(low, high, (whole,), generator=generator)
+            )
+            torch.randn_like = (
+                lambda x: part(  # type: ignore[assignment]
+                    torch.randn(whole, *x.shape[1:], generator=generator, dtype=x.dtype)
+                )
+            )
+            return super().losses(batch)
+        finally:
+            torch.randint, torch.randn_like = randint, randn_like
+
+
+CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
+    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
+    "h2vq, one rank without hands": lambda: tokenizer(H2VQConfig(**BOOK), (True, False, True) + 3 * (False,)),
+    "separate": lambda: tokenizer(SeparateConfig(**BOOK)),
+    "rvq": lambda: tokenizer(RvqConfig(**BOOK)),
+    "fsq": lambda: tokenizer(FsqConfig(**SMALL, steps=(5, 4))),
+    "tma": tma,
+    "tma, compiled": tma,
+    "gpt": gpt,
+    "gpt, compiled": gpt,
+    "gpt, samples": gpt_samples,
+    "diffusion": diffusion,
+}
+
+
+class Wrapped(nn.Module):
+    """What Lightning does: DDP calls the losses through `forward`."""
+
+    def __init__(self, module: StageModule) -> None:
+        super().__init__()
+        self.module = module
+
+    def forward(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        return self.module.losses(batch)
+
+
+def train(case: str) -> dict[str, Any]:
+    """20 steps on this rank's part of the batches; figures are averaged over ranks."""
+    torch.manual_seed(0)
+    module, batches = CASES[case]()
+    module.net.double()
+    optimizer = module.configure_optimizers()["optimizer"]
+    if case.endswith("compiled"):
+        torch.compiler.reset()  # graphs of other tests in this process count too
+        module.losses = torch.compile(module.losses, fullgraph=True, backend="eager")  # type: ignore[method-assign]
+    model: nn.Module = Wrapped(module)
+    if world_size() > 1:
+        # The null text stays unused in evaluation mode.
+        model = DistributedDataParallel(
+            model, forward_sync_buffers=False, find_unused_parameters=case.startswith("gpt")
+        )
+    size = BATCH // world_size()
+    mine = slice(rank() * size, (rank() + 1) * size)
+    figures: dict[str, list[float]] = {}
+    for step in range(STEPS):
+        values = model({name: value[mine] for name, value in batches(step).items()})
+        optimizer.zero_grad()
+        values["loss"].backward()
+        for name, value in values.items():
+            mean = value.detach().double()
+            if world_size() > 1:
+                dist.all_reduce(mean)
+            figures.setdefault(name, []).append(mean.item() / world_size())
+        if step < STEPS - 1:
+            optimizer.step()
+    grads = {name: p.grad for name, p in module.net.named_parameters() if p.grad is not None}
+    return {"figures": figures, "grads": grads, "state": module.net.state_dict()}
+
+
+def worker(number: int, folder: Path) -> None:
+    torch.set_num_threads(1)
+    init = f"file://{folder}/rendezvous"
+    dist.init_process_group("gloo", init_method=init, rank=number, world_size=2)
+    torch.save({case: train(case) for case in CASES}, folder / f"{number}.pt")
+    dist.barrier()
+    # Without destructors: those of DDP and gloo can wait for each other.
+    os._exit(0)
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    """What each of two ranks found, per case."""
+    folder = tmp_path_factory.mktemp("ranks")
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-P", __file__, str(number), str(folder)],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+        for number in range(2)
+    ]
+    try:
+        assert [process.wait(timeout=200) for process in ranks] == [0, 0]
+    finally:
+        for process in ranks:
+            process.kill()
+    return [torch.load(folder / f"{number}.pt", weights_only=True) for number in range(2)]
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("case", list(CASES))
+def test_two_ranks_equal_one_process(case: str, two: list[dict[str, Any]]) -> None:
+    one = train(case)
+    for name, values in one["figures"].items():
+        assert two[0][case]["figures"][name] == pytest.approx(values, rel=1e-5, abs=1e-5), name
+    for kind in ("grads", "state"):
+        assert one[kind].keys() == two[0][case][kind].keys()
+        for name, value in one[kind].items():
+            first, second = (result[case][kind][name] for result in two)
+            assert torch.equal(first, second), name
+            torch.testing.assert_close(first, value, rtol=1e-5, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
+    resets = [sum(v[1:]) for name, v in one["figures"].items() if name.startswith("resets")]
+    if case.startswith(("h2vq", "rvq", "separate")):
+        assert sum(resets) > 5, "the codebooks were too calm to prove much"
+
+
+if __name__ == "__main__":
+    worker(int(sys.argv[1]), Path(sys.argv[2]))

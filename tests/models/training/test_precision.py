@@ -1,0 +1,244 @@
+"""Mixed precision: every stage trains under autocast with finite losses near the float32 ones, and what must
+be float32 is.
+
+What learns by averages (codebooks) or exponentiates (InfoNCE, KL, logits) is kept out of the half types:
+inputs are made that only float32 gets right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.diffusion.module import DiffusionModule
+from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.gpt.module import GptModule
+from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.gpt.tokens import interleave
+from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig
+from motionloom.models.quantize.fsq import FsqQuantizer
+from motionloom.models.tma.losses import info_nce, kl_four
+from motionloom.models.tma.module import TmaModule
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import AnyTokenizerConfig, FsqConfig, H2VQConfig, RvqConfig
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.stage_module import OptimConfig, StageModule
+
+LAYOUT = MotionLayout.named("wholebody313")
+SMALL: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8}
+BOOK: dict[str, Any] = {**SMALL, "num_codes": 8, "reset_below": 0.1}
+OPTIM = OptimConfig(lr=1e-3)
+STEPS = 4
+HALVES = [torch.bfloat16, torch.float16]
+
+Case = tuple[StageModule, dict[str, Tensor]]
+
+
+def captioned(dim: int) -> dict[str, Tensor]:
+    return {
+        "motion": torch.randn(4, 16, dim),
+        "length": torch.tensor([16, 16, 12, 9]),
+        "text_tokens": torch.randn(4, 5, 12),
+        "text_mask": torch.arange(5)[None] < torch.tensor([[5], [4], [3], [2]]),
+        "sentence": torch.randn(4, 12),
+        "similarity": torch.eye(4, 12),
+    }
+
+
+def tokenizer(config: AnyTokenizerConfig) -> Case:
+    net = build_tokenizer(config, LAYOUT)
+    net.basis.learn(
+        np.zeros(net.dim), np.full(net.dim, 0.02)
+    )  # independent noise in every column bends fingers wildly
+    return TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms()), captioned(net.dim)
+
+
+def tma() -> Case:
+    net = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2, dropout=0, attention_dropout=0), 40, 12)
+    return TmaModule(net, OPTIM, seed=0, max_steps=STEPS), captioned(40)
+
+
+def diffusion() -> Case:
+    net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2, dropout=0), 40, 12)
+    return DiffusionModule(net, OPTIM, seed=0, max_steps=STEPS), captioned(40)
+
+
+def gpt() -> Case:
+    book = build_tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0), LAYOUT)
+    align = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), 313, 12)
+    config = GptConfig(layers=1, dim=16, heads=2, ff=16, block_size=20, dropout=0, attention_dropout=0)
+    net = InterleavedGPT(config, book.streams, book.pattern, 16)
+    module = GptModule(net, OPTIM, seed=0, max_steps=STEPS, tokenizer=book.freeze(), tma=align)
+    codes = {"body": torch.randint(8, (4, 8)), "hand": torch.randint(8, (4, 4))}
+    groups = torch.tensor([4, 3, 2, 4])
+    tokens, kinds, length = interleave(codes, book.pattern, ends=net.num_codes, groups=groups)
+    text, sentence = torch.randn(4, 16), torch.randn(4, 12)
+    return module, {"tokens": tokens, "kinds": kinds, "length": length, "text": text, "similarity": sentence}
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
+    "rvq": lambda: tokenizer(RvqConfig(**BOOK)),
+    "fsq": lambda: tokenizer(FsqConfig(**SMALL, steps=(5, 4))),
+    "tma": tma,
+    "diffusion": diffusion,
+    "gpt": gpt,
+}
+
+
+def build(case: str) -> Case:
+    torch.manual_seed(0)
+    return CASES[case]()
+
+
+def train(case: str, half: torch.dtype | None) -> tuple[StageModule, list[dict[str, Tensor]]]:
+    """A few steps on one batch, as Lightning makes them: forward and losses under autocast, the rest outside.
+
+    float16 takes the gradient of a scaled loss, as behind a gradient scaler.
+    """
+    module, batch = build(case)
+    module.fused = half != torch.float16
+    optimizer = module.configure_optimizers()["optimizer"]
+    scale = 1024.0 if half == torch.float16 else 1.0
+    found = []
+    for step in range(STEPS):
+        torch.manual_seed(step)
+        with torch.autocast("cpu", half or torch.bfloat16, enabled=half is not None):
+            values = module.losses(batch)
+        optimizer.zero_grad()
+        (values["loss"] * scale).backward()
+        for parameter in module.net.parameters():
+            if parameter.grad is not None:
+                parameter.grad /= scale
+        optimizer.step()
+        found.append({name: value.detach() for name, value in values.items()})
+    return module, found
+
+
+@pytest.mark.parametrize("half", HALVES, ids=str)
+@pytest.mark.parametrize("case", list(CASES))
+def test_a_few_steps_are_near_those_in_float32(case: str, half: torch.dtype) -> None:
+    before = {name: (v.dtype, v.is_floating_point()) for name, v in build(case)[0].net.state_dict().items()}
+    module, found = train(case, half)
+    _, expected = train(case, None)
+    for step in range(STEPS):
+        for name, value in found[step].items():
+            assert torch.isfinite(value).all(), (name, step)
+            assert value.dtype == torch.float32, name
+    for step, (mixed, full) in enumerate(zip(found, expected, strict=True)):
+        assert mixed["loss"].item() == pytest.approx(full["loss"].item(), rel=0.03), step
+    state = module.net.state_dict()
+    for name, (dtype, floating) in before.items():
+        assert state[name].dtype == dtype
+        assert not floating or (dtype == torch.float32 and torch.isfinite(state[name]).all()), name
+    assert all(p.grad is None or p.grad.dtype == torch.float32 for p in module.net.parameters())
+
+
+def autocast(half: torch.dtype) -> torch.autocast:
+    return torch.autocast("cpu", half)
+
+
+@pytest.mark.parametrize("half", HALVES, ids=str)
+def test_codes_are_assigned_in_float32(half: torch.dtype) -> None:
+    """Codes a thousandth apart, far from zero: bfloat16 and float16 would call them the same."""
+    quantizer = EmaQuantizer(QuantizerConfig(num_codes=16, dim=4)).eval()
+    quantizer.codebook.copy_(1 + torch.arange(16)[:, None] * 1e-3)
+    z = quantizer.codebook[None] + 2e-4
+    fsq = FsqQuantizer(4, (5, 4))
+    wide = torch.randn(1, 200, 4) * 3
+    plain = fsq(wide).codes
+    with autocast(half):
+        out = quantizer(z)
+        assert torch.equal(out.codes[0], torch.arange(16))
+        assert out.quantized.dtype == out.penalty.dtype == torch.float32
+        assert torch.equal(fsq(wide).codes, plain)
+        assert quantizer.vectors(out.codes).dtype == torch.float32
+
+
+def test_averages_move_by_less_than_a_half_type_resolves() -> None:
+    """One use in a hundred steps' memory: 1000 + 0.01 x 1 is 1000 in bfloat16."""
+    quantizer = EmaQuantizer(QuantizerConfig(num_codes=2, dim=2, reset_below=1e-3)).bfloat16()
+    quantizer._is_initialised = True
+    quantizer.codebook.copy_(torch.tensor([[0.0, 0.0], [9.0, 9.0]]))
+    quantizer.ema_count.fill_(1000.0)
+    with autocast(torch.bfloat16):
+        quantizer(torch.zeros(1, 1010, 2, dtype=torch.bfloat16))
+    torch.testing.assert_close(quantizer.ema_count, torch.tensor([1000.1, 990.0]))
+
+
+@pytest.mark.parametrize("bad", [float("inf"), float("nan")])
+def test_an_overflow_does_not_stay_in_the_codebook(bad: float) -> None:
+    """float16 overflows now and then; the scaler leaves the step out, the codebook leaves the vector out."""
+    torch.manual_seed(0)
+    quantizer, same = (EmaQuantizer(QuantizerConfig(num_codes=4, dim=2, reset_below=0.1)) for _ in range(2))
+    same.load_state_dict(quantizer.state_dict())
+    z = torch.randn(2, 20, 2)
+    mask = torch.ones(2, 20, dtype=torch.bool)
+    mask[1, 3] = False
+    for _ in range(3):
+        broken = z.clone()
+        broken[1, 3] = bad
+        out, expected = quantizer(broken), same(z, mask)
+        assert torch.equal(out.penalty, expected.penalty)
+        assert not torch.isfinite(out.quantized[1, 3]).all()  # the loss still shows it
+    for name, value in same.state_dict().items():
+        assert torch.equal(quantizer.state_dict()[name], value), name
+
+
+@pytest.mark.parametrize("half", HALVES, ids=str)
+def test_contrastive_and_kl_terms_are_float32_whatever_comes_in(half: torch.dtype) -> None:
+    torch.manual_seed(0)
+    text, motion = torch.randn(8, 32).to(half), torch.randn(8, 32).to(half)
+    # exp(12) is beyond float16, and 256 + 1 is 256 in bfloat16.
+    spread = torch.linspace(-12, 12, 8 * 32).view(8, 32).to(half)
+    still = torch.zeros_like(spread)
+    nce = info_nce(text.double(), motion.double())
+    kl = kl_four((text.double(), spread.double()), (motion.double(), still.double()))
+    with autocast(half):
+        for value, expected in (
+            (info_nce(text, motion), nce),
+            (kl_four((text, spread), (motion, still)), kl),
+        ):
+            assert value.dtype == torch.float32
+            assert value.item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("half", HALVES, ids=str)
+def test_logits_leave_the_gpt_in_float32_and_sum_to_one(half: torch.dtype) -> None:
+    module, batch = build("gpt")
+    with torch.no_grad(), autocast(half):
+        logits = module.net(batch["tokens"], batch["kinds"], batch["text"])
+    assert logits.dtype == torch.float32
+    real = batch["tokens"] >= 0
+    torch.testing.assert_close(logits.softmax(-1).sum(-1)[real], torch.ones(int(real.sum())))
+
+
+@pytest.mark.parametrize("case", ["h2vq", "tma", "gpt"])
+def test_lightning_clips_and_steps_in_bfloat16(case: str) -> None:
+    """Clipping with a fused optimizer, which Lightning's own clipping refuses here."""
+    module, batch = build(case)
+    before = [p.detach().clone() for p in module.net.parameters()]
+    trainer = L.Trainer(
+        accelerator="cpu", devices=1, precision="bf16-mixed", max_steps=2, gradient_clip_val=1e-3,
+        logger=False, enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    norms = []
+
+    def measure(*_: Any) -> None:
+        grads = [p.grad for p in module.net.parameters() if p.grad is not None]
+        norms.append(torch.nn.utils.get_total_norm(grads).item())
+
+    module.on_before_zero_grad = measure  # type: ignore[method-assign]
+    trainer.fit(module, DataLoader([batch] * 2, batch_size=None))  # type: ignore[arg-type]
+    assert max(norms) == pytest.approx(1e-3, rel=0.01)
+    moved = [not torch.equal(old, new) for old, new in zip(before, module.net.parameters(), strict=True)]
+    assert sum(moved) > len(moved) / 2

@@ -1,0 +1,122 @@
+"""Networks on another device get their inputs there, and give what the CPU gives (`second_device.py`)."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.text.build import build_text_cache
+from motionloom.datasets.text.cache import TextCache
+from motionloom.pipeline.evaluation.figures import embed_motions
+from motionloom.pipeline.evaluation.truth import reconstruct, truth_of
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.sampling import SamplingConfig
+from motionloom.pipeline.launch.hardware import Hardware, choose_device
+from motionloom.pipeline.stages.tokens import encode_split
+from motionloom.pipeline.store.data import open_split
+from motionloom.pipeline.store.networks import CPU, LoadedTma, load_tokenizer
+
+CAPTIONS = ["a person waves with the left hand", "a person walks"]
+
+
+@pytest.fixture(scope="module")
+def second() -> Iterator[ModuleType]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[2] / "helpers"))
+        yield importlib.import_module("second_device")
+
+
+def test_the_second_device_is_strict(second: ModuleType) -> None:
+    with second.second_device() as device:
+        far = torch.ones(3).to(device)
+        assert far.device == (far + far).device == device and (far + 1).cpu().tolist() == [2, 2, 2]
+        with pytest.raises(RuntimeError, match="expected all tensors on maia:0"):
+            far + torch.ones(3)
+        with pytest.raises(RuntimeError):
+            far.numpy()
+        far[1] = 5
+        assert far.tolist() == [1, 5, 1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("face", ["gpt", "vae", "diffusion ddpm", "diffusion ddim", "diffusion dpm++"])
+def test_motions_are_made_where_the_networks_lie(face: str, second: ModuleType, small_run: Any) -> None:
+    kind, _, sampler = face.partition(" ")
+    asked = {"face_model": kind, "cfg_scale": 1.5, "denoising_steps": 3, "sampler": sampler or "ddpm"}
+    sampling = SamplingConfig.parse(asked, "sampling")
+    near = Bundle.open(small_run.folder)
+    with second.second_device() as device:
+        far = Bundle.open(small_run.folder, device)
+        assert far.device == far.tma.device == device  # type: ignore[union-attr]
+        made = far.generate(CAPTIONS, seconds=2.0, seed=3, sampling=sampling)
+    assert str(far.text_encoder._model.device) == str(device)
+    for ours, theirs in zip(
+        made, near.generate(CAPTIONS, seconds=2.0, seed=3, sampling=sampling), strict=True
+    ):
+        np.testing.assert_allclose(ours.features, theirs.features, atol=1e-4)
+        np.testing.assert_allclose(ours.face, theirs.face, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_tokens_captions_and_clips_are_encoded_where_the_networks_lie(
+    second: ModuleType, small_run: Any, tmp_path: Path
+) -> None:
+    stages = small_run.folder / "stages"
+    dataset = open_split(stages / "data", "test")
+    stats = FeatureStats.load(stages / "stats/stats.safetensors")
+    truths = [truth_of(dataset, i) for i in range(len(dataset))]
+
+    def everything(device: torch.device, name: str) -> list[Any]:
+        tokenizer, tma = load_tokenizer(stages / "tokenizer", device), LoadedTma.load(stages / "tma", device)
+        captions = [truth.caption for truth in truths]
+        cache = build_text_cache(tmp_path / name, captions, "minilm", progress=False, device=str(device))
+        assert isinstance(cache, TextCache)
+        codes = encode_split(tokenizer, dataset, stats, 256).codes
+        rebuilt = reconstruct(tokenizer, stats, truths[0].features)
+        motions = embed_motions(tma, stats, [truth.features for truth in truths])
+        values = [*codes.values(), motions, tma.embed_captions(captions, cache)]
+        assert all(value.device == CPU for value in values)
+        return [*(value.numpy() for value in values), rebuilt, cache.sentence(captions)]
+
+    with second.second_device() as device:
+        far = everything(device, "far")
+    for ours, theirs in zip(far, everything(CPU, "near"), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
+def test_a_choice_of_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert choose_device("cpu") == choose_device(torch.device("cpu")) == torch.device("cpu")
+    for count, accelerator in ((0, "cpu"), (2, "cuda:0")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda count=count: count > 0)
+        monkeypatch.setattr(torch.cuda, "device_count", lambda count=count: count)
+        assert choose_device("auto") == Hardware().device() == torch.device(accelerator)
+        assert Hardware(accelerator="cpu").device() == torch.device("cpu")
+        with pytest.raises(UserError, match=r"device 'gpu': .* take auto, cpu, cuda or cuda:N"):
+            choose_device("gpu")
+    assert choose_device("cuda:1") == torch.device("cuda", 1)
+    with pytest.raises(UserError, match=r"device 'cuda:2': GPUs 0 to 1 are here"):
+        choose_device("cuda:2")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert Hardware().device() == torch.device("cuda", 1), "each process of a run takes its own GPU"
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(UserError, match="device 'cuda': no GPU is here"):
+        choose_device("cuda")
+    with pytest.raises(UserError, match=r"hardware\.accelerator is gpu and no GPU is here.*--device cpu"):
+        Hardware(accelerator="gpu").device()
+
+
+@pytest.mark.slow
+def test_commands_refuse_a_device_that_is_not_here(small_run: Any, call: Callable[..., Any]) -> None:
+    for words in (("generate", small_run.folder, "a person waves"), ("retrieval", small_run.folder),
+                  ("evaluate", small_run.folder), ("report", small_run.folder)):  # fmt: skip
+        done = call(*words, "--device", "cuda:99")
+        assert done.code == 2 and "device 'cuda:99'" in done.err

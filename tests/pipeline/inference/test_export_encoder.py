@@ -1,0 +1,139 @@
+"""Exported models bring their text encoder along, whether it was a folder or a model of the hub."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import huggingface_hub.constants
+import huggingface_hub.errors
+import numpy as np
+import pytest
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.text.build import build_text_cache
+from motionloom.pipeline.inference.bundle import Bundle, text_encoder_of
+from motionloom.pipeline.inference.pretrained import write_bundle
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.graph import Selection
+from motionloom.pipeline.store import encoder_files
+
+RECIPE = """
+extends: t2m-gpt-tiny
+name: own-encoder
+hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
+stages:
+  data: {clips: 24, min_seconds: 2.0, max_seconds: 5.0}
+  tokenizer:
+    net: {width: 8, depth: 1, code_dim: 8, num_codes: 8}
+    train: {steps: 2, batch_size: 4}
+  gpt:
+    net: {layers: 1, dim: 16, heads: 2, ff: 16}
+    train: {steps: 2, batch_size: 4}
+"""
+CAPTIONS = ["a person walks", "someone jumps"]
+HUB_NAME = "nobody/tiny-clip"
+
+
+@pytest.fixture(scope="module")
+def models() -> Iterator[ModuleType]:
+    """Makers of tiny text encoders."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[2] / "datasets" / "text"))
+        yield importlib.import_module("test_text_cache")
+
+
+def train(folder: Path, encoder: str) -> Path:
+    """A model on that encoder; returns the run folder."""
+    (folder / "recipe.yaml").write_text(RECIPE)
+    run = folder / "run"
+    overrides = [f"text.encoder={encoder}"]
+    run_recipe(
+        folder / "recipe.yaml", run, overrides=overrides, select=Selection(until="gpt"),
+        console=Console(quiet=True),
+    )  # fmt: skip
+    return run
+
+
+def motions(folder: Path) -> list[np.ndarray]:
+    return [motion.joints for motion in Bundle.open(folder).generate(CAPTIONS, seconds=1.0, seed=3)]
+
+
+def check_alone(run: Path, exported: Path, *originals: Path) -> None:
+    """The exported folder gives the run's motions when neither the run nor its encoder is left."""
+    wanted = motions(run)
+    write_bundle(run, exported)
+    for folder in (run, *originals):
+        shutil.rmtree(folder)
+    for made, first in zip(motions(exported), wanted, strict=True):
+        np.testing.assert_array_equal(made, first)
+    files = [path for path in (exported / "text_encoder").rglob("*") if path.is_file()]
+    assert {path.suffix for path in files} <= {".safetensors", ".json", ".txt"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["clip", "distilbert"])
+def test_a_folder_named_from_where_the_run_was_started(
+    kind: str, models: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, elsewhere = tmp_path / "start", tmp_path / "elsewhere"
+    start.mkdir()
+    elsewhere.mkdir()
+    encoder: Path = getattr(models, f"tiny_{kind}")(start)
+    (encoder / "pytorch_model.bin").write_bytes(b"pickled")
+    monkeypatch.chdir(start)
+    run = train(tmp_path, encoder.name)
+    assert text_encoder_of(run / "stages/text") == str(encoder)
+    monkeypatch.chdir(elsewhere)
+    check_alone(run, tmp_path / "exported", encoder)
+
+
+@pytest.mark.slow
+def test_a_model_of_the_hub(models: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache = tmp_path / "hub"
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(cache))
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    stored = cache / f"models--{HUB_NAME.replace('/', '--')}"
+    (stored / "refs").mkdir(parents=True)
+    (stored / "refs/main").write_text("f00d")
+    shutil.copytree(models.tiny_clip(tmp_path), stored / "snapshots/f00d")
+    run = train(tmp_path, HUB_NAME)
+    assert text_encoder_of(run / "stages/text") == HUB_NAME
+    kept = tmp_path / "kept"
+    shutil.copytree(run, kept)
+    check_alone(run, tmp_path / "exported", cache)
+    with pytest.raises(UserError, match=f"text encoder '{HUB_NAME}' cannot be copied .*put the model back"):
+        write_bundle(kept, tmp_path / "second")
+    assert not list((tmp_path / "second").rglob("*.json")), "nothing that looks like a model is left"
+
+
+def test_the_hub_is_asked_when_its_cache_lacks_the_model(
+    models: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoder = models.tiny_clip(tmp_path)
+    build_text_cache(tmp_path / "text/cache", CAPTIONS, str(encoder), progress=False)
+    asked = []
+
+    def download(name: str, *, allow_patterns: list[str], local_files_only: bool = False) -> str:
+        assert name == HUB_NAME and "*.safetensors" in allow_patterns and "*.bin" not in allow_patterns
+        asked.append(local_files_only)
+        if local_files_only:
+            raise huggingface_hub.errors.LocalEntryNotFoundError("not here")
+        return str(encoder)
+
+    monkeypatch.setattr(encoder_files, "snapshot_download", download)
+    encoder_files.copy_encoder(HUB_NAME, tmp_path / "text", tmp_path / "copy")
+    assert asked == [True, False] and (tmp_path / "copy/model.safetensors").is_file()
+
+
+def test_another_model_at_the_same_place_is_refused(models: ModuleType, tmp_path: Path) -> None:
+    encoder = models.tiny_distilbert(tmp_path)
+    build_text_cache(tmp_path / "text/cache", CAPTIONS, str(encoder), progress=False)
+    models.tiny_distilbert(tmp_path, seed=1)
+    with pytest.raises(UserError, match="its weights are not those that encoded this run's captions"):
+        encoder_files.copy_encoder(str(encoder), tmp_path / "text", tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()

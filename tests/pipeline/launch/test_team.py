@@ -1,0 +1,189 @@
+"""A launcher and a recipe that disagree are refused, before two processes train into the same files.
+
+Requeueing under SLURM is left to the run itself, which resumes whatever happens.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
+from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import process_rank, srun_tasks
+from motionloom.pipeline.launch.team import Team, environment
+from motionloom.pipeline.runs.api import run_recipe
+
+RECIPE = """
+name: x
+hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
+stages:
+  data: {kind: synth, clips: 16}
+  stats: {kind: stats}
+  tokenizer:
+    kind: vq
+    net: {width: 8, depth: 1, code_dim: 8, num_codes: 8}
+    train: {steps: 2, batch_size: 4, validate_every: 0}
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_launcher(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [*os.environ]:
+        if name.startswith("SLURM_") or name in {"RANK", "WORLD_SIZE", "NODE_RANK", "LOCAL_RANK"}:
+            monkeypatch.delenv(name)
+
+
+Srun = Callable[..., dict[str, str]]
+
+
+@pytest.fixture
+def srun(monkeypatch: pytest.MonkeyPatch) -> Srun:
+    """What `srun --nodes N --ntasks-per-node K` says to one of its tasks."""
+
+    def go(per_node: int, nodes: int = 1, rank: int = 0, **more: str) -> dict[str, str]:
+        tasks = str(per_node * nodes)
+        facts = {
+            "SLURM_JOB_ID": "7",
+            "SLURM_JOB_NAME": "train",
+            "SLURM_NTASKS": tasks,
+            "SLURM_STEP_NUM_TASKS": tasks,
+            "SLURM_NTASKS_PER_NODE": str(per_node),
+            "SLURM_NNODES": str(nodes),
+            "SLURM_PROCID": str(rank),
+            "SLURM_LOCALID": str(rank % per_node),
+            "SLURM_NODEID": str(rank // per_node),
+            **more,
+        }
+        for name, value in facts.items():
+            monkeypatch.setenv(name, value)
+        return facts
+
+    return go
+
+
+def cpu(devices: int = 0, nodes: int = 1) -> Hardware:
+    return Hardware(accelerator="cpu", devices=devices, nodes=nodes)
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_tasks_of_srun_do_not_train_alone(srun: Srun, rank: int) -> None:
+    srun(2, rank=rank)
+    assert process_rank() == rank
+    with pytest.raises(UserError, match="srun started 2 processes on 1 node and the recipe asks for 1 on 1"):
+        Team.start(cpu())
+
+
+@pytest.mark.parametrize(
+    ("per_node", "nodes", "devices", "hosts"), [(4, 1, 2, 1), (1, 2, 2, 1), (2, 2, 4, 1)]
+)
+def test_other_numbers_are_refused_too(
+    srun: Srun, per_node: int, nodes: int, devices: int, hosts: int
+) -> None:
+    srun(per_node, nodes)
+    with pytest.raises(UserError, match=r"set hardware.devices \(processes on a node\) and hardware.nodes"):
+        Team.start(cpu(devices, hosts))
+
+
+def test_srun_must_say_how_many_on_a_node(srun: Srun, monkeypatch: pytest.MonkeyPatch) -> None:
+    srun(2)
+    monkeypatch.delenv("SLURM_NTASKS_PER_NODE")
+    with pytest.raises(UserError, match="srun --nodes 1 --ntasks-per-node 2"):
+        Team.start(cpu(2))
+
+
+def test_torchrun_inside_a_job_goes_by_its_own_numbers(srun: Srun, monkeypatch: pytest.MonkeyPatch) -> None:
+    srun(1, 2)
+    monkeypatch.setenv("RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "3")
+    with pytest.raises(UserError, match="the launcher started 3 processes and the recipe asks for 2"):
+        Team.start(cpu(2))
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    assert Team.start(cpu(1)).leads
+
+
+def test_a_script_or_a_shell_inside_a_job_is_one_process(srun: Srun, monkeypatch: pytest.MonkeyPatch) -> None:
+    srun(2)
+    monkeypatch.delenv("SLURM_STEP_NUM_TASKS")  # a batch script: rank 0, and the job's number of tasks
+    assert srun_tasks() == 1
+    assert Team.start(cpu()).world == 1
+    with pytest.raises(UserError, match="alone in its SLURM job: start it with srun --nodes 2"):
+        Team.start(cpu(1, nodes=2))
+    monkeypatch.delenv("SLURM_PROCID")  # a shell of salloc
+    assert Team.start(cpu()).world == 1
+    monkeypatch.setenv("LOCAL_RANK", "1")  # started by Lightning's own launcher
+    assert process_rank() == 1
+
+
+def test_a_checkpoint_of_lightnings_requeueing_is_not_taken_up(
+    srun: Srun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    srun(1)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hpc_ckpt_1.ckpt").write_bytes(b"of another stage")
+    (tmp_path / "x.yaml").write_text(RECIPE)
+    before = signal.getsignal(signal.SIGUSR1)
+    run = run_recipe(tmp_path / "x.yaml", tmp_path / "run", console=Console(quiet=True))
+    assert (run / "stages/tokenizer/model.safetensors").is_file()
+    assert signal.getsignal(signal.SIGUSR1) == before
+
+
+def test_the_environment_is_slurms_only_under_srun(srun: Srun, monkeypatch: pytest.MonkeyPatch) -> None:
+    srun(1)
+    assert isinstance(environment(), LightningEnvironment), "alone"
+    monkeypatch.setenv("SLURM_NTASKS", "2")
+    monkeypatch.setenv("SLURM_NTASKS_PER_NODE", "2")
+    assert isinstance(environment(), LightningEnvironment), "one process of a script that may use two"
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
+    monkeypatch.setenv("SLURM_JOB_NAME", "interactive")  # srun inside salloc
+    found = environment()
+    assert isinstance(found, SLURMEnvironment) and not found.auto_requeue
+    with monkeypatch.context() as inside:
+        for name in ("TORCHELASTIC_RUN_ID", "RANK", "GROUP_RANK", "LOCAL_RANK", "LOCAL_WORLD_SIZE"):
+            inside.setenv(name, "0")
+        assert environment() is None, "torchrun inside SLURM"
+    monkeypatch.delenv("SLURM_NTASKS")
+    assert environment() is None
+
+
+@pytest.mark.slow
+def test_a_script_inside_a_job_starts_its_own_processes(
+    srun: Srun, monkeypatch: pytest.MonkeyPatch, start: Callable[..., Any], tmp_path: Path
+) -> None:
+    srun(2)
+    monkeypatch.delenv("SLURM_STEP_NUM_TASKS")
+    (tmp_path / "x.yaml").write_text(RECIPE)
+    process = start("run", tmp_path / "x.yaml", "-o", tmp_path / "run", "--set", "hardware.devices=2")
+    output = process.communicate(timeout=120)[0]
+    assert process.returncode == 0, output
+    assert output.count("[3/3] tokenizer") == 1
+
+
+@pytest.mark.slow
+def test_two_tasks_of_srun_train_together(
+    srun: Srun, monkeypatch: pytest.MonkeyPatch, start: Callable[..., Any], tmp_path: Path
+) -> None:
+    (tmp_path / "x.yaml").write_text(RECIPE)
+    command = ("run", tmp_path / "x.yaml", "-o", tmp_path / "run", "--set")
+    for devices, code in ((1, 2), (2, 0)):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        processes = []
+        for rank in (0, 1):
+            srun(2, rank=rank, MASTER_PORT=str(port), SLURM_NODELIST="127.0.0.1")
+            processes.append(start(*command, f"hardware.devices={devices}"))
+        for process in processes:
+            output = process.communicate(timeout=120)[0]
+            assert process.returncode == code, output
+            assert code == 0 or "srun started 2 processes" in output
+    assert (tmp_path / "run/stages/tokenizer/model.safetensors").is_file()

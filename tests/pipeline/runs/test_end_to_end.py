@@ -1,0 +1,319 @@
+"""One small recipe through every command, from no data to motions that tools and browsers open."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bvhio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import yaml
+from safetensors.numpy import load_file, save_file
+
+from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.inference.pretrained import MotionModel
+
+pytestmark = pytest.mark.slow
+
+STAGES = [
+    "data",
+    "stats",
+    "text",
+    "tokenizer",
+    "face_tokenizer",
+    "tma",
+    "tokens",
+    "face_tokens",
+    "gpt",
+    "face_gpt",
+    "face_vae",
+    "face_diffusion",
+    "generate",
+    "evaluate",
+    "report",
+]
+WAVE = ("a person waves with the left hand", "--face", "a happy face", "--seconds", "2")
+
+
+def arrays(path: Path) -> dict[str, Any]:
+    with np.load(path, allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def only(folder: Path, suffix: str) -> Path:
+    (path,) = folder.glob(f"*{suffix}")
+    return path
+
+
+@pytest.fixture(scope="module")
+def copy(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run at another place, free to be changed."""
+    folder = tmp_path_factory.mktemp("copy") / "run"
+    shutil.copytree(small_run.folder, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def motions(copy: Path, tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any]) -> Path:
+    """What `generate` writes for one caption."""
+    folder = tmp_path_factory.mktemp("motions")
+    process = start("generate", copy, *WAVE, "--seed", 5, "-o", folder)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, output
+    assert {Path(line).suffix for line in output.splitlines()} == {".npz", ".bvh", ".mp4", ".html"}
+    return folder
+
+
+def test_a_run_ends_with_the_page(small_run: Any) -> None:
+    last = small_run.output.splitlines()[-1]
+    page = Path(last.removeprefix("watch it: "))
+    assert page == small_run.folder / "stages/report/report.html"
+    html = page.read_text()
+    assert len(html) > 100_000 and "http://" not in re.sub(r"http://www\.w3\.org/\S+", "", html)
+    for number, name in enumerate(STAGES, start=1):
+        assert f"[{number}/{len(STAGES)}] {name} (" in small_run.output
+        artifact = Artifact.find(small_run.folder / "stages" / name)
+        assert (
+            artifact is not None
+            and artifact.outputs
+            and artifact.missing(small_run.folder / "stages" / name) is None
+        )
+
+
+def test_a_second_run_does_nothing_and_says_so(small_run: Any, call: Callable[..., Any]) -> None:
+    before = {p: p.stat().st_mtime_ns for p in small_run.folder.rglob("*")}
+    done = call("run", small_run.recipe, "--out", small_run.folder)
+    assert done.code == 0
+    assert f"all {len(STAGES)} stages are finished, nothing to do" in done.out
+    assert done.out.splitlines()[-1] == small_run.output.splitlines()[-1]
+    assert {p: p.stat().st_mtime_ns for p in small_run.folder.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    ("change", "below"),
+    [
+        ("tma.optim.lr=0.001", {"tma", "gpt", "generate", "evaluate", "report"}),
+        ("face_gpt.train.steps=9", {"face_gpt", "generate", "evaluate", "report"}),
+        ("evaluate.repeats=2", {"evaluate", "report"}),
+        ("gpt.train.checkpoint_every=7", set()),
+        ("hardware.threads=2", set()),
+    ],
+)
+def test_a_change_reruns_that_stage_and_those_below(
+    change: str, below: set[str], small_run: Any, call: Callable[..., Any]
+) -> None:
+    plan = call("run", small_run.recipe, "--out", small_run.folder, "--set", change, "--dry-run")
+    assert plan.code == 0
+    rows = dict(re.findall(r"^│ (\w+) +│ \w+ +│ (\w+) +│", plan.out, re.MULTILINE))
+    assert list(rows) == STAGES
+    assert {name for name, action in rows.items() if action != "skip"} == below
+    assert f"{len(below)} of {len(STAGES)} stages would run" in plan.out
+    if below:
+        assert f"changed: {change.split('.', 1)[1].split('=')[0]}" in plan.out
+
+
+def test_changed_stages_run_and_the_others_stay(copy: Path, small_run: Any, call: Callable[..., Any]) -> None:
+    def artifacts() -> dict[str, str]:
+        return {name: (copy / "stages" / name / "artifact.json").read_text() for name in STAGES}
+
+    before = artifacts()
+    assert call("run", small_run.recipe, "--out", copy, "--set", "evaluate.clips=5").code == 0
+    changed = {name for name, text in artifacts().items() if text != before[name]}
+    assert changed == {"evaluate", "report"}
+    assert call("run", small_run.recipe, "--out", copy).code == 0
+    # The report's title is the name of the run's folder, which is the same here.
+    assert artifacts() == before
+
+
+def test_npz_says_what_it_holds(motions: Path) -> None:
+    stored = arrays(only(motions, ".npz"))
+    facts = json.loads(str(stored["metadata"]))
+    assert facts["caption"] == WAVE[0] and facts["face_caption"] == WAVE[2] and facts["seed"] == 5
+    frames = round(2 * facts["fps"])
+    assert abs(len(stored["joints"]) - frames) < 4
+    assert stored["joints"].shape[1:] == (len(facts["joint_names"]), 3) == (52, 3)
+    assert stored["features"].shape == (len(stored["joints"]), 313)
+    assert stored["face"].shape == (len(stored["joints"]), 50)
+    assert all(np.isfinite(stored[name]).all() for name in ("joints", "features", "face"))
+
+
+def test_bvh_shows_the_same_motion(motions: Path) -> None:
+    path = only(motions, ".bvh")
+    stored = arrays(only(motions, ".npz"))
+    names, joints = json.loads(str(stored["metadata"]))["joint_names"], stored["joints"]
+    motion = read_bvh(path)
+    order = [motion.joints.index(name) for name in names]
+    positions = motion.positions()[:, order] / 100
+    assert np.linalg.norm(positions - joints, axis=-1).mean() < 0.05
+    root = bvhio.readAsHierarchy(str(path)).loadPose(7)
+    found = {joint.Name: np.array(joint.PositionWorld) / 100 for joint, _, _ in root.layout()}
+    np.testing.assert_allclose([found[name] for name in names], positions[7], atol=2e-4)
+
+
+def test_film_and_page_are_whole(motions: Path) -> None:
+    frames = len(arrays(only(motions, ".npz"))["joints"])
+    counted, seconds = imageio_ffmpeg.count_frames_and_secs(str(only(motions, ".mp4")))
+    assert counted == frames and seconds > 1
+    assert WAVE[0] in (motions / "index.html").read_text()
+
+
+def test_same_seed_same_motion(copy: Path, motions: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
+    for seed, equal in ((5, True), (6, False)):
+        out = tmp_path / str(seed)
+        assert call("generate", copy, *WAVE, "--seed", seed, "-f", "npz", "-o", out).code == 0
+        again, first = arrays(only(out, ".npz")), arrays(only(motions, ".npz"))
+        assert np.array_equal(again["joints"], first["joints"]) is equal
+        assert np.array_equal(again["face"], first["face"]) is equal
+
+
+def test_an_exported_folder_works_alone(
+    small_run: Any, motions: Path, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    run, exported, elsewhere = tmp_path / "run", tmp_path / "exported", tmp_path / "else/where"
+    shutil.copytree(small_run.folder, run)
+    done = call("export", run, "-o", exported)
+    assert done.code == 0 and "motionloom generate" in done.out
+    shutil.rmtree(run)
+    shutil.copytree(exported, elsewhere)
+    shutil.rmtree(exported)
+    files = [p for p in elsewhere.rglob("*") if p.is_file()]
+    assert {p.suffix for p in files} == {".json", ".safetensors"}
+    assert json.loads((elsewhere / "skeleton.json").read_text())["name"] == "smplx52"
+    assert not any(str(small_run.folder.parent) in p.read_text() for p in files if p.suffix == ".json")
+    out = tmp_path / "motions"
+    assert call("generate", elsewhere, *WAVE, "--seed", 5, "-f", "npz", "-o", out).code == 0
+    np.testing.assert_array_equal(
+        arrays(only(out, ".npz"))["joints"], arrays(only(motions, ".npz"))["joints"]
+    )
+
+
+@pytest.mark.parametrize("kind", ["vae", "diffusion"])
+def test_each_face_generator_gives_its_own_face(
+    kind: str, copy: Path, motions: Path, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    first = arrays(only(motions, ".npz"))
+    for name in ("once", "again"):
+        options = ("--seed", 5, "-f", "npz", "--face-model", kind, "-o", tmp_path / name)
+        assert call("generate", copy, *WAVE, *options).code == 0
+    once, again = (arrays(only(tmp_path / name, ".npz")) for name in ("once", "again"))
+    np.testing.assert_array_equal(once["joints"], first["joints"])
+    np.testing.assert_array_equal(once["face"], again["face"])
+    assert once["face"].shape == first["face"].shape and not np.allclose(once["face"], first["face"])
+
+
+def test_from_pretrained_needs_the_saved_folder_alone(
+    copy: Path, motions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    MotionModel(copy).save_pretrained(tmp_path / "saved")
+    text = "".join(p.read_text() for p in (tmp_path / "saved").rglob("*") if p.suffix in (".json", ".md"))
+    assert str(copy) not in text
+    model = MotionModel.from_pretrained(tmp_path / "saved")
+    made = model.generate([WAVE[0]], face_captions=[WAVE[2]], seconds=2.0, seed=5)[0]
+    first = arrays(only(motions, ".npz"))
+    np.testing.assert_array_equal(made.joints.astype(np.float32), first["joints"].astype(np.float32))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    with pytest.raises(UserError, match="nobody/none: no such folder, and the hub does not give it"):
+        MotionModel.from_pretrained("nobody/none", local_files_only=True)
+
+
+def test_retrieval_under_four_protocols(copy: Path, call: Callable[..., Any]) -> None:
+    done = call("retrieval", copy)
+    assert done.code == 0
+    rows = json.loads((copy / "retrieval.json").read_text())["protocols"]
+    assert [row["protocol"] for row in rows] == list("ABCD")
+    whole, threshold = rows[0]["figures"], rows[1]["figures"]
+    for k in (1, 2, 3, 5, 10):
+        assert f"R@{k}" in done.out
+        assert threshold[f"t2m/R@{k}"] >= whole[f"t2m/R@{k}"], "more counts as a hit"
+    assert whole["t2m/R@1"] <= whole["t2m/R@3"] <= whole["t2m/R@10"] <= 1
+
+
+def test_retrieval_by_another_alignment_stage(
+    small_run: Any, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(small_run.folder, run)
+    done = call("retrieval", run, "--stage", "temos")
+    assert done.code == 2 and "no stage 'temos'" in done.err and "this run has tma" in done.err
+    assert "face_vae" not in done.err
+    recipe = yaml.safe_load((run / "recipe.yaml").read_text())
+    recipe["stages"]["temos"] = recipe["stages"]["tma"]
+    (run / "recipe.yaml").write_text(yaml.safe_dump(recipe, sort_keys=False))
+    unfinished = call("retrieval", run, "--stage", "temos")
+    assert unfinished.code == 2 and "no finished 'temos' stage" in unfinished.err
+    shutil.copytree(run / "stages/tma", run / "stages/temos")
+    weights = load_file(run / "stages/temos/model.safetensors")
+    weights["text_encoder.project.weight"] *= -1
+    save_file(weights, run / "stages/temos/model.safetensors")
+    assert call("retrieval", run).code == 0
+    other = call("retrieval", run, "--stage", "temos")
+    assert other.code == 0 and "Retrieval of stage temos" in other.out
+    ours, theirs = (json.loads((run / f"retrieval{x}.json").read_text()) for x in ("", "-temos"))
+    assert ours["stage"] == "tma" and theirs["stage"] == "temos"
+    assert [row["protocol"] for row in theirs["protocols"]] == list("ABCD")
+    assert ours["protocols"] != theirs["protocols"]
+
+
+@pytest.mark.parametrize("command", ["retrieval", "evaluate", "report", "export"])
+def test_an_exported_folder_is_called_one(
+    command: str, copy: Path, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    assert call("export", copy, "-o", tmp_path / "model").code == 0
+    done = call(command, tmp_path / "model")
+    assert done.code == 2 and "an exported folder" in done.err and "name the run folder" in done.err
+    help_text = call(command, "--help").out
+    assert "A run folder (runs/NAME)." in help_text and "made by export" not in help_text
+
+
+def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
+    done = call("evaluate", copy, "--clips", 4, "--repeats", 2)
+    assert done.code == 0 and "nearest training clip" in done.out and "chance" in done.out
+    figures = json.loads((copy / "evaluate/metrics.json").read_text())
+    assert figures["clips"] == 4 and figures["split"] == "test"
+    assert figures["reconstruction_mm"]["mpjpe"] > 0
+    for wrong in (("--repeats", 0), ("--clips", -4)):
+        done = call("evaluate", copy, *wrong)
+        assert done.code == 2 and f"evaluate: key '{wrong[0][2:]}' = {wrong[1]}" in done.err
+    page = tmp_path / "new/folder/page.html"
+    done = call("report", copy, "-o", page)
+    assert done.code == 0 and done.out.strip() == str(page)
+    assert "Figures on held-out clips" in page.read_text()
+
+
+def test_alignment_works_with_the_sentence_prior_too(
+    copy: Path, small_run: Any, call: Callable[..., Any]
+) -> None:
+    change = ("--set", "gpt.prior=sentence", "--until", "gpt")
+    done = call("run", small_run.recipe, "--out", copy, *change)
+    assert done.code == 0, done.out
+    log = [json.loads(line) for line in (copy / "stages/gpt/metrics.jsonl").read_text().splitlines()]
+    assert all(row["val/align"] > 0 for row in log if "val/align" in row) and log
+    assert any("val/align" in row for row in log)
+    assert call("run", small_run.recipe, "--out", copy, "--until", "gpt").code == 0
+
+
+@pytest.mark.browser
+def test_the_page_plays_in_a_browser(browser: Any, until: Callable[..., None], small_run: Any) -> None:
+    trouble: list[str] = []
+    page = browser.new_page()
+    page.on("console", lambda m: trouble.append(m.text) if m.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: trouble.append(str(error)))
+    page.goto((small_run.folder / "stages/report/report.html").as_uri())
+    end = time.monotonic() + 30
+    until(page, "window.__viewer && window.__viewer.draws > 0", 30)
+    frames = set()
+    while len(frames) < 5:
+        frames.add(page.evaluate("window.__viewer.frame"))
+        assert time.monotonic() < end, "the frames do not advance"
+        page.wait_for_timeout(50)
+    page.close()
+    assert not trouble

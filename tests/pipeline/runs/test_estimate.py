@@ -1,0 +1,128 @@
+"""What a recipe would take: the paper's counts, and memory that follows the batch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.runs.estimate import estimate
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.api import run_recipe
+
+PAPER = """
+name: paper-sizes
+stages:
+  data: {kind: synth, layout: wholebody363}
+  stats: {kind: stats}
+  text: {kind: text}
+  tokenizer: {kind: h2vq, train: {batch_size: 64}}
+  vanilla: {kind: vq, net: {num_codes: 1024, reset_below: 0.2}, train: {batch_size: 64}}
+  tma: {kind: tma, train: {batch_size: 64}}
+  tokens: {kind: tokens}
+  gpt: {kind: gpt, loss: {align_weight: 0.0}, train: {batch_size: 64}}
+"""
+
+
+@pytest.fixture
+def paper(tmp_path: Path) -> Path:
+    path = tmp_path / "paper.yaml"
+    path.write_text(PAPER)
+    return path
+
+
+def test_paper_counts(paper: Path) -> None:
+    rows = {row.stage: row for row in estimate(load_recipe(paper))}
+    assert rows["gpt"].note == "98 body + 49 hand + 2 End = 149 for 196 frames"
+    assert rows["gpt"].parameters == pytest.approx(229e6, rel=0.01)
+    # 7.5 groups a second: (2 + 1) x 9 bits against 1 x 10 bits.
+    assert rows["tokenizer"].note == "2 body + 1 hand per 4 frames, 202 bit/s"
+    assert rows["vanilla"].note == "1 code per 4 frames, 75 bit/s"
+    assert {row.local_batch for row in rows.values()} == {64}
+
+
+def test_memory_follows_batch_and_checkpointing(paper: Path) -> None:
+    def memory(*overrides: str) -> int:
+        return next(r.memory_bytes for r in estimate(load_recipe(paper, overrides)) if r.stage == "gpt")
+
+    whole = memory()
+    weights = 16 * next(r.parameters for r in estimate(load_recipe(paper)) if r.stage == "gpt")
+    half = memory("gpt.train.batch_size=32")
+    assert whole - weights == pytest.approx(2 * (half - weights), rel=0.02)
+    assert memory("gpt.train.checkpoint_activations=true") - weights < 0.2 * (whole - weights)
+    assert memory("gpt.train.accumulate=2") == half
+
+
+def test_half_precision_keeps_the_losses_whole(paper: Path) -> None:
+    rows = {
+        precision: next(
+            row
+            for row in estimate(load_recipe(paper, [f"gpt.train.precision={precision}"]))
+            if row.stage == "gpt"
+        )
+        for precision in ("32-true", "bf16-mixed")
+    }
+    kept = {name: row.memory_bytes - 16 * row.parameters for name, row in rows.items()}
+    assert 0.5 * kept["32-true"] < kept["bf16-mixed"] < 0.9 * kept["32-true"]
+
+
+def test_codebooks_are_told(paper: Path) -> None:
+    row = next(r for r in estimate(load_recipe(paper)) if r.stage == "vanilla")
+    assert row.codebook == 1024 * 512
+    large = estimate(load_recipe(paper, ["vanilla.net.num_codes=4096", "vanilla.net.reset_below=0.1"]))
+    other = next(r for r in large if r.stage == "vanilla")
+    # The codebook itself and its running sums, float32.
+    assert other.memory_bytes - row.memory_bytes >= 3072 * 512 * 2 * 4
+
+
+def test_saved_bytes_of_a_known_network() -> None:
+    """Against the real thing: sizes of the storages that real tensors keep."""
+    from motionloom.datasets.motion.layout import MotionLayout
+    from motionloom.models.training.stage_module import OptimConfig
+    from motionloom.models.tokenizer.build import build_tokenizer
+    from motionloom.models.tokenizer.config import VqConfig
+    from motionloom.models.tokenizer.module import TokenizerModule
+    from motionloom.pipeline.runs.estimate import _saved_bytes
+
+    config = VqConfig(width=16, depth=1, code_dim=16, num_codes=32)
+    sizes = []
+    for fake in (True, False):
+        mode = torch._subclasses.fake_tensor.FakeTensorMode(allow_non_fake_inputs=True)
+        with mode if fake else torch.enable_grad():
+            net = build_tokenizer(config, MotionLayout.named("body133"))
+            module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms())
+            batch = {"motion": torch.zeros(4, 16, 133), "length": torch.full((4,), 16)}
+            sizes.append(_saved_bytes(module, batch, None))
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
+
+
+def test_bits_of_a_tokenizer() -> None:
+    from motionloom.datasets.motion.layout import MotionLayout
+    from motionloom.models.tokenizer.build import build_tokenizer
+    from motionloom.models.tokenizer.config import RvqConfig
+
+    net = build_tokenizer(RvqConfig(width=8, code_dim=8, num_codes=16), MotionLayout.named("body133", fps=20))
+    assert net.bits_per_second == 5 * 2 * 4
+
+
+def test_dry_run_tells(paper: Path, tmp_path: Path) -> None:
+    console = Console(record=True, width=160)
+    run_recipe(paper, tmp_path / "run", dry_run=True, console=console)
+    said = console.export_text()
+    assert "98 body + 49 hand + 2 End = 149 for 196 frames" in said
+    assert "GiB" in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_layout_that_does_not_fit_is_told_with_the_stage() -> None:
+    recipe = load_recipe("humantomato-tiny", ["data.layout=body133"])
+    with pytest.raises(UserError, match="stage tokenizer: layout body133 has no hand columns"):
+        estimate(recipe)
+    recipe = load_recipe("bvh-body", ["data.layout=body133", "tma.net.finger_gain=4"])
+    with pytest.raises(
+        UserError, match=r"stage tma: finger_gain needs body and hands together \(layout body133\)"
+    ):
+        estimate(recipe)

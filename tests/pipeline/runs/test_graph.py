@@ -1,0 +1,165 @@
+"""The stage graph: skip, re-run, resume, select; on stages that only write a number."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pydantic import Field
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.files import atomic, write_json
+from motionloom.pipeline.runs.graph import Selection, execute, make_plan
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.stages.stage import RUNTIME, StageConfig, StageContext, StageKind
+from motionloom.pipeline.stages import table
+
+
+class AddConfig(StageConfig):
+    add: int = 1
+    workers: int = Field(1, json_schema_extra=RUNTIME)
+
+
+def run_add(context: StageContext) -> None:
+    above = [json.loads((folder / "value.json").read_text()) for folder in context.inputs.values()]
+    write_json(context.folder / "value.json", sum(above) + context.config.add)
+
+
+@pytest.fixture(autouse=True)
+def toy_kinds(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setitem(table.STAGES, "root", StageKind("root", "a number", AddConfig, run_add))
+    monkeypatch.setitem(
+        table.STAGES, "sum", StageKind("sum", "a sum", AddConfig, run_add, ("left", "right?"))
+    )
+    yield
+
+
+def recipe(tmp_path: Path, *overrides: str) -> Recipe:
+    path = tmp_path / "toy.yaml"
+    path.write_text(
+        "name: toy\nstages:\n"
+        "  left: {kind: root, add: 1}\n"
+        "  right: {kind: root, add: 10}\n"
+        "  both: {kind: sum}\n"
+        "  one: {kind: sum, inputs: {left: right, right: right}}\n"
+        "  top: {kind: sum, inputs: {left: both}, add: 100}\n"
+    )
+    return load_recipe(path, overrides)
+
+
+def go(tmp_path: Path, *overrides: str, select: Selection | None = None) -> list[str]:
+    loaded = recipe(tmp_path, *overrides)
+    run = tmp_path / "run"
+    return execute(loaded, run, make_plan(loaded, run, select), Console(quiet=True))
+
+
+def value(tmp_path: Path, stage: str) -> int:
+    return int((tmp_path / "run/stages" / stage / "value.json").read_text())
+
+
+def test_runs_all_then_nothing(tmp_path: Path) -> None:
+    assert go(tmp_path) == ["left", "right", "both", "one", "top"]
+    assert value(tmp_path, "top") == 122
+    assert go(tmp_path) == []
+
+
+def test_a_change_runs_that_stage_and_those_below(tmp_path: Path) -> None:
+    go(tmp_path)
+    assert go(tmp_path, "left.add=2") == ["left", "both", "top"]
+    assert value(tmp_path, "top") == 123
+    assert go(tmp_path, "left.add=2", "top.add=0") == ["top"]
+
+
+def test_runtime_fields_change_nothing(tmp_path: Path) -> None:
+    go(tmp_path)
+    assert go(tmp_path, "left.workers=7", "hardware.workers=3") == []
+
+
+def test_seed_changes_everything(tmp_path: Path) -> None:
+    go(tmp_path)
+    assert go(tmp_path, "seed=5") == ["left", "right", "both", "one", "top"]
+
+
+def test_reason_names_the_field(tmp_path: Path) -> None:
+    go(tmp_path)
+    loaded = recipe(tmp_path, "left.add=2")
+    reasons = {row.stage.name: row.reason for row in make_plan(loaded, tmp_path / "run")}
+    assert reasons["left"] == "changed: add 1 -> 2"
+    assert reasons["both"] == "input left changed"
+    assert reasons["right"] == "finished"
+
+
+def test_lost_output_runs_again(tmp_path: Path) -> None:
+    go(tmp_path)
+    (tmp_path / "run/stages/both/value.json").unlink()
+    assert go(tmp_path) == ["both"]
+
+
+def test_new_version_of_a_kind_runs_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go(tmp_path)
+    monkeypatch.setitem(
+        table.STAGES, "sum", StageKind("sum", "a sum", AddConfig, run_add, ("left", "right?"), version=2)
+    )
+    assert go(tmp_path) == ["both", "one", "top"]
+
+
+def test_selection(tmp_path: Path) -> None:
+    assert go(tmp_path, select=Selection(until="both")) == ["left", "right", "both"]
+    with pytest.raises(UserError, match="did you mean 'both'"):
+        go(tmp_path, select=Selection(until="bot"))
+    go(tmp_path)
+    assert go(tmp_path, select=Selection(first="both")) == ["both", "top"]
+    assert go(tmp_path, select=Selection(only="one", force=True)) == ["one"]
+    with pytest.raises(UserError, match="is not finished"):
+        go(tmp_path, "right.add=4", select=Selection(only="top"))
+
+
+def test_artifact_lists_outputs_and_inputs(tmp_path: Path) -> None:
+    go(tmp_path)
+    artifact = Artifact.find(tmp_path / "run/stages/both")
+    assert artifact is not None
+    assert set(artifact.outputs) == {"value.json"}
+    assert {role: i.stage for role, i in artifact.inputs.items()} == {"left": "left", "right": "right"}
+
+
+def test_atomic_leaves_nothing_on_error(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), atomic(tmp_path / "file") as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_two_processes_do_not_share_a_run(tmp_path: Path) -> None:
+    holder = subprocess.Popen(
+        [
+            sys.executable,
+            "-P",
+            "-c",
+            "import fcntl, sys, time; file = open(sys.argv[1], 'w'); fcntl.flock(file, 2);"
+            "print('held', flush=True); time.sleep(60)",
+            str(lock_file(tmp_path)),
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+        with pytest.raises(UserError, match="another motionloom process"):
+            go(tmp_path)
+    finally:
+        os.kill(holder.pid, signal.SIGKILL)
+        holder.wait()
+    assert go(tmp_path) == ["left", "right", "both", "one", "top"]
+
+
+def lock_file(tmp_path: Path) -> Path:
+    (tmp_path / "run").mkdir()
+    return tmp_path / "run/.lock"

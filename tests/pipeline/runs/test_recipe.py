@@ -1,0 +1,167 @@
+"""Recipes: reading, overriding, refusing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.runs.recipe import load_recipe, shipped_recipes
+from motionloom.pipeline.runs.api import run_recipe
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "recipe.yaml"
+    path.write_text(text)
+    return path
+
+
+BASE = """
+name: small
+stages:
+  data: {kind: synth, clips: 8}
+  stats: {kind: stats}
+"""
+
+
+@pytest.mark.parametrize("name", sorted(shipped_recipes()))
+def test_shipped_recipes_load_and_reload(name: str, tmp_path: Path) -> None:
+    recipe = load_recipe(name)
+    assert recipe.description
+    assert load_recipe(write(tmp_path, recipe.to_yaml())) == recipe
+
+
+def test_override_changes_one_value() -> None:
+    plain = load_recipe("humantomato-tiny")
+    changed = load_recipe("humantomato-tiny", ["tma.optim.lr=1e-3"])
+    assert changed.stage("tma").config.optim.lr == 1e-3  # type: ignore[attr-defined]
+    same = [s for s in changed.stages if s.name != "tma"]
+    assert same == [s for s in plain.stages if s.name != "tma"]
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("tma.optim.lrr=1", "did you mean 'lr'"),
+        ("tmaa.optim.lr=1", "did you mean 'tma'"),
+        ("tma.optim.lr", "stage.field=value"),
+        ("tma.optim.lr=fast", "optim.lr"),
+        ("tma.train.steps=0", "train.steps"),
+        ("hardware.device=2", "did you mean 'hardware.devices'|did you mean 'devices'"),
+        ("tma.kind=tmaa", "is no stage kind; did you mean 'tma'"),
+        ("gpt.net.heads=7", "with --set: stages.gpt: .*dim 160 must be a multiple of heads 7"),
+        ("tma.net.heads=3", "latent 128 must be a multiple of heads 3"),
+        ("tokenizer.inputs.data=null", "stage 'tokenizer' needs a stage 'None'"),
+    ],
+)
+def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        load_recipe("humantomato-tiny", [override])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("name: x\nstages: {stats: {kind: stats}}", "needs a stage 'data'"),
+        (
+            "name: x\nstages: {data: {kind: synth}, stats: {kind: stats, inputs: {dat: data}}}",
+            "unknown role 'dat'",
+        ),
+        ("name: x\nstage: {}", "unknown key 'stage'; did you mean 'stages'"),
+        ("name: ../x\nstages: {}", "name"),
+        ("name: x\nstages: {../../victim: {kind: stats}}", "stage name '../../victim'"),
+        ("name: x\nstages: {/tmp/victim: {kind: stats}}", "stage name '/tmp/victim'"),
+        ("[1, 2]", "mapping"),
+        ("a: [", "not valid YAML"),
+        ("extends: recipe\nname: x", "circle"),
+        (
+            "name: x\nstages: {data: {kind: synth}, stats: {kind: stats}, text: {kind: text}, "
+            "face_vae: {kind: tma, part: face, net: {frame_stride: 2}}}",
+            "frame_stride must be 1",
+        ),
+    ],
+)
+def test_wrong_recipes_are_refused(text: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=says):
+        load_recipe(write(tmp_path, text))
+
+
+def test_unknown_recipe_names_the_nearest() -> None:
+    with pytest.raises(UserError, match="did you mean 'humantomato-tiny'"):
+        load_recipe("humantomato-tin")
+
+
+def test_extends_merges_into_the_base(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(BASE)
+    recipe = load_recipe(write(tmp_path, "extends: base\nname: child\nstages: {data: {clips: 9}}"))
+    assert recipe.name == "child"
+    assert recipe.stage("data").config.clips == 9  # type: ignore[attr-defined]
+    assert [s.name for s in recipe.stages] == ["data", "stats"]
+
+
+CAPTIONED = """
+name: two-encoders
+stages:
+  data: {kind: synth, clips: 8}
+  stats: {kind: stats}
+  text: {kind: text}
+  clip: {kind: text, encoder: some-clip}
+  tma: {kind: tma}
+  tokenizer: {kind: h2vq}
+  tokens: {kind: tokens}
+  gpt: {kind: gpt, prior: sentence, inputs: {text: clip}}
+"""
+
+
+def test_a_tma_on_captions_of_another_encoder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        UserError, match=r"'gpt' reads captions as 'clip' .* its TMA 'tma' .* those of 'text'"
+    ):
+        load_recipe(write(tmp_path, CAPTIONED))
+    for change in (("inputs: {text: clip}", "inputs: {text: clip, tma: null}"), ("some-clip", "minilm")):
+        load_recipe(write(tmp_path, CAPTIONED.replace(*change)))
+
+
+@pytest.mark.parametrize("override", ["tokenizer.net.reset_below=1.0", "tokenizer.net.num_codes=8192"])
+def test_a_codebook_too_large_for_its_batches_is_refused(override: str, tmp_path: Path) -> None:
+    for dry_run in (True, False):
+        with pytest.raises(UserError, match=r"stage tokenizer: .*net.reset_below to 0\.\d+ or less"):
+            run_recipe(
+                "humantomato-tiny",
+                tmp_path,
+                overrides=[override],
+                dry_run=dry_run,
+                console=Console(quiet=True),
+            )
+    assert not list(tmp_path.rglob("artifact.json")), "refused before anything ran"
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("gpt.net.block_size=4", "block_size 4 holds no motion.* take 6"),
+        ("hardware.accelerator=gpu", "no GPU is here; set hardware.devices"),
+    ],
+)
+def test_a_dry_run_refuses_what_cannot_run(override: str, says: str, tmp_path: Path) -> None:
+    if "gpu" in override and torch.cuda.is_available():
+        pytest.skip("there is a GPU here")
+    console = Console(record=True, width=500)
+    with pytest.raises(UserError, match=says):
+        run_recipe("humantomato-tiny", tmp_path, overrides=[override], dry_run=True, console=console)
+
+
+def test_shards_that_are_not_there_or_of_another_layout(tmp_path: Path) -> None:
+    path = tmp_path / "recipe.yaml"
+    path.write_text("name: x\nstages: {data: {kind: shards, path: shards}, stats: {kind: stats}}")
+    missing = [f"data.path={tmp_path / 'nowhere'}"]
+    with pytest.raises(UserError, match="nowhere: no such folder; set the path of the data stage"):
+        run_recipe(path, tmp_path / "run", overrides=missing, dry_run=True, console=Console(quiet=True))
+    synthesize(SynthConfig(clips=4), tmp_path / "shards", workers=1)
+    other = [f"data.path={tmp_path / 'shards'}", "data.layout=body133"]
+    with pytest.raises(UserError, match="layout wholebody363, but the recipe wants body133"):
+        run_recipe(path, tmp_path / "run", overrides=other, dry_run=True, console=Console(quiet=True))

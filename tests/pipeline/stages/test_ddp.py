@@ -1,0 +1,213 @@
+"""Two processes on one machine: they finish, leave, agree with one process, and fail together."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+from safetensors.numpy import load_file
+
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.graph import Selection
+
+pytestmark = pytest.mark.slow
+
+# Without what draws per process (dropout, latent noise), so that one and two processes can be compared.
+RECIPE = """
+extends: small
+name: small
+stages:
+  tokenizer: {train: {steps: 4, checkpoint_every: 2, validate_every: 2}}
+  tma:
+    net: {dropout: 0.0}
+    loss: {reconstruction: 0.0, latent: 0.0}
+    train: {steps: 4, checkpoint_every: 2, validate_every: 2}
+  gpt:
+    net: {dropout: 0.0, condition_dropout: 0.0}
+    loss: {align_weight: 0.0}
+    train: {steps: 10, checkpoint_every: 5, validate_every: 5}
+"""
+PAIR = ("--set", "hardware.devices=2")
+
+
+@pytest.fixture(scope="module")
+def recipe(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recipes")
+    shutil.copy(small_run.recipe, folder / "small.yaml")
+    (folder / "pair.yaml").write_text(RECIPE)
+    return folder / "pair.yaml"
+
+
+@pytest.fixture(scope="module")
+def single(small_run: Any, recipe: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run by one process; data, statistics and text are there already."""
+    run = tmp_path_factory.mktemp("single") / "run"
+    shutil.copytree(small_run.folder, run)
+    return run_recipe(recipe, run, select=Selection(until="gpt"), console=Console(quiet=True))
+
+
+@pytest.fixture
+def running(start: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
+    """Like `start`, and nothing outlives the test."""
+    processes = []
+
+    def go(*arguments: object, **options: Any) -> Any:
+        processes.append(start(*arguments, **options))
+        return processes[-1]
+
+    yield go
+    for process in processes:
+        try:
+            os.killpg(process.pid, signal.SIGKILL)
+        except ProcessLookupError:
+            continue
+
+
+def finish(process: Any, code: int = 0, seconds: float = 90) -> str:
+    """The output of a process that must end by itself."""
+    output: str = process.communicate(timeout=seconds)[0]
+    assert process.returncode == code, output
+    return output
+
+
+def rows(run: Path, stage: str) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (run / "stages" / stage / "metrics.jsonl").read_text().splitlines()]
+
+
+def files(run: Path) -> set[str]:
+    return {p.relative_to(run).as_posix() for p in run.rglob("*") if p.is_file()}
+
+
+def assert_same_training(one: Path, two: Path, stage: str) -> None:
+    weights = [load_file(run / "stages" / stage / "model.safetensors") for run in (one, two)]
+    assert weights[0].keys() == weights[1].keys()
+    for name, value in weights[0].items():
+        error = np.abs(value.astype(np.float64) - weights[1][name])
+        if "quantizer" in name:
+            # A vector between two codes may fall to the other one by a rounding error.
+            assert np.quantile(error, 0.5) < 1e-4 and error.mean() < 1e-2, (stage, name)
+        else:
+            assert error.max() < 1e-4, (stage, name)
+    logged = [rows(run, stage) for run in (one, two)]
+    assert [row["step"] for row in logged[0]] == [row["step"] for row in logged[1]]
+    for first, second in zip(*logged, strict=True):
+        compared = [name for name in first if name.endswith(("loss", "recon", "ce", "contrastive", "kl"))]
+        for name in compared:
+            assert second[name] == pytest.approx(first[name], rel=1e-3, abs=1e-4), (stage, name)
+
+
+def test_two_processes_equal_one(
+    small_run: Any,
+    single: Path,
+    recipe: Path,
+    running: Callable[..., Any],
+    call: Callable[..., Any],
+    tmp_path: Path,
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(small_run.folder, run)
+    output = finish(running("run", recipe, "--out", run, "--until", "gpt", *PAIR))
+    assert output.count("[4/15] tokenizer") == output.count("[7/15] tokens") == 1, "only one process speaks"
+    assert files(run) == files(single)
+    for stage in ("tokenizer", "tma"):
+        assert_same_training(single, run, stage)
+    again = call("run", recipe, "--out", run, "--until", "gpt", *PAIR)
+    assert again.code == 0 and "nothing to do" in again.out
+
+
+def test_torchrun_equals_one_process(
+    single: Path, recipe: Path, running: Callable[..., Any], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(single, run)
+    torchrun = (
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        2,
+        "--no-python",
+    )
+    program = Path(sys.executable).with_name("motionloom")
+    # The GPT alone, so that both have exactly the same tokens.
+    output = finish(
+        running(program, "run", recipe, "--out", run, "--from", "gpt", "--until", "gpt", program=torchrun)
+    )
+    assert output.count("[9/15] gpt") == 1
+    assert files(run) == files(single)
+    assert_same_training(single, run, "gpt")
+
+
+def test_a_launcher_that_does_not_match_is_refused(
+    recipe: Path, call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("RANK", "0"), ("LOCAL_RANK", "0"), ("WORLD_SIZE", "2"), ("LOCAL_WORLD_SIZE", "2")):
+        monkeypatch.setenv(name, value)
+    done = call("run", recipe, "--out", tmp_path / "run", "--set", "hardware.devices=1")
+    assert done.code == 2 and "the launcher started 2 processes and the recipe asks for 1" in done.err
+
+
+def test_a_batch_that_does_not_divide_is_refused_before_anything_runs(
+    recipe: Path, call: Callable[..., Any], tmp_path: Path
+) -> None:
+    done = call("run", recipe, "--out", tmp_path / "run", "--set", "gpt.train.batch_size=7", *PAIR)
+    assert done.code == 2 and "train.batch_size 7 does not divide by 2 processes" in done.err
+    assert not (tmp_path / "run/stages").exists()
+
+
+def children(process: Any) -> list[int]:
+    return [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+
+
+def is_gone(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks up processes in /proc")
+@pytest.mark.parametrize("victim", ["other", "lead"])
+def test_no_process_outlives_another(
+    victim: str, small_run: Any, recipe: Path, running: Callable[..., Any], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(small_run.folder, run)
+    shutil.rmtree(run / "stages/tokenizer")
+    endless = ("--set", "tokenizer.train.steps=1000000", "--until", "tokenizer")
+    process = running("run", recipe, "--out", run, *endless, *PAIR)
+    end = time.monotonic() + 90
+    while not list(run.glob("stages/tokenizer/checkpoints/*.ckpt")):
+        assert process.poll() is None and time.monotonic() < end, process.communicate()[0]
+        time.sleep(0.05)
+    (other,) = [pid for pid in children(process) if not is_gone(pid)]
+    os.kill(other if victim == "other" else process.pid, signal.SIGKILL)
+    output = process.communicate(timeout=30)[0]
+    assert process.returncode != 0 and "Traceback" not in output
+    end = time.monotonic() + 30
+    while not is_gone(other):
+        assert time.monotonic() < end, "the other process goes on alone"
+        time.sleep(0.05)
+
+
+def test_an_error_of_the_lead_ends_those_who_wait(
+    single: Path, recipe: Path, running: Callable[..., Any], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(single, run)
+    (run / "stages/.tokens.removed").write_text("in the way")  # the lead cannot clear the stage's folder
+    words = ("run", recipe, "--out", run, "--from", "tokens", "--until", "gpt", *PAIR)
+    output = finish(running(*words), code=1, seconds=60)
+    assert "NotADirectoryError" in output
+    assert "process 1: another process of this run has stopped" in output

@@ -1,0 +1,190 @@
+"""What a GPT trains on: captions about a part of a clip, clips without captions, clips without hands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.loading.statistics import compute
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import HANDS, Caption, Split, UserError
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.shards.writer import write_dataset
+from motionloom.models.gpt.tokens import deinterleave
+from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import AnyTokenizerConfig, H2VQConfig, VqConfig
+from motionloom.pipeline.evaluation.truth import captioned, spread, truth_of
+from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
+from motionloom.pipeline.stages.tokens import encode_split
+from motionloom.pipeline.store.tokens import TokenBatches, TokenStore
+
+LAYOUT = MotionLayout.named("wholebody363")  # 30 fps
+FRAMES = 90
+WALKS = Caption(text="walks", start=0.0, end=1.0)
+SITS = Caption(text="sits", start=1.0, end=2.5)
+BLINK = Caption(text="blinks", start=2.0, end=2.05)
+ALL = Caption(text="everything")
+GROUPS = {"walks": (0, 8), "sits": (8, 19), "everything": (0, 22)}
+"""Groups of four frames with the borders nearest to those above."""
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Clip i has the captions `texts[i]`, the face captions `faces[i]` and holds the bits `held[i]`."""
+
+    texts: Sequence[list[Caption]]
+    faces: Sequence[list[Caption]] = ()
+    held: Sequence[int] = ()
+
+    def __call__(self, i: int) -> Sample:
+        motion = np.random.default_rng(i).standard_normal((FRAMES, LAYOUT.dim)).astype(np.float32)
+        meta = LAYOUT.clip_meta(
+            f"clip{i}", source="made", split="train", frames=FRAMES, licence="CC0",
+            has_hands=not self.held or bool(self.held[i] & HANDS), truth={"action": "none"},
+        )  # fmt: skip
+        faces = list(self.faces[i]) if self.faces else []
+        return Sample(meta, motion, texts=list(self.texts[i]), face_texts=faces)
+
+
+def dataset_of(out: Path, convert: Convert) -> ShardDataset:
+    items: list[tuple[Split, int]] = [("train", i) for i in range(len(convert.texts))]
+    write_dataset(
+        out, items, convert, name="made", layout=LAYOUT, licence="CC0", converter="test",
+        converter_version=1, options={}, clips_per_shard=3, progress=False,
+    )  # fmt: skip
+    return ShardDataset.open(out, "train")
+
+
+def places(dataset: ShardDataset) -> list[int]:
+    """Where clip 0, 1, ... came to lie: shards are shuffled when they are written."""
+    return [dataset.ids.index(f"clip{i}") for i in range(len(dataset))]
+
+
+def clips_of(
+    dataset: ShardDataset, *, face: bool = False, config: AnyTokenizerConfig | None = None
+) -> tuple[GptClips, TokenStore, Tokenizer]:
+    torch.manual_seed(0)
+    small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
+    net = build_tokenizer(config or H2VQConfig(**small), dataset.layout)
+    net(torch.randn(8, 16, net.dim))
+    net.freeze()
+    store = encode_split(net, dataset, compute(dataset), 512)
+    return gpt_clips(dataset, store, net, face=face, min_frames=16), store, net
+
+
+def batches_of(clips: GptClips, net: Tokenizer, *, most: int = 40, training: bool = True) -> TokenBatches:
+    eye, ends = torch.eye(len(clips.texts)), {s.name: s.num_codes for s in net.streams}
+    return TokenBatches(
+        clips.store, clips.captions, eye, eye, net.pattern, ends, most, 4, 0, training=training,
+        sources=clips.sources, held=clips.held,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("captions", [[WALKS, SITS], [SITS, WALKS, ALL, BLINK]])
+def test_a_caption_comes_with_its_own_tokens(tmp_path: Path, captions: list[Caption]) -> None:
+    """Each sequence is the stretch that its caption is about, and ends there."""
+    clips, store, net = clips_of(dataset_of(tmp_path, Convert([captions] * 2)))
+    assert clips.texts == [c.text for c in captions if c is not BLINK], "too short beside longer ones"
+    batches, seen = batches_of(clips, net), set()
+    streams = {s.name: (s.num_codes, s.per_group) for s in net.streams}
+    ends = {name: size for name, (size, _) in streams.items()}
+    wanted = {  # a clip's tokens and its caption's, cut by hand
+        (text, clip): {
+            name: store.codes[name][(22 * clip + first) * n : (22 * clip + end) * n]
+            for name, (_, n) in streams.items()
+        }
+        for text, (first, end) in GROUPS.items()
+        for clip in range(2)
+    }
+    for k in range(20):
+        batch = batches[k]
+        read = deinterleave(batch["tokens"], net.pattern, ends=ends)
+        assert torch.equal(batch["length"], 3 * read.groups + 2), "an End closes every sequence"
+        for row, at in enumerate(batch["text"].argmax(1).tolist()):
+            text, count = clips.texts[at], int(read.groups[row])
+            found = [
+                clip
+                for clip in range(2)
+                if all(
+                    torch.equal(read.codes[name][row, : count * n], wanted[text, clip][name])
+                    for name, (_, n) in streams.items()
+                )
+            ]
+            assert found, text
+            seen.add(text)
+    assert seen == set(clips.texts)
+    first = batches_of(clips, net, training=False)[0]
+    assert clips.texts[int(first["text"][0].argmax())] == captions[0].text
+
+
+def test_a_long_stretch_is_cropped_inside(tmp_path: Path) -> None:
+    clips, store, net = clips_of(dataset_of(tmp_path, Convert([[SITS]])))
+    body, allowed = store.codes["body"], range(8, 19 - 5 + 1)
+    begun = set()
+    for k in range(40):
+        batch = batches_of(clips, net, most=5)[k]
+        assert (batch["length"] == 15).all(), "no End: the motion goes on"
+        codes = deinterleave(batch["tokens"], net.pattern).codes["body"]
+        for row in codes:
+            begun |= {i for i in range(18) if torch.equal(row, body[2 * i : 2 * i + 10])}
+    assert begun == set(allowed)
+
+
+def test_truth_is_what_the_caption_is_about(tmp_path: Path) -> None:
+    texts = [[WALKS, SITS], [SITS, ALL], [], [BLINK, SITS]]
+    faces = [[Caption(text="frowns", start=1.5), Caption(text="smiles", end=1.0)], [ALL], [], []]
+    dataset = dataset_of(tmp_path, Convert(texts, faces))
+    where = places(dataset)
+    truths = [truth_of(dataset, i) for i in where]
+    assert [t.caption for t in truths] == ["walks", "everything", "", "sits"]
+    assert [t.face_caption for t in truths] == ["smiles", "everything", "", "sits"]
+    spans = [(0, 28), (0, 88), (0, 88), (30, 74)]
+    for i, (truth, (first, end)) in enumerate(zip(truths, spans, strict=True)):
+        np.testing.assert_array_equal(
+            truth.features, dataset.motion(where[i])[first:end, LAYOUT.part("bodyhand")]
+        )
+        assert truth.face is not None and len(truth.face) == len(truth.joints) == end - first
+    assert [t.truth is None for t in truths] == [True, False, False, True], "of whole clips alone"
+    assert captioned(dataset)[where].tolist() == [True, True, False, True]
+    assert set(spread(dataset, 10)) == set(where) - {where[2]}
+
+
+@pytest.mark.parametrize("face", [False, True])
+def test_clips_without_a_caption_are_left_out(tmp_path: Path, face: bool) -> None:
+    some: list[list[Caption]] = [[ALL], [], [WALKS], [], []]
+    everywhere = [[ALL]] * 5
+    dataset = dataset_of(tmp_path, Convert(everywhere if face else some, some if face else everywhere))
+    clips, store, net = clips_of(dataset, face=face)
+    assert clips.uncaptioned == 3 and set(clips.texts) == {"everything", "walks"}
+    assert len(clips.store.groups) == len(clips.captions) == 2
+    for row, clip in enumerate(sorted([places(dataset)[0], places(dataset)[2]])):
+        assert torch.equal(clips.store.clip(row)["body"], store.clip(clip)["body"])
+    assert batches_of(clips, net)[0]["tokens"].shape[0] == 4
+
+
+def test_no_caption_at_all_is_refused(tmp_path: Path) -> None:
+    dataset = dataset_of(tmp_path, Convert([[ALL], [WALKS]]))
+    with pytest.raises(UserError, match="no clip of split 'train' has a face caption"):
+        clips_of(dataset, face=True)
+    silent = dataset_of(tmp_path / "silent", Convert([[], []]))
+    with pytest.raises(UserError, match="no clip of split 'train' has a caption"):
+        clips_of(silent)
+    with pytest.raises(UserError, match="no clip of split 'train' has a caption"):
+        spread(silent, 4)
+
+
+def test_a_tokenizer_without_a_hand_stream_needs_hands(tmp_path: Path) -> None:
+    dataset = dataset_of(tmp_path, Convert([[ALL]] * 3, held=(3, 2, 3)))
+    config = VqConfig(width=8, depth=1, code_dim=8, num_codes=8)
+    clips, _, _ = clips_of(dataset, config=config)
+    assert len(clips.captions) == 2 and clips.held is None and clips.uncaptioned == 0
+    bare = dataset_of(tmp_path / "bare", Convert([[ALL]] * 2, held=(2, 2)))
+    with pytest.raises(UserError, match="holds all that the tokenizer models"):
+        clips_of(bare, config=VqConfig(width=8, depth=1, code_dim=8, num_codes=8, part="bodyhand"))
