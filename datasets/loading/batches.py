@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from motionloom.datasets.base.randomness import uniform
+from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.loading.crops import Crops, padded_length
 from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
@@ -42,17 +43,15 @@ class MotionBatch(TypedDict):
 
 
 class CaptionBatch(MotionBatch):
-    """A motion batch with one caption per clip: S tokens of E values, `text_mask` true where a token is."""
+    """A motion batch with one caption per clip."""
 
     index: Tensor
     """Clip numbers in the dataset, int64 [B]."""
     valid: Tensor
     """bool [B]; false for the repeats that fill an evaluation batch up to the number of ranks."""
     caption: list[str]
-    text_tokens: Tensor
-    text_mask: Tensor
-    sentence: Tensor
-    """float32 [B, E], unit length."""
+    conditions: Conditions
+    """"text": word features, and sentence embeddings of unit length as its pooled vectors."""
     similarity: Tensor
     """float32 [B, S], unit length: embeddings that say which captions mean the same."""
 
@@ -189,12 +188,12 @@ class _CaptionedClips:
             "index": torch.from_numpy(clips.copy()),
             "valid": torch.ones(len(clips), dtype=torch.bool),
             "caption": captions,
+            "conditions": {},
         }
         if self.text is not None:
-            tokens, mask = self.text.tokens(captions)
-            batch["text_tokens"] = torch.from_numpy(tokens)
-            batch["text_mask"] = torch.from_numpy(mask)
-            batch["sentence"] = torch.from_numpy(self.text.sentence(captions))
+            tokens, mask = map(torch.from_numpy, self.text.tokens(captions))
+            sentence = torch.from_numpy(self.text.sentence(captions))
+            batch["conditions"] = {"text": Condition(tokens, mask, sentence)}
             batch["similarity"] = torch.from_numpy(self.text.similarity(captions))
         return batch  # type: ignore[return-value]
 

@@ -23,11 +23,12 @@ class DiffusionModule(StageModule):
         self.noiser = net.config.schedule.noiser()
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Loss of {"motion" [B, T, D], "length" [B], "sentence" [B, E], "held" bool [B, D] (optional: all)}.
+        """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "held" bool [B, D]
+        (optional: all).
 
-        Time steps and noise are drawn anew each call; evaluation tells every caption.
+        Time steps and noise are drawn anew each call; in evaluation no caption is dropped.
         """
-        motion, length, text = batch["motion"], batch["length"], batch["sentence"]
+        motion, length, text = batch["motion"], batch["length"], batch["conditions"]["text"].pooled
         schedule = self.net.config.schedule
         mask = length_mask(length, motion.shape[1])
         step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)

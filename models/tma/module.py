@@ -45,8 +45,8 @@ class TmaModule(StageModule):
         self.loss_config = loss or TmaLossConfig()
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Loss of one batch: "motion" [B, T, D], "length" [B], "text_tokens" [B, S, E], "text_mask",
-        "similarity" [B, S] (sBERT embeddings, for the filter), "held" bool [B, D] (optional: all).
+        """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "similarity" [B, S]
+        (sBERT embeddings, for the filter), "held" bool [B, D] (optional: all).
 
         Columns of a part that a clip does not hold are 0, the mean, for the encoder and not reconstructed; it
         is judged in the coordinates that the encoder reads.
@@ -55,7 +55,8 @@ class TmaModule(StageModule):
         """
         net, weight = self.net, self.loss_config
         motion, length = batch["motion"], batch["length"]
-        text = net.encode_text(batch["text_tokens"], batch["text_mask"])
+        words = batch["conditions"]["text"]
+        text = net.encode_text(words.features, words.mask)
         held = batch.get("held")
         moved = net.encode_motion(motion, length, held)
         z_text, z_motion = self._latent(*text), self._latent(*moved)

@@ -93,6 +93,7 @@ class Tokenizer(nn.Module, ABC):
             )
         self.config = config
         self.layout = layout
+        self.part: Part = part
         self.streams = streams
         self.pattern = pattern
         self.is_frozen = False

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
 from motionloom.datasets.schema import HANDS, HELD_ALL
@@ -18,9 +17,9 @@ from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.metrics.reconstruction import accel, mpjpe, pa_mpjpe
 from motionloom.models.metrics.retrieval import recall
-from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.pipeline.evaluation.truth import Truth, joint_layout, reconstruct_truth
-from motionloom.pipeline.store.networks import LoadedTma
+from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth
+from motionloom.pipeline.inference.bundle import joint_layout
+from motionloom.pipeline.store.networks import LoadedTma, TrainedTokenizer
 
 KEY_FRAMES = 16
 """Moments of a clip that the nearest-clip search compares."""
@@ -55,20 +54,20 @@ def local_joints(features: NDArray[np.float32], layout: MotionLayout) -> NDArray
 
 
 def reconstruction_figures(
-    tokenizer: Tokenizer, stats: FeatureStats, train: ClipDataset, truths: Sequence[Truth]
+    tokenizer: TrainedTokenizer, train: ClipDataset, truths: Sequence[Truth]
 ) -> dict[str, float]:
     """Errors in millimetres of the tokenizer, of the mean pose and of the nearest training clip.
 
     `mpjpe_*` compares poses (root and heading aligned), `global_*` compares positions in the world, the path
     included. Of a clip without hands the body's joints alone count, and nothing in `mpjpe_hand`.
     """
-    layout = truths_layout(tokenizer)
-    body = stats.mean[tokenizer.layout.part("bodyhand")].astype(np.float32)
+    layout = joint_layout(tokenizer.layout)
+    body = tokenizer.stats.mean[tokenizer.layout.part("bodyhand")].astype(np.float32)
     nearest = NearestClip(train)
     rows: dict[str, list[float]] = {}
     for truth in truths:
         real = local_joints(truth.features, layout)
-        found = reconstruct_truth(tokenizer, stats, truth)
+        found = reconstruct_truth(tokenizer, truth)
         constant = np.broadcast_to(body, truth.features.shape)
         other = nearest.features(truth.features, truth.held)
         joints = slice(None) if truth.held & HANDS else slice(BODY_JOINTS)
@@ -107,11 +106,6 @@ def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
         each = [mpjpe(pose[:, hand], real[:, hand]) * len(hand) / (len(hand) - 1) for hand in hands]
         out["mpjpe_hand"] = torch.stack(each).mean(0)
     return out
-
-
-def truths_layout(tokenizer: Tokenizer) -> MotionLayout:
-    """The body-hand layout a tokenizer's truths are in."""
-    return joint_layout(tokenizer.layout)
 
 
 class NearestClip:
@@ -167,7 +161,6 @@ def stretch(values: NDArray[np.float32], frames: int) -> NDArray[np.float64]:
 
 def embed_motions(
     tma: LoadedTma,
-    stats: FeatureStats,
     motions: Sequence[NDArray[np.float32]],
     held: Sequence[int] | None = None,
     batch: int = 64,
@@ -177,7 +170,7 @@ def embed_motions(
     `held` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
     """
     columns = tma.layout.part(tma.part)
-    mean, std = stats.mean[columns], stats.std[columns]
+    mean, std = tma.stats.mean[columns], tma.stats.std[columns]
     order = np.argsort([len(m) for m in motions], kind="stable")
     masks = tma.layout.held_columns[:, columns][[HELD_ALL] * len(motions) if held is None else held]
     out: dict[int, Tensor] = {}

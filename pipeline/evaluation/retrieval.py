@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.retrieval import RECALLS, recall
+from motionloom.pipeline.contract.finished import Finished, Shelf, finished_stages
+from motionloom.pipeline.contract.stage import ALIGNMENT
 from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.truth import truth_of
-from motionloom.pipeline.inference.bundle import part_folders, stages_of
 from motionloom.pipeline.launch.hardware import choose_device
-from motionloom.pipeline.runs.graph import stage_folder
 from motionloom.pipeline.store.artifact import require_consistent
-from motionloom.pipeline.store.data import held_out, open_split, open_text
 from motionloom.pipeline.store.files import write_json
-from motionloom.pipeline.store.networks import LoadedTma
+from motionloom.pipeline.store.run_folder import stages_of
 
 THRESHOLD = 0.9
 """Protocol B: captions with a higher sentence cosine count as the same."""
@@ -42,18 +39,17 @@ class ProtocolResult:
 
 
 def retrieve(
-    run: Path, stage: str = "tma", *, split: str | None = None, seed: int = 0, device: str = "auto"
+    run: Path, stage: str | None = None, *, split: str | None = None, seed: int = 0, device: str = "auto"
 ) -> list[ProtocolResult]:
     """All four protocols for one alignment stage of a run, on a split of its data.
 
-    By default its test split, else another held out.
+    By default the run's first alignment stage, on its test split or else another one held out.
     """
-    parts = _folders(run, stage)
-    data = parts["data"]
-    dataset = open_split(data, split or held_out(data, prefer="test"))
-    tma = LoadedTma.load(parts["model"], choose_device(device))
-    stats = FeatureStats.load(parts["stats"] / "stats.safetensors")
-    cache = open_text(parts["text"])
+    found = alignment_stage(run, stage)
+    shelf = Shelf(choose_device(device))
+    tma, given = shelf.get(found), shelf.given(found.inputs)
+    data, cache = given["data"], given["text"].cache
+    dataset = data.split(split) if split else data.held_out(prefer="test")
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
     truths = [t for t in truths if t.caption and len(t.features) >= 4]
     if len(truths) < 2:
@@ -62,7 +58,7 @@ def retrieve(
         )
     captions = [t.caption for t in truths]
     text = tma.embed_captions(captions, cache)
-    motion = embed_motions(tma, stats, [t.features for t in truths], [t.held for t in truths])
+    motion = embed_motions(tma, [t.features for t in truths], [t.held for t in truths])
     sentence = torch.as_tensor(cache.similarity(captions))
     rows = [
         _result("A", "whole split", recall(text, motion)),
@@ -77,25 +73,25 @@ def retrieve(
     return rows
 
 
-def _folders(run: Path, stage: str) -> dict[str, Path]:
-    """Folders of an alignment model ("model") and of what it was trained on, all finished."""
-    stages = stages_of(run)
-    aligned = [name for name, entry in stages.items() if entry["kind"] == "tma" and not _of_face(entry)]
-    if stage not in aligned:
-        known = f"this run has {', '.join(aligned)}" if aligned else "this run has none"
-        raise UserError(f"{run}: no stage '{stage}' that aligns text with body and hands; {known}")
-    inputs = stages[stage].get("inputs", {})
-    roles = {"model": stage, **{role: inputs.get(role) or role for role in ("data", "stats", "text")}}
-    found = {role: stage_folder(run, name) for role, name in roles.items()}
-    for folder in found.values():
-        if not (folder / "artifact.json").is_file():
-            raise UserError(f"{run}: no finished '{folder.name}' stage; run the recipe up to it first")
-    require_consistent(run, (folder.name for folder in found.values()))
+def alignment_stage(run: Path, name: str | None = None) -> Finished:
+    """A finished stage that aligns text with motion, by name or the run's first."""
+    stages = finished_stages(run)
+    aligned = [stage.name for stage in stages.values() if stage.gives(ALIGNMENT)]
+    if name is None and aligned:
+        name = aligned[0]
+    if name not in aligned:
+        if name is None or name in stages_of(run):
+            what = f"'{name}' is not a finished stage" if name else "no finished stage is one"
+        else:
+            what = f"there is no stage '{name}'"
+        known = f"this run has {', '.join(aligned)}" if aligned else "this run has none yet"
+        raise UserError(f"{run}: {what} that aligns text with body and hands; {known}")
+    found = stages[str(name)]
+    missing = [role for role in ("data", "stats", "text") if role not in found.inputs]
+    if missing:
+        raise UserError(f"{run}: no finished '{missing[0]}' stage; run the recipe up to it first")
+    require_consistent(run, (name, *(stage.name for stage in found.inputs.values())))
     return found
-
-
-def _of_face(entry: dict[str, Any]) -> bool:
-    return entry.get("part") == "face"
 
 
 def _result(protocol: str, meaning: str, figures: dict[str, float]) -> ProtocolResult:
@@ -128,7 +124,7 @@ def retrieval_command(
     console: Console,
 ) -> Path:
     """Print the table and write RUN/retrieval.json; of another `stage` than TMA, RUN/retrieval-STAGE.json."""
-    main = part_folders(run).get("tma", Path("tma")).name
+    main = alignment_stage(run).name
     stage = stage or main
     rows = retrieve(run, stage, split=split, seed=seed, device=device)
     console.print(retrieval_table(rows, "TMA retrieval" if stage == main else f"Retrieval of stage {stage}"))

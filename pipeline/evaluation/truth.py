@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
-from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.features import decode, face_of
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import FACE, HELD_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.pipeline.store.networks import device_of
+from motionloom.pipeline.inference.bundle import joint_layout
+from motionloom.pipeline.store.networks import TrainedTokenizer
 
 
 @dataclass(frozen=True)
@@ -34,13 +31,6 @@ class Truth:
     face_caption: str
     truth: dict | None
     held: int = HELD_ALL
-
-
-def joint_layout(layout: MotionLayout) -> MotionLayout:
-    """The layout of the body-hand columns alone."""
-    if not layout.has("face"):
-        return layout
-    return MotionLayout.named("wholebody313", fps=layout.fps, family=layout.family)
 
 
 def truth_of(
@@ -84,36 +74,19 @@ def _overlap(one: CaptionSpan, other: CaptionSpan) -> int:
     return min(one.end, other.end) - max(one.first, other.first)
 
 
-@torch.no_grad()
-def reconstruct(
-    tokenizer: Tokenizer, stats: FeatureStats, features: NDArray[np.float32], held: int = HELD_ALL
-) -> NDArray[np.float32]:
-    """Through the tokenizer and back, in the features' own units [T, D]; T a multiple of four.
-
-    `held` says what the clip holds; of what it does not hold, nothing is read and the mean comes back.
-    """
-    columns, device = tokenizer.columns.cpu().numpy(), device_of(tokenizer)
-    mean, std = stats.mean[columns], stats.std[columns]
-    motion = torch.from_numpy(((features - mean) / std).astype(np.float32))[None].to(device)
-    mask = torch.from_numpy(tokenizer.layout.held_columns[held, columns])[None].to(device)
-    rebuilt = tokenizer.decode(tokenizer.encode(motion, held=mask), held=mask)
-    out = rebuilt.masked_fill(~mask[:, None], 0.0)[0].cpu().numpy()
-    return np.asarray(out * std + mean, dtype=np.float32)
-
-
-def reconstruct_truth(tokenizer: Tokenizer, stats: FeatureStats, truth: Truth) -> NDArray[np.float32]:
+def reconstruct_truth(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.float32]:
     """A clip's body-hand features [T, D] through a tokenizer of any part of the body, face included or not.
 
     Of columns that it does not model, the mean comes back.
     """
     layout = tokenizer.layout
-    out = np.tile(stats.mean.astype(np.float32), (len(truth.features), 1))
+    out = np.tile(tokenizer.stats.mean.astype(np.float32), (len(truth.features), 1))
     given = out.copy()
     given[:, layout.part("bodyhand")] = truth.features
     if truth.face is not None:
         given[:, layout.slice("face")] = truth.face
-    columns = tokenizer.columns.cpu().numpy()
-    out[:, columns] = reconstruct(tokenizer, stats, given[:, columns], truth.held)
+    columns = tokenizer.columns
+    out[:, columns] = tokenizer.reconstruct(given[:, columns], truth.held)
     return out[:, layout.part("bodyhand")]
 
 

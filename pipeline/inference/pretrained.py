@@ -10,34 +10,26 @@ installation, the text encoder: nothing else is needed, and nothing in it is eve
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from huggingface_hub import ModelHubMixin, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
-from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.inference.bundle import (
-    PARTS,
-    Bundle,
-    BundleFile,
-    GeneratedMotion,
-    part_folders,
-    text_encoder_of,
-)
-from motionloom.pipeline.inference.sampling import SamplingConfig
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
+from motionloom.pipeline.inference.exported import BUNDLE_FILE, write_exported
 from motionloom.pipeline.launch.hardware import choose_device
-from motionloom.pipeline.store.encoder_files import BUILT_IN, copy_encoder
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.weights import LayoutFacts
 
-_WEIGHTS = ("model.safetensors", "model.json", "stats.safetensors")
-_ENCODER = "text_encoder"
+if TYPE_CHECKING:
+    from motionloom.datasets.audio.sound import Sound
+
 _HUB_CONFIG = {"format": "motionloom bundle"}
 """`config.json`, which the hub looks for; nothing here reads it."""
 
@@ -48,7 +40,7 @@ class MotionModel(
     pipeline_tag="text-to-3d",
     tags=["human-motion", "text-to-motion", "whole-body"],
 ):
-    """Captions to whole-body motions."""
+    """Captions, music or both to whole-body motions."""
 
     def __init__(self, folder: Path | str, device: str | torch.device = "auto") -> None:
         self.folder = Path(folder)
@@ -74,26 +66,28 @@ class MotionModel(
 
     def generate(
         self,
-        captions: Sequence[str],
+        captions: Sequence[str] | None = None,
         *,
         face_captions: Sequence[str] | None = None,
+        sounds: Sequence[Sound | None] | None = None,
         seconds: float | Sequence[float] | None = None,
         seed: int = 0,
         sampling: SamplingConfig | Mapping[str, Any] | None = None,
     ) -> list[GeneratedMotion]:
-        """Motions for captions, in order; the same seed, captions and settings give the same motions.
+        """Motions for captions, sounds or both, in order; equal arguments give equal motions.
 
         A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
-        the model decides. `sampling` is a `SamplingConfig` or a mapping like `{"top_p": 0.9}`. An option that
-        this model takes no notice of is refused.
+        a motion is as long as its sound, or else the model decides. `sampling` is a `SamplingConfig` or a
+        mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused.
         """
         return self.bundle.generate(
-            captions, face_captions=face_captions, seconds=seconds, seed=seed, sampling=sampling, strict=True
-        )
+            captions, face_captions=face_captions, sounds=sounds, seconds=seconds, seed=seed,
+            sampling=sampling, strict=True,
+        )  # fmt: skip
 
     def _save_pretrained(self, save_directory: Path) -> None:
         """Copy all that `generate` needs into the folder."""
-        if (self.folder / "bundle.json").is_file():
+        if (self.folder / BUNDLE_FILE).is_file():
             shutil.copytree(self.folder, save_directory, dirs_exist_ok=True)
         else:
             write_bundle(self.folder, save_directory)
@@ -117,39 +111,16 @@ class MotionModel(
         folder = snapshot_download(
             model_id, revision=revision, cache_dir=cache_dir, force_download=force_download,
             local_files_only=local_files_only, token=token,
-            allow_patterns=["*.json", "*.safetensors", f"{_ENCODER}/*"],
+            allow_patterns=["*.json", "*.safetensors", "*.txt", "*.model"],
         )  # fmt: skip
         return cls(folder, device)
 
 
 def write_bundle(run: Path, out: Path) -> None:
     """Copy what generation needs of a run's finished stages into `out`; `bundle.json` is written last."""
-    parts = part_folders(run)
-    bundle = Bundle.from_run(run)  # opens every part, so a broken one is found before anything is copied
-    encoder = text_encoder_of(parts["text"])
-    if encoder != BUILT_IN:  # first, because it may not be found any more
-        copy_encoder(encoder, parts["text"], out / _ENCODER)
-        encoder = _ENCODER
-    for role, source in parts.items():
-        if role == "text":
-            continue
-        (out / role).mkdir(parents=True, exist_ok=True)
-        for name in _WEIGHTS:
-            if (source / name).is_file():
-                shutil.copyfile(source / name, out / role / name)
-    skeleton = bundle.layout.skeleton
-    write_json(out / "skeleton.json", _plain(skeleton))
+    bundle = Bundle.from_run(run)
+    for stage in bundle.stages:
+        bundle.of(stage)  # opens every stage, so a broken one is found before anything is copied
+    out.mkdir(parents=True, exist_ok=True)
     write_json(out / "config.json", _HUB_CONFIG)
-    held = tuple(part for part in PARTS if part in parts and part != "text")
-    facts = BundleFile(layout=LayoutFacts.of(bundle.layout), text_encoder=encoder, parts=held)
-    write_json(out / "bundle.json", facts.dump())
-
-
-def _plain(skeleton: Skeleton) -> dict[str, Any]:
-    made = {
-        "name": skeleton.name,
-        "joints": skeleton.joints,
-        "parents": skeleton.parents,
-        "offsets": skeleton.rest,
-    }
-    return dict(json.loads(json.dumps(made)))
+    write_exported(bundle.stages, LayoutFacts.of(bundle.layout), bundle.layout.skeleton, out)

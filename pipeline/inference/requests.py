@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.inference.faces import DiffusionFace, FaceGenerator, FaceKind, VaeFace, choose
-from motionloom.pipeline.inference.sampling import SamplingConfig
+from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
+from motionloom.pipeline.contract.sampling import SamplingConfig
 
-_OF_DIFFUSION = {"sampler": "--sampler", "denoising_steps": "--steps"}
+if TYPE_CHECKING:
+    from motionloom.datasets.audio.sound import Sound
+
+_OPTIONS = {"face_cfg_scale": "--face-cfg", "sampler": "--sampler", "denoising_steps": "--steps"}
+"""Settings that some generators take, and how the command line calls them."""
 
 
 def caption_list(given: Iterable[str], name: str = "captions") -> list[str]:
@@ -42,20 +46,64 @@ def sampling_of(given: SamplingConfig | Mapping[str, Any] | None) -> SamplingCon
     return SamplingConfig.parse({} if given is None else given, "sampling")
 
 
-def require_used(
-    faces: dict[FaceKind, FaceGenerator], face_captions: Iterable[str] | None, sampling: SamplingConfig
-) -> None:
-    """Refuse options that were given, and that this model's face takes no notice of."""
-    face = choose(faces, sampling.face_model)
+def prompts_of(
+    captions: Sequence[str] | None, faces: Sequence[str] | None, sounds: Sequence[Sound | None] | None
+) -> list[Prompt]:
+    """One prompt a motion from lists of equal length; what is None is left out."""
+    given = {"captions": captions, "sounds": sounds}
+    counts = {name: len(values) for name, values in given.items() if values is not None}
+    if not counts:
+        raise UserError("nothing to generate from: give captions, sounds or both")
+    if len(set(counts.values())) > 1:
+        raise UserError(" but ".join(f"{count} {name}" for name, count in counts.items()))
+    count = next(iter(counts.values()))
+    if faces is not None and len(faces) != count:
+        raise UserError(f"{count} captions but {len(faces)} face captions")
+    return [
+        Prompt(
+            text=captions[row] if captions else "",
+            face_text=faces[row] if faces else "",
+            sound=sounds[row] if sounds else None,
+        )
+        for row in range(count)
+    ]
+
+
+def require_driven(generator: MotionGenerator, prompts: Iterable[Prompt]) -> None:
+    """Refuse prompts of modalities that a model is not conditioned on."""
+    for row, prompt in enumerate(prompts):
+        for name in sorted(prompt.modalities - generator.modalities):
+            known = " and ".join(sorted(generator.modalities))
+            raise UserError(f"prompt {row} has {name}, and this model is conditioned on {known} only")
+
+
+class _Chooses(Protocol):
+    @property
+    def stages(self) -> Sequence[Any]: ...
+    @property
+    def faces(self) -> Mapping[str, Any]: ...
+    @property
+    def generator(self) -> MotionGenerator: ...
+    def choose_face(self, wanted: str | None) -> Any: ...
+    def of(self, stage: Any) -> MotionGenerator: ...
+
+
+def require_used(model: _Chooses, face_captions: Iterable[str] | None, sampling: SamplingConfig) -> None:
+    """Refuse options that were given, and that no generator in use takes notice of."""
+    face = model.choose_face(sampling.face_model)
     if face is None:
         if face_captions is not None:
             raise UserError("this model makes no face: leave the face captions (--face) out")
         if sampling.face_cfg_scale is not None:
             raise UserError("this model makes no face: leave face_cfg_scale (--face-cfg) out")
-    if isinstance(face, VaeFace) and sampling.face_cfg_scale is not None:
-        raise UserError("the face's VAE knows no guidance: leave face_cfg_scale (--face-cfg) out")
-    unused = [name for name in _OF_DIFFUSION if name in sampling.model_fields_set]
-    if unused and not isinstance(face, DiffusionFace):
-        told = " and ".join(f"{name} ({_OF_DIFFUSION[name]})" for name in unused)
-        fix = "choose --face-model diffusion, or leave it out" if "diffusion" in faces else "leave it out"
-        raise UserError(f"{told}: only a diffusion model takes it, and none is used here; {fix}")
+    used = model.generator.settings | (model.of(face).settings if face is not None else frozenset())
+    unused = [
+        name
+        for name in _OPTIONS
+        if name in sampling.model_fields_set and getattr(sampling, name) is not None and name not in used
+    ]
+    if unused:
+        named = " and ".join(f"{name} ({_OPTIONS[name]})" for name in unused)
+        takers = [m for m, s in model.faces.items() if set(unused) <= model.of(s).settings]
+        fix = f"choose --face-model {takers[0]}, or leave it out" if takers else "leave it out"
+        raise UserError(f"{named}: no generator that is used here takes it; {fix}")

@@ -11,10 +11,14 @@ import yaml
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.contract.finished import Shelf, preview_of
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import StageContext
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.outputs import Format, write_motions
+from motionloom.pipeline.inference.pretrained import write_bundle
 from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
-from motionloom.pipeline.inference.bundle import Bundle, require_run
-from motionloom.pipeline.store.files import require_file_place, require_folder
+from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.runs.graph import (
     Selection,
     execute,
@@ -23,14 +27,12 @@ from motionloom.pipeline.runs.graph import (
     replaced_trainings,
     require_fit,
     selected,
-    stage_folder,
+    stage_inputs,
 )
-from motionloom.pipeline.launch.hardware import choose_device
-from motionloom.pipeline.inference.outputs import Format, write_motions
-from motionloom.pipeline.inference.pretrained import write_bundle
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe, nearest
-from motionloom.pipeline.inference.sampling import SamplingConfig
-from motionloom.pipeline.stages.stage import StageContext
+from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.files import require_file_place, require_folder
+from motionloom.pipeline.store.run_folder import require_run, stage_folder
 
 
 def run_recipe(
@@ -81,7 +83,7 @@ def run_recipe(
     for row in plan:
         page = stage_folder(run, row.stage.name) / "report.html"
         # Not the page of an earlier run with other settings.
-        if row.stage.kind.name == "report" and row.action != "leave" and page.is_file():
+        if "page" in row.stage.kind.gives(row.stage.config) and row.action != "leave" and page.is_file():
             console.print(f"watch it: {page.resolve()}", soft_wrap=True)
     return run
 
@@ -102,15 +104,19 @@ def _require_same_recipe(run: Path, name: str) -> None:
 
 def _say_estimate(recipe: Recipe, console: Console) -> None:
     """What the trainings would take, where the recipe says enough."""
-    from motionloom.pipeline.runs.estimate import data_layout, estimate, estimate_table
+    from motionloom.pipeline.runs.estimate import estimate, estimate_table
 
     if not any(stage.kind.trains for stage in recipe.stages):
         return
-    try:
-        data_layout(recipe)
-    except UserError as error:
-        console.print(str(error))
-        return
+    stages = {stage.name: stage for stage in recipe.stages}
+    for stage in recipe.stages:
+        if "data" not in stage.kind.gives(stage.config):
+            continue
+        try:
+            preview_of(stage, stages)
+        except UserError as error:
+            console.print(str(error))
+            return
     console.print(estimate_table(estimate(recipe)))
 
 
@@ -152,33 +158,38 @@ def generate_motions(
 
 
 def _stage_again(
-    folder: Path, kind: str, console: Console, changes: dict[str, Any], device: str = "auto"
+    folder: Path,
+    what: str,
+    target: str,
+    console: Console,
+    changes: dict[str, Any],
+    device: str = "auto",
 ) -> Path:
-    """Run one evaluating stage of a finished run again, into the run folder itself.
+    """Run the stage of a finished run that gives `what` again, into the run folder itself.
 
     On `device`: auto is what the recipe's hardware says.
     """
-    wanted = None if device == "auto" else choose_device(device)
     recipe = _recipe_of(folder)
-    stage = next((s for s in recipe.stages if s.kind.name == kind), None)
+    shelf = Shelf(recipe.hardware.device() if device == "auto" else choose_device(device))
+    stage = next((s for s in recipe.stages if what in s.kind.gives(s.config)), None)
     if stage is None:
-        raise UserError(f"{folder}: its recipe has no {kind} stage; add one and run it again")
+        raise UserError(f"{folder}: its recipe has no {target} stage; add one and run it again")
     given = {name: value for name, value in changes.items() if value is not None}
-    config = stage.kind.config.parse({**stage.config.dump(), **given}, kind)
-    inputs = {role: stage_folder(folder, name) for role, name in stage.inputs.items()}
-    for role, path in inputs.items():
-        if not (path / "artifact.json").is_file():
+    config = stage.kind.config.parse({**stage.config.dump(), **given}, target)
+    inputs = stage_inputs(recipe, folder, stage)
+    for role, source in inputs.items():
+        if not (source.folder / "artifact.json").is_file():
             raise UserError(
-                f"{folder}: stage '{path.name}' (role {role}) is not finished; run the recipe first"
+                f"{folder}: stage '{source.name}' (role {role}) is not finished; run the recipe first"
             )
-    require_consistent(folder, (path.name for path in inputs.values()))
-    target = folder / kind
-    target.mkdir(exist_ok=True)
+    require_consistent(folder, (source.name for source in inputs.values()))
+    out = folder / target
+    out.mkdir(exist_ok=True)
     context = StageContext(
-        stage.name, recipe.name, config, target, inputs, recipe.seed, recipe.hardware, console, wanted
+        stage.name, recipe.name, config, out, inputs, recipe.seed, recipe.hardware, console, shelf
     )
     stage.kind.run(context)
-    return target
+    return out
 
 
 def evaluate_run(
@@ -191,14 +202,14 @@ def evaluate_run(
 ) -> Path:
     """Figures of a finished run; writes RUN/evaluate/metrics.json."""
     changes = {"clips": clips, "repeats": repeats}
-    return _stage_again(folder, "evaluate", console, changes, device) / "metrics.json"
+    return _stage_again(folder, "figures", "evaluate", console, changes, device) / "metrics.json"
 
 
 def report_run(folder: Path, out: Path | None, *, device: str = "auto", console: Console) -> Path:
     """The page of a finished run; returns its path."""
     if out is not None:
         require_file_place(out)
-    page = _stage_again(folder, "report", console, {}, device) / "report.html"
+    page = _stage_again(folder, "page", "report", console, {}, device) / "report.html"
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(page, out)

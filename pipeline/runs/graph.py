@@ -25,10 +25,12 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import digest, remove_tree, write_json, write_text
+from motionloom.pipeline.store.run_folder import stage_folder
+from motionloom.pipeline.contract.finished import Finished, Shelf
+from motionloom.pipeline.contract.stage import Stage, StageContext, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
-from motionloom.pipeline.runs.recipe import Recipe, Stage
-from motionloom.pipeline.stages.stage import StageContext, fingerprint_fields
+from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.launch.team import Team
 
 Action = Literal["skip", "run", "resume", "leave"]
@@ -58,11 +60,6 @@ class PlannedStage:
     reason: str
     asked: bool = False
     """The selection names it to run again (`--from`, `--force`)."""
-
-
-def stage_folder(run: Path, name: str) -> Path:
-    """Where a stage keeps its files."""
-    return run / "stages" / name
 
 
 def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
@@ -129,14 +126,13 @@ def replaced_trainings(run: Path, plan: Sequence[PlannedStage]) -> tuple[list[st
 
 
 def _fingerprint(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> str:
-    external = stage.kind.external(stage.config) if stage.kind.external else None
     return digest(
         {
             "kind": stage.kind.name,
             "version": stage.kind.version,
             "seed": recipe.seed,
             "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
-            "external": external,
+            "external": stage.kind.external(stage.config),
             "inputs": {role: rows[name].fingerprint for role, name in stage.inputs.items()},
         }
     )
@@ -248,7 +244,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
         if leads:
             write_text(run / "recipe.yaml", recipe.to_yaml())
             for row in plan:
-                if row.action == "skip" and row.stage.kind.settle is not None:
+                if row.action == "skip":
                     row.stage.kind.settle(row.stage.config, stage_folder(run, row.stage.name))
         for row in todo:
             stage, folder = row.stage, stage_folder(run, row.stage.name)
@@ -262,10 +258,11 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 recipe=recipe.name,
                 config=stage.config,
                 folder=folder,
-                inputs={role: stage_folder(run, name) for role, name in stage.inputs.items()},
+                inputs=stage_inputs(recipe, run, stage),
                 seed=recipe.seed,
                 hardware=recipe.hardware,
                 console=console,
+                shelf=Shelf(recipe.hardware.device()),
             )
             if stage.kind.trains:
                 team.meet()
@@ -279,6 +276,20 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 _artifact(recipe, row, plan).finish(folder)
                 console.print(f"    finished in {seconds:.1f} s")
     return [row.stage.name for row in todo]
+
+
+def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]:
+    """The stages that feed one of a recipe, by role."""
+    made: dict[str, Finished] = {}
+
+    def finished(name: str) -> Finished:
+        if name not in made:
+            source = recipe.stage(name)
+            inputs = {role: finished(above) for role, above in source.inputs.items()}
+            made[name] = Finished(name, source.kind, source.config, stage_folder(run, name), inputs)
+        return made[name]
+
+    return {role: finished(name) for role, name in stage.inputs.items()}
 
 
 def _prepare(folder: Path, row: PlannedStage) -> None:

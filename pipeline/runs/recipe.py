@@ -27,8 +27,8 @@ from pydantic import Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.stage import StageConfig, StageKind
-from motionloom.pipeline.stages.table import STAGES
+from motionloom.pipeline.contract.registry import stage_kinds
+from motionloom.pipeline.contract.stage import Every, Stage, StageKind
 
 
 class RecipeFile(Config):
@@ -48,16 +48,6 @@ class RecipeFile(Config):
             if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
                 raise ValueError(f"stage name '{name}': use letters, digits, - and _ only")
         return stages
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage of a resolved recipe. `inputs` maps role to stage name."""
-
-    name: str
-    kind: StageKind
-    config: StageConfig
-    inputs: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -84,8 +74,7 @@ class Recipe:
         stages: dict[str, Any] = {}
         for stage in self.stages:
             entry: dict[str, Any] = {"kind": stage.kind.name, **stage.config.dump()}
-            roles = [role.removesuffix("?") for role in stage.kind.inputs]
-            renamed = {role: stage.inputs.get(role) for role in roles if stage.inputs.get(role) != role}
+            renamed = _written_inputs(stage)
             stages[stage.name] = {**entry, "inputs": renamed} if renamed else entry
         data = {
             "name": self.name,
@@ -95,6 +84,17 @@ class Recipe:
             "stages": stages,
         }
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+
+
+def _written_inputs(stage: Stage) -> dict[str, Any]:
+    """The `inputs` of a stage that are not as the roles' names would have them."""
+    out: dict[str, Any] = {}
+    for role in stage.kind.roles():
+        if isinstance(role, Every):
+            out[role.name] = [name for key, name in stage.inputs.items() if key == role.key(name)]
+        elif stage.inputs.get(role.name) != role.name:
+            out[role.name] = stage.inputs.get(role.name)
+    return out
 
 
 def nearest(name: str, valid: Sequence[str]) -> str:
@@ -199,60 +199,29 @@ def _number(value: Any) -> Any:
 
 
 def _stages(file: RecipeFile, where: str) -> tuple[Stage, ...]:
-    out: list[Stage] = []
+    kinds, parsed = stage_kinds(), []
     for name, entry in file.stages.items():
         fields = dict(entry)
         kind_name = fields.pop("kind", None)
         renamed = fields.pop("inputs", None) or {}
-        if kind_name not in STAGES:
-            hint = nearest(str(kind_name), list(STAGES))
+        if kind_name not in kinds:
+            hint = nearest(str(kind_name), list(kinds))
             raise UserError(f"{where}: stages.{name}.kind = '{kind_name}' is no stage kind{hint}")
-        kind = STAGES[kind_name]
+        kind = kinds[kind_name]
         config = kind.config.parse(_numbers(fields), f"{where}: stages.{name}")
-        out.append(Stage(name, kind, config, _resolve(name, kind, renamed, list(file.stages), where)))
-    _check_encoders(out, where)
-    _check_starts(out, where)
+        parsed.append((Stage(name, kind, config, {}), renamed))
+    all_stages = [stage for stage, _ in parsed]
+    out = [
+        Stage(stage.name, stage.kind, stage.config, _resolve(stage, renamed, all_stages, where))
+        for stage, renamed in parsed
+    ]
+    named = {stage.name: stage for stage in out}
+    for stage in out:
+        try:
+            stage.kind.check(stage, named)
+        except UserError as error:
+            raise UserError(f"{where}: {error}") from None
     return _in_order(out, where)
-
-
-def _check_encoders(stages: list[Stage], where: str) -> None:
-    """A TMA must be given captions by the encoder that it was trained on."""
-    named = {stage.name: stage for stage in stages}
-    for stage in stages:
-        tma, own = named.get(stage.inputs.get("tma", "")), stage.inputs.get("text", "")
-        other = tma.inputs.get("text", "") if tma is not None else own
-        if own in named and other in named and named[own].config != named[other].config:
-            raise UserError(
-                f"{where}: stage '{stage.name}' reads captions as '{own}' encodes them, but its TMA "
-                f"'{stage.inputs['tma']}' was trained on those of '{other}'; name one text stage for both, "
-                f"or leave the TMA out (inputs: {{tma: null}})"
-            )
-
-
-_SIZES = ("layers", "dim", "heads", "ff", "block_size")
-
-
-def _check_starts(stages: list[Stage], where: str) -> None:
-    """A GPT can go on from another's weights where both are one network that reads and writes the same."""
-    named = {stage.name: stage for stage in stages}
-    for stage in stages:
-        start = named.get(stage.inputs.get("start", ""))
-        if start is None:
-            continue
-        ours: Any = stage.config
-        theirs: Any = start.config
-        if start.kind is not stage.kind:
-            wrong = [f"kind ({start.kind.name})"]
-        else:
-            wrong = [f"net.{size}" for size in _SIZES if getattr(ours.net, size) != getattr(theirs.net, size)]
-            wrong += ["prior"] if ours.prior != theirs.prior else []
-            roles = ("text", "tokenizer") + (("tma",) if ours.prior == "tma" else ())
-            wrong += [f"inputs.{role}" for role in roles if start.inputs.get(role) != stage.inputs.get(role)]
-        if wrong:
-            raise UserError(
-                f"{where}: stage '{stage.name}' starts from '{start.name}', which differs in "
-                f"{', '.join(wrong)}; give both the same"
-            )
 
 
 def _in_order(stages: list[Stage], where: str) -> tuple[Stage, ...]:
@@ -281,25 +250,48 @@ def _numbers(value: Any) -> Any:
     return value
 
 
-def _resolve(name: str, kind: StageKind, renamed: Any, known: list[str], where: str) -> dict[str, str]:
-    roles = {role.removesuffix("?"): role.endswith("?") for role in kind.inputs}
+def _resolve(stage: Stage, renamed: Any, all_stages: list[Stage], where: str) -> dict[str, str]:
+    """Role -> stage; a role that is filled by several stages has one entry for each (`Every.key`)."""
+    name, roles = stage.name, stage.kind.roles()
     if not isinstance(renamed, dict):
         raise UserError(f"{where}: stages.{name}.inputs must map roles to stages, like {{data: other_data}}")
-    for role in renamed:
-        if role not in roles:
-            raise UserError(
-                f"{where}: stages.{name}.inputs: unknown role '{role}'{nearest(role, list(roles))}"
-            )
+    for role_name in renamed:
+        if role_name not in [role.name for role in roles]:
+            hint = nearest(role_name, [role.name for role in roles])
+            raise UserError(f"{where}: stages.{name}.inputs: unknown role '{role_name}'{hint}")
+    known = [other.name for other in all_stages]
     inputs = {}
-    for role, optional in roles.items():
-        source = renamed.get(role, role)
-        if source is None and optional:
+    for role in roles:
+        if isinstance(role, Every):
+            for source in _every(stage, role, renamed.get(role.name), all_stages, where):
+                inputs[role.key(source)] = source
+            continue
+        source = renamed.get(role.name, role.name)
+        if source is None and role.optional:
             continue
         if source in known:
-            inputs[role] = source
-        elif role in renamed or not optional:
+            inputs[role.name] = source
+        elif role.name in renamed or not role.optional:
             raise UserError(
-                f"{where}: stage '{name}' needs a stage '{source}' (role '{role}')"
+                f"{where}: stage '{name}' needs a stage '{source}' (role '{role.name}')"
                 f"{nearest(str(source), [other for other in known if other != name])}"
             )
     return inputs
+
+
+def _every(stage: Stage, role: Every, listed: Any, all_stages: list[Stage], where: str) -> list[str]:
+    """The stages of an `Every` role: as listed, else all that give what it wants."""
+    giving = [other.name for other in all_stages if role.gives in other.kind.gives(other.config)]
+    if listed is None:
+        return [name for name in giving if name != stage.name]
+    if isinstance(listed, str):
+        listed = [listed]
+    if not isinstance(listed, list):
+        raise UserError(f"{where}: stages.{stage.name}.inputs.{role.name} must list stages, like [gpt]")
+    for name in listed:
+        if name not in giving:
+            raise UserError(
+                f"{where}: stages.{stage.name}.inputs.{role.name}: '{name}' is no stage that gives a "
+                f"{role.gives}{nearest(str(name), giving)}"
+            )
+    return listed

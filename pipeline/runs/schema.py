@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from typing import Any
 
+from motionloom.pipeline.contract.registry import stage_kinds
+from motionloom.pipeline.contract.stage import Every, StageKind
 from motionloom.pipeline.runs.recipe import RecipeFile
-from motionloom.pipeline.stages.stage import StageKind
-from motionloom.pipeline.stages.table import STAGES
 
 
 def recipe_schema() -> dict[str, Any]:
     """Draft 2020-12 schema of a recipe file: one branch per stage kind, told apart by `kind`."""
     schema = RecipeFile.model_json_schema()
     definitions: dict[str, Any] = schema.setdefault("$defs", {})
-    branches = []
-    for name, kind in STAGES.items():
+    branches, kinds = [], stage_kinds()
+    for name, kind in kinds.items():
         stage = kind.config.model_json_schema(ref_template="#/$defs/{model}")
         definitions.update(stage.pop("$defs", {}))
         stage["title"] = f"{name}: {kind.summary}"
@@ -34,7 +34,7 @@ def recipe_schema() -> dict[str, Any]:
         )
     schema["properties"]["stages"]["additionalProperties"] = {
         "type": "object",
-        "properties": {"kind": {"enum": list(STAGES)}},
+        "properties": {"kind": {"enum": list(kinds)}},
         "allOf": branches,
     }
     schema["properties"]["extends"] = {"type": "string", "description": "A recipe to start from, by name."}
@@ -45,10 +45,11 @@ def recipe_schema() -> dict[str, Any]:
 
 
 def _inputs(kind: StageKind) -> dict[str, Any]:
-    roles = [role.removesuffix("?") for role in kind.inputs]
+    one: dict[str, Any] = {"type": ["string", "null"]}
+    several: dict[str, Any] = {"type": "array", "items": {"type": "string"}}
     return {
         "type": "object",
         "description": "Which stage feeds a role; without it the stage of the role's own name.",
-        "properties": {role: {"type": ["string", "null"]} for role in roles},
+        "properties": {role.name: several if isinstance(role, Every) else one for role in kind.roles()},
         "additionalProperties": False,
     }

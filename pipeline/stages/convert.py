@@ -13,8 +13,8 @@ from motionloom.datasets.convert.humanml3d.convert import HumanMl3dConfig
 from motionloom.datasets.convert.motionx.convert import MotionXConfig
 from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.stages.data import say_shards
-from motionloom.pipeline.stages.stage import StageConfig, StageContext
+from motionloom.pipeline.contract.stage import StageConfig, StageContext
+from motionloom.pipeline.stages.data import DataStage, say_shards
 from motionloom.pipeline.store.data import SHARDS
 from motionloom.pipeline.store.files import sha256_file
 
@@ -47,6 +47,14 @@ CONVERTED: dict[str, tuple[str, type[StageConfig]]] = {
     "bvh": ("BVH", BvhStageConfig),
 }
 """Stage kind, which is also the converter's name, -> (the source's name, config)."""
+
+
+class ConvertStage(DataStage):
+    """Shards converted from a source."""
+
+    def external(self, config: ConvertConfig) -> dict[str, Any]:
+        """The source's files."""
+        return source_facts(config)
 
 
 def run_convert(context: StageContext) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, Self
 
+import torch
 from pydantic import Field, model_validator
 
 from motionloom.datasets.check.dataset import check
@@ -14,9 +15,54 @@ from motionloom.datasets.shards.reader import manifest_layout, read_manifest, re
 from motionloom.datasets.shards.reading import CacheConfig, Reading
 from motionloom.datasets.shards.store import is_url, open_store
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.stages.stage import RUNTIME, StageConfig, StageContext
-from motionloom.pipeline.store.data import READER, REFERENCE, SHARDS, DataPart, Reader, Reference
+from motionloom.pipeline.contract.finished import Finished
+from motionloom.pipeline.contract.stage import RUNTIME, FunctionStage, Given, StageConfig, StageContext
+from motionloom.pipeline.store.data import (
+    READER,
+    REFERENCE,
+    SHARDS,
+    Data,
+    DataPart,
+    DataPreview,
+    Reader,
+    Reference,
+)
 from motionloom.pipeline.store.files import write_json
+
+
+class DataStage(FunctionStage):
+    """A kind that brings shards. Its config names the layout that they will have."""
+
+    def gives(self, config: Any) -> frozenset[str]:
+        """Clips."""
+        return frozenset({"data"})
+
+    def preview(self, config: Any, given: Given) -> DataPreview:
+        """The layout, as the config says or as existing shards are."""
+        if isinstance(config, ShardsStageConfig):
+            return DataPreview(config.found_layout())
+        name, fps = getattr(config, "layout", None), getattr(config, "fps", None)
+        if name is None:
+            raise UserError(
+                "the layout of the data is not known; set data.layout to see what the trainings take"
+            )
+        return DataPreview(MotionLayout.named(name, fps=fps or 30.0))
+
+    def load(self, stage: Finished, given: Given, device: torch.device) -> Data:
+        """Its splits."""
+        return Data(stage.folder)
+
+
+class ShardsStage(DataStage):
+    """A checked pointer to shards that exist already."""
+
+    def external(self, config: ShardsStageConfig) -> dict[str, Any]:
+        """Checksums of the manifests."""
+        return shards_source(config)
+
+    def settle(self, config: ShardsStageConfig, folder: Path) -> None:
+        """How to read changes no result, so it is written anew whenever the recipe runs."""
+        settle_shards(config, folder)
 
 
 class SynthStageConfig(SynthConfig, StageConfig):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict
 from typing import Any
 
@@ -11,6 +12,18 @@ from pydantic import Field
 from rich.table import Table
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.finished import Finished
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.showing import FigureTable, Showing
+from motionloom.pipeline.contract.stage import (
+    GENERATOR,
+    SHOWING,
+    Every,
+    Given,
+    StageConfig,
+    StageContext,
+    StageKind,
+)
 from motionloom.pipeline.evaluation.figures import (
     Interval,
     chance,
@@ -20,12 +33,12 @@ from motionloom.pipeline.evaluation.figures import (
     truth_agreement,
 )
 from motionloom.pipeline.evaluation.truth import Truth, captioned, spread, truth_of
-from motionloom.pipeline.inference.bundle import Bundle, text_encoder_of
-from motionloom.pipeline.inference.sampling import SamplingConfig
+from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.stages.progress import bar
-from motionloom.pipeline.stages.stage import StageConfig, StageContext
-from motionloom.pipeline.store.data import held_out, open_split, open_text
 from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.networks import LoadedTma, TrainedTokenizer
+
+_FILE = "metrics.json"
 
 
 class EvaluateConfig(StageConfig):
@@ -40,93 +53,120 @@ class EvaluateConfig(StageConfig):
     sampling: SamplingConfig = SamplingConfig()
 
 
-def run_evaluate(context: StageContext) -> None:
-    """Write `metrics.json` and print it as tables."""
-    config: EvaluateConfig = context.config
-    data = context.input("data")
-    bundle = Bundle.from_parts(dict(context.inputs), text_encoder_of(context.input("text")), context.device)
-    split = held_out(data, prefer="test")
-    dataset = open_split(data, split)
-    truths = [truth_of(dataset, i) for i in sorted(spread(dataset, config.clips))]
-    truths = [t for t in truths if len(t.features) >= bundle.tokenizer.group_frames]
-    if not truths:
-        raise UserError(
-            f"{dataset.where}: no captioned clip of split '{split}' is long enough for one group of tokens"
-        )
-    if left := int((~captioned(dataset)).sum()):
-        context.console.print(f"    {split}: {left} clips without a caption are left out")
-    figures: dict[str, Any] = {"split": split, "clips": len(truths)}
-    figures["bits_per_second"] = bundle.tokenizer.bits_per_second
-    figures["reconstruction_mm"] = reconstruction_figures(
-        bundle.tokenizer, bundle.stats, open_split(data, "train"), truths
-    )
-    generated = _generate(bundle, truths, config, context)
-    if bundle.tma is not None:
-        figures.update(_retrieval(bundle, truths, generated, config, context))
-    if any(t.truth for t in truths):
-        figures["agreement_with_caption"] = {
-            "truth": truth_agreement([(t, t.joints, t.face) for t in truths], dataset.layout.fps),
-            "generated": truth_agreement(
-                [
-                    (t, g.joints, g.face)
-                    for motions in generated
-                    for t, g in zip(truths, motions, strict=True)
-                ],
-                dataset.layout.fps,
-            ),
-        }
-    write_json(context.folder / "metrics.json", _plain(figures))
-    for table in tables(_plain(figures)):
-        context.console.print(table)
+class EvaluateStage(StageKind):
+    """Reconstruction, retrieval and generation on the test split."""
+
+    name = "evaluate"
+    summary = "figures on the test split"
+    config = EvaluateConfig
+    takes = ("data", "text?", "tokenizer?", "tma?", Every("generators", GENERATOR))
+    version = 3  # generators as the recipe has them
+
+    def gives(self, config: Any) -> frozenset[str]:
+        """Its tables."""
+        return frozenset({"figures", SHOWING})
+
+    def run(self, context: StageContext) -> None:
+        """Write `metrics.json` and print it as tables."""
+        figures = _plain(_Evaluation(context).figures())
+        write_json(context.folder / _FILE, figures)
+        for table in tables(figures):
+            context.console.print(table)
+
+    def show(self, stage: Finished, given: Given) -> list[Showing]:
+        """The tables."""
+        figures = json.loads((stage.folder / _FILE).read_text())
+        return [FigureTable(title, columns, rows) for title, columns, rows in figure_rows(figures)]
 
 
-def _generate(
-    bundle: Bundle, truths: list[Truth], config: EvaluateConfig, context: StageContext
-) -> list[list]:
-    out = []
-    with bar(context.console) as progress:
-        task = progress.add_task("generating", total=config.repeats * len(truths), note="")
-        for repeat in range(config.repeats):
-            motions = []
-            for start in range(0, len(truths), 64):
-                part = truths[start : start + 64]
-                motions += bundle.generate(
-                    [t.caption for t in part],
-                    face_captions=[t.face_caption for t in part],
-                    seed=context.seed + 7919 * (repeat + 1) + start,
-                    sampling=config.sampling,
-                )
-                progress.update(task, advance=len(part))
-            out.append(motions)
-    return out
+class _Evaluation:
+    """What one evaluation measures."""
 
+    def __init__(self, context: StageContext) -> None:
+        self.context, self.config = context, context.config
+        self.tokenizer: TrainedTokenizer | None = context.given.get("tokenizer")
+        self.tma: LoadedTma | None = context.given.get("tma")
+        self.bundle = Bundle(context.every("generators"), context.shelf)
+        self.dataset = context.given["data"].held_out(prefer="test")
 
-def _retrieval(
-    bundle: Bundle, truths: list[Truth], generated: list[list], config: EvaluateConfig, context: StageContext
-) -> dict[str, Any]:
-    assert bundle.tma is not None
-    size = min(config.size, len(truths))
-    text = bundle.tma.embed_captions([t.caption for t in truths], open_text(context.input("text")))
-    real = embed_motions(bundle.tma, bundle.stats, [t.features for t in truths], [t.held for t in truths])
-    repeats = max(config.repeats, 5)
-    figures = retrieval_figures(text, real, size=size, repeats=repeats, seed=context.seed)
-    made: dict[str, list[float]] = {}
-    for repeat, motions in enumerate(generated):
-        latent = embed_motions(bundle.tma, bundle.stats, [g.features for g in motions])
-        once = retrieval_figures(text, latent, size=size, repeats=1, seed=context.seed + repeat)
-        for name, value in once.items():
-            made.setdefault(name, []).append(value.mean)
-        distance = torch.linalg.vector_norm(text - latent, dim=-1).mean()
-        made.setdefault("matching_score", []).append(float(distance))
-    real_distance = float(torch.linalg.vector_norm(text - real, dim=-1).mean())
-    return {
-        "retrieval": {
+    def figures(self) -> dict[str, Any]:
+        """All figures, each beside its trivial answer."""
+        dataset, context = self.dataset, self.context
+        unit = self.tokenizer.net.group_frames if self.tokenizer else self.bundle.generator.unit_frames
+        truths = [truth_of(dataset, i) for i in sorted(spread(dataset, self.config.clips))]
+        truths = [t for t in truths if len(t.features) >= unit]
+        if not truths:
+            raise UserError(
+                f"{dataset.where}: no captioned clip of split '{dataset.split}' is long enough for one group "
+                f"of tokens"
+            )
+        if left := int((~captioned(dataset)).sum()):
+            context.console.print(f"    {dataset.split}: {left} clips without a caption are left out")
+        figures: dict[str, Any] = {"split": dataset.split, "clips": len(truths)}
+        if self.tokenizer is not None:
+            train = context.given["data"].split("train")
+            figures["bits_per_second"] = self.tokenizer.net.bits_per_second
+            figures["reconstruction_mm"] = reconstruction_figures(self.tokenizer, train, truths)
+        generated = self.generate(truths)
+        if self.tma is not None:
+            figures["retrieval"] = self.retrieval(self.tma, truths, generated)
+        if any(t.truth for t in truths):
+            figures["agreement_with_caption"] = self.agreement(truths, generated)
+        return figures
+
+    def generate(self, truths: list[Truth]) -> list[list[GeneratedMotion]]:
+        """The captions of `truths` performed, once for each repeat."""
+        out, config, seed = [], self.config, self.context.seed
+        with bar(self.context.console) as progress:
+            task = progress.add_task("generating", total=config.repeats * len(truths), note="")
+            for repeat in range(config.repeats):
+                motions: list[GeneratedMotion] = []
+                for start in range(0, len(truths), 64):
+                    part = truths[start : start + 64]
+                    motions += self.bundle.generate(
+                        [t.caption for t in part],
+                        face_captions=[t.face_caption for t in part],
+                        seed=seed + 7919 * (repeat + 1) + start,
+                        sampling=config.sampling,
+                    )
+                    progress.update(task, advance=len(part))
+                out.append(motions)
+        return out
+
+    def retrieval(
+        self, tma: LoadedTma, truths: list[Truth], generated: list[list[GeneratedMotion]]
+    ) -> dict[str, Any]:
+        """Recall among `size`, of real and of generated motion."""
+        config, seed = self.config, self.context.seed
+        size = min(config.size, len(truths))
+        text = tma.embed_captions([t.caption for t in truths], self.context.given["text"].cache)
+        real = embed_motions(tma, [t.features for t in truths], [t.held for t in truths])
+        repeats = max(config.repeats, 5)
+        figures = retrieval_figures(text, real, size=size, repeats=repeats, seed=seed)
+        made: dict[str, list[float]] = {}
+        for repeat, motions in enumerate(generated):
+            latent = embed_motions(tma, [g.features for g in motions])
+            once = retrieval_figures(text, latent, size=size, repeats=1, seed=seed + repeat)
+            for name, value in once.items():
+                made.setdefault(name, []).append(value.mean)
+            distance = torch.linalg.vector_norm(text - latent, dim=-1).mean()
+            made.setdefault("matching_score", []).append(float(distance))
+        real_distance = float(torch.linalg.vector_norm(text - real, dim=-1).mean())
+        return {
             "size": size,
             "chance": {f"r{k}": chance(k, size) for k in (1, 2, 3)},
             "real": {**figures, "matching_score": Interval(real_distance, 0.0)},
             "generated": {name: Interval.of(values) for name, values in made.items()},
         }
-    }
+
+    def agreement(self, truths: list[Truth], generated: list[list[GeneratedMotion]]) -> dict[str, Any]:
+        """Whether motions do what their captions say, by their joints."""
+        fps = self.dataset.layout.fps
+        made = [(t, g.joints, g.face) for motions in generated for t, g in zip(truths, motions, strict=True)]
+        return {
+            "truth": truth_agreement([(t, t.joints, t.face) for t in truths], fps),
+            "generated": truth_agreement(made, fps),
+        }
 
 
 def _plain(value: Any) -> Any:
@@ -152,27 +192,8 @@ def _table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
 def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
     """(title, columns, rows) of each table; the report draws the same ones."""
     out = []
-    r = figures["reconstruction_mm"]
-    out.append(
-        (
-            f"Reconstruction on {figures['clips']} {figures['split']} clips, mm (lower is better); "
-            f"codes of {figures['bits_per_second']:.0f} bit/s",
-            ["", "pose", "body", "fingers from the wrist", "in the world", "PA-MPJPE", "ACCEL"],
-            [
-                [
-                    title,
-                    *(_mm(r.get(f"{key}{suffix}")) for key in ("mpjpe", "mpjpe_body", "mpjpe_hand")),
-                    _mm(r[f"global_mpjpe{suffix}"]),
-                    *(_mm(r.get(key)) if not suffix else "" for key in ("pa_mpjpe", "accel")),
-                ]
-                for title, suffix in (
-                    ("tokenizer", ""),
-                    ("nearest training clip", "_nearest_train_clip"),
-                    ("mean pose", "_mean_pose"),
-                )
-            ],
-        )
-    )
+    if "reconstruction_mm" in figures:
+        out.append(_reconstruction_rows(figures))
     if "retrieval" in figures:
         found = figures["retrieval"]
         rows = [
@@ -200,6 +221,28 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
             )
         )
     return out
+
+
+def _reconstruction_rows(figures: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
+    r = figures["reconstruction_mm"]
+    return (
+        f"Reconstruction on {figures['clips']} {figures['split']} clips, mm (lower is better); "
+        f"codes of {figures['bits_per_second']:.0f} bit/s",
+        ["", "pose", "body", "fingers from the wrist", "in the world", "PA-MPJPE", "ACCEL"],
+        [
+            [
+                title,
+                *(_mm(r.get(f"{key}{suffix}")) for key in ("mpjpe", "mpjpe_body", "mpjpe_hand")),
+                _mm(r[f"global_mpjpe{suffix}"]),
+                *(_mm(r.get(key)) if not suffix else "" for key in ("pa_mpjpe", "accel")),
+            ]
+            for title, suffix in (
+                ("tokenizer", ""),
+                ("nearest training clip", "_nearest_train_clip"),
+                ("mean pose", "_mean_pose"),
+            )
+        ],
+    )
 
 
 def _mm(value: float | None) -> str:

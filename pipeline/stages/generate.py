@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import Field
 
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import GENERATOR, Every, StageConfig, StageContext, StageKind
 from motionloom.pipeline.evaluation.truth import spread, truth_of
-from motionloom.pipeline.inference.bundle import Bundle, text_encoder_of
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.outputs import FORMATS, Format, write_motions
-from motionloom.pipeline.inference.sampling import SamplingConfig
-from motionloom.pipeline.stages.stage import StageConfig, StageContext
-from motionloom.pipeline.store.data import held_out, open_split
 
 
 class GenerateConfig(StageConfig):
@@ -22,19 +23,31 @@ class GenerateConfig(StageConfig):
     formats: list[Format] = Field(default_factory=lambda: list(FORMATS))
 
 
-def run_generate(context: StageContext) -> None:
-    """Generate, decode and write."""
-    config: GenerateConfig = context.config
-    bundle = Bundle.from_parts(dict(context.inputs), text_encoder_of(context.input("text")), context.device)
-    captions, faces = list(config.captions), list(config.captions)
-    if not captions:
-        data = context.input("data")
-        dataset = open_split(data, held_out(data, prefer="test"))
-        truths = [truth_of(dataset, i) for i in spread(dataset, config.count)]
-        captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
-    motions = bundle.generate(captions, face_captions=faces, seed=context.seed, sampling=config.sampling)
-    write_motions(
-        context.folder / "motions", motions, config.formats, title="Generated motions", seed=context.seed
-    )
-    for motion in motions:
-        context.console.print(f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {motion.caption}")
+class GenerateStage(StageKind):
+    """Motions for captions, written for tools and as a page to watch."""
+
+    name = "generate"
+    summary = "motions from captions"
+    config = GenerateConfig
+    takes = ("data", Every("generators", GENERATOR))
+    version = 3  # generators as the recipe has them
+
+    def gives(self, config: Any) -> frozenset[str]:
+        """Files to watch."""
+        return frozenset({"motions"})
+
+    def run(self, context: StageContext) -> None:
+        """Generate, decode and write."""
+        config: GenerateConfig = context.config
+        bundle = Bundle(context.every("generators"), context.shelf)
+        captions, faces = list(config.captions), list(config.captions)
+        if not captions:
+            dataset = context.given["data"].held_out(prefer="test")
+            truths = [truth_of(dataset, i) for i in spread(dataset, config.count)]
+            captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
+        motions = bundle.generate(captions, face_captions=faces, seed=context.seed, sampling=config.sampling)
+        write_motions(
+            context.folder / "motions", motions, config.formats, title="Generated motions", seed=context.seed
+        )
+        for motion in motions:
+            context.console.print(f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {motion.caption}")

@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
+from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.gpt.sampling import generate
+from motionloom.pipeline.contract.finished import Finished
+from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import GENERATOR, Given, Stage
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
-from motionloom.pipeline.stages.stage import StageContext
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig, fit
-from motionloom.pipeline.store.data import held_out, open_split, open_text
-from motionloom.pipeline.store.networks import LoadedTma, load_gpt, load_tokenizer
-from motionloom.pipeline.store.tokens import TokenBatches, TokenStore
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, save_model
+from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
+from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer, device_of
+from motionloom.pipeline.store.tokens import TokenBatches
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
 Prior = Literal["tma", "sentence"]
+
+_SIZES = ("layers", "dim", "heads", "ff", "block_size")
+"""Of the network; a GPT goes on from another only where these are equal."""
 
 
 class GptStageConfig(TrainedStageConfig):
@@ -42,93 +55,280 @@ class GptStageConfig(TrainedStageConfig):
     def require_fit(self, hardware: Hardware) -> None:
         """A model that samples as it trains is neither one graph nor cut over ranks."""
         super().require_fit(hardware)
-        sampled = self.loss.align_weight > 0 and self.loss.align_on == "samples"
-        if sampled and (self.train.compile or self.train.strategy == "fsdp"):
+        if self.aligned_on_samples and (self.train.compile or self.train.strategy == "fsdp"):
             raise UserError(
                 "loss.align_on samples draws motions token by token, which train.compile and train.strategy "
                 "fsdp cannot do; set compile: false and strategy: ddp, or align_on: predictions"
             )
 
+    @property
+    def aligned(self) -> bool:
+        """Whether L_align is part of the loss."""
+        return self.loss.align_weight > 0
 
-def run_gpt(context: StageContext) -> None:
-    """Train on exported tokens."""
-    config: GptStageConfig = context.config
-    tokenizer = load_tokenizer(context.input("tokenizer"))
-    tma_folder = context.optional("tma")
-    align = config.loss.align_weight > 0
-    needed = config.prior == "tma" or align
-    if needed and tma_folder is None:
-        raise UserError(f"stage {context.name}: prior 'tma' and align_weight > 0 need a tma stage before it")
-    tma = LoadedTma.load(tma_folder, context.device) if needed and tma_folder is not None else None
-    text = open_text(context.input("text"))
-    text_dim = tma.net.config.latent if config.prior == "tma" and tma else text.dim
-    torch.manual_seed(context.seed)
-    net = InterleavedGPT(config.net, tokenizer.streams, tokenizer.pattern, text_dim)
-    start = context.optional("start")
-    if start is not None:
-        net.load_state_dict(load_gpt(start, tokenizer)[0].state_dict())
-    module = GptModule(
-        net,
-        config.optim,
-        seed=context.seed,
-        max_steps=config.train.steps,
-        loss=config.loss,
-        tokenizer=tokenizer if align else None,
-        tma=tma.net if align and tma else None,
-    )
-    data = context.input("data")
-    per_group = {s.name: s.per_group for s in tokenizer.streams}
+    @property
+    def aligned_on_samples(self) -> bool:
+        """Whether it samples as it trains."""
+        return self.aligned and self.loss.align_on == "samples"
 
-    @cache
-    def clips_of(split: str) -> GptClips:
-        store = TokenStore.load(context.input("tokens") / f"tokens-{split}.safetensors", per_group)
-        clips = gpt_clips(
-            open_split(data, split), store, tokenizer, face=config.face, min_frames=config.min_frames
-        )
-        if clips.uncaptioned:
-            kind = "face caption" if config.face else "caption"
-            context.console.print(f"    {split}: {clips.uncaptioned} clips without a {kind} are left out")
-        return clips
 
-    def batches(split: str, batch: int, rank: int = 0, world: int = 1, *, training: bool) -> TokenBatches:
-        clips = clips_of(split)
-        latents = tma.embed_captions(clips.texts, text) if tma is not None else None
-        if config.prior == "tma" and latents is not None:
-            prior = latents
-        else:
-            prior = torch.as_tensor(text.sentence(clips.texts))
-        return TokenBatches(
-            clips.store,
-            clips.captions,
-            prior,
-            torch.as_tensor(text.similarity(clips.texts)),
-            net.pattern,
-            net.num_codes,
-            net.max_groups,
-            batch,
-            context.seed,
-            rank,
-            world,
-            training,
-            clips.sources,
-            latents=latents if align and config.prior != "tma" else None,
-            held=clips.held,
-        )
+class GptStage(TrainedStage):
+    """A GPT, trained on exported tokens."""
 
-    def train(batch: int, rank: int, world: int) -> Dataset[Any]:
-        return batches("train", batch, rank, world, training=True)
+    name = "gpt"
+    summary = "GPT over motion tokens"
+    config = GptStageConfig
+    takes = ("data", "text", "tokenizer", "tokens", "tma?", "start?")
+    version = 3  # captions about parts of clips, clips without hands, sBERT's filter, dropped texts
 
-    def validation() -> Dataset[Any]:
-        return batches(held_out(data), 32, training=False)
+    def gives(self, config: GptStageConfig) -> frozenset[str]:
+        """Motion of text."""
+        return super().gives(config) | {GENERATOR}
 
-    fit(context, module, config.train, train, validation, config.optim.grad_clip)
-    if module.global_rank == 0:
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
+        """Its TMA must read captions as it does, and a GPT that it starts from must be the same network."""
+        _check_text(stage, others)
+        _check_start(stage, others)
+
+    def facts(self, config: GptStageConfig, given: Given) -> ModelFacts:
+        """Config, streams and the width of the prior."""
+        if (config.prior == "tma" or config.aligned) and "tma" not in given:
+            raise UserError("prior 'tma' and align_weight > 0 need a tma stage before it")
+        tokenizer: TrainedTokenizer = given["tokenizer"]
+        text_dim = given["tma"].net.config.latent if config.prior == "tma" else given["text"].dim
         extra = {
             "text_dim": text_dim,
             "prior": config.prior,
-            "streams": {s.name: s.num_codes for s in tokenizer.streams},
-            "pattern": list(tokenizer.pattern),
+            "streams": {s.name: s.num_codes for s in tokenizer.net.streams},
+            "pattern": list(tokenizer.net.pattern),
         }
-        layout = open_split(data, "train").layout
-        facts = ModelFacts(kind="gpt", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra)
-        save_model(context.folder, net, facts)
+        layout = LayoutFacts.of(given["data"].layout)
+        return ModelFacts(kind="gpt", config=config.net.dump(), layout=layout, extra=extra)
+
+    def network(self, facts: ModelFacts, given: Given) -> InterleavedGPT:
+        """The GPT over the tokenizer's streams, which must be those it was made for."""
+        tokenizer = given["tokenizer"].net
+        expected = {s.name: s.num_codes for s in tokenizer.streams}
+        streams, pattern = facts.fact("streams", dict), facts.fact("pattern", list)
+        if streams != expected or tuple(pattern) != tuple(tokenizer.pattern):
+            raise UserError(
+                f"{facts.where}: this GPT was trained on streams {streams}, "
+                f"the tokenizer has {expected}; train it again on this tokenizer"
+            )
+        config = GptConfig.parse(facts.config, facts.where)
+        return InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, facts.fact("text_dim", int))
+
+    def prepare(self, config: GptStageConfig, net: InterleavedGPT, given: Given) -> None:
+        """Go on from another GPT's weights, where the recipe names one."""
+        if "start" in given:
+            net.load_state_dict(given["start"].net.state_dict())
+
+    def module(self, config: GptStageConfig, net: Any, given: Given, seed: int) -> GptModule:
+        """Cross-entropy, and L_align on what the frozen tokenizer and TMA make of its tokens."""
+        return GptModule(
+            net,
+            config.optim,
+            seed=seed,
+            max_steps=config.train.steps,
+            loss=config.loss,
+            tokenizer=given["tokenizer"].net if config.aligned else None,
+            tma=given["tma"].net if config.aligned else None,
+        )
+
+    def batches(self, config: GptStageConfig, net: nn.Module, given: Given, seed: int, say: Say) -> Batches:
+        """Token sequences with one caption each."""
+        assert isinstance(net, InterleavedGPT)
+        data, text, tokenizer = given["data"], given["text"].cache, given["tokenizer"].net
+        tma = given["tma"] if config.prior == "tma" or config.aligned else None
+
+        @cache
+        def clips_of(split: str) -> GptClips:
+            store = given["tokens"].open(split)
+            dataset = data.split(split)
+            clips = gpt_clips(dataset, store, tokenizer, face=config.face, min_frames=config.min_frames)
+            if clips.uncaptioned:
+                kind = "face caption" if config.face else "caption"
+                say(f"{split}: {clips.uncaptioned} clips without a {kind} are left out")
+            return clips
+
+        def batches(split: str, batch: int, rank: int = 0, world: int = 1, *, training: bool) -> TokenBatches:
+            clips = clips_of(split)
+            latents = tma.embed_captions(clips.texts, text) if tma is not None else None
+            if config.prior == "tma" and latents is not None:
+                prior = latents
+            else:
+                prior = torch.as_tensor(text.sentence(clips.texts))
+            return TokenBatches(
+                clips.store,
+                clips.captions,
+                prior,
+                torch.as_tensor(text.similarity(clips.texts)),
+                net.pattern,
+                net.num_codes,
+                net.max_groups,
+                batch,
+                seed,
+                rank,
+                world,
+                training,
+                clips.sources,
+                latents=latents if config.aligned and config.prior != "tma" else None,
+                held=clips.held,
+            )
+
+        def train(batch: int, rank: int, world: int) -> Dataset[Any]:
+            return batches("train", batch, rank, world, training=True)
+
+        def validation() -> Dataset[Any]:
+            return batches(data.held_out().split, 32, training=False)
+
+        return Batches(train, validation)
+
+    def dry_module(self, config: GptStageConfig, net: Any, given: Given) -> GptModule:
+        """Without the judge of sampled motions, which keeps nothing for the backward pass."""
+        module = self.module(config, net, given, seed=0)
+        if config.aligned_on_samples:
+            module.tokenizer = None
+        return module
+
+    def example(self, config: GptStageConfig, net: Any, given: Given, batch: int) -> Example:
+        """The longest sequences; samples that are judged are so many more rows."""
+        assert isinstance(net, InterleavedGPT)
+        if config.aligned_on_samples:
+            batch *= 1 + config.loss.samples
+        tokenizer, groups, ends = given["tokenizer"].net, net.max_groups, len(net.names)
+        length = groups * len(net.pattern) + ends
+        order = torch.tensor([net.names.index(name) for name in (net.pattern * groups + net.names)])
+        inputs = {
+            "tokens": torch.zeros(batch, length, dtype=torch.int64),
+            "kinds": order.expand(batch, -1),
+            "text": torch.empty(batch, net.text_dim),
+            "similarity": torch.empty(batch, given["text"].dim),
+        }
+        if config.aligned and "tma" in given:
+            inputs["tma_text"] = torch.empty(batch, given["tma"].net.config.latent)
+        parts = " + ".join(f"{groups * s.per_group} {s.name}" for s in tokenizer.streams)
+        frames = groups * tokenizer.group_frames
+        return Example(inputs, f"{parts} + {ends} End = {length} for {frames} frames")
+
+    def loaded(self, net: InterleavedGPT, facts: ModelFacts, given: Given) -> LoadedGpt:
+        """The network and its kind of prior."""
+        return LoadedGpt(net, facts.fact("prior", str))
+
+    def generator(self, stage: Finished, given: Given, device: torch.device) -> MotionGenerator:
+        """Motion, or expressions, of text."""
+        return GptGenerator(self.load(stage, given, device), given, stage.config.face)
+
+    def exported(self, config: GptStageConfig) -> tuple[str, ...]:
+        """What decodes its tokens and encodes its words."""
+        return ("tokenizer", "text", "tma") if config.prior == "tma" else ("tokenizer", "text")
+
+    def curves(self, config: Any) -> tuple[Curve, ...]:
+        """Cross-entropy and accuracy."""
+        return (Curve("ce"), Curve("accuracy"), Curve("align"))
+
+
+@dataclass(frozen=True)
+class GptGenerator:
+    """Tokens sampled from a GPT, then decoded: body and hands, or the face's residual codes (B.4)."""
+
+    gpt: LoadedGpt
+    given: Mapping[str, Any]
+    face: bool
+    method = "gpt"
+    modalities = frozenset({"text"})
+
+    @property
+    def tokenizer(self) -> TrainedTokenizer:
+        """What decodes the tokens."""
+        tokenizer: TrainedTokenizer = self.given["tokenizer"]
+        return tokenizer
+
+    @property
+    def layout(self) -> MotionLayout:
+        """Layout of whole frames."""
+        return self.tokenizer.layout
+
+    @property
+    def part(self) -> Part:
+        """The columns that the tokenizer models."""
+        return self.tokenizer.net.part
+
+    @property
+    def settings(self) -> frozenset[str]:
+        """How tokens are drawn."""
+        guidance = {"face_cfg_scale"} if self.face else set()
+        return frozenset({"temperature", "top_k", "top_p", "cfg_scale"} | guidance)
+
+    @property
+    def unit_frames(self) -> int:
+        """A group of tokens."""
+        return self.tokenizer.net.group_frames
+
+    @property
+    def max_frames(self) -> int:
+        """What the GPT's block holds."""
+        return self.gpt.net.max_groups * self.unit_frames
+
+    def prior(self, request: GenerationRequest) -> Tensor:
+        """First input of the GPT [B, E]: the TMA text latent or the sentence embedding."""
+        if self.gpt.prior == "sentence":
+            return request.pooled_text("this GPT").to(device_of(self.gpt.net))
+        if "tma" not in self.given:
+            raise UserError("this GPT needs the TMA text encoder, and no tma stage is here")
+        text = request.conditions["text"]
+        latent: Tensor = self.given["tma"].embed_text(text.features, text.mask)
+        return latent
+
+    @torch.no_grad()
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        """Lengths that are no whole groups are made of one group more, and cut."""
+        sampling, unit = request.sampling, self.unit_frames
+        groups = None if request.frames is None else torch.tensor([-(-n // unit) for n in request.frames])
+        codes = generate(
+            self.gpt.net,
+            self.prior(request),
+            groups=groups,
+            temperature=sampling.temperature,
+            top_k=sampling.top_k or None,
+            top_p=sampling.top_p,
+            cfg_scale=sampling.face_guidance if self.face else sampling.cfg_scale,
+            seed=list(request.seeds),
+        )
+        motions = self.tokenizer.decode(codes.codes, codes.groups.tolist())
+        if request.frames is None:
+            return motions
+        return [motion[:count] for motion, count in zip(motions, request.frames, strict=True)]
+
+
+def _check_text(stage: Stage, others: Mapping[str, Stage]) -> None:
+    """A TMA must be given captions by the encoder that it was trained on."""
+    tma, own = others.get(stage.inputs.get("tma", "")), stage.inputs.get("text", "")
+    other = tma.inputs.get("text", "") if tma is not None else own
+    if own in others and other in others and others[own].config != others[other].config:
+        raise UserError(
+            f"stage '{stage.name}' reads captions as '{own}' encodes them, but its TMA "
+            f"'{stage.inputs['tma']}' was trained on those of '{other}'; name one text stage for both, "
+            f"or leave the TMA out (inputs: {{tma: null}})"
+        )
+
+
+def _check_start(stage: Stage, others: Mapping[str, Stage]) -> None:
+    """A GPT can go on from another's weights where both are one network that reads and writes the same."""
+    start = others.get(stage.inputs.get("start", ""))
+    if start is None:
+        return
+    ours: GptStageConfig = stage.config
+    theirs: Any = start.config
+    if start.kind is not stage.kind:
+        wrong = [f"kind ({start.kind.name})"]
+    else:
+        wrong = [f"net.{size}" for size in _SIZES if getattr(ours.net, size) != getattr(theirs.net, size)]
+        wrong += ["prior"] if ours.prior != theirs.prior else []
+        roles = ("text", "tokenizer") + (("tma",) if ours.prior == "tma" else ())
+        wrong += [f"inputs.{role}" for role in roles if start.inputs.get(role) != stage.inputs.get(role)]
+    if wrong:
+        raise UserError(
+            f"stage '{stage.name}' starts from '{start.name}', which differs in {', '.join(wrong)}; give "
+            f"both the same"
+        )

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from motionloom.datasets.loading.statistics import compute
+from pathlib import Path
+
+import torch
+
+from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
-from motionloom.pipeline.stages.stage import StageConfig, StageContext
-from motionloom.pipeline.store.data import captions_of, open_split, splits_of
+from motionloom.pipeline.contract.finished import Finished
+from motionloom.pipeline.contract.stage import Given, StageConfig, StageContext, StageKind
+from motionloom.pipeline.store.data import captions_of
 from motionloom.pipeline.store.encoder_files import keep_place
+from motionloom.pipeline.store.files import copy_files
+from motionloom.pipeline.store.text import TextPreview, TextSource
+
+_STATS = "stats.safetensors"
 
 
 class StatsConfig(StageConfig):
@@ -28,33 +37,70 @@ class TextConfig(StageConfig):
     the filter of negatives and retrieval protocol B, whatever `encoder` is."""
 
 
-def run_stats(context: StageContext) -> None:
-    """One streaming pass over the training split."""
-    dataset = open_split(context.input("data"), "train")
-    compute(dataset, group=context.config.group).save(context.folder / "stats.safetensors")
-    context.console.print(
-        f"    {len(dataset)} clips, {int(dataset.frames.sum())} frames, {dataset.layout.dim} dimensions"
-    )
+class StatsStage(StageKind):
+    """Mean and deviation of every feature."""
+
+    name = "stats"
+    summary = "mean and deviation"
+    config = StatsConfig
+    takes = ("data",)
+
+    def run(self, context: StageContext) -> None:
+        """One streaming pass over the training split."""
+        dataset = context.given["data"].split("train")
+        compute(dataset, group=context.config.group).save(context.folder / _STATS)
+        context.console.print(
+            f"    {len(dataset)} clips, {int(dataset.frames.sum())} frames, {dataset.layout.dim} dimensions"
+        )
+
+    def load(self, stage: Finished, given: Given, device: torch.device) -> FeatureStats:
+        """The statistics."""
+        return FeatureStats.load(stage.folder / _STATS)
+
+    def export(self, stage: Finished, target: Path) -> None:
+        """The statistics."""
+        copy_files(stage.folder, target, (_STATS,))
 
 
-def run_text(context: StageContext) -> None:
-    """Embed the captions of all splits."""
-    keep_place(context.config.encoder, context.folder)
-    captions: set[str] = set()
-    for split in splits_of(context.input("data")):
-        dataset = open_split(context.input("data"), split)
-        for index in in_order(dataset, "texts.json", "face_texts.json"):
-            captions.update(c.text for c in captions_of(dataset, index, face=False))
-            captions.update(c.text for c in captions_of(dataset, index, face=True))
-    cache = build_text_cache(
-        context.folder / "cache",
-        captions,
-        context.config.encoder,
-        workers=context.hardware.convert_workers,
-        progress=context.console.is_terminal,
-        device=str(context.device),
-        similarity=context.config.similarity,
-    )
-    context.console.print(
-        f"    {len(captions)} different captions, {cache.dim}-d embeddings by {cache.encoder}"
-    )
+class TextStage(StageKind):
+    """Embeddings of every caption."""
+
+    name = "text"
+    summary = "caption embeddings"
+    config = TextConfig
+    takes = ("data",)
+    version = 2  # `similarity`
+
+    def run(self, context: StageContext) -> None:
+        """Embed the captions of all splits."""
+        keep_place(context.config.encoder, context.folder)
+        data, captions = context.given["data"], set[str]()
+        for split in data.splits:
+            dataset = data.split(split)
+            for index in in_order(dataset, "texts.json", "face_texts.json"):
+                captions.update(c.text for c in captions_of(dataset, index, face=False))
+                captions.update(c.text for c in captions_of(dataset, index, face=True))
+        cache = build_text_cache(
+            context.folder / "cache",
+            captions,
+            context.config.encoder,
+            workers=context.hardware.convert_workers,
+            progress=context.console.is_terminal,
+            device=str(context.device),
+            similarity=context.config.similarity,
+        )
+        context.console.print(
+            f"    {len(captions)} different captions, {cache.dim}-d embeddings by {cache.encoder}"
+        )
+
+    def preview(self, config: TextConfig, given: Given) -> TextPreview:
+        """The width of the encoder's features."""
+        return TextPreview.of(config.encoder)
+
+    def load(self, stage: Finished, given: Given, device: torch.device) -> TextSource:
+        """The cache, and the encoder for new words."""
+        return TextSource(stage.folder, stage.config.encoder, device)
+
+    def export(self, stage: Finished, target: Path) -> None:
+        """The encoder."""
+        TextSource(stage.folder, stage.config.encoder, torch.device("cpu")).export(target)

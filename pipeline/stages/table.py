@@ -1,124 +1,39 @@
-"""The stage table: one line per kind.
-
-A new stage is a network file, a LightningModule file, a line here and a recipe entry.
-"""
+"""Our own stage kinds, registered: one line each (`contract/registry.py`)."""
 
 from __future__ import annotations
 
-from motionloom.pipeline.stages import (
-    convert,
-    data,
-    diffusion,
-    evaluate,
-    generate,
-    gpt,
-    prepare,
-    report,
-    tma,
-    tokenizer,
-    tokens,
+from motionloom.pipeline.contract.registry import register
+from motionloom.pipeline.stages.convert import CONVERTED, ConvertStage, run_convert
+from motionloom.pipeline.stages.data import (
+    DataStage,
+    ShardsStage,
+    ShardsStageConfig,
+    SynthStageConfig,
+    run_shards,
+    run_synth,
 )
-from motionloom.pipeline.stages.stage import StageConfig, StageKind
+from motionloom.pipeline.stages.diffusion import DiffusionStage
+from motionloom.pipeline.stages.evaluate import EvaluateStage
+from motionloom.pipeline.stages.generate import GenerateStage
+from motionloom.pipeline.stages.gpt import GptStage
+from motionloom.pipeline.stages.prepare import StatsStage, TextStage
+from motionloom.pipeline.stages.report import ReportStage
+from motionloom.pipeline.stages.tma import TmaStage
+from motionloom.pipeline.stages.tokenizer import TOKENIZERS, TokenizerStage
+from motionloom.pipeline.stages.tokens import TokensStage
 
-_ALL_MODELS = (
-    "data",
-    "stats",
-    "text",
-    "tokenizer",
-    "tma?",
-    "gpt",
-    "face_tokenizer?",
-    "face_gpt?",
-    "face_vae?",
-    "face_diffusion?",
-)
-
-
-def _tokenizer(name: str, summary: str, config: type[StageConfig]) -> StageKind:
-    # Version 2: fingers in the palm's frame (`finger_gain`).
-    run, inputs = tokenizer.run_tokenizer, ("data", "stats")
-    return StageKind(name, summary, config, run, inputs, version=2, trains=True)
-
-
-STAGES: dict[str, StageKind] = {
-    kind.name: kind
-    for kind in (
-        StageKind("synth", "synthetic shards", data.SynthStageConfig, data.run_synth),
-        *(
-            StageKind(
-                name, f"shards from {title}", config, convert.run_convert, external=convert.source_facts
-            )
-            for name, (title, config) in convert.CONVERTED.items()
-        ),
-        StageKind(
-            "shards",
-            "existing shards",
-            data.ShardsStageConfig,
-            data.run_shards,
-            external=data.shards_source,
-            settle=data.settle_shards,
-        ),
-        StageKind("stats", "mean and deviation", prepare.StatsConfig, prepare.run_stats, ("data",)),
-        # Version 2: `similarity`.
-        StageKind("text", "caption embeddings", prepare.TextConfig, prepare.run_text, ("data",), version=2),
-        _tokenizer("h2vq", "H2VQ tokenizer", tokenizer.H2VQStageConfig),
-        _tokenizer("vq", "VQ tokenizer", tokenizer.VqStageConfig),
-        _tokenizer("rvq", "RVQ tokenizer", tokenizer.RvqStageConfig),
-        _tokenizer("separate", "body and hands apart", tokenizer.SeparateStageConfig),
-        _tokenizer("fsq", "FSQ tokenizer", tokenizer.FsqStageConfig),
-        StageKind(
-            "tma",
-            "text-motion alignment",
-            tma.TmaStageConfig,
-            tma.run_tma,
-            ("data", "stats", "text"),
-            version=2,  # the filter of negatives is sBERT's
-            trains=True,
-        ),
-        StageKind(
-            "diffusion",
-            "motion diffusion",
-            diffusion.DiffusionStageConfig,
-            diffusion.run_diffusion,
-            ("data", "stats", "text"),
-            trains=True,
-        ),
-        StageKind(
-            "tokens", "token export", tokens.TokensConfig, tokens.run_tokens, ("data", "stats", "tokenizer")
-        ),
-        StageKind(
-            "gpt",
-            "GPT over motion tokens",
-            gpt.GptStageConfig,
-            gpt.run_gpt,
-            ("data", "text", "tokenizer", "tokens", "tma?", "start?"),
-            version=3,  # captions about parts of clips, clips without hands, sBERT's filter, dropped texts
-            trains=True,
-        ),
-        # Version 2 of these three: captions about parts of clips; none without a caption.
-        StageKind(
-            "generate",
-            "motions from captions",
-            generate.GenerateConfig,
-            generate.run_generate,
-            _ALL_MODELS,
-            version=2,
-        ),
-        StageKind(
-            "evaluate",
-            "figures on the test split",
-            evaluate.EvaluateConfig,
-            evaluate.run_evaluate,
-            _ALL_MODELS,
-            version=2,
-        ),
-        StageKind(
-            "report",
-            "the page to watch",
-            report.ReportConfig,
-            report.run_report,
-            (*_ALL_MODELS, "generate?", "evaluate?"),
-            version=2,
-        ),
-    )
-}
+register(DataStage("synth", "synthetic shards", SynthStageConfig, run_synth))
+for name, (title, config) in CONVERTED.items():
+    register(ConvertStage(name, f"shards from {title}", config, run_convert))
+register(ShardsStage("shards", "existing shards", ShardsStageConfig, run_shards))
+register(StatsStage())
+register(TextStage())
+for name, summary, config in TOKENIZERS:
+    register(TokenizerStage(name, summary, config))
+register(TmaStage())
+register(DiffusionStage())
+register(TokensStage())
+register(GptStage())
+register(GenerateStage())
+register(EvaluateStage())
+register(ReportStage())

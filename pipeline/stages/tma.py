@@ -1,13 +1,17 @@
-"""Text-motion alignment stage (HumanTOMATO section 3.5, appendix D)."""
+"""Text-motion alignment stage; without InfoNCE it is TEMOS, of the face the facial cVAE (HumanTOMATO 3.5,
+B.5.1, D).
+"""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
+from torch import nn
 from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.batches import CaptionBatches, EvalBatches
@@ -15,10 +19,15 @@ from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.tma.module import TmaLossConfig, TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
-from motionloom.pipeline.stages.stage import StageContext
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig, fit
-from motionloom.pipeline.store.data import held_out, open_split, open_stats, open_text
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, save_model
+from motionloom.pipeline.contract.finished import Finished
+from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import ALIGNMENT, GENERATOR, Given
+from motionloom.pipeline.stages.examples import caption_example
+from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
+from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.store.networks import LoadedTma
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
 
 class TmaStageConfig(TrainedStageConfig):
@@ -49,55 +58,123 @@ def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:
     return layout.part(part)
 
 
-def run_tma(context: StageContext) -> None:
-    """Train the alignment model on whole clips and their captions."""
-    config = context.config
-    data, stats, text = (
-        context.input("data"),
-        open_stats(context.input("stats")),
-        open_text(context.input("text")),
-    )
-    dataset = open_split(data, "train", training=True)
+class TmaStage(TrainedStage):
+    """Motion and text encoders, trained on whole clips and their captions."""
+
+    name = "tma"
+    summary = "text-motion alignment"
+    config = TmaStageConfig
+    takes = ("data", "stats", "text")
+    version = 2  # the filter of negatives is sBERT's
+
+    def gives(self, config: TmaStageConfig) -> frozenset[str]:
+        """One space for text and motion; of the face also motion of text (B.5.1)."""
+        return super().gives(config) | {GENERATOR if config.part == "face" else ALIGNMENT}
+
+    def facts(self, config: TmaStageConfig, given: Given) -> ModelFacts:
+        """Config, layout and the widths of both sides."""
+        layout = given["data"].layout
+        part_columns(layout, config.part)
+        extra = {"text_dim": given["text"].dim, "max_frames": config.max_frames, "part": config.part}
+        return ModelFacts(kind="tma", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra)
+
+    def network(self, facts: ModelFacts, given: Given) -> Tma:
+        """Both encoders and the decoder."""
+        layout, part = facts.layout.layout(), facts.extra.get("part", "bodyhand")
+        if part not in get_args(Part) or not layout.has_part(part):
+            raise UserError(
+                f"{facts.where}: key 'extra.part' = {part!r} is no part of layout {layout.name}; "
+                "run or export the stage again"
+            )
+        config = TmaConfig.parse(facts.config, facts.where)
+        return Tma.of_layout(config, layout, part, facts.fact("text_dim", int))
+
+    def prepare(self, config: TmaStageConfig, net: Tma, given: Given) -> None:
+        """The coordinates it reads depend on how features are normalised."""
+        if net.basis is not None:
+            columns, stats = part_columns(given["data"].layout, config.part), given["stats"]
+            net.basis.learn(stats.mean[columns], stats.std[columns])
+
+    def module(self, config: TmaStageConfig, net: Any, given: Given, seed: int) -> TmaModule:
+        """Reconstruction, KL, latents and InfoNCE."""
+        return TmaModule(net, config.optim, seed=seed, max_steps=config.train.steps, loss=config.loss)
+
+    def batches(self, config: TmaStageConfig, net: nn.Module, given: Given, seed: int, say: Say) -> Batches:
+        """Whole clips with one caption each."""
+        return caption_batches(config, given, seed)
+
+    def example(self, config: TmaStageConfig, net: Any, given: Given, batch: int) -> Example:
+        """The longest clips with captions of usual length."""
+        return caption_example(batch, config.max_frames, net.motion_dim, net.text_dim)
+
+    def loaded(self, net: Tma, facts: ModelFacts, given: Given) -> LoadedTma:
+        """The model with the statistics of its motion."""
+        frames, part = facts.fact("max_frames", int), facts.extra.get("part", "bodyhand")
+        return LoadedTma(net, facts.layout.layout(), frames, part, given)
+
+    def generator(self, stage: Finished, given: Given, device: torch.device) -> MotionGenerator:
+        """The facial cVAE."""
+        return VaeFace(self.load(stage, given, device))
+
+    def exported(self, config: Any) -> tuple[str, ...]:
+        """Statistics, and the encoder of its words."""
+        return ("stats", "text")
+
+    def curves(self, config: Any) -> tuple[Curve, ...]:
+        """InfoNCE and the whole."""
+        return (Curve("contrastive"), Curve("loss"))
+
+
+def caption_batches(config: Any, given: Given, seed: int) -> Batches:
+    """Captioned clips of one part: `config` has `part`, `max_frames` and `min_frames`."""
+    data, stats, text = given["data"], given["stats"], given["text"].cache
+    dataset = data.split("train", training=True)
     columns = part_columns(dataset.layout, config.part)
-    torch.manual_seed(context.seed)
-    net = Tma.of_layout(config.net, dataset.layout, config.part, text.dim)
-    if net.basis is not None:
-        net.basis.learn(stats.mean[columns], stats.std[columns])
-    module = TmaModule(net, config.optim, seed=context.seed, max_steps=config.train.steps, loss=config.loss)
+    frames = {"max_frames": config.max_frames, "min_frames": config.min_frames}
+    face = config.part == "face"
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
         return CaptionBatches(
-            dataset,
-            stats,
-            text,
-            batch_size=batch,
-            max_frames=config.max_frames,
-            min_frames=config.min_frames,
-            seed=context.seed,
-            rank=rank,
-            world=world,
-            face=config.part == "face",
-            columns=columns,
-        )
-
-    held = open_split(data, held_out(data))
+            dataset, stats, text, batch_size=batch, seed=seed, rank=rank, world=world, face=face,
+            columns=columns, **frames,
+        )  # fmt: skip
 
     def validation() -> Dataset[Any]:
-        return EvalBatches(
-            held,
-            stats,
-            text,
-            batch_size=32,
-            max_frames=config.max_frames,
-            min_frames=config.min_frames,
-            face=config.part == "face",
-            columns=columns,
-        )
+        return EvalBatches(data.held_out(), stats, text, batch_size=32, face=face, columns=columns, **frames)
 
-    fit(context, module, config.train, train, validation, config.optim.grad_clip)
-    if module.global_rank == 0:
-        extra = {"text_dim": text.dim, "max_frames": config.max_frames, "part": config.part}
-        facts = ModelFacts(
-            kind="tma", config=config.net.dump(), layout=LayoutFacts.of(dataset.layout), extra=extra
+    return Batches(train, validation)
+
+
+@dataclass(frozen=True)
+class VaeFace:
+    """One latent of the text, decoded to all frames at once (B.5.1)."""
+
+    tma: LoadedTma
+    method = "vae"
+    modalities = frozenset({"text"})
+    settings = frozenset({"temperature"})
+    unit_frames = 1
+    max_frames = None
+    part: Part = "face"
+
+    @property
+    def layout(self) -> MotionLayout:
+        """Layout of whole frames."""
+        return self.tma.layout
+
+    @torch.no_grad()
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        """The latent is drawn from the text's Gaussian; temperature scales its width."""
+        if request.frames is None:
+            raise UserError("the face's VAE makes a length that it is given, and none was")
+        frames, seeds, device, net = request.frames, request.seeds, self.tma.device, self.tma.net
+        text = request.conditions["text"]
+        mu, logvar = net.encode_text(text.features.to(device), text.mask.to(device))
+        noise = torch.stack(
+            [torch.randn(mu.shape[1], generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         )
-        save_model(context.folder, net, facts)
+        z = mu + request.sampling.temperature * (0.5 * logvar).exp() * noise.to(device)
+        made = net.decode(z, torch.tensor(list(frames)).to(device), max(frames))
+        columns = self.layout.part(self.part)
+        values = [made[row, :count].cpu().numpy() for row, count in enumerate(frames)]
+        return [np.asarray(self.tma.stats.denormalize(v, columns), dtype=np.float32) for v in values]

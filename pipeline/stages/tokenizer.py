@@ -1,4 +1,4 @@
-"""Tokenizer stages: H2VQ, VQ, RVQ; body-hand, body only or face (HumanTOMATO section 3.2, appendix B.2)."""
+"""Tokenizer stages: H2VQ, VQ, RVQ, FSQ; body-hand, body only or face (HumanTOMATO section 3.2, B.2)."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from typing import Any
 
 import torch
 from pydantic import Field
+from torch import nn
 from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.batches import EvalBatches, WindowBatches
 from motionloom.datasets.schema import UserError
-from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import (
     AnyTokenizerConfig,
@@ -20,16 +21,21 @@ from motionloom.models.tokenizer.config import (
     RvqConfig,
     SeparateConfig,
     VqConfig,
+    parse_tokenizer,
 )
 from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import Given
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.stage import StageContext
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig, fit
-from motionloom.pipeline.store.data import held_out, open_split, open_stats
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, save_model
+from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
+from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.store.networks import TrainedTokenizer
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
 
-class _TokenizerStageConfig(TrainedStageConfig):
+class TokenizerStageConfig(TrainedStageConfig):
+    """What every tokenizer stage has."""
+
     train: TrainConfig = TrainConfig(steps=100_000, batch_size=256)
     window: int = Field(64, ge=4, multiple_of=4)
     """Frames of a training window."""
@@ -53,76 +59,129 @@ class _TokenizerStageConfig(TrainedStageConfig):
             )
 
 
-class H2VQStageConfig(_TokenizerStageConfig):
+class H2VQStageConfig(TokenizerStageConfig):
     """Body and hand codebooks with their hierarchy."""
 
     net: H2VQConfig = H2VQConfig()
 
 
-class VqStageConfig(_TokenizerStageConfig):
+class VqStageConfig(TokenizerStageConfig):
     """One codebook."""
 
     net: VqConfig = VqConfig()
 
 
-class RvqStageConfig(_TokenizerStageConfig):
+class RvqStageConfig(TokenizerStageConfig):
     """Residual codebooks (body-only data, face)."""
 
     net: RvqConfig = RvqConfig()
 
 
-class SeparateStageConfig(_TokenizerStageConfig):
+class SeparateStageConfig(TokenizerStageConfig):
     """Body and hands apart, the ablation of H2VQ."""
 
     net: SeparateConfig = SeparateConfig()
 
 
-class FsqStageConfig(_TokenizerStageConfig):
+class FsqStageConfig(TokenizerStageConfig):
     """Finite scalar quantization."""
 
     net: FsqConfig = FsqConfig()
 
 
-def run_tokenizer(context: StageContext) -> None:
-    """Train a tokenizer on windows of the training split."""
-    config = context.config
-    data, stats = context.input("data"), open_stats(context.input("stats"))
-    dataset = open_split(data, "train", training=True)
-    torch.manual_seed(context.seed)
-    net = build_tokenizer(config.net, dataset.layout)
-    columns = net.columns.numpy()
-    net.basis.learn(stats.mean[columns], stats.std[columns])
-    module = TokenizerModule(
-        net, config.optim, seed=context.seed, max_steps=config.train.steps, **config.net.loss_terms()
-    )
+class TokenizerStage(TrainedStage):
+    """A tokenizer, trained on windows of the training split."""
 
-    def train(batch: int, rank: int, world: int) -> Dataset[Any]:
-        return WindowBatches(
-            dataset,
-            stats,
-            window=config.window,
-            batch_size=batch,
-            windows_per_clip=config.windows_per_clip,
-            seed=context.seed,
-            rank=rank,
-            world=world,
-            columns=columns,
+    takes = ("data", "stats")
+    version = 2  # fingers in the palm's frame (`finger_gain`)
+
+    def __init__(self, name: str, summary: str, config: type[TokenizerStageConfig]) -> None:
+        self.name, self.summary, self.config = name, summary, config
+
+    def gives(self, config: Any) -> frozenset[str]:
+        """Tokens of motion, and motion of tokens."""
+        return super().gives(config) | {"tokenizer"}
+
+    def facts(self, config: TokenizerStageConfig, given: Given) -> ModelFacts:
+        """Config and layout."""
+        layout = LayoutFacts.of(given["data"].layout)
+        return ModelFacts(kind=config.net.kind, config=config.net.dump(), layout=layout)
+
+    def network(self, facts: ModelFacts, given: Given) -> Tokenizer:
+        """The tokenizer of the layout's columns."""
+        config = parse_tokenizer(facts.config, f"{facts.where}: config")
+        return build_tokenizer(config, facts.layout.layout())
+
+    def prepare(self, config: TokenizerStageConfig, net: Tokenizer, given: Given) -> None:
+        """The coordinates it learns in depend on how features are normalised."""
+        columns, stats = net.columns.numpy(), given["stats"]
+        net.basis.learn(stats.mean[columns], stats.std[columns])
+
+    def module(self, config: TokenizerStageConfig, net: Any, given: Given, seed: int) -> TokenizerModule:
+        """Reconstruction and commitment."""
+        steps = config.train.steps
+        return TokenizerModule(net, config.optim, seed=seed, max_steps=steps, **config.net.loss_terms())
+
+    def batches(
+        self, config: TokenizerStageConfig, net: nn.Module, given: Given, seed: int, say: Say
+    ) -> Batches:
+        """Windows; validation on longer stretches."""
+        assert isinstance(net, Tokenizer)
+        data, stats, columns = given["data"], given["stats"], net.columns.numpy()
+        dataset = data.split("train", training=True)
+
+        def train(batch: int, rank: int, world: int) -> Dataset[Any]:
+            return WindowBatches(
+                dataset,
+                stats,
+                window=config.window,
+                batch_size=batch,
+                windows_per_clip=config.windows_per_clip,
+                seed=seed,
+                rank=rank,
+                world=world,
+                columns=columns,
+            )
+
+        def validation() -> Dataset[Any]:
+            return EvalBatches(
+                data.held_out(),
+                stats,
+                batch_size=64,  # enough tokens that its perplexity compares with training's
+                max_frames=4 * config.window,
+                columns=columns,
+            )
+
+        return Batches(train, validation)
+
+    def example(self, config: TokenizerStageConfig, net: Any, given: Given, batch: int) -> Example:
+        """A batch of windows."""
+        per_group = " + ".join(f"{s.per_group} {s.name}" for s in net.streams)
+        return Example(
+            {
+                "motion": torch.empty(batch, config.window, net.dim),
+                "length": torch.full((batch,), config.window),
+            },
+            f"{per_group} per {GROUP_FRAMES} frames, {net.bits_per_second:.0f} bit/s",
         )
 
-    held = open_split(data, held_out(data))
+    def loaded(self, net: Tokenizer, facts: ModelFacts, given: Given) -> TrainedTokenizer:
+        """The tokenizer, frozen, with the statistics of its input."""
+        return TrainedTokenizer(net.freeze(), given)
 
-    def validation() -> Dataset[Any]:
-        return EvalBatches(
-            held,
-            stats,
-            batch_size=64,  # enough tokens that its perplexity compares with training's
-            max_frames=4 * config.window,
-            columns=columns,
-        )
+    def exported(self, config: Any) -> tuple[str, ...]:
+        """Statistics turn what it decodes into metres."""
+        return ("stats",)
 
-    fit(context, module, config.train, train, validation, config.optim.grad_clip)
-    if module.global_rank == 0:
-        facts = ModelFacts(
-            kind=config.net.kind, config=config.net.dump(), layout=LayoutFacts.of(dataset.layout)
-        )
-        save_model(context.folder, net, facts)
+    def curves(self, config: Any) -> tuple[Curve, ...]:
+        """Reconstruction, and how the codebooks are used."""
+        return tuple(Curve(name) for name in ("recon", "perplexity", "usage", "dead", "resets"))
+
+
+TOKENIZERS: tuple[tuple[str, str, type[TokenizerStageConfig]], ...] = (
+    ("h2vq", "H2VQ tokenizer", H2VQStageConfig),
+    ("vq", "VQ tokenizer", VqStageConfig),
+    ("rvq", "RVQ tokenizer", RvqStageConfig),
+    ("separate", "body and hands apart", SeparateStageConfig),
+    ("fsq", "FSQ tokenizer", FsqStageConfig),
+)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,11 +15,12 @@ from pydantic import Field
 
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.tokenizer.base import Stream, Tokenizer
+from motionloom.pipeline.contract.finished import Finished
+from motionloom.pipeline.contract.showing import Bars, Showing
+from motionloom.pipeline.contract.stage import SHOWING, Given, StageConfig, StageContext, StageKind
 from motionloom.pipeline.stages.progress import bar
-from motionloom.pipeline.stages.stage import StageConfig, StageContext
-from motionloom.pipeline.store.data import open_split, open_stats, splits_of
-from motionloom.pipeline.store.networks import device_of, load_tokenizer
+from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.tokens import TokenStore
 
 
@@ -27,32 +31,80 @@ class TokensConfig(StageConfig):
     """Frames (padding included) in one encoder call."""
 
 
-def run_tokens(context: StageContext) -> None:
-    """Write `tokens-SPLIT.safetensors` for every split."""
-    tokenizer = load_tokenizer(context.input("tokenizer"), context.device)
-    stats = open_stats(context.input("stats"))
-    for split in splits_of(context.input("data")):
-        dataset = open_split(context.input("data"), split)
-        with bar(context.console) as progress:
-            task = progress.add_task(f"tokens {split}", total=len(dataset), note="")
-            store = encode_split(
-                tokenizer,
-                dataset,
-                stats,
-                context.config.batch_frames,
-                partial(progress.advance, task),
+@dataclass(frozen=True)
+class Tokens:
+    """What a tokens stage gives: the codes of each split."""
+
+    folder: Path
+    streams: tuple[Stream, ...]
+
+    def open(self, split: str) -> TokenStore:
+        """Codes of the clips of one split."""
+        return TokenStore.load(
+            self.folder / f"tokens-{split}.safetensors", {s.name: s.per_group for s in self.streams}
+        )
+
+
+class TokensStage(StageKind):
+    """Every clip of every split through the trained tokenizer, once."""
+
+    name = "tokens"
+    summary = "token export"
+    config = TokensConfig
+    takes = ("data", "stats", "tokenizer")
+
+    def gives(self, config: Any) -> frozenset[str]:
+        """Tokens of every clip."""
+        return frozenset({"tokens", SHOWING})
+
+    def run(self, context: StageContext) -> None:
+        """Write `tokens-SPLIT.safetensors` for every split."""
+        data, stats, tokenizer = (context.given[role] for role in ("data", "stats", "tokenizer"))
+        for split in data.splits:
+            dataset = data.split(split)
+            with bar(context.console) as progress:
+                task = progress.add_task(f"tokens {split}", total=len(dataset), note="")
+                store = encode_split(
+                    tokenizer.net,
+                    dataset,
+                    stats,
+                    context.config.batch_frames,
+                    partial(progress.advance, task),
+                )
+            store.save(context.folder / f"tokens-{split}.safetensors")
+            whole = store.whole_clips()
+            used = ", ".join(
+                f"{s.name} {len(torch.unique(whole.codes[s.name]))}/{s.num_codes} codes"
+                for s in tokenizer.net.streams
             )
-        store.save(context.folder / f"tokens-{split}.safetensors")
-        whole = store.whole_clips()
-        used = ", ".join(
-            f"{s.name} {len(torch.unique(whole.codes[s.name]))}/{s.num_codes} codes"
-            for s in tokenizer.streams
-        )
-        lacking = len(dataset) - len(whole.groups)
-        note = f"; {lacking} clips lack hands or a face: no GPT learns tokens of those" if lacking else ""
-        context.console.print(
-            f"    {split}: {len(dataset)} clips, {int(store.starts[-1])} groups; {used}{note}"
-        )
+            lacking = len(dataset) - len(whole.groups)
+            note = f"; {lacking} clips lack hands or a face: no GPT learns tokens of those" if lacking else ""
+            context.console.print(
+                f"    {split}: {len(dataset)} clips, {int(store.starts[-1])} groups; {used}{note}"
+            )
+
+    def load(self, stage: Finished, given: Given, device: torch.device) -> Tokens:
+        """The codes on disk."""
+        return Tokens(stage.folder, tuple(given["tokenizer"].net.streams))
+
+    def show(self, stage: Finished, given: Given) -> list[Showing]:
+        """How often each code is used by the training clips."""
+        out: list[Showing] = []
+        tokens = self.load(stage, given, torch.device("cpu"))
+        store = tokens.open("train").whole_clips()
+        for stream in tokens.streams:
+            uses = np.bincount(store.codes[stream.name].numpy(), minlength=stream.num_codes)
+            used = int((uses > 0).sum())
+            title = f"{used} of {stream.num_codes} codes used by the training clips"
+            out.append(
+                Bars(
+                    f"{stage.name}, {stream.name}: {title}",
+                    np.sort(uses)[::-1],
+                    "code, most used first",
+                    "uses",
+                )
+            )
+        return out
 
 
 def encode_split(

@@ -24,11 +24,11 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.models.layers.transformer import Transformer
 from motionloom.models.training.sharding import make_whole
 from motionloom.models.training.stage_module import OptimConfig, StageModule
+from motionloom.pipeline.contract.stage import RUNTIME, StageConfig, StageContext
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import environment
 from motionloom.pipeline.stages.progress import MetricLog, StepProgress
-from motionloom.pipeline.stages.stage import RUNTIME, StageConfig, StageContext
 
 _KEPT = 2
 """Checkpoints kept: the newest, and one more in case that is torn."""

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
 from motionloom.datasets.loading.mix import MixedDataset
-from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Config, Manifest
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.reader import ShardDataset, read_manifest
 from motionloom.datasets.shards.reading import CacheConfig, Reading
 from motionloom.datasets.shards.store import open_store
-from motionloom.datasets.text.cache import TextCache
 
 SHARDS = "shards"
 REFERENCE = "reference.json"
@@ -94,14 +95,36 @@ def _held(manifest: Manifest) -> set[str]:
     return {shard.split for shard in manifest.shards if shard.samples}
 
 
-def open_stats(folder: Path) -> FeatureStats:
-    """Statistics of a stats stage."""
-    return FeatureStats.load(folder / "stats.safetensors")
+@dataclass(frozen=True)
+class DataPreview:
+    """What is known of a data stage before it has run."""
+
+    layout: MotionLayout
 
 
-def open_text(folder: Path) -> TextCache:
-    """Cache of a text stage."""
-    return TextCache.open(folder / "cache")
+@dataclass(frozen=True)
+class Data:
+    """What a data stage gives: its splits."""
+
+    folder: Path
+
+    @cached_property
+    def layout(self) -> MotionLayout:
+        """Layout of the clips."""
+        return self.split(splits_of(self.folder)[0]).layout
+
+    def split(self, name: str, *, training: bool = False) -> ClipDataset:
+        """See `open_split`."""
+        return open_split(self.folder, name, training=training)
+
+    def held_out(self, *, prefer: str = "val") -> ClipDataset:
+        """A split that is not trained on, where there is one."""
+        return self.split(held_out(self.folder, prefer=prefer))
+
+    @property
+    def splits(self) -> list[str]:
+        """Splits that hold at least one clip."""
+        return splits_of(self.folder)
 
 
 def captions_of(dataset: ClipDataset, index: int, *, face: bool) -> list[Caption]:

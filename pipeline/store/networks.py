@@ -1,31 +1,26 @@
-"""Trained networks loaded for use: frozen, in eval mode, with the facts a caller needs."""
+"""Trained networks as later stages use them: frozen, with the statistics of what they read and write."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import get_args
+from functools import cached_property
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import HELD_ALL
 from motionloom.datasets.text.cache import TextCache
-from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import parse_tokenizer
-from motionloom.pipeline.store.weights import load_facts, load_weights
 
 CPU = torch.device("cpu")
-
-
-def freeze(net: torch.nn.Module) -> None:
-    """Evaluation mode and no gradients."""
-    net.eval()
-    net.requires_grad_(False)
 
 
 def device_of(net: torch.nn.Module) -> torch.device:
@@ -33,18 +28,65 @@ def device_of(net: torch.nn.Module) -> torch.device:
     return next(net.parameters()).device
 
 
-def load_tokenizer(folder: Path, device: torch.device = CPU) -> Tokenizer:
-    """A trained tokenizer."""
-    facts = load_facts(folder)
-    config = parse_tokenizer(facts.config, f"{folder / 'model.json'}: config")
-    net = build_tokenizer(config, facts.layout.layout())
-    load_weights(folder, net)
-    return net.freeze().to(device)
+@dataclass(frozen=True)
+class TrainedTokenizer:
+    """A trained tokenizer and the statistics of its motion."""
+
+    net: Tokenizer
+    given: Mapping[str, Any]
+    """What its stage was given; "stats" of it."""
+
+    @property
+    def layout(self) -> MotionLayout:
+        """Layout of the full frames."""
+        return self.net.layout
+
+    @cached_property
+    def columns(self) -> NDArray[np.int64]:
+        """Columns of the layout that it models, [C]."""
+        return self.net.columns.cpu().numpy()
+
+    @property
+    def stats(self) -> FeatureStats:
+        """Mean and deviation of its input."""
+        stats: FeatureStats = self.given["stats"]
+        return stats
+
+    @torch.no_grad()
+    def decode(self, codes: Mapping[str, Tensor], groups: Sequence[int]) -> list[NDArray[np.float32]]:
+        """Features in their own units, [T, C] a sample; each is decoded alone, so padding plays no part.
+
+        `codes`: per stream int64 [B, G * per_group]; `groups` [B]: valid groups of each.
+        """
+        out = []
+        for row, count in enumerate(groups):
+            single = {s.name: codes[s.name][row : row + 1, : count * s.per_group] for s in self.net.streams}
+            out.append(self.own_units(self.net.decode(single)[0]))
+        return out
+
+    def own_units(self, motion: Tensor) -> NDArray[np.float32]:
+        """Normalised features [T, C] of its columns -> metres, radians and expression values."""
+        values = motion.cpu().numpy()
+        return np.asarray(self.stats.denormalize(values, self.columns), dtype=np.float32)
+
+    @torch.no_grad()
+    def reconstruct(self, features: NDArray[np.float32], held: int = HELD_ALL) -> NDArray[np.float32]:
+        """Through the tokenizer and back, [T, C] of its columns in their own units; T a multiple of four.
+
+        `held` says what the clip holds; of what it does not hold, nothing is read and the mean comes back.
+        """
+        columns, device = self.columns, device_of(self.net)
+        mean, std = self.stats.mean[columns], self.stats.std[columns]
+        motion = torch.from_numpy(((features - mean) / std).astype(np.float32))[None].to(device)
+        mask = torch.from_numpy(self.layout.held_columns[held, columns])[None].to(device)
+        rebuilt = self.net.decode(self.net.encode(motion, held=mask), held=mask)
+        out = rebuilt.masked_fill(~mask[:, None], 0.0)[0].cpu().numpy()
+        return np.asarray(out * std + mean, dtype=np.float32)
 
 
 @dataclass(frozen=True)
 class LoadedTma:
-    """A trained alignment model and the columns it reads.
+    """A trained alignment model, the columns it reads and their statistics.
 
     Its methods take tensors of any device and give those of its own.
     """
@@ -54,23 +96,14 @@ class LoadedTma:
     max_frames: int
     part: Part
     """The columns it reads."""
+    given: Mapping[str, Any]
+    """What its stage was given; "stats" and "text" of it."""
 
-    @staticmethod
-    def load(folder: Path, device: torch.device = CPU) -> LoadedTma:
-        """Read from a tma stage."""
-        facts = load_facts(folder)
-        layout, part = facts.layout.layout(), facts.extra.get("part", "bodyhand")
-        if part not in get_args(Part) or not layout.has_part(part):
-            raise UserError(
-                f"{folder / 'model.json'}: key 'extra.part' = {part!r} is no part of layout {layout.name}; "
-                "run or export the stage again"
-            )
-        text_dim = facts.fact(folder, "text_dim", int)
-        net = Tma.of_layout(TmaConfig.parse(facts.config, str(folder)), layout, part, text_dim)
-        load_weights(folder, net)
-        freeze(net.to(device))
-        frames = facts.fact(folder, "max_frames", int)
-        return LoadedTma(net, layout, frames, part)
+    @property
+    def stats(self) -> FeatureStats:
+        """Mean and deviation of its motion."""
+        stats: FeatureStats = self.given["stats"]
+        return stats
 
     @property
     def device(self) -> torch.device:
@@ -102,18 +135,9 @@ class LoadedTma:
         return self.net.encode_motion(motion.to(self.device), length.to(self.device), near)[0]
 
 
-def load_gpt(folder: Path, tokenizer: Tokenizer) -> tuple[InterleavedGPT, str]:
-    """A trained GPT, on the tokenizer's device, and its kind of text prior ("tma" or "sentence")."""
-    facts = load_facts(folder)
-    expected = {s.name: s.num_codes for s in tokenizer.streams}
-    streams, pattern = facts.fact(folder, "streams", dict), facts.fact(folder, "pattern", list)
-    if streams != expected or tuple(pattern) != tuple(tokenizer.pattern):
-        raise UserError(
-            f"{folder}: this GPT was trained on streams {streams}, "
-            f"the tokenizer has {expected}; train it again on this tokenizer"
-        )
-    config = GptConfig.parse(facts.config, str(folder))
-    net = InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, facts.fact(folder, "text_dim", int))
-    load_weights(folder, net)
-    freeze(net.to(device_of(tokenizer)))
-    return net, facts.fact(folder, "prior", str)
+@dataclass(frozen=True)
+class LoadedGpt:
+    """A trained GPT and its kind of text prior ("tma" or "sentence")."""
+
+    net: InterleavedGPT
+    prior: str

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
@@ -15,6 +15,9 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.store.files import atomic, write_json
 
 Fact = TypeVar("Fact")
+
+MODEL_FILES = ("model.safetensors", "model.json")
+"""What a trained network leaves behind."""
 
 
 class LayoutFacts(Config):
@@ -41,16 +44,20 @@ class ModelFacts(Config):
     config: dict[str, Any]
     layout: LayoutFacts
     extra: dict[str, Any] = Field(default_factory=dict)
+    _where: str = PrivateAttr("model.json")
 
-    def fact(self, folder: Path, key: str, kind: type[Fact]) -> Fact:
+    def fact(self, key: str, kind: type[Fact]) -> Fact:
         """A fact in `extra`, of the kind it must be."""
         value = self.extra.get(key)
         if not isinstance(value, kind):
             missing = "is required" if key not in self.extra else f"= {value!r:.60} is no {kind.__name__}"
-            raise UserError(
-                f"{folder / 'model.json'}: key 'extra.{key}' {missing}; run or export the stage again"
-            )
+            raise UserError(f"{self.where}: key 'extra.{key}' {missing}; run or export the stage again")
         return value
+
+    @property
+    def where(self) -> str:
+        """The file these were read from, for messages."""
+        return self._where
 
 
 def save_model(folder: Path, net: torch.nn.Module, facts: ModelFacts) -> None:
@@ -63,7 +70,9 @@ def save_model(folder: Path, net: torch.nn.Module, facts: ModelFacts) -> None:
 
 def load_facts(folder: Path) -> ModelFacts:
     """Facts of the network in a folder."""
-    return ModelFacts.load_json(folder / "model.json")
+    facts = ModelFacts.load_json(folder / "model.json")
+    facts._where = str(folder / "model.json")
+    return facts
 
 
 def load_weights(folder: Path, net: torch.nn.Module) -> None:

@@ -165,10 +165,20 @@ def test_caption_batches(train: ShardDataset, stats: FeatureStats, text: TextCac
             assert (motion[length[row] :] == 0).all()
             spans_seen.add((clip, caption))
             words = [len(word) for word in caption.split()]
-            assert batch["text_tokens"][row, :, 0][batch["text_mask"][row]].tolist() == words
-            assert (batch["text_tokens"][row][~batch["text_mask"][row]] == 0).all()
-        assert batch["sentence"].shape == (16, 4) and batch["text_mask"].dtype == torch.bool
-        assert batch["text_tokens"].dtype == torch.float32
+            assert (
+                batch["conditions"]["text"]
+                .features[row, :, 0][batch["conditions"]["text"].mask[row]]
+                .tolist()
+                == words
+            )
+            assert (
+                batch["conditions"]["text"].features[row][~batch["conditions"]["text"].mask[row]] == 0
+            ).all()
+        assert (
+            batch["conditions"]["text"].pooled.shape == (16, 4)
+            and batch["conditions"]["text"].mask.dtype == torch.bool
+        )
+        assert batch["conditions"]["text"].features.dtype == torch.float32
     both = [clip for clip in range(len(train)) if len({c for i, c in spans_seen if i == clip}) == 2]
     assert len(both) > 10, "both captions of a clip must be drawn in time"
 
@@ -251,11 +261,11 @@ def test_batches_hold_the_embeddings_that_say_what_is_alike(
         return CaptionBatches(train, stats, cache, batch_size=8, max_frames=40, min_frames=8)[0]
 
     plain = batch_of(text)
-    assert torch.equal(plain["similarity"], plain["sentence"]), "one encoder for both"
+    assert torch.equal(plain["similarity"], plain["conditions"]["text"].pooled), "one encoder for both"
     captions = list(text.captions_by_key().values())
     TextCache.build(tmp_path / "similarity", captions, Likeness(), progress=False)
     batch = batch_of(TextCache.build(tmp_path, captions, WordLengths(), progress=False))
-    assert torch.equal(batch["sentence"], plain["sentence"])
+    assert torch.equal(batch["conditions"]["text"].pooled, plain["conditions"]["text"].pooled)
     wanted = np.eye(3)[[len(caption) % 3 for caption in batch["caption"]]]
     np.testing.assert_array_equal(batch["similarity"].numpy(), wanted)
 

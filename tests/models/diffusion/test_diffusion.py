@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.models.diffusion.sampling import sample_motions
@@ -73,7 +74,11 @@ def test_learns_which_motion_a_text_means(sampler: Sampler) -> None:
     optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
     text = torch.eye(2).repeat(16, 1)
     motion = (text[:, :1] * 2 - 1)[:, None].expand(-1, 8, 3) * torch.tensor([1.0, -1.0, 0.5])
-    batch = {"motion": motion, "length": torch.full((32,), 8), "sentence": text}
+    batch = {
+        "motion": motion,
+        "length": torch.full((32,), 8),
+        "conditions": {"text": Condition(text[:, None], torch.ones(32, 1, dtype=torch.bool), text)},
+    }
     module.train()
     for _ in range(150):
         optimizer.zero_grad()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from motionloom.datasets.conditions import Condition
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.training.stage_module import OptimConfig
@@ -102,8 +103,7 @@ def toy_batch(seed: int, size: int = 32) -> dict[str, torch.Tensor]:
     return {
         "motion": motion,
         "length": length,
-        "text_tokens": tokens,
-        "text_mask": torch.ones(size, 3, dtype=torch.bool),
+        "conditions": {"text": Condition(tokens, torch.ones(size, 3, dtype=torch.bool))},
         "similarity": torch.eye(size),
     }
 
@@ -123,7 +123,7 @@ def test_learns_to_retrieve() -> None:
     batch = toy_batch(10_000)
     with torch.no_grad():
         values = module.losses(batch)
-        text, _ = net.encode_text(batch["text_tokens"], batch["text_mask"])
+        text, _ = net.encode_text(*batch["conditions"]["text"][:2])
         motion, _ = net.encode_motion(batch["motion"], batch["length"])
     similar = torch.nn.functional.normalize(text, dim=1) @ torch.nn.functional.normalize(motion, dim=1).T
     top1 = (similar.argmax(1) == torch.arange(32)).float().mean().item()

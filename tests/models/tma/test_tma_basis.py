@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.tma.losses import reconstruction_loss
 from motionloom.models.tma.module import TmaModule
@@ -80,7 +81,8 @@ def test_the_reconstruction_is_judged_in_the_coordinates() -> None:
     module = TmaModule(net, OptimConfig(), seed=0, max_steps=1).eval()
     words = torch.randn(2, 4, 6, generator=torch.Generator().manual_seed(2))
     batch = {
-        "motion": x, "length": LENGTH, "text_tokens": words, "text_mask": torch.ones(2, 4, dtype=torch.bool),
+        "motion": x, "length": LENGTH,
+        "conditions": {"text": Condition(words, torch.ones(2, 4, dtype=torch.bool))},
         "similarity": torch.eye(2), "held": held,
     }  # fmt: skip
     found = module.losses(batch)

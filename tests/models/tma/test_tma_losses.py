@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
+from motionloom.datasets.conditions import Condition
 from motionloom.models.gpt.module import GptLossConfig
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.losses import (
@@ -83,8 +84,9 @@ def test_without_a_threshold_every_pair_is_a_negative() -> None:
         loss=TmaLossConfig(threshold=None),
     ).eval()  # fmt: skip
     batch = {
-        "motion": torch.randn(8, 4, 5), "length": torch.full((8,), 4), "text_tokens": torch.randn(8, 2, 5),
-        "text_mask": torch.ones(8, 2, dtype=torch.bool), "similarity": sentence,
+        "motion": torch.randn(8, 4, 5), "length": torch.full((8,), 4),
+        "conditions": {"text": Condition(torch.randn(8, 2, 5), torch.ones(8, 2, dtype=torch.bool))},
+        "similarity": sentence,
     }  # fmt: skip
     everything = module.losses(batch)["contrastive"]
     module.loss_config = TmaLossConfig()
@@ -181,8 +183,12 @@ def test_two_ranks_equal_one_process(tmp_path: Path) -> None:
         "tma": {
             "motion": torch.randn(6, 12, 7, generator=generator),
             "length": torch.tensor([12, 5, 3, 9, 12, 11]),
-            "text_tokens": torch.randn(6, 4, 5, generator=generator),
-            "text_mask": torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
+            "conditions": {
+                "text": Condition(
+                    torch.randn(6, 4, 5, generator=generator),
+                    torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
+                )
+            },
             "similarity": sentence,
         },
         "gpt": {

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
@@ -156,9 +157,11 @@ def captioned(held: list[int], columns: Tensor) -> dict[str, Tensor]:
     size = len(held)
     torch.manual_seed(2)
     return batch_of(columns, held) | {
-        "text_tokens": torch.randn(size, 3, 6),
-        "text_mask": torch.ones(size, 3, dtype=torch.bool),
-        "sentence": torch.randn(size, 6),
+        "conditions": {
+            "text": Condition(
+                torch.randn(size, 3, 6), torch.ones(size, 3, dtype=torch.bool), torch.randn(size, 6)
+            )
+        },
         "similarity": torch.eye(size, 6),
     }
 

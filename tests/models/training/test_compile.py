@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
@@ -35,9 +36,13 @@ def windows(dim: int) -> dict[str, Any]:
 
 def captioned(dim: int) -> dict[str, Any]:
     return windows(dim) | {
-        "text_tokens": torch.randn(4, 5, 12),
-        "text_mask": torch.arange(5)[None] < torch.tensor([[5], [4], [3], [2]]),
-        "sentence": torch.nn.functional.normalize(torch.randn(4, 12), dim=-1),
+        "conditions": {
+            "text": Condition(
+                torch.randn(4, 5, 12),
+                torch.arange(5)[None] < torch.tensor([[5], [4], [3], [2]]),
+                torch.nn.functional.normalize(torch.randn(4, 12), dim=-1),
+            )
+        },
         "similarity": torch.nn.functional.normalize(torch.randn(4, 12), dim=-1),
     }
 

@@ -31,6 +31,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
@@ -87,9 +88,13 @@ def captions(step: int) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(step)
     same = [0, 1, 2, 1, 3, 4]  # a caption that both ranks hold
     return {
-        "text_tokens": torch.randn(BATCH, 4, TEXT, generator=generator, dtype=torch.float64),
-        "text_mask": torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
-        "sentence": torch.eye(TEXT, dtype=torch.float64)[same],
+        "conditions": {
+            "text": Condition(
+                torch.randn(BATCH, 4, TEXT, generator=generator, dtype=torch.float64),
+                torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
+                torch.eye(TEXT, dtype=torch.float64)[same],
+            )
+        },
         "similarity": torch.eye(TEXT, dtype=torch.float64)[same],
     }
 

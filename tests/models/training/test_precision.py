@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
@@ -47,9 +48,13 @@ def captioned(dim: int) -> dict[str, Tensor]:
     return {
         "motion": torch.randn(4, 16, dim),
         "length": torch.tensor([16, 16, 12, 9]),
-        "text_tokens": torch.randn(4, 5, 12),
-        "text_mask": torch.arange(5)[None] < torch.tensor([[5], [4], [3], [2]]),
-        "sentence": torch.randn(4, 12),
+        "conditions": {
+            "text": Condition(
+                torch.randn(4, 5, 12),
+                torch.arange(5)[None] < torch.tensor([[5], [4], [3], [2]]),
+                torch.randn(4, 12),
+            )
+        },
         "similarity": torch.eye(4, 12),
     }
 

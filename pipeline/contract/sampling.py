@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from motionloom.datasets.schema import Config
@@ -22,8 +20,8 @@ class SamplingConfig(Config):
     """Classifier-free guidance; 1 is off. Needs a model trained with `condition_dropout` > 0."""
     face_cfg_scale: float | None = Field(None, ge=1)
     """The same of the face's GPT or diffusion model; None takes `cfg_scale`."""
-    face_model: Literal["gpt", "vae", "diffusion"] | None = None
-    """Which of the run's face generators; by default the first it has, in this order."""
+    face_model: str | None = None
+    """Which face generator, by its method (gpt, vae, diffusion) or its stage; by default the first."""
     sampler: Sampler = "ddpm"
     """Sampler of diffusion models."""
     denoising_steps: int = Field(50, ge=1)

@@ -1,0 +1,137 @@
+"""Finished stages, of a run folder or of an exported one, and what they give, loaded once on one device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.registry import stage_kind
+from motionloom.pipeline.contract.stage import GENERATOR, Given, Stage, StageKind
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.run_folder import stage_folder, stages_of
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.contract.generation import MotionGenerator
+
+CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished stage and those that fed it."""
+
+    name: str
+    kind: StageKind
+    config: Any
+    folder: Path
+    inputs: Mapping[str, Finished]
+
+    def gives(self, what: str) -> bool:
+        """Whether other stages may ask this one for `what`."""
+        return what in self.kind.gives(self.config)
+
+    def upstream(self) -> Iterator[Finished]:
+        """All stages above this one, each once, those it reads first."""
+        seen: set[str] = set()
+        todo = list(self.inputs.values())
+        while todo:
+            stage = todo.pop(0)
+            if stage.name not in seen:
+                seen.add(stage.name)
+                yield stage
+                todo += stage.inputs.values()
+
+
+class Shelf:
+    """What finished stages give, each loaded once, all on one device."""
+
+    def __init__(self, device: torch.device = CPU) -> None:
+        self.device = device
+        self._loaded: dict[Path, Any] = {}
+
+    def get(self, stage: Finished) -> Any:
+        """What `stage` gives."""
+        if stage.folder not in self._loaded:
+            self._loaded[stage.folder] = stage.kind.load(stage, self.given(stage.inputs), self.device)
+        return self._loaded[stage.folder]
+
+    def given(self, inputs: Mapping[str, Finished]) -> Given:
+        """What `inputs` give, by role."""
+        return Given({role: partial(self.get, stage) for role, stage in inputs.items()})
+
+    def generator(self, stage: Finished) -> MotionGenerator:
+        """The generator that a stage is."""
+        return stage.kind.generator(stage, self.given(stage.inputs), self.device)
+
+
+def preview_of(stage: Stage, others: Mapping[str, Stage]) -> Any:
+    """What a stage of a recipe will give, as far as it is known before it has run."""
+    return stage.kind.preview(stage.config, previews(stage, others))
+
+
+def previews(stage: Stage, others: Mapping[str, Stage]) -> Given:
+    """Previews of a stage's inputs, by role."""
+
+    def maker(name: str) -> Callable[[], Any]:
+        return lambda: preview_of(others[name], others)
+
+    return Given({role: maker(name) for role, name in stage.inputs.items()})
+
+
+def finished_stages(run: Path) -> dict[str, Finished]:
+    """The finished stages of a run by name, in the recipe's order."""
+    out: dict[str, Finished] = {}
+
+    def find(name: str) -> Finished | None:
+        if name not in out:
+            folder = stage_folder(run, name)
+            artifact = Artifact.find(folder)
+            if artifact is None:
+                return None
+            where = str(folder / "artifact.json")
+            kind = stage_kind(artifact.kind, where)
+            if artifact.version != kind.version and GENERATOR in _gives(kind, artifact):
+                raise UserError(
+                    f"{where}: made by version {artifact.version} of stage kind {kind.name}, which is now "
+                    f"version {kind.version}; run the recipe again"
+                )
+            inputs = {role: find(source.stage) for role, source in artifact.inputs.items()}
+            config = kind.config.parse(artifact.config, f"{where}: config")
+            found = {role: stage for role, stage in inputs.items() if stage is not None}
+            out[name] = Finished(name, kind, config, folder, found)
+        return out[name]
+
+    names = list(stages_of(run))
+    for name in names:
+        find(name)
+    return {name: out[name] for name in names if name in out}
+
+
+def _gives(kind: StageKind, artifact: Artifact) -> frozenset[str]:
+    try:
+        return kind.gives(kind.config.parse(artifact.config, "config"))
+    except UserError:
+        return frozenset()
+
+
+def generators_of(stages: Mapping[str, Finished]) -> list[Finished]:
+    """The stages of a run that generate, its default first.
+
+    Where a stage of the run reads generators, such as `generate`, those that it reads come first: a recipe
+    with several says so which it means.
+    """
+    makers = [stage for stage in stages.values() if stage.gives(GENERATOR)]
+    named = [
+        source
+        for stage in stages.values()
+        if not stage.gives(GENERATOR)
+        for source in stage.inputs.values()
+        if source.gives(GENERATOR)
+    ]
+    return list({stage.name: stage for stage in (*named, *makers)}.values())

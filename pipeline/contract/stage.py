@@ -1,0 +1,260 @@
+"""The contract of a stage: what every kind answers for itself, so that nothing else holds a list of kinds.
+
+A kind says which inputs it takes and what it gives, runs, and loads again what it left behind. Kinds that
+train say more (`stages/trained.py`). The graph, the dry run, exports, `generate`, `evaluate` and the report
+ask these questions of the stages of a run; a new stage answers them in its own file and is registered by one
+line (`registry.py`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from pydantic import BaseModel
+from pydantic.config import JsonDict
+from rich.console import Console
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.launch.hardware import Hardware
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.contract.finished import Finished, Shelf
+    from motionloom.pipeline.contract.generation import MotionGenerator
+    from motionloom.pipeline.contract.showing import Curve, Showing
+
+RUNTIME: JsonDict = {"runtime": True}
+"""Marks a config field that changes how a stage runs, not what it makes: it is not fingerprinted."""
+
+GENERATOR = "generator"
+"""What a stage gives that makes motion: `StageKind.generator`."""
+
+ALIGNMENT = "alignment"
+"""What a stage gives that embeds text and motion in one space: it loads as a `LoadedTma`."""
+
+SHOWING = "showing"
+"""What a stage gives that has curves or figures for the report."""
+
+
+class StageConfig(Config):
+    """Base of every stage's config."""
+
+    def require_fit(self, hardware: Hardware) -> None:
+        """Refuse, before anything runs, settings that cannot run on this hardware."""
+
+
+@dataclass(frozen=True)
+class Role:
+    """An input of a stage, filled by the stage of the same name unless the recipe names another."""
+
+    name: str
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class Every:
+    """An input filled by every stage before this one that gives something, or by those the recipe lists."""
+
+    name: str
+    gives: str
+    optional: ClassVar[bool] = True
+
+    def key(self, stage: str) -> str:
+        """The name under which one of them stands among a stage's inputs."""
+        return f"{self.name}.{stage}"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a resolved recipe. `inputs` maps roles to stage names."""
+
+    name: str
+    kind: StageKind
+    config: Any
+    inputs: dict[str, str]
+
+
+class Given(Mapping[str, Any]):
+    """What the inputs of a stage give, by role; each is made when it is first asked for."""
+
+    def __init__(self, makers: Mapping[str, Callable[[], Any]]) -> None:
+        self._makers = dict(makers)
+        self._made: dict[str, Any] = {}
+
+    def __getitem__(self, role: str) -> Any:
+        if role not in self._made:
+            self._made[role] = self._makers[role]()
+        return self._made[role]
+
+    def __contains__(self, role: object) -> bool:
+        return role in self._makers
+
+    def __iter__(self) -> Any:
+        return iter(self._makers)
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """All that a stage's `run` may use. `inputs` maps each role to a finished stage."""
+
+    name: str
+    recipe: str
+    """Name of the recipe, for people."""
+    config: Any
+    folder: Path
+    inputs: Mapping[str, Finished]
+    seed: int
+    hardware: Hardware
+    console: Console
+    shelf: Shelf
+    """Where inputs are loaded, each once."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where a stage computes that does not train, and where its inputs are loaded."""
+        return self.shelf.device
+
+    @property
+    def given(self) -> Given:
+        """What the inputs give, loaded on first use."""
+        return self.shelf.given(self.inputs)
+
+    def input(self, role: str) -> Path:
+        """Folder of an input."""
+        return self.inputs[role].folder
+
+    def every(self, role: str) -> list[Finished]:
+        """The stages of a role that is declared with `Every`, in the recipe's order."""
+        return [stage for key, stage in self.inputs.items() if key.startswith(f"{role}.")]
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """What a dry run says of a stage that trains, computed without any data."""
+
+    parameters: int
+    codebook: int
+    """Values of codebooks that learn by averages and have no gradient."""
+    local_batch: int
+    memory_bytes: int
+    note: str
+    """What its tokens are."""
+
+
+class StageKind(ABC):
+    """What one kind of stage answers. Subclasses set the attributes and override what applies to them."""
+
+    name: str
+    """In recipes: `kind: name`."""
+    summary: str
+    """A few words for people."""
+    config: type[StageConfig]
+    takes: tuple[str | Every, ...] = ()
+    """Inputs: roles, with a trailing "?" for one that a recipe can do without, or `Every`."""
+    version: int = 1
+    """Raised when the same config makes something else than before."""
+    trains: bool = False
+
+    def gives(self, config: Any) -> frozenset[str]:
+        """Names of what other stages may ask of this one, such as "tokenizer" or `GENERATOR`."""
+        return frozenset()
+
+    def roles(self) -> tuple[Role | Every, ...]:
+        """`takes`, parsed."""
+        return tuple(
+            one if isinstance(one, Every) else Role(one.removesuffix("?"), one.endswith("?"))
+            for one in self.takes
+        )
+
+    # Before and while it runs.
+
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:  # noqa: B027 (nothing to refuse)
+        """Refuse, with a `UserError`, a combination with the recipe's other stages that cannot work."""
+
+    def external(self, config: Any) -> Any:
+        """Facts about files outside the run (names, sizes, checksums) that belong to the fingerprint."""
+        return None
+
+    @abstractmethod
+    def run(self, context: StageContext) -> None:
+        """Make the stage's outputs in `context.folder`."""
+
+    def settle(self, config: Any, folder: Path) -> None:  # noqa: B027 (most kinds have none)
+        """Put RUNTIME settings into the folder of a finished stage, for the stages that read it."""
+
+    # What it gives to other stages.
+
+    def preview(self, config: Any, given: Given) -> Any:
+        """What `load` will give, as far as it is known before the stage has run (dry runs)."""
+        return None
+
+    def load(self, stage: Finished, given: Given, device: torch.device) -> Any:
+        """What the finished stage gives to those that take it."""
+        return stage.folder
+
+    def generator(self, stage: Finished, given: Given, device: torch.device) -> MotionGenerator:
+        """A generator of motion, of a kind that gives `GENERATOR`."""
+        raise NotImplementedError(f"stages of kind {self.name} generate nothing")
+
+    def exported(self, config: Any) -> tuple[str, ...]:
+        """Roles whose stages an export must take along for this stage to load."""
+        return ()
+
+    def export(self, stage: Finished, target: Path) -> None:
+        """Copy what loading needs into `target`, an empty folder."""
+        raise UserError(f"{stage.folder}: a stage of kind {self.name} cannot be exported")
+
+    # What a dry run and the report say of it.
+
+    def estimate(self, config: Any, given: Given, hardware: Hardware) -> ModelCard | None:
+        """Sizes of a kind that trains; None for the others."""
+        return None
+
+    def curves(self, config: Any) -> tuple[Curve, ...]:
+        """Curves of the training log that are worth drawing."""
+        return ()
+
+    def show(self, stage: Finished, given: Given) -> list[Showing]:
+        """Figures of the finished stage for the report, beside its curves."""
+        return []
+
+
+@dataclass
+class FunctionStage(StageKind):
+    """A kind that is one function; for stages that train nothing."""
+
+    name: str
+    summary: str
+    config: type[StageConfig]
+    function: Callable[[StageContext], None]
+    takes: tuple[str | Every, ...] = ()
+    version: int = 1
+    trains: bool = False
+    given_names: frozenset[str] = field(default_factory=frozenset)
+
+    def gives(self, config: Any) -> frozenset[str]:
+        """As named at construction."""
+        return self.given_names
+
+    def run(self, context: StageContext) -> None:
+        """Call the function."""
+        self.function(context)
+
+
+def fingerprint_fields(config: BaseModel) -> dict[str, Any]:
+    """The config as plain data without the fields marked RUNTIME."""
+    out: dict[str, Any] = {}
+    for name, info in type(config).model_fields.items():
+        extra = info.json_schema_extra
+        if isinstance(extra, dict) and extra.get("runtime"):
+            continue
+        value = getattr(config, name)
+        out[name] = fingerprint_fields(value) if isinstance(value, BaseModel) else value
+    return out

@@ -1,0 +1,41 @@
+"""Where a run keeps what, read without running anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from motionloom.datasets.schema import UserError
+
+
+def stage_folder(run: Path, name: str) -> Path:
+    """Where a stage keeps its files."""
+    return run / "stages" / name
+
+
+def stages_of(run: Path) -> dict[str, dict[str, Any]]:
+    """The stages of a run's resolved recipe, as they are written there."""
+    require_run(run)
+    path = run / "recipe.yaml"
+    try:
+        recipe = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise UserError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
+    stages = recipe.get("stages") if isinstance(recipe, dict) else None
+    if not isinstance(stages, dict) or not all(isinstance(e, dict) and "kind" in e for e in stages.values()):
+        raise UserError(f"{path}: holds no stages; run the recipe again into this folder")
+    return stages
+
+
+def require_run(folder: Path) -> None:
+    """Refuse what is no run folder, and say what it is instead."""
+    if (folder / "recipe.yaml").is_file():
+        return
+    if (folder / "bundle.json").is_file():
+        raise UserError(
+            f"{folder}: an exported folder, which generates and holds nothing else; name the run folder "
+            f"(runs/NAME) that it was made from"
+        )
+    raise UserError(f"{folder}: not a run folder (no recipe.yaml)")

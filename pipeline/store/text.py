@@ -1,0 +1,98 @@
+"""What a text stage gives: its cache of encoded captions, and the encoder that made it, for new words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.text.cache import TextCache
+from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
+from motionloom.pipeline.store.encoder_files import BUILT_IN, copy_encoder, place_of
+from motionloom.pipeline.store.files import write_json
+
+_EXPORTED = "text.json"
+_COPY = "encoder"
+_KNOWN_WIDTHS = {BUILT_IN: 384}
+_USUAL_WIDTH = 768
+"""Of DistilBERT and CLIP ViT-L/14, assumed for encoders that are not loaded to look."""
+
+
+class ExportedText(Config):
+    """`text.json` of an exported text stage."""
+
+    encoder: str
+    """`minilm`, or the folder beside this file."""
+    dim: int
+
+
+@dataclass(frozen=True)
+class TextPreview:
+    """What is known of a text stage before it has run."""
+
+    dim: int
+
+    @staticmethod
+    def of(encoder: str) -> TextPreview:
+        """Width of an encoder's features, or what most have."""
+        return TextPreview(_KNOWN_WIDTHS.get(encoder, _USUAL_WIDTH))
+
+
+@dataclass(frozen=True)
+class TextSource:
+    """A finished text stage, in a run or in an export."""
+
+    folder: Path
+    named: str
+    """The encoder as its config names it."""
+    device: torch.device
+
+    @cached_property
+    def cache(self) -> TextCache:
+        """The captions of the data, encoded; an export has none."""
+        return TextCache.open(self.folder / "cache")
+
+    @property
+    def _exported(self) -> bool:
+        return (self.folder / _EXPORTED).is_file()
+
+    @cached_property
+    def dim(self) -> int:
+        """Width of its features."""
+        if self._exported:
+            return ExportedText.load_json(self.folder / _EXPORTED).dim
+        return self.cache.dim
+
+    @property
+    def encoder_name(self) -> str:
+        """The encoder to load; in an export, nothing outside its folder is ever followed."""
+        if not self._exported:
+            return place_of(self.folder) or self.named
+        name = ExportedText.load_json(self.folder / _EXPORTED).encoder
+        if name == BUILT_IN:
+            return name
+        if name in {"", ".", ".."} or "/" in name or "\\" in name or not (self.folder / name).is_dir():
+            raise UserError(
+                f"{self.folder / _EXPORTED}: encoder = {name!r} is neither '{BUILT_IN}' nor a folder beside "
+                f"this file; export the run again"
+            )
+        return str(self.folder / name)
+
+    @cached_property
+    def encoder(self) -> TextEncoder:
+        """Loaded on first use; it is the slow part of starting."""
+        return load_text_encoder(self.encoder_name, device=str(self.device))
+
+    def export(self, target: Path) -> None:
+        """What encoding new words needs; an encoder that comes with the installation is not copied."""
+        target.mkdir(parents=True, exist_ok=True)
+        name = self.encoder_name
+        if name != BUILT_IN:
+            if self._exported:
+                raise UserError(f"{self.folder}: an export with its own encoder; copy the folder instead")
+            copy_encoder(name, self.folder, target / _COPY)
+            name = _COPY
+        write_json(target / _EXPORTED, ExportedText(encoder=name, dim=self.dim).dump())
