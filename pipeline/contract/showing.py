@@ -1,4 +1,4 @@
-"""What a stage has to show in the report: curves of its training log, and figures of what it made."""
+"""What a stage has to show: curves and figures in the report, sizes in a dry run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ class Curve:
 class Showing(Protocol):
     """Something the report can draw."""
 
-    title: str
+    @property
+    def title(self) -> str:
+        """What is shown, for people."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -42,3 +45,16 @@ class FigureTable:
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """What a dry run says of a stage that trains, computed without any data."""
+
+    parameters: int
+    codebook: int
+    """Values of codebooks that learn by averages and have no gradient."""
+    local_batch: int
+    memory_bytes: int
+    note: str
+    """What its tokens are."""

@@ -9,10 +9,11 @@ line (`registry.py`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from pydantic import BaseModel
@@ -20,12 +21,11 @@ from pydantic.config import JsonDict
 from rich.console import Console
 
 from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve, ModelCard, Showing
 from motionloom.pipeline.launch.hardware import Hardware
 
-if TYPE_CHECKING:
-    from motionloom.pipeline.contract.finished import Finished, Shelf
-    from motionloom.pipeline.contract.generation import MotionGenerator
-    from motionloom.pipeline.contract.showing import Curve, Showing
+CPU = torch.device("cpu")
 
 RUNTIME: JsonDict = {"runtime": True}
 """Marks a config field that changes how a stage runs, not what it makes: it is not fingerprinted."""
@@ -101,6 +101,54 @@ class Given(Mapping[str, Any]):
 
 
 @dataclass(frozen=True)
+class Finished:
+    """A finished stage and those that fed it."""
+
+    name: str
+    kind: StageKind
+    config: Any
+    folder: Path
+    inputs: Mapping[str, Finished]
+
+    def gives(self, what: str) -> bool:
+        """Whether other stages may ask this one for `what`."""
+        return what in self.kind.gives(self.config)
+
+    def upstream(self) -> Iterator[Finished]:
+        """All stages above this one, each once, those it reads first."""
+        seen: set[str] = set()
+        todo = list(self.inputs.values())
+        while todo:
+            stage = todo.pop(0)
+            if stage.name not in seen:
+                seen.add(stage.name)
+                yield stage
+                todo += stage.inputs.values()
+
+
+class Shelf:
+    """What finished stages give, each loaded once, all on one device."""
+
+    def __init__(self, device: torch.device = CPU) -> None:
+        self.device = device
+        self._loaded: dict[Path, Any] = {}
+
+    def get(self, stage: Finished) -> Any:
+        """What `stage` gives."""
+        if stage.folder not in self._loaded:
+            self._loaded[stage.folder] = stage.kind.load(stage, self.given(stage.inputs), self.device)
+        return self._loaded[stage.folder]
+
+    def given(self, inputs: Mapping[str, Finished]) -> Given:
+        """What `inputs` give, by role."""
+        return Given({role: partial(self.get, stage) for role, stage in inputs.items()})
+
+    def generator(self, stage: Finished) -> MotionGenerator:
+        """The generator that a stage is."""
+        return stage.kind.generator(stage, self.given(stage.inputs), self.device)
+
+
+@dataclass(frozen=True)
 class StageContext:
     """All that a stage's `run` may use. `inputs` maps each role to a finished stage."""
 
@@ -133,19 +181,6 @@ class StageContext:
     def every(self, role: str) -> list[Finished]:
         """The stages of a role that is declared with `Every`, in the recipe's order."""
         return [stage for key, stage in self.inputs.items() if key.startswith(f"{role}.")]
-
-
-@dataclass(frozen=True)
-class ModelCard:
-    """What a dry run says of a stage that trains, computed without any data."""
-
-    parameters: int
-    codebook: int
-    """Values of codebooks that learn by averages and have no gradient."""
-    local_batch: int
-    memory_bytes: int
-    note: str
-    """What its tokens are."""
 
 
 class StageKind(ABC):

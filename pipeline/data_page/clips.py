@@ -14,7 +14,7 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.pipeline.data_page.facts import DataFacts
-from motionloom.pipeline.evaluation.truth import joint_layout
+from motionloom.pipeline.inference.bundle import joint_layout
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.viewer import ViewerMotion
 

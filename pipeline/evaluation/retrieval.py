@@ -11,8 +11,8 @@ from rich.table import Table
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.retrieval import RECALLS, recall
-from motionloom.pipeline.contract.finished import Finished, Shelf, finished_stages
-from motionloom.pipeline.contract.stage import ALIGNMENT
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import ALIGNMENT, Finished, Shelf
 from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.launch.hardware import choose_device

@@ -21,9 +21,10 @@ from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.sampling import sample_seeds
-from motionloom.pipeline.contract.finished import CPU, Finished, Shelf, finished_stages, generators_of
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator, Prompt
+from motionloom.pipeline.contract.lookup import finished_stages, generators_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import CPU, Finished, Shelf
 from motionloom.pipeline.inference.conditions import PromptEncoder
 from motionloom.pipeline.inference.exported import BUNDLE_FILE, open_exported
 from motionloom.pipeline.inference.requests import (

@@ -49,7 +49,7 @@ class PromptEncoder:
     def _sounds(self, prompts: Sequence[Prompt], fps: float) -> Condition:
         from motionloom.datasets.audio.features import motion_frame_features
 
-        rows = []
+        rows: list[Tensor | None] = []
         for prompt in prompts:
             sound = prompt.sound
             if sound is None:

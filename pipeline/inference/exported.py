@@ -12,8 +12,8 @@ from pydantic import Field
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.contract.finished import Finished
 from motionloom.pipeline.contract.registry import stage_kind
+from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.weights import LayoutFacts
 

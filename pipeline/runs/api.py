@@ -11,7 +11,8 @@ import yaml
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.finished import Shelf, preview_of
+from motionloom.pipeline.contract.lookup import preview_of
+from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.inference.bundle import Bundle

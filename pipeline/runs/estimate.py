@@ -5,8 +5,8 @@ from __future__ import annotations
 from rich.table import Table
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.finished import previews
-from motionloom.pipeline.contract.stage import ModelCard
+from motionloom.pipeline.contract.lookup import previews
+from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.recipe import Recipe
 
 

@@ -26,7 +26,7 @@ from motionloom.models.training.distributed import alone
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import digest, remove_tree, write_json, write_text
 from motionloom.pipeline.store.run_folder import stage_folder
-from motionloom.pipeline.contract.finished import Finished, Shelf
+from motionloom.pipeline.contract.stage import Finished, Shelf
 from motionloom.pipeline.contract.stage import Stage, StageContext, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank

@@ -17,10 +17,9 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.models.diffusion.sampling import sample_motions
-from motionloom.pipeline.contract.finished import Finished
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Given
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given
 from motionloom.pipeline.stages.examples import caption_example
 from motionloom.pipeline.stages.tma import caption_batches, part_columns
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage

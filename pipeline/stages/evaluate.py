@@ -12,13 +12,13 @@ from pydantic import Field
 from rich.table import Table
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.finished import Finished
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import FigureTable, Showing
 from motionloom.pipeline.contract.stage import (
     GENERATOR,
     SHOWING,
     Every,
+    Finished,
     Given,
     StageConfig,
     StageContext,

@@ -19,10 +19,9 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.sampling import generate
-from motionloom.pipeline.contract.finished import Finished
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Given, Stage
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage

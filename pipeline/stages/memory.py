@@ -19,7 +19,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from motionloom.models.layers.transformer import SelfAttention
 from motionloom.models.quantize.ema import EmaQuantizer
 from motionloom.models.training.stage_module import StageModule
-from motionloom.pipeline.contract.stage import ModelCard
+from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.training import TrainConfig, prepare_module
 

@@ -9,8 +9,7 @@ import torch
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
-from motionloom.pipeline.contract.finished import Finished
-from motionloom.pipeline.contract.stage import Given, StageConfig, StageContext, StageKind
+from motionloom.pipeline.contract.stage import Finished, Given, StageConfig, StageContext, StageKind
 from motionloom.pipeline.store.data import captions_of
 from motionloom.pipeline.store.encoder_files import keep_place
 from motionloom.pipeline.store.files import copy_files

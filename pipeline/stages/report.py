@@ -9,13 +9,13 @@ import numpy as np
 from pydantic import Field
 
 from motionloom.datasets.motion.features import decode
-from motionloom.pipeline.contract.finished import Finished
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
 from motionloom.pipeline.contract.stage import (
     GENERATOR,
     SHOWING,
     Every,
+    Finished,
     StageConfig,
     StageContext,
     StageKind,

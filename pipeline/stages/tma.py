@@ -19,10 +19,9 @@ from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.tma.module import TmaLossConfig, TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
-from motionloom.pipeline.contract.finished import Finished
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import ALIGNMENT, GENERATOR, Given
+from motionloom.pipeline.contract.stage import ALIGNMENT, GENERATOR, Finished, Given
 from motionloom.pipeline.stages.examples import caption_example
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig

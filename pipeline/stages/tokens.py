@@ -16,9 +16,8 @@ from pydantic import Field
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import Stream, Tokenizer
-from motionloom.pipeline.contract.finished import Finished
 from motionloom.pipeline.contract.showing import Bars, Showing
-from motionloom.pipeline.contract.stage import SHOWING, Given, StageConfig, StageContext, StageKind
+from motionloom.pipeline.contract.stage import SHOWING, Finished, Given, StageConfig, StageContext, StageKind
 from motionloom.pipeline.stages.progress import bar
 from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.tokens import TokenStore

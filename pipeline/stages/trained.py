@@ -16,8 +16,8 @@ import torch
 from torch import nn
 
 from motionloom.models.training.stage_module import StageModule
-from motionloom.pipeline.contract.finished import Finished
-from motionloom.pipeline.contract.stage import SHOWING, Given, ModelCard, StageContext, StageKind
+from motionloom.pipeline.contract.showing import ModelCard
+from motionloom.pipeline.contract.stage import SHOWING, Finished, Given, StageContext, StageKind
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.memory import model_card
 from motionloom.pipeline.stages.training import BatchSource, EvalSource, TrainedStageConfig, fit

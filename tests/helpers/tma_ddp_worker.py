@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.distributed as dist
 from safetensors.torch import load_file, save_file
 from torch.nn.parallel import DistributedDataParallel
 
+from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
@@ -30,6 +32,14 @@ class Wrapped(torch.nn.Module):
 
     def forward(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
         return self.module.losses(batch)["loss"]
+
+
+def batch_of(stored: dict[str, torch.Tensor]) -> dict[str, Any]:
+    """A batch as it is stored, with its text as a condition."""
+    batch: dict[str, Any] = dict(stored)
+    if "text_tokens" in batch:
+        batch["conditions"] = {"text": Condition(batch.pop("text_tokens"), batch.pop("text_mask"))}
+    return batch
 
 
 def build_tma() -> TmaModule:
@@ -71,7 +81,7 @@ def main() -> None:
     for name, build in BUILDERS.items():
         batch = load_file(folder / f"{name}.safetensors")
         size = len(batch["length"]) // world
-        local = {key: value[rank * size : (rank + 1) * size] for key, value in batch.items()}
+        local = batch_of({key: value[rank * size : (rank + 1) * size] for key, value in batch.items()})
         # In evaluation mode no text is dropped, so the GPT's null text goes unused.
         model = DistributedDataParallel(Wrapped(build()), find_unused_parameters=name == "gpt")
         loss = model(local)

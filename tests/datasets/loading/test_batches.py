@@ -165,19 +165,10 @@ def test_caption_batches(train: ShardDataset, stats: FeatureStats, text: TextCac
             assert (motion[length[row] :] == 0).all()
             spans_seen.add((clip, caption))
             words = [len(word) for word in caption.split()]
-            assert (
-                batch["conditions"]["text"]
-                .features[row, :, 0][batch["conditions"]["text"].mask[row]]
-                .tolist()
-                == words
-            )
-            assert (
-                batch["conditions"]["text"].features[row][~batch["conditions"]["text"].mask[row]] == 0
-            ).all()
-        assert (
-            batch["conditions"]["text"].pooled.shape == (16, 4)
-            and batch["conditions"]["text"].mask.dtype == torch.bool
-        )
+            text = batch["conditions"]["text"]
+            assert text.features[row, :, 0][text.mask[row]].tolist() == words
+            assert (text.features[row][~text.mask[row]] == 0).all()
+        assert text.pooled is not None and text.pooled.shape == (16, 4) and text.mask.dtype == torch.bool
         assert batch["conditions"]["text"].features.dtype == torch.float32
     both = [clip for clip in range(len(train)) if len({c for i, c in spans_seen if i == clip}) == 2]
     assert len(both) > 10, "both captions of a clip must be drawn in time"

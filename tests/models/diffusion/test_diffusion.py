@@ -74,11 +74,8 @@ def test_learns_which_motion_a_text_means(sampler: Sampler) -> None:
     optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
     text = torch.eye(2).repeat(16, 1)
     motion = (text[:, :1] * 2 - 1)[:, None].expand(-1, 8, 3) * torch.tensor([1.0, -1.0, 0.5])
-    batch = {
-        "motion": motion,
-        "length": torch.full((32,), 8),
-        "conditions": {"text": Condition(text[:, None], torch.ones(32, 1, dtype=torch.bool), text)},
-    }
+    text_condition = Condition(text[:, None], torch.ones(32, 1, dtype=torch.bool), text)
+    batch = {"motion": motion, "length": torch.full((32,), 8), "conditions": {"text": text_condition}}
     module.train()
     for _ in range(150):
         optimizer.zero_grad()

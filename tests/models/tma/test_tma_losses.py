@@ -183,12 +183,8 @@ def test_two_ranks_equal_one_process(tmp_path: Path) -> None:
         "tma": {
             "motion": torch.randn(6, 12, 7, generator=generator),
             "length": torch.tensor([12, 5, 3, 9, 12, 11]),
-            "conditions": {
-                "text": Condition(
-                    torch.randn(6, 4, 5, generator=generator),
-                    torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
-                )
-            },
+            "text_tokens": torch.randn(6, 4, 5, generator=generator),
+            "text_mask": torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
             "similarity": sentence,
         },
         "gpt": {
@@ -210,11 +206,12 @@ def test_two_ranks_equal_one_process(tmp_path: Path) -> None:
         for process in ranks:
             process.kill()
 
-    builders = runpy.run_path(str(worker))["BUILDERS"]
+    made = runpy.run_path(str(worker))
+    builders = made["BUILDERS"]
     for name, batch in batches.items():
         result = load_file(tmp_path / f"{name}_result.safetensors")
         module = builders[name]()
-        loss = module.losses(batch)["loss"]
+        loss = module.losses(made["batch_of"](batch))["loss"]
         loss.backward()
         close(result.pop("loss"), loss.detach(), rtol=1e-5)
         expected = {key: p.grad for key, p in module.net.named_parameters() if p.grad is not None}

@@ -28,6 +28,7 @@ import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
+from batch_rows import rows_of
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -246,7 +247,7 @@ def train(case: str) -> dict[str, Any]:
     mine = slice(rank() * size, (rank() + 1) * size)
     figures: dict[str, list[float]] = {}
     for step in range(STEPS):
-        values = model({name: value[mine] for name, value in batches(step).items()})
+        values = model(rows_of(batches(step), mine))
         optimizer.zero_grad()
         values["loss"].backward()
         for name, value in values.items():

@@ -1,10 +1,8 @@
-"""Finished stages, of a run folder or of an exported one, and what they give, loaded once on one device."""
+"""The stages of a run that have finished, and previews of those that have not run yet."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,62 +10,14 @@ import torch
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.registry import stage_kind
-from motionloom.pipeline.contract.stage import GENERATOR, Given, Stage, StageKind
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage, StageKind
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.run_folder import stage_folder, stages_of
 
 if TYPE_CHECKING:
-    from motionloom.pipeline.contract.generation import MotionGenerator
+    pass
 
 CPU = torch.device("cpu")
-
-
-@dataclass(frozen=True)
-class Finished:
-    """A finished stage and those that fed it."""
-
-    name: str
-    kind: StageKind
-    config: Any
-    folder: Path
-    inputs: Mapping[str, Finished]
-
-    def gives(self, what: str) -> bool:
-        """Whether other stages may ask this one for `what`."""
-        return what in self.kind.gives(self.config)
-
-    def upstream(self) -> Iterator[Finished]:
-        """All stages above this one, each once, those it reads first."""
-        seen: set[str] = set()
-        todo = list(self.inputs.values())
-        while todo:
-            stage = todo.pop(0)
-            if stage.name not in seen:
-                seen.add(stage.name)
-                yield stage
-                todo += stage.inputs.values()
-
-
-class Shelf:
-    """What finished stages give, each loaded once, all on one device."""
-
-    def __init__(self, device: torch.device = CPU) -> None:
-        self.device = device
-        self._loaded: dict[Path, Any] = {}
-
-    def get(self, stage: Finished) -> Any:
-        """What `stage` gives."""
-        if stage.folder not in self._loaded:
-            self._loaded[stage.folder] = stage.kind.load(stage, self.given(stage.inputs), self.device)
-        return self._loaded[stage.folder]
-
-    def given(self, inputs: Mapping[str, Finished]) -> Given:
-        """What `inputs` give, by role."""
-        return Given({role: partial(self.get, stage) for role, stage in inputs.items()})
-
-    def generator(self, stage: Finished) -> MotionGenerator:
-        """The generator that a stage is."""
-        return stage.kind.generator(stage, self.given(stage.inputs), self.device)
 
 
 def preview_of(stage: Stage, others: Mapping[str, Stage]) -> Any:
