@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from motionloom.datasets.audio import rhythm
 from motionloom.datasets.audio.compiled import load_librosa
 from motionloom.datasets.audio.sound import resample_sound
 from motionloom.datasets.audio.spectra import HOP, mel_power, separate, tuning
@@ -98,14 +99,14 @@ def audio_features(
         found = separate(samples, settings.rate)
         mfcc = librosa.feature.mfcc(S=librosa.power_to_db(found.mel, ref=np.max), n_mfcc=_MFCC)
         notes = _constant_q(found.harmonic, settings.rate, octaves)
-        onsets = _percussive_onsets(found.percussive_mel)
+        onsets = rhythm.onset_strength(found.percussive_mel)
         columns = [
             mfcc,
             librosa.feature.delta(mfcc, width=3),
             librosa.feature.chroma_cqt(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
             onsets[None],
-            _flags(_beat_frames(onsets, settings), len(onsets))[None],
-            librosa.feature.tempogram(onset_envelope=onsets, win_length=DIM - 54),
+            rhythm.flags(_beat_frames(onsets, settings), len(onsets))[None],
+            rhythm.tempogram(onsets, DIM - 54),
         ]
     return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
 
@@ -127,8 +128,8 @@ def baseline_features(
             onsets[None],
             librosa.feature.mfcc(S=level, n_mfcc=_MFCC),
             librosa.feature.chroma_cens(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
-            _flags(picked, len(onsets))[None],
-            _flags(_beat_frames(onsets, settings), len(onsets))[None],
+            rhythm.flags(picked, len(onsets))[None],
+            rhythm.flags(_beat_frames(onsets, settings), len(onsets))[None],
         ]
     return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
 
@@ -140,7 +141,7 @@ def beats(
     settings = settings or AudioSettings()
     samples = _prepared(samples, rate, settings)
     with _no_remarks():
-        onsets = _percussive_onsets(separate(samples, settings.rate).percussive_mel)
+        onsets = rhythm.onset_strength(separate(samples, settings.rate).percussive_mel)
         return np.asarray(_beat_frames(onsets, settings) / settings.fps)
 
 
@@ -207,28 +208,10 @@ def _constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArra
     return np.asarray(magnitude)
 
 
-def _percussive_onsets(mel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Onset strength [T] of percussive mel power [128, T]."""
-    librosa = load_librosa()
-    strength = librosa.onset.onset_strength(S=librosa.power_to_db(mel), aggregate=np.median)
-    return np.asarray(strength)
-
-
 def _beat_frames(onsets: NDArray[np.float32], settings: AudioSettings) -> NDArray[np.int64]:
-    _, found = load_librosa().beat.beat_track(
-        onset_envelope=onsets,
-        sr=settings.rate,
-        hop_length=HOP,
-        start_bpm=settings.start_bpm,
-        tightness=settings.tightness,
+    return rhythm.track_beats(
+        onsets, settings.rate, start_bpm=settings.start_bpm, tightness=settings.tightness
     )
-    return np.asarray(found)
-
-
-def _flags(frames: NDArray[np.int64], count: int) -> NDArray[np.float32]:
-    out = np.zeros(count, dtype=np.float32)
-    out[frames] = 1
-    return out
 
 
 @contextmanager
