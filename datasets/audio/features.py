@@ -40,8 +40,11 @@ from motionloom.datasets.audio.spectra import HOP, mel_power, separate, tuning
 from motionloom.datasets.schema import Config, UserError
 
 DIM = 438
+BEAT = 53
+"""The column of beats."""
+
 BASELINE_DIM = 35
-VERSION = 1
+VERSION = 2
 """Raised whenever the same sound and settings give other numbers: cached features are then made again."""
 
 _MFCC = 20
