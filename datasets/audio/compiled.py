@@ -1,9 +1,9 @@
 """librosa, imported when it is first used and compiled by one process at a time.
 
-librosa compiles parts of itself with numba: about a minute when it is first used on a machine, then seconds in
-each process. Processes that fill one cache of numba's at once can mix their files and crash (numba issue
-10128), which the workers of a first conversion would do. So the first process compiles everything that audio
-features use behind a lock and leaves a mark; whoever finds the mark just imports.
+librosa compiles parts of itself with numba: half a minute or more when it is first used on a machine, then
+seconds in each process. Processes that fill one cache of numba's at once can mix their files and crash (numba
+issue 10128), which the workers of a first conversion would do. So the first process compiles everything that
+audio features use behind a lock and leaves a mark; whoever finds the mark just imports.
 """
 
 from __future__ import annotations

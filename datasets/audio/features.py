@@ -219,7 +219,8 @@ def _beat_frames(onsets: NDArray[np.float32], settings: AudioSettings) -> NDArra
 
 @contextmanager
 def _no_remarks() -> Iterator[None]:
-    """Without librosa's warnings of windows longer than the sound and mel bands without a bin: as published."""
+    """Without librosa's warnings of short sounds and of mel bands without a bin: both are as published."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="n_fft=|Empty filters|Trying to estimate", category=UserWarning)
+        for remark in ("n_fft=", "Empty filters", "Trying to estimate"):
+            warnings.filterwarnings("ignore", message=remark, category=UserWarning)
         yield

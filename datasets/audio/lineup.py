@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.features import BEAT, HOP, AudioSettings, audio_features
+from motionloom.datasets.audio.features import BEAT, AudioSettings, audio_features
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.audio.spectra import HOP
 from motionloom.datasets.schema import UserError
 
 
@@ -55,7 +56,7 @@ def rows_at(
     if frames < 1 or fps <= 0:
         raise UserError(f"features cannot be lined up with {frames} frames at {fps:g} a second")
     nearest = np.floor(np.arange(frames) * (features_fps / fps) + 0.5).astype(np.int64)
-    out = features[np.minimum(nearest, len(features) - 1)]
+    out: NDArray[np.float32] = features[np.minimum(nearest, len(features) - 1)]
     beats = np.floor(np.flatnonzero(features[:, BEAT]) * (fps / features_fps) + 0.5).astype(np.int64)
     out[:, BEAT] = 0
     out[beats[beats < frames], BEAT] = 1

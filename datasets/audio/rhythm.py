@@ -1,7 +1,7 @@
-"""Tempogram and beats of onset strengths by librosa, a long piece of music in parts.
+"""Tempogram and beats of onset strengths by librosa, long music block by block.
 
 librosa's tempogram takes some 20 kB a frame while it is made, and its beat tracker makes another one only to
-know the mean of it. Both are the same when they are made part by part.
+know the mean of it. Both are the same when they are made in blocks.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def onset_strength(mel: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def tempogram(onsets: NDArray[np.float32], width: int) -> NDArray[np.float32]:
     """Onset strengths [T] -> [width, T]: autocorrelation around each frame, the largest value 1."""
-    return np.concatenate([part.astype(np.float32) for part in _tempograms(onsets, width)], axis=1)
+    return np.concatenate([block.astype(np.float32) for block in _tempograms(onsets, width)], axis=1)
 
 
 def track_beats(
@@ -39,11 +39,12 @@ def track_beats(
     if not onsets.any():
         return np.empty(0, dtype=np.int64)
     width = int(librosa.time_to_frames(_TEMPO_SECONDS, sr=rate, hop_length=HOP))
-    mean = sum(part.sum(axis=1, keepdims=True) for part in _tempograms(onsets, width)) / len(onsets)
+    mean = sum(block.sum(axis=1, keepdims=True) for block in _tempograms(onsets, width)) / len(onsets)
     tempo = librosa.feature.tempo(tg=mean, sr=rate, hop_length=HOP, start_bpm=start_bpm)
-    _, found = librosa.beat.beat_track(
-        onset_envelope=onsets, sr=rate, hop_length=HOP, bpm=tempo, tightness=tightness
-    )
+    with np.errstate(divide="ignore"):  # at 5 frames a second a beat can be a frame, and 0 a step it refuses
+        _, found = librosa.beat.beat_track(
+            onset_envelope=onsets, sr=rate, hop_length=HOP, bpm=tempo, tightness=tightness
+        )
     return np.asarray(found)
 
 

@@ -3,7 +3,7 @@
 Notable choices:
 - libsndfile decodes (WAV of 8, 16, 24, 32 bit and float, FLAC, OGG, MP3); what it lets pass is caught by
   `headers`.
-- Sound is read, mixed to mono and resampled block by block: memory is that of the samples that come out, twice.
+- Sound is read, mixed to mono and resampled block by block: memory is twice that of the samples that come out.
 - Several channels become their mean. Float sound and lossy decoders overshoot a little: clipped to -1..1.
 """
 
@@ -110,10 +110,13 @@ def read_sound(
 
 
 def require_audible(samples: NDArray[np.float32], path: Path | str, *, quietest: float = 1e-4) -> None:
-    """`UserError` naming the file where no sample [n] reaches `quietest` (-80 dB of full scale **[ours]**)."""
+    """`UserError` naming the file where no sample [n] reaches `quietest` (-80 dB of full scale, **[ours]**).
+
+    Only for music that a motion is asked for: features of silence can be computed, and data may hold it.
+    """
     peak = float(max(samples.max(), -samples.min())) if len(samples) else 0.0
     if peak < quietest:
-        raise UserError(f"{path}: silent (its loudest sample is {peak:.2g} of 1): give music that can be heard")
+        raise UserError(f"{path}: silent (its loudest sample is {peak:.2g}): give music that can be heard")
 
 
 def sound_seconds(path: Path, name: str | None = None) -> float:
@@ -183,7 +186,7 @@ def _resampled(
 
 
 def _length(path: Path, name: str, claimed: int, rate: int, kind: str) -> int:
-    """Samples of sound; `UserError` for a length that no sound can have, or that the file does not bear out."""
+    """Samples of sound; `UserError` for a length that cannot be, or that the file does not bear out."""
     if rate <= 0:
         raise UserError(f"{name}: sample rate {rate}")
     if claimed <= 0:
@@ -197,7 +200,7 @@ def _length(path: Path, name: str, claimed: int, rate: int, kind: str) -> int:
         raise UserError(f"{name}: cut short: {there} samples of {claimed}")
     if not stated and there > claimed + max(_MP3_SLACK, there // 50):
         raise UserError(
-            f"{name}: an MP3 of varying bit rate that does not state its length; write it anew (as WAV or FLAC)"
+            f"{name}: an MP3 of varying bit rate that does not state its length; write it as WAV or FLAC"
         )
     return min(there, claimed)  # an unstated length is a guess from the size, which tags add to
 

@@ -25,7 +25,7 @@ MELS = 128
 
 _MEDIAN = 31
 _MARGIN = 32
-"""Frames beside a piece: 15 for medians, 2 each for the window there, back and there again, 2 for the edge."""
+"""Frames beside a piece: 15 for medians, 2 each for the windows there, back and there again, and to spare."""
 
 _PIECE = 2048
 """Frames of a piece without its margins; some 100 MB are used at once."""
@@ -78,12 +78,12 @@ def separate(samples: NDArray[np.float32], rate: int) -> Spectra:
 
 def mel_power(samples: NDArray[np.float32], rate: int) -> NDArray[np.float32]:
     """Mono samples [n] -> mel power [128, T]."""
-    parts = [_mel(_magnitude(piece.samples), rate)[:, piece.inside] for piece in _pieces(samples)]
-    return np.concatenate(parts, axis=1)
+    found = [_mel(_magnitude(piece.samples), rate)[:, piece.inside] for piece in _pieces(samples)]
+    return np.concatenate(found, axis=1)
 
 
 def tuning(samples: NDArray[np.float32], rate: int, bins: int) -> float:
-    """`librosa.estimate_tuning`: how far the music is from A = 440 Hz, in bins of which an octave has `bins`."""
+    """`librosa.estimate_tuning`: how far the music is from A = 440 Hz, in bins (`bins` an octave)."""
     librosa = load_librosa()
     pitches, heights = [], []
     for piece in _pieces(samples):

@@ -108,7 +108,7 @@ def test_silence_is_equal_to_librosa_and_has_no_notes_or_beats() -> None:
 
 
 def test_pieces_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where a piece ends with the sound: 180 frames are 4 pieces of 45, and the last frame is a fifth."""
+    """Also where a piece ends with the sound: 180 frames are 4 pieces of 45, the last one is a fifth."""
     samples = song(3.0, 30720, seed=2)
     assert len(samples) == 180 * 512
     want, low = audio_features(samples, 30720), baseline_features(samples, 30720)
