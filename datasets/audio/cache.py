@@ -10,7 +10,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from motionloom.datasets.audio.features import DIM, VERSION, AudioSettings, audio_features
 from motionloom.datasets.audio.sound import read_sound
 from motionloom.datasets.base.files import sha256_of, write_with
+from motionloom.datasets.base.pool import Workers
+from motionloom.datasets.schema import UserError
 
 
 class AudioCache:
@@ -40,9 +42,20 @@ class AudioCache:
         with _alone(found.with_suffix(".lock")):
             if (known := _load(found)) is not None:
                 return known
-            features = audio_features(samples, rate, self.settings)
+            try:
+                features = audio_features(samples, rate, self.settings)
+            except UserError as error:
+                raise UserError(f"{path}: {error}") from None
             write_with(found, partial(np.save, arr=features, allow_pickle=False))
             return features
+
+    def all_features(self, paths: Sequence[Path], workers: int = 1) -> list[NDArray[np.float32]]:
+        """Features [T, 438] of every sound file, in the same order, computed in so many processes."""
+        out: dict[int, NDArray[np.float32]] = {}
+        with Workers(workers) as pool:
+            for position, features in pool.run(self.features, paths):
+                out[position] = features
+        return [out[position] for position in range(len(paths))]
 
     def _place(self, content: str) -> Path:
         what = json.dumps([content, self.settings.dump(), VERSION], sort_keys=True)

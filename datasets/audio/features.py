@@ -17,42 +17,46 @@ smoothed chroma (CENS), 33 note onsets, 34 beats.
 Notable choices:
 - The frame rate is what is chosen; the sound is resampled to 512 samples a frame, as published: 60 frames a
   second are 30720 Hz, 7.5 are 3840 Hz.
-- librosa defines the numbers but does not compute them: its way takes 25 times as long, most of it in median
-  filters, and compiles itself with numba before. Tests hold the two together.
+- librosa computes everything, each spectrum once (`spectra`).
+- Frames of chroma 140 dB below the loudest one have no notes: what is there is rounding, which librosa scales
+  up to 1.
 - A frame's number is time x frames a second; a sound of n samples has 1 + n // 512 frames.
 """
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
-from scipy import fft
 
 from motionloom.datasets.audio import rhythm
-from motionloom.datasets.audio.chroma import Tuning, chroma, fitting_octaves, normalized
-from motionloom.datasets.audio.median import REACH
+from motionloom.datasets.audio.compiled import load_librosa
 from motionloom.datasets.audio.sound import resample_sound
-from motionloom.datasets.audio.spectrum import (
-    HOP,
-    MELS,
-    Separation,
-    decibels,
-    frame_count,
-    mel_power,
-    spectra,
-)
+from motionloom.datasets.audio.spectra import HOP, mel_power, separate, tuning
 from motionloom.datasets.schema import Config, UserError
 
 DIM = 438
+BEAT = 53
+"""The column of beats."""
+
 BASELINE_DIM = 35
-VERSION = 1
+VERSION = 2
 """Raised whenever the same sound and settings give other numbers: cached features are then made again."""
 
 _MFCC = 20
 _AIST_KINDS = ("mBR", "mPO", "mLO", "mMH", "mLH", "mWA", "mKR", "mJS", "mJB")
 _SHORTEST = 3
 """Frames; fewer have no change of MFCC."""
+
+_BINS = 36
+"""Constant-Q bins an octave."""
+
+_SILENCE = 1e-7
+"""-140 dB."""
 
 
 class AudioSettings(Config):
@@ -93,19 +97,21 @@ def audio_features(
     settings = settings or AudioSettings()
     samples = _prepared(samples, rate, settings)
     octaves = _octaves(settings)
-    mel, harmonic, percussive = _separated(samples, settings.rate)
-    mfcc = _mfcc(decibels(mel, loudest=True))
-    notes = chroma(harmonic, settings.rate, octaves, _tuning(harmonic, settings.rate))
-    onsets = rhythm.onset_strength(decibels(_mel(percussive, settings.rate), loudest=False), "median")
-    out = np.empty((len(mfcc), DIM), dtype=np.float32)
-    out[:, :20] = mfcc
-    out[1:-1, 20:40] = (mfcc[2:] - mfcc[:-2]) / 2
-    out[0, 20:40], out[-1, 20:40] = out[1, 20:40], out[-2, 20:40]
-    out[:, 40:52] = normalized(notes, np.inf)
-    out[:, 52] = onsets
-    out[:, 53] = _flags(_beat_frames(onsets, settings), len(out))
-    out[:, 54:] = rhythm.tempogram(onsets, DIM - 54)
-    return out
+    librosa = load_librosa()
+    with _no_remarks():
+        found = separate(samples, settings.rate)
+        mfcc = librosa.feature.mfcc(S=librosa.power_to_db(found.mel, ref=np.max), n_mfcc=_MFCC)
+        notes = _constant_q(found.harmonic, settings.rate, octaves)
+        onsets = rhythm.onset_strength(found.percussive_mel)
+        columns = [
+            mfcc,
+            librosa.feature.delta(mfcc, width=3),
+            librosa.feature.chroma_cqt(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
+            onsets[None],
+            rhythm.flags(_beat_frames(onsets, settings), len(onsets))[None],
+            rhythm.tempogram(onsets, DIM - 54),
+        ]
+    return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
 
 
 def baseline_features(
@@ -114,16 +120,21 @@ def baseline_features(
     """Mono samples [n] at `rate` Hz -> float32 [T, 35]; give `start_bpm` as published (`aist_bpm`)."""
     settings = settings or AudioSettings()
     samples = _prepared(samples, rate, settings)
-    level = decibels(_mel(samples, settings.rate), loudest=False)
-    onsets = rhythm.onset_strength(level, "mean")
-    notes = chroma(samples, settings.rate, _octaves(settings), _tuning(samples, settings.rate))
-    out = np.empty((len(level), BASELINE_DIM), dtype=np.float32)
-    out[:, 0] = onsets
-    out[:, 1:21] = _mfcc(level)
-    out[:, 21:33] = _smoothed(notes)
-    out[:, 33] = _flags(rhythm.pick_onsets(onsets, settings.fps), len(out))
-    out[:, 34] = _flags(_beat_frames(onsets, settings), len(out))
-    return out
+    octaves = _octaves(settings)
+    librosa = load_librosa()
+    with _no_remarks():
+        level = librosa.power_to_db(mel_power(samples, settings.rate))
+        onsets = librosa.onset.onset_strength(S=level)
+        notes = _constant_q(samples, settings.rate, octaves)
+        picked = librosa.onset.onset_detect(onset_envelope=onsets, sr=settings.rate)
+        columns = [
+            onsets[None],
+            librosa.feature.mfcc(S=level, n_mfcc=_MFCC),
+            librosa.feature.chroma_cens(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
+            rhythm.flags(picked, len(onsets))[None],
+            rhythm.flags(_beat_frames(onsets, settings), len(onsets))[None],
+        ]
+    return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
 
 
 def beats(
@@ -132,9 +143,9 @@ def beats(
     """Times of the beats in seconds, ascending: those that column 53 of `audio_features` marks."""
     settings = settings or AudioSettings()
     samples = _prepared(samples, rate, settings)
-    _, _, percussive = _separated(samples, settings.rate)
-    onsets = rhythm.onset_strength(decibels(_mel(percussive, settings.rate), loudest=False), "median")
-    return np.asarray(_beat_frames(onsets, settings) / settings.fps)
+    with _no_remarks():
+        onsets = rhythm.onset_strength(separate(samples, settings.rate).percussive_mel)
+        return np.asarray(_beat_frames(onsets, settings) / settings.fps)
 
 
 def aist_bpm(music: str) -> float:
@@ -146,6 +157,20 @@ def aist_bpm(music: str) -> float:
         if kind in _AIST_KINDS:
             return 80.0 + 10 * int(digit)
     raise UserError(f"'{music}' is no AIST music: expected such as mBR0, of {', '.join(_AIST_KINDS)} or mHO")
+
+
+def fitting_octaves(rate: int, most: int = 7) -> int:
+    """As many octaves above C1 as fit below half the rate, at most `most`; 0 where not even one does."""
+    librosa = load_librosa()
+    for octaves in range(most, 0, -1):
+        # Tuning moves the filters by less than half a bin.
+        frequencies = librosa.cqt_frequencies(
+            octaves * _BINS, fmin=librosa.note_to_hz("C1"), bins_per_octave=_BINS, tuning=0.5
+        )
+        _, highest = librosa.filters.wavelet_lengths(freqs=frequencies, sr=rate)
+        if highest <= rate / 2:
+            return octaves
+    return 0
 
 
 def _prepared(samples: NDArray[np.float32], rate: int, settings: AudioSettings) -> NDArray[np.float32]:
@@ -170,56 +195,32 @@ def _octaves(settings: AudioSettings) -> int:
     return settings.octaves or fitting
 
 
-def _separated(
-    samples: NDArray[np.float32], rate: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """(mel power [T, 128], harmonic samples [n], percussive samples [n]) from one transform."""
-    separation = Separation(len(samples))
-    mel = np.empty((frame_count(len(samples)), MELS), dtype=np.float32)
-    for start, stop, block in spectra(samples, reach=REACH):
-        magnitude = np.abs(block)
-        separation.add(start, stop, block, magnitude)
-        first = start - max(0, start - REACH)
-        mel[start:stop] = mel_power(magnitude[first : first + stop - start], rate)
-    return mel, *separation.sounds()
-
-
-def _mel(samples: NDArray[np.float32], rate: int) -> NDArray[np.float32]:
-    """Mel power [T, 128]."""
-    return np.concatenate([mel_power(np.abs(block), rate) for _, _, block in spectra(samples)])
-
-
-def _tuning(samples: NDArray[np.float32], rate: int) -> float:
-    tuning = Tuning(rate)
-    for _, _, block in spectra(samples, exact=False):
-        tuning.add(np.abs(block))
-    return tuning.estimate()
-
-
-def _mfcc(level: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mel levels [T, 128] in dB -> [T, 20]."""
-    return np.asarray(fft.dct(level, axis=1, norm="ortho")[:, :_MFCC])
-
-
-def _smoothed(notes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Chroma [T, 12] -> CENS: shares in four steps, smoothed over 41 frames, each frame of length 1."""
-    shares = normalized(notes, 1)
-    steps = np.zeros_like(shares)
-    for threshold in (0.4, 0.2, 0.1, 0.05):
-        steps += (shares > threshold) * np.float32(0.25)
-    bell = np.hanning(43)
-    reach = len(bell) // 2
-    smooth = [np.convolve(column, bell / bell.sum())[reach : reach + len(steps)] for column in steps.T]
-    return normalized(np.stack(smooth, axis=1).astype(np.float32), 2)
+def _constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArray[np.float32]:
+    """Magnitudes [36 x octaves, T] from C1 up; frames of nothing but rounding are 0."""
+    found = load_librosa().cqt(
+        samples,
+        sr=rate,
+        hop_length=HOP,
+        n_bins=_BINS * octaves,
+        bins_per_octave=_BINS,
+        tuning=tuning(samples, rate, _BINS),
+    )
+    magnitude = np.abs(found)
+    loudest = magnitude.max(axis=0)
+    magnitude[:, loudest < _SILENCE * loudest.max()] = 0
+    return np.asarray(magnitude)
 
 
 def _beat_frames(onsets: NDArray[np.float32], settings: AudioSettings) -> NDArray[np.int64]:
     return rhythm.track_beats(
-        onsets, settings.fps, start_bpm=settings.start_bpm, tightness=settings.tightness
+        onsets, settings.rate, start_bpm=settings.start_bpm, tightness=settings.tightness
     )
 
 
-def _flags(frames: NDArray[np.int64], count: int) -> NDArray[np.float32]:
-    out = np.zeros(count, dtype=np.float32)
-    out[frames] = 1
-    return out
+@contextmanager
+def _no_remarks() -> Iterator[None]:
+    """Without librosa's warnings of short sounds and of mel bands without a bin: both are as published."""
+    with warnings.catch_warnings():
+        for remark in ("n_fft=", "Empty filters", "Trying to estimate"):
+            warnings.filterwarnings("ignore", message=remark, category=UserWarning)
+        yield

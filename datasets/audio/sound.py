@@ -1,21 +1,23 @@
 """Sound files -> mono float32 samples, and resampling.
 
 Notable choices:
-- libsndfile decodes (WAV of 8, 16, 24, 32 bit and float, FLAC, OGG, MP3), but it reads a WAV that was cut
-  short without a word and takes any name for any format; both are checked here on the chunks of the file.
-- Sound is read block by block, so memory follows what a file holds, not what its header claims.
+- libsndfile decodes (WAV of 8, 16, 24, 32 bit and float, FLAC, OGG, MP3); what it lets pass is caught by
+  `headers`.
+- Sound is read, mixed to mono and resampled block by block: memory is twice that of the samples that come out.
 - Several channels become their mean. Float sound and lossy decoders overshoot a little: clipped to -1..1.
 """
 
 from __future__ import annotations
 
-import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.audio.headers import check_sound_header, mp3_samples
 from motionloom.datasets.schema import UserError
 
 MAX_SAMPLES = 2**28
@@ -25,14 +27,65 @@ MAX_PEAK = 8.0
 """Float sound may overshoot 1; beyond this it is in another unit (integers stored as floats)."""
 
 _BLOCK = 2**18
-_WAV_SUFFIXES = (".wav", ".wave")
+
+_MP3_SLACK = 4 * 1152
+"""Samples that an MP3's frames may hold more than its sound: a description, and silence at both ends."""
 
 
-def read_sound(path: Path, name: str | None = None) -> tuple[NDArray[np.float32], int]:
-    """A sound file -> (mono samples [n] in [-1, 1], rate in Hz).
+@dataclass(frozen=True, eq=False)
+class Sound:
+    """Mono sound: the raw form of music that motion is conditioned on."""
 
-    `UserError` naming the file for sound that is missing, cut short, empty, not what its name says, without
-    a sample rate, or that holds NaN or infinity. `name` stands for the path in errors.
+    samples: NDArray[np.float32]
+    """[S], finite, -1..1."""
+    rate: int
+    """Samples a second."""
+
+    def __post_init__(self) -> None:
+        samples = np.asarray(self.samples, dtype=np.float32)
+        if samples.ndim != 1 or not np.isfinite(samples).all():
+            raise UserError(f"sound must be finite mono samples [S], not of shape {list(samples.shape)}")
+        if self.rate <= 0:
+            raise UserError(f"sample rates must be positive, not {self.rate}")
+        if len(samples) and (peak := max(samples.max(), -samples.min())) > 1:
+            raise UserError(f"sound must lie between -1 and 1; it reaches {peak:.3g}")
+        object.__setattr__(self, "samples", samples)
+
+    @classmethod
+    def read(cls, path: Path | str, rate: int | None = None) -> Self:
+        """A sound file, at its own sample rate or another one; `UserError` as of `read_sound`."""
+        samples, found = read_sound(Path(path), rate=rate)
+        return cls(np.clip(samples, -1.0, 1.0), found)
+
+    @property
+    def seconds(self) -> float:
+        """Its length."""
+        return len(self.samples) / self.rate
+
+    def slice(self, start: float, end: float | None = None) -> Sound:
+        """From second `start` to second `end`, or as far as there is sound; the samples are not copied."""
+        first = round(max(0.0, start) * self.rate)
+        last = len(self.samples) if end is None else round(max(0.0, end) * self.rate)
+        if first >= min(last, len(self.samples)):
+            raise UserError(
+                f"nothing between second {start:g} and {'the end' if end is None else f'{end:g}'} of sound "
+                f"of {self.seconds:.3f} s"
+            )
+        return Sound(self.samples[first:last], self.rate)
+
+    def resampled(self, rate: int) -> Sound:
+        """The same sound at another sample rate."""
+        return Sound(np.clip(resample_sound(self.samples, self.rate, rate), -1.0, 1.0), rate)
+
+
+def read_sound(
+    path: Path, name: str | None = None, *, rate: int | None = None
+) -> tuple[NDArray[np.float32], int]:
+    """A sound file -> (mono samples [n] in [-1, 1], rate in Hz): its own rate, or resampled to `rate`.
+
+    Resampled sound may overshoot a little. `UserError` naming the file for sound that is missing, cut short,
+    empty, not what its name says, without a sample rate, or that holds NaN or infinity. `name` stands for the
+    path in errors.
     """
     import soundfile  # only data with sound pays for the import
 
@@ -40,30 +93,30 @@ def read_sound(path: Path, name: str | None = None) -> tuple[NDArray[np.float32]
     check_sound_header(path, name)
     try:
         with soundfile.SoundFile(path) as file:
-            claimed, rate = file.frames, int(file.samplerate)
-            if claimed > MAX_SAMPLES:
-                raise UserError(f"{name}: {claimed} samples; the longest sound read is {MAX_SAMPLES}")
-            blocks = [
-                block.mean(axis=1)
-                for block in file.blocks(blocksize=_BLOCK, dtype="float32", always_2d=True)
-                if len(block)
-            ]
+            found = int(file.samplerate)
+            wanted = _length(path, name, file.frames, found, file.format)
+            blocks = _mono(file, name, wanted)
+            if rate is None or rate == found:
+                made = list(blocks)
+            else:
+                wanted = resampled_length(wanted, found, rate)
+                made = list(_resampled(blocks, found, rate))
     except (soundfile.SoundFileError, RuntimeError, OSError) as error:
         raise UserError(f"{name}: not readable sound ({_reason(error)})") from None
-    samples = np.concatenate(blocks) if blocks else np.empty(0, np.float32)
-    if rate <= 0:
-        raise UserError(f"{name}: sample rate {rate}")
-    if len(samples) < claimed:
-        raise UserError(f"{name}: cut short: {len(samples)} samples of {claimed}")
-    if not len(samples):
-        raise UserError(f"{name}: no sound in it (0 samples)")
-    finite = np.isfinite(samples)
-    if not finite.all():
-        raise UserError(f"{name}: NaN or infinity at sample {int(np.argmin(finite))}")
-    peak = float(np.abs(samples).max())
-    if peak > MAX_PEAK:
-        raise UserError(f"{name}: samples reach {peak:.3g}; float sound lies between -1 and 1")
-    return np.clip(samples, -1.0, 1.0), rate
+    samples = np.concatenate(made)
+    if len(samples) < wanted:
+        raise UserError(f"{name}: cut short: {len(samples)} samples of {wanted}")
+    return samples[:wanted], rate or found
+
+
+def require_audible(samples: NDArray[np.float32], path: Path | str, *, quietest: float = 1e-4) -> None:
+    """`UserError` naming the file where no sample [n] reaches `quietest` (-80 dB of full scale, **[ours]**).
+
+    Only for music that a motion is asked for: features of silence can be computed, and data may hold it.
+    """
+    peak = float(max(samples.max(), -samples.min())) if len(samples) else 0.0
+    if peak < quietest:
+        raise UserError(f"{path}: silent (its loudest sample is {peak:.2g}): give music that can be heard")
 
 
 def sound_seconds(path: Path, name: str | None = None) -> float:
@@ -76,14 +129,7 @@ def sound_seconds(path: Path, name: str | None = None) -> float:
         info: Any = soundfile.info(path)
     except (soundfile.SoundFileError, RuntimeError, OSError) as error:
         raise UserError(f"{name}: not readable sound ({_reason(error)})") from None
-    if info.frames <= 0 or info.samplerate <= 0:
-        raise UserError(f"{name}: no sound in it ({info.frames} samples at {info.samplerate} Hz)")
-    return float(info.frames / info.samplerate)
-
-
-def _reason(error: Exception) -> str:
-    """libsndfile's own words, without the path that soundfile puts before them."""
-    return str(getattr(error, "error_string", error)).rstrip(".")
+    return _length(path, name, info.frames, info.samplerate, info.format) / float(info.samplerate)
 
 
 def resample_sound(samples: NDArray[np.float32], rate_in: int, rate_out: int) -> NDArray[np.float32]:
@@ -94,62 +140,74 @@ def resample_sound(samples: NDArray[np.float32], rate_in: int, rate_out: int) ->
     """
     import soxr
 
-    if rate_in <= 0 or rate_out <= 0:
-        raise UserError(f"sample rates must be positive, not {rate_in} and {rate_out}")
+    length = resampled_length(len(samples), rate_in, rate_out)
     if rate_in == rate_out:
         return samples
     made = soxr.resample(np.asarray(samples, dtype=np.float32), rate_in, rate_out, quality="HQ")
-    out = np.zeros(-(-len(samples) * rate_out // rate_in), dtype=np.float32)
+    out = np.zeros(length, dtype=np.float32)
     kept = min(len(out), len(made))
     out[:kept] = made[:kept]
     return out
 
 
-def check_sound_header(path: Path, name: str | None = None) -> None:
-    """`UserError` for what libsndfile lets pass: a missing or empty file, a `.wav` that is none or is cut."""
-    name = str(path) if name is None else name
-    if not path.is_file():
-        raise UserError(f"{name}: no such file")
-    size = path.stat().st_size
-    if size == 0:
-        raise UserError(f"{name}: empty file (0 bytes)")
-    with path.open("rb") as file:
-        head = file.read(12)
-        if head[:4] in (b"RIFF", b"RF64") and head[8:] == b"WAVE":
-            _check_wave_chunks(file, name, size)
-        elif path.suffix.lower() in _WAV_SUFFIXES:
-            raise UserError(f"{name}: not a WAV file (it does not begin with RIFF ... WAVE)")
+def resampled_length(samples: int, rate_in: int, rate_out: int) -> int:
+    """Samples that `resample_sound` makes of so many."""
+    if rate_in <= 0 or rate_out <= 0:
+        raise UserError(f"sample rates must be positive, not {rate_in} and {rate_out}")
+    return -(-samples * rate_out // rate_in)
 
 
-def _check_wave_chunks(file: BinaryIO, name: str, size: int) -> None:
-    """Walk the chunks up to the samples: a format with a rate, and as many bytes as the file promises."""
-    long_data: int | None = None
-    formatted = False
-    while len(head := file.read(8)) == 8:
-        kind, length = struct.unpack("<4sI", head)
-        start = file.tell()
-        if kind == b"ds64":  # 64-bit lengths of RF64
-            body = file.read(min(length, 16))
-            long_data = struct.unpack("<Q", body[8:16])[0] if len(body) == 16 else None
-        elif kind == b"fmt ":
-            body = file.read(min(length, 16))
-            if len(body) < 16:
-                raise UserError(f"{name}: the format chunk is cut short")
-            channels, rate = struct.unpack("<HI", body[2:8])
-            if not rate:
-                raise UserError(f"{name}: sample rate 0")
-            if not channels:
-                raise UserError(f"{name}: 0 channels")
-            formatted = True
-        elif kind == b"data":
-            if long_data is not None and length == 0xFFFFFFFF:
-                length = long_data
-            if not formatted:
-                raise UserError(f"{name}: samples before the format chunk")
-            if not length:
-                raise UserError(f"{name}: no sound in it (0 samples)")
-            if length > size - start:
-                raise UserError(f"{name}: cut short: {size - start} bytes of sound, {length} expected")
-            return
-        file.seek(start + length + length % 2)  # chunks lie at even places
-    raise UserError(f"{name}: no data chunk, or cut short before it")
+def _mono(file: Any, name: str, count: int) -> Iterator[NDArray[np.float32]]:
+    """The first `count` samples as mono blocks [n], checked and clipped; tags behind them are not decoded."""
+    at = 0
+    for block in file.blocks(blocksize=_BLOCK, frames=count, dtype="float32", always_2d=True):
+        samples = block.mean(axis=1)
+        finite = np.isfinite(samples)
+        if not finite.all():
+            raise UserError(f"{name}: NaN or infinity at sample {at + int(np.argmin(finite))}")
+        peak = float(np.abs(samples).max(initial=0))
+        if peak > MAX_PEAK:
+            raise UserError(f"{name}: samples reach {peak:.3g}; float sound lies between -1 and 1")
+        at += len(samples)
+        yield np.clip(samples, -1.0, 1.0)
+
+
+def _resampled(
+    blocks: Iterator[NDArray[np.float32]], rate_in: int, rate_out: int
+) -> Iterator[NDArray[np.float32]]:
+    """The blocks at another rate, with silence at the end for what rounding leaves out."""
+    import soxr
+
+    stream = soxr.ResampleStream(rate_in, rate_out, 1, dtype="float32", quality="HQ")
+    for block in blocks:
+        yield stream.resample_chunk(block)
+    yield stream.resample_chunk(np.empty(0, dtype=np.float32), last=True)
+    yield np.zeros(1, dtype=np.float32)
+
+
+def _length(path: Path, name: str, claimed: int, rate: int, kind: str) -> int:
+    """Samples of sound; `UserError` for a length that cannot be, or that the file does not bear out."""
+    if rate <= 0:
+        raise UserError(f"{name}: sample rate {rate}")
+    if claimed <= 0:
+        raise UserError(f"{name}: no sound in it, or cut short (0 samples)")
+    if claimed > MAX_SAMPLES:
+        raise UserError(f"{name}: {claimed} samples; the longest sound read is {MAX_SAMPLES}")
+    if kind != "MP3" or (frames := mp3_samples(path)) is None:
+        return claimed
+    there, stated = frames
+    if stated and there < claimed:
+        raise UserError(f"{name}: cut short: {there} samples of {claimed}")
+    if not stated and there > claimed + max(_MP3_SLACK, there // 50):
+        raise UserError(
+            f"{name}: an MP3 of varying bit rate that does not state its length; write it as WAV or FLAC"
+        )
+    return min(there, claimed)  # an unstated length is a guess from the size, which tags add to
+
+
+def _reason(error: Exception) -> str:
+    """libsndfile's own words, without the path that soundfile puts before them; two of them say nothing."""
+    words = str(getattr(error, "error_string", error)).rstrip(".")
+    if words.startswith("File does not exist"):
+        return "of no known format"
+    return "damaged" if words.startswith("Unspecified internal error") else words

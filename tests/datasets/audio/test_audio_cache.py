@@ -102,3 +102,19 @@ def test_others_wait_for_the_one_that_computes_and_not_for_a_killed_one(music: P
     said = [process.communicate(timeout=60)[0] for process in both]
     assert sorted(said) == ["", "computing\n"]
     assert [process.returncode for process in both] == [0, 0]
+
+
+def test_several_sounds_in_processes(music: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.wav"
+    soundfile.write(other, np.random.default_rng(0).uniform(-0.5, 0.5, 7680), 15360)
+    store = AudioCache(tmp_path / "cache", AudioSettings(fps=30))
+    found = store.all_features([other, music, other], workers=2)
+    assert [len(features) for features in found] == [16, 31, 16]
+    for path, features in zip((other, music), found, strict=False):
+        np.testing.assert_array_equal(features, AudioCache(tmp_path / "again", store.settings).features(path))
+
+
+def test_a_sound_that_is_too_short_is_named(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "short.wav", np.zeros(100), 15360)
+    with pytest.raises(UserError, match=r"short\.wav: sound of 0\.007 s is too short"):
+        AudioCache(tmp_path / "cache").features(tmp_path / "short.wav")

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio import rhythm, spectrum
-from motionloom.datasets.audio.chroma import chroma, fitting_octaves, normalized
+from motionloom.datasets.audio import rhythm, spectra
 from motionloom.datasets.audio.features import (
     AudioSettings,
     aist_bpm,
     audio_features,
     baseline_features,
     beats,
+    fitting_octaves,
 )
-from motionloom.datasets.audio.median import running_median
 from motionloom.datasets.schema import UserError
 
 
@@ -88,7 +87,7 @@ def test_sound_of_another_rate_is_resampled(golden: dict[str, NDArray]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fps", "seconds"), [(60.0, 4.03), (30.0, 5.0), (20.0, 12.9), (120.0, 2.0), (7.5, 9.0)]
+    ("fps", "seconds"), [(60.0, 4.03), (30.0, 5.0), (20.0, 12.9), (240.0, 2.0), (7.5, 9.0), (5.0, 11.3)]
 )
 def test_equal_to_librosa(fps: float, seconds: float) -> None:
     settings = AudioSettings(fps=fps)
@@ -108,24 +107,29 @@ def test_silence_is_equal_to_librosa_and_has_no_notes_or_beats() -> None:
     assert not after[:, 40:52].any(), "rounding is not scaled up to notes"
 
 
-def test_memory_blocks_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pieces_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a piece ends with the sound: 180 frames are 4 pieces of 45, the last one is a fifth."""
     samples = song(3.0, 30720, seed=2)
-    want = audio_features(samples, 30720)
-    for block in (1, 7, 40, 1000):
-        monkeypatch.setattr(spectrum, "_BLOCK", block)
+    assert len(samples) == 180 * 512
+    want, low = audio_features(samples, 30720), baseline_features(samples, 30720)
+    for size in (1, 7, 45, 1000):
+        monkeypatch.setattr(spectra, "_PIECE", size)
+        monkeypatch.setattr(rhythm, "_BLOCK", size)
         np.testing.assert_allclose(audio_features(samples, 30720), want, rtol=0, atol=5e-4)
+        np.testing.assert_allclose(baseline_features(samples, 30720), low, rtol=0, atol=5e-4)
 
 
-@pytest.mark.parametrize("rows", [1, 3, 15, 16, 17, 31, 100])
-def test_running_median_is_exact(rows: int) -> None:
-    values = np.random.default_rng(rows).integers(0, 50, (rows, 37)).astype(np.float32)
-    padded = np.pad(values, ((15, 15), (0, 0)), mode="symmetric")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 31, axis=0)
-    np.testing.assert_array_equal(running_median(values), np.median(windows, axis=-1))
+@pytest.mark.parametrize("columns", [1, 3, 15, 16, 17, 31, 100])
+def test_row_medians_are_exact(columns: int) -> None:
+    values = np.random.default_rng(columns).integers(0, 50, (37, columns)).astype(np.float32)
+    padded = np.pad(values, ((0, 0), (15, 15)), mode="symmetric")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 31, axis=1)
+    np.testing.assert_array_equal(spectra._row_medians(values), np.median(windows, axis=-1))
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_beats_and_onsets_equal_librosas(seed: int) -> None:
+def test_beats_equal_librosas(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tempo comes from a mean that is taken in blocks; librosa's own holds every tempogram at once."""
     import librosa
 
     rng = np.random.default_rng(seed)
@@ -134,23 +138,29 @@ def test_beats_and_onsets_equal_librosas(seed: int) -> None:
     onsets[:: int(0.5 * fps)] += 3
     onsets[: len(onsets) // 5] *= seed % 2
     rate, bpm = int(fps * 512), float(rng.uniform(60, 200))
-    tempo, want = librosa.beat.beat_track(onset_envelope=onsets, sr=rate, start_bpm=bpm, tightness=80)
-    found = rhythm.track_beats(onsets, fps, start_bpm=bpm, tightness=80)
-    np.testing.assert_array_equal(found, want)
-    assert rhythm.tempo(onsets, fps, bpm) == pytest.approx(float(np.squeeze(tempo)))
-    np.testing.assert_array_equal(
-        rhythm.pick_onsets(onsets, fps), librosa.onset.onset_detect(onset_envelope=onsets, sr=rate)
-    )
+    _, want = librosa.beat.beat_track(onset_envelope=onsets, sr=rate, start_bpm=bpm, tightness=80)
+    monkeypatch.setattr(rhythm, "_BLOCK", 300)
+    np.testing.assert_array_equal(rhythm.track_beats(onsets, rate, start_bpm=bpm, tightness=80), want)
 
 
 def test_a_tone_is_its_note() -> None:
-    """A check that needs no other implementation: A4 is A, and one octave more changes nothing."""
-    time = np.arange(30720, dtype=np.float32) / 30720
+    """A check that needs no other implementation."""
+    time = np.arange(61440, dtype=np.float32) / 30720
     for hertz, note in ((440.0, 9), (220.0, 9), (261.63, 0)):
         tone = np.sin(2 * np.pi * hertz * time).astype(np.float32)
-        rows = normalized(chroma(tone, 30720, 7, 0.0), np.inf)[20:40]
+        rows = audio_features(tone, 30720)[40:80, 40:52]
         assert (rows.argmax(axis=1) == note).all()
         assert np.sort(rows, axis=1)[:, -3].max() < 0.2
+
+
+@pytest.mark.parametrize("fps", [5.0, 7.5, 60.0, 240.0])
+def test_the_shortest_sound(fps: float) -> None:
+    settings = AudioSettings(fps=fps)
+    noise = np.random.default_rng(0).uniform(-1, 1, 6 * 512).astype(np.float32)
+    for frames in range(3, 8):
+        for features, width in ((audio_features, 438), (baseline_features, 35)):
+            found = features(noise[: (frames - 1) * 512], settings.rate, settings)
+            assert found.shape == (frames, width) and np.isfinite(found).all()
 
 
 def test_mistakes_are_named() -> None:

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import soundfile
 
-from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
+from motionloom.datasets.audio import sound
+from motionloom.datasets.audio.headers import mp3_samples
+from motionloom.datasets.audio.sound import (
+    Sound,
+    read_sound,
+    require_audible,
+    resample_sound,
+    sound_seconds,
+)
 from motionloom.datasets.schema import UserError
 
 RATE = 16_000
@@ -155,3 +165,142 @@ def test_resampling_equals_the_golden_vectors(shared: Path) -> None:
     assert resample_sound(track, 30720, 30720) is track
     with pytest.raises(UserError, match="positive"):
         resample_sound(track, 0, 16000)
+
+
+@pytest.mark.parametrize("rates", [(48000, 30720), (44100, 48000), (8000, 3840)])
+def test_reading_at_another_rate_equals_resampling(
+    tmp_path: Path, rates: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, (own, wanted) = tmp_path / "a.wav", rates
+    for count in (1, 3000, 40001):
+        noise = np.random.default_rng(count).uniform(-0.9, 0.9, (count, 2)).astype(np.float32)
+        soundfile.write(path, noise, own, subtype="FLOAT")
+        samples, rate = read_sound(path)
+        monkeypatch.setattr(sound, "_BLOCK", 4096)
+        found, at = read_sound(path, rate=wanted)
+        assert (rate, at) == (own, wanted)
+        np.testing.assert_array_equal(found, resample_sound(samples, own, wanted))
+
+
+def test_memory_follows_the_mono_samples(tmp_path: Path) -> None:
+    """A minute of 48 kHz in eight channels: 92 MB as float32, 11.5 MB in mono."""
+    path = tmp_path / "a.flac"
+    with soundfile.SoundFile(path, "w", 48000, 8) as file:
+        for _ in range(60):
+            file.write(np.zeros((48000, 8), dtype=np.float32))
+    read_sound(path, rate=30720)  # imports
+    tracemalloc.start()
+    try:
+        samples, _ = read_sound(path, rate=30720)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(samples) == 60 * 30720
+    assert peak < 2 * samples.nbytes + 2 * 2**18 * 8 * 4 + 2**22
+
+
+def test_sound_of_a_file(tmp_path: Path, tone: np.ndarray) -> None:
+    path = tmp_path / "a.wav"
+    soundfile.write(path, tone, RATE, subtype="FLOAT")
+    whole = Sound.read(path)
+    assert (whole.rate, whole.seconds) == (RATE, 1.0)
+    np.testing.assert_array_equal(whole.samples, tone)
+    np.testing.assert_array_equal(whole.slice(0.25, 0.5).samples, tone[4000:8000])
+    np.testing.assert_array_equal(whole.slice(0.9, 5).samples, tone[14400:])
+    np.testing.assert_array_equal(whole.slice(-1).samples, tone)
+    with pytest.raises(UserError, match=r"nothing between second 2 and the end of sound of 1\.000 s"):
+        whole.slice(2)
+    with pytest.raises(UserError, match=r"nothing between second 0\.5 and 0\.5"):
+        whole.slice(0.5, 0.5)
+    half = whole.resampled(8000)
+    np.testing.assert_array_equal(half.samples, Sound.read(path, 8000).samples)
+    assert (half.rate, half.seconds) == (8000, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("samples", "rate", "reason"),
+    [
+        (np.zeros((2, 5)), 100, "not of shape"),
+        (np.array([0, np.nan]), 100, "finite"),
+        (np.array([0, -1.5]), 100, "reaches 1.5"),
+        (np.zeros(5), 0, "positive"),
+    ],
+)
+def test_what_is_no_sound(samples: np.ndarray, rate: int, reason: str) -> None:
+    with pytest.raises(UserError, match=reason):
+        Sound(samples, rate)
+
+
+def test_silence_can_be_refused(tone: np.ndarray) -> None:
+    require_audible(tone, "tone.wav")
+    require_audible(0.001 * tone, "tone.wav")
+    for silent in (np.zeros(100, np.float32), 1e-4 * tone, tone[:0]):
+        with pytest.raises(UserError, match=r"tone\.wav: silent"):
+            require_audible(silent, Path("tone.wav"))
+
+
+def mp3(path: Path, samples: np.ndarray, rate: int = 44100, **how: Any) -> bytes:
+    soundfile.write(path, samples, rate, **how)
+    return path.read_bytes()
+
+
+def frames_of(raw: bytes) -> bytes:
+    """Without the first frame, in which the encoder states the length."""
+    return raw[raw.index(raw[:2], 10) :]
+
+
+@pytest.mark.parametrize("rate", [8000, 16000, 22050, 24000, 32000, 44100, 48000])
+@pytest.mark.parametrize("channels", [1, 2])
+def test_mp3s_of_every_rate(tmp_path: Path, tone: np.ndarray, rate: int, channels: int) -> None:
+    path = tmp_path / "a.mp3"
+    mp3(path, np.repeat(tone[:, None], channels, axis=1), rate)
+    samples, found = read_sound(path)
+    assert (found, samples.shape) == (rate, tone.shape)
+    counted = mp3_samples(path)
+    assert counted is not None and counted[1] and len(tone) < counted[0] < len(tone) + 5 * 1152
+
+
+def test_mp3s_with_tags_and_without_a_stated_length(tmp_path: Path, tone: np.ndarray) -> None:
+    path = tmp_path / "a.mp3"
+    whole = mp3(path, np.tile(tone, 5), bitrate_mode="CONSTANT", compression_level=0.6)
+    header = b"ID3\x04\0\0\0\0\x10\0" + bytes(2048)
+    for raw in (frames_of(whole), header + frames_of(whole), frames_of(whole) + b"TAG" + bytes(125)):
+        path.write_bytes(raw)
+        samples, _ = read_sound(path)
+        assert 0 <= len(samples) - 5 * len(tone) < 5 * 1152
+        assert sound_seconds(path) == len(samples) / 44100
+    path.write_bytes(frames_of(mp3(path, np.tile(tone, 5))))
+    with pytest.raises(UserError, match=r"a\.mp3: an MP3 of varying bit rate that does not state its length"):
+        read_sound(path)
+
+
+def test_damaged_mp3s_and_oggs(tmp_path: Path, tone: np.ndarray) -> None:
+    path = tmp_path / "a.mp3"
+    raw = mp3(path, np.tile(tone, 5))
+    half = len(raw) // 2
+    for damaged, reason in (
+        (raw[:half], r"cut short: \d+ samples of 80000"),
+        (raw[:half] + bytes(4000) + raw[half + 4000 :], "not readable sound .damaged"),
+        (raw[:200], "not readable sound .of no known format"),
+        (b"not sound at all" * 100, "not readable sound .of no known format"),
+        (b"", "empty file"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(UserError, match=rf"a\.mp3: {reason}"):
+            read_sound(path)
+    path = tmp_path / "a.ogg"
+    soundfile.write(path, np.tile(tone, 5), RATE)
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(UserError, match=r"a\.ogg: .*cut short"):
+        read_sound(path)
+
+
+def test_real_songs(shared: Path) -> None:
+    """Ogg Vorbis in stereo at two rates."""
+    songs = sorted((shared / "data/music").glob("*.ogg"))
+    assert songs
+    for path in songs:
+        samples, rate = read_sound(path)
+        assert rate in (44100, 48000)
+        assert len(samples) / rate == pytest.approx(sound_seconds(path))
+        require_audible(samples, path)
