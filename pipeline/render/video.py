@@ -1,4 +1,4 @@
-"""MP4 of one motion: frames drawn with Pillow, piped to the ffmpeg that ships with imageio-ffmpeg (H.264, AAC)."""
+"""MP4 of one motion: Pillow draws, the ffmpeg that ships with imageio-ffmpeg encodes (H.264 and AAC)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def write_mp4(
     """Film joints [T, N, 3] (metres, Y up); `progress(done, total)` is called after every frame.
 
     `sound` starts with the first frame; it is cut, or filled up with silence, to the T / fps seconds of the
-    film. The file appears under its name only when it is whole. `size` is rounded up to even numbers for H.264.
+    film. The file appears under its name only when it is whole. `size` is rounded up to even numbers for
+    H.264.
     """
     import imageio_ffmpeg  # the binary is looked up on import: only for those who film
 
