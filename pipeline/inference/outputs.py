@@ -12,8 +12,10 @@ import numpy as np
 
 from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.kinematics import joints_to_rotations
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.render.face import synthetic_face_controls
+from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 from motionloom.pipeline.store.files import atomic, require_folder
@@ -29,13 +31,25 @@ def file_stem(number: int, caption: str) -> str:
 
 
 def write_motions(
-    folder: Path, motions: Sequence[GeneratedMotion], formats: Sequence[Format], *, title: str, seed: int
+    folder: Path,
+    motions: Sequence[GeneratedMotion],
+    formats: Sequence[Format],
+    *,
+    title: str,
+    seed: int,
+    scores: Sequence[Score] | None = None,
 ) -> list[Path]:
-    """Write every motion in every format; the page holds all of them. Returns the paths."""
+    """Write every motion in every format; the page holds all of them. Returns the paths.
+
+    `scores`, one for each motion: sound for the film and the page, beats and segments for the page.
+    """
     require_folder(folder)
+    scores = [Score()] * len(motions) if scores is None else scores
+    if len(scores) != len(motions):
+        raise UserError(f"{len(scores)} scores for {len(motions)} motions; give one for each")
     folder.mkdir(parents=True, exist_ok=True)
     out: list[Path] = []
-    for number, motion in enumerate(motions):
+    for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
         stem = folder / file_stem(number, motion.caption)
         if "npz" in formats:
             out.append(write_npz(stem.with_suffix(".npz"), motion, seed))
@@ -43,17 +57,22 @@ def write_motions(
             out.append(write_bvh_of(stem.with_suffix(".bvh"), motion))
         if "mp4" in formats:
             path = stem.with_suffix(".mp4")
-            write_mp4(path, motion.joints, motion.layout.skeleton, motion.layout.fps, motion.caption)
+            skeleton, fps = motion.layout.skeleton, motion.layout.fps
+            write_mp4(path, motion.joints, skeleton, fps, motion.caption, sound=score.sound)
             out.append(path)
     if "html" in formats:
         page = folder / "index.html"
-        write_viewer(page, [viewer_motion(m, "generated") for m in motions], title)
+        shown = [viewer_motion(m, "generated", score=s) for m, s in zip(motions, scores, strict=True)]
+        write_viewer(page, shown, title)
         out.append(page)
     return out
 
 
-def viewer_motion(motion: GeneratedMotion, label: str, group: str = "") -> ViewerMotion:
-    """A generated motion as the viewer takes it."""
+def viewer_motion(
+    motion: GeneratedMotion, label: str, group: str = "", score: Score | None = None
+) -> ViewerMotion:
+    """A generated motion as the viewer takes it, with its sound, beats and segments."""
+    score = score or Score()
     return ViewerMotion(
         joints=motion.joints,
         fps=motion.layout.fps,
@@ -62,6 +81,9 @@ def viewer_motion(motion: GeneratedMotion, label: str, group: str = "") -> Viewe
         caption=motion.caption,
         group=group,
         face_controls=None if motion.face is None else synthetic_face_controls(motion.face),
+        sound=score.sound,
+        beats=score.beats,
+        segments=score.segments,
     )
 
 

@@ -19,6 +19,7 @@ from motionloom.pipeline.render.files import write_text
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
     fill,
+    media_policy,
     resource,
     safe_json,
     viewer_data,
@@ -39,6 +40,7 @@ class Page:
         self._blocks: list[str] = []
         self._contents: list[tuple[str, str]] = []
         self._viewers = 0
+        self._sounding = False
 
     def add_heading(self, text: str) -> Page:
         """Start a section; sections are listed at the head of the page."""
@@ -128,7 +130,9 @@ class Page:
         name = f"viewer-{self._viewers}"
         if note:
             self.add_text(note)
-        data = safe_json(viewer_data(motions))
+        content = viewer_data(motions)
+        self._sounding |= "sounds" in content
+        data = safe_json(content)
         self._blocks.append(
             f'<div class="mlv viewer" id="{name}"></div>'
             f'<script type="application/json" id="{name}-data">{data}</script>'
@@ -154,6 +158,7 @@ class Page:
         contents = f'<nav aria-label="Sections">{links}</nav>' if len(self._contents) > 1 else ""
         return fill(
             resource("page.html"),
+            MEDIA=media_policy(self._sounding),
             TITLE=escape(self.title),
             SUBTITLE=f"<p>{escape(self.subtitle)}</p>" if self.subtitle else "",
             STYLE=resource("page.css") + (resource("viewer.css") if self._viewers else ""),

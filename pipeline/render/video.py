@@ -1,4 +1,4 @@
-"""MP4 of one motion: frames drawn with Pillow, piped to the ffmpeg that ships with imageio-ffmpeg (H.264)."""
+"""MP4 of one motion: Pillow draws, the ffmpeg that ships with imageio-ffmpeg encodes (H.264 and AAC)."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from motionloom.pipeline.render.figure import figure_for
 from motionloom.pipeline.render.files import part_path
 from motionloom.pipeline.render.lettering import font, wrap
 from motionloom.pipeline.render.raster import SKY, Pose, draw_ground, draw_pose, halve
+from motionloom.pipeline.render.sound import RATE, Soundtrack, film_sound
 
 Progress = Callable[[int, int], None]
 
@@ -31,17 +32,20 @@ def write_mp4(
     size: tuple[int, int] = (512, 512),
     view: str = "3/4",
     follow: bool = True,
+    sound: Soundtrack | None = None,
     progress: Progress | None = None,
 ) -> None:
     """Film joints [T, N, 3] (metres, Y up); `progress(done, total)` is called after every frame.
 
-    The file appears under its name only when it is whole. `size` is rounded up to even numbers for H.264.
+    `sound` starts with the first frame; it is cut, or filled up with silence, to the T / fps seconds of the
+    film. The file appears under its name only when it is whole. `size` is rounded up to even numbers for
+    H.264.
     """
     import imageio_ffmpeg  # the binary is looked up on import: only for those who film
 
     width, height = (side + side % 2 for side in size)
     frames = render_frames(joints, skeleton, fps, caption, size=(width, height), view=view, follow=follow)
-    part = part_path(path)
+    part, wav = part_path(path), part_path(path.with_suffix(".wav"))
     writer = imageio_ffmpeg.write_frames(
         str(part),
         (width, height),
@@ -49,11 +53,16 @@ def write_mp4(
         codec="libx264",
         pix_fmt_out="yuv420p",
         macro_block_size=2,
-        output_params=["-preset", "veryfast", "-crf", "20", "-movflags", "+faststart"],
+        output_params=["-preset", "veryfast", "-crf", "20", "-movflags", "+faststart"]
+        + ([] if sound is None else ["-ar", str(RATE), "-b:a", "128k"]),
+        audio_path=None if sound is None else str(wav),
+        audio_codec=None if sound is None else "aac",
         ffmpeg_log_level="error",
     )
     try:
-        writer.send(None)
+        if sound is not None:
+            wav.write_bytes(film_sound(sound, len(joints) / fps))
+        writer.send(None)  # starts ffmpeg, which opens the WAV
         for done, frame in enumerate(frames, start=1):
             writer.send(frame.tobytes())
             if progress is not None:
@@ -63,6 +72,7 @@ def write_mp4(
     finally:
         writer.close()
         part.unlink(missing_ok=True)
+        wav.unlink(missing_ok=True)
 
 
 def render_frames(

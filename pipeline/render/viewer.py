@@ -2,6 +2,7 @@
 
 * The file opens from disk without a network: own script and style are inlined, a policy forbids any request.
 * Positions travel as 16-bit integers over each clip's own bounding box (about 0.1 mm over 8 m) in base64.
+* Sound travels once, however many motions it belongs to, and no longer than they last: see `sound`.
 * Titles, labels and captions are untrusted: they enter the page only as JSON without `<`, `>` and `&`, and
   the script puts them on screen through `textContent`.
 """
@@ -24,6 +25,8 @@ from numpy.typing import NDArray
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.figure import Figure, figure_for
 from motionloom.pipeline.render.files import write_text
+from motionloom.pipeline.render.score import Segments, score_data
+from motionloom.pipeline.render.sound import Playing, Soundtrack, embed_sounds
 
 SCRIPTS = (
     "viewer_space.js",
@@ -32,6 +35,8 @@ SCRIPTS = (
     "viewer_body.js",
     "viewer_clip.js",
     "viewer_page.js",
+    "viewer_score.js",
+    "viewer_sound.js",
     "viewer_app.js",
 )
 FACE_CONTROLS = ("smile", "brow", "eye_open", "mouth_open", "frown")
@@ -46,7 +51,8 @@ class ViewerMotion:
     `joints` [T, N, 3] metres, Y up; `parents` [N] with -1 for the root; `label` is the chip ('truth',
     'generated'); motions with one `group` share a row. `face_controls` [T, 5] are smile, brow (-1 lowered,
     1 raised), eye-open (0 closed, 1 neutral), mouth-open and frown (mouth corners down, inner brows up);
-    neutral is (0, 0, 1, 0, 0).
+    neutral is (0, 0, 1, 0, 0). `sound` starts with frame 0; `beats` are seconds, ticks on the time line;
+    `segments` are what drives the motion when: (start, end, label) in seconds, or `Segment`s.
     """
 
     joints: NDArray[Any]
@@ -56,16 +62,21 @@ class ViewerMotion:
     caption: str = ""
     group: str = ""
     face_controls: NDArray[Any] | None = None
+    sound: Soundtrack | None = None
+    beats: Sequence[float] = ()
+    segments: Segments = ()
 
 
 def write_viewer(path: Path, motions: Sequence[ViewerMotion], title: str, note: str = "") -> None:
     """Write the viewer page; `UserError` for motions that cannot be drawn."""
     template = resource("viewer.html")
+    data = viewer_data(motions, title, note)
     page = fill(
         template,
+        MEDIA=media_policy("sounds" in data),
         TITLE=escape(title),
         STYLE=resource("viewer.css"),
-        DATA=safe_json(viewer_data(motions, title, note)),
+        DATA=safe_json(data),
         SCRIPT=viewer_script(),
     )
     write_text(path, page)
@@ -103,6 +114,7 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
                 "face": face,
             }
         )
+    tracks = _tracks(motions, clips)
     return {
         "title": title,
         "note": note,
@@ -110,7 +122,36 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
         "faceStep": FACE_STEP,
         "figures": [figure.to_json() for figure in figures],
         "motions": clips,
+        **tracks,
     }
+
+
+def media_policy(sounding: bool) -> str:
+    """What a page's content policy adds for sound: media made by its own script, from no address."""
+    return "; media-src blob:" if sounding else ""
+
+
+def _tracks(motions: Sequence[ViewerMotion], clips: list[dict[str, Any]]) -> dict[str, Any]:
+    """Distinct `sounds` and `scores`, where there are any; each clip gets the numbers of its own."""
+    names = [_name(motion, number) for number, motion in enumerate(motions)]
+    lengths = [len(motion.joints) / motion.fps for motion in motions]
+    sounds, playing = embed_sounds(
+        [Playing(name, m.sound, length) for name, m, length in zip(names, motions, lengths, strict=True)]
+    )
+    scores: list[dict[str, Any]] = []
+    for motion, clip, name, length, sound in zip(motions, clips, names, lengths, playing, strict=True):
+        if sound is not None:
+            clip["sound"] = sound
+        score = score_data(motion.beats, motion.segments, length, name)
+        if any(score.values()):
+            if score not in scores:
+                scores.append(score)
+            clip["score"] = scores.index(score)
+    encoded = [
+        {"mime": s.mime, "seconds": s.seconds, "data": base64.b64encode(s.data).decode("ascii")}
+        for s in sounds
+    ]
+    return ({"sounds": encoded} if encoded else {}) | ({"scores": scores} if scores else {})
 
 
 def quantise(
@@ -152,7 +193,7 @@ def resource(name: str) -> str:
 
 
 def _checked(motion: ViewerMotion, number: int) -> NDArray[np.float64]:
-    where = f"motion {number} ('{motion.label or motion.caption}')"
+    where = _name(motion, number)
     joints = np.asarray(motion.joints, np.float64)
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
         raise UserError(f"{where}: joints must be [T, N, 3] with T > 0, got {list(joints.shape)}")
@@ -169,6 +210,10 @@ def _checked(motion: ViewerMotion, number: int) -> NDArray[np.float64]:
                 f"{where}: face_controls must be finite [T={len(joints)}, 5], got {list(face.shape)}"
             )
     return joints
+
+
+def _name(motion: ViewerMotion, number: int) -> str:
+    return f"motion {number} ('{motion.label or motion.caption}')"
 
 
 def _base64(values: NDArray[Any]) -> str:

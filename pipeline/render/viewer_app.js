@@ -28,6 +28,8 @@ function readTheme(root) {
 function mountViewer(root, data, options) {
   const page = Boolean(options && options.page);
   const clips = data.motions.map((raw) => openClip(raw, data.figures[raw.figure], data.faceStep));
+  const sounds = data.sounds || [], scores = data.scores || [];
+  clips.forEach((clip, k) => { clip.sound = data.motions[k].sound; clip.score = scores[data.motions[k].score]; });
   const duration = Math.max(...clips.map((c) => c.duration));
   const rate = Math.max(...clips.map((c) => c.fps));
   const last = Math.round(duration * rate);
@@ -44,17 +46,18 @@ function mountViewer(root, data, options) {
   }
   const { board, cells } = buildCells(clips);
   root.append(board);
-  const bar = buildBar(root, last, duration);
+  const strip = scores.length ? buildStrip(duration) : null;
+  const bar = buildBar(root, last, duration, strip, sounds.length > 0);
   root.classList.toggle("mlv-single", clips.length === 1);
   root.classList.toggle("mlv-tall", page || board.children.length > 1 || clips.length > 4);
   bar.theme.hidden = !page;
   const button = (name, act) => bar[name].addEventListener("click", act);
 
   // ---- clock
+  const localTime = (clip) => (state.loop && clip.frames > 1 ? state.time % (clip.duration + 1 / clip.fps) : state.time);
   const localFrame = (clip) => {
     if (clip.frames < 2) return 0;
-    const t = state.loop ? state.time % (clip.duration + 1 / clip.fps) : state.time;
-    return clamp(t * clip.fps, 0, clip.frames - 1);
+    return clamp(localTime(clip) * clip.fps, 0, clip.frames - 1);
   };
   const frame = () => clamp(Math.round(state.time * rate), 0, last);
   const play = (on) => {
@@ -67,6 +70,33 @@ function mountViewer(root, data, options) {
   };
   const setFrame = (k) => { state.time = clamp(k, 0, last) / rate; refresh(); };
   const step = (by) => { play(false); setFrame(frame() + by); };
+
+  // ---- sound and score: those of one motion at a time
+  let lead = null;
+  const player = makePlayer(sounds, {
+    laps: (time) => {
+      if (!state.loop || !lead || lead.frames < 2) return [0, 0];
+      const lap = lead.duration + 1 / lead.fps;
+      return [lap, Math.floor(time / lap)];
+    },
+    changed: () => {
+      bar.sound.setAttribute("aria-pressed", String(player.on));
+      bar.sound.disabled = player.failed;
+      bar.sound.title = player.failed ? "This browser cannot play the sound" : player.on ? "Sound off (M)" : "Sound on (M)";
+      bar.sound.setAttribute("aria-label", bar.sound.title);
+      if (player.on) for (const other of window.__viewers) if (other !== handle) other.setSound(false);
+      for (const cell of cells) cell.hear.setAttribute("aria-pressed", String(player.on && cell.clip.sound === lead.sound));
+      refresh();
+    },
+    stopped: () => play(false),
+  });
+  const follow = (clip) => {
+    lead = clip;
+    player.choose(clip.sound);
+    if (strip) strip.show(clip.score);
+    refresh();
+  };
+  const setSound = (on) => { if (sounds.length) player.turn(on); };
 
   // ---- camera
   const setView = (name) => {
@@ -123,6 +153,7 @@ function mountViewer(root, data, options) {
     drawTrail(ctx, lens, clip, local, theme);
     drawShadow(ctx, lens, clip, nodes, clip.figure, theme);
     drawFigure(ctx, lens, clip, clip.figure, nodes, faceAt(clip, local, data.faceNeutral), theme);
+    cell.now.show(segmentAt(clip.score, localTime(clip)));
     const own = Math.round(local), over = !state.loop && state.time > clip.duration + 0.5 / clip.fps;
     cell.count.textContent = `${own + 1} / ${clip.frames}${over ? " · ended" : ""}`;
   };
@@ -131,16 +162,19 @@ function mountViewer(root, data, options) {
     const passed = Math.min((now - before) / 1000, 0.1);
     before = now;
     if (state.playing && !dragging && duration > 0) {
-      state.time += passed * state.speed;
-      if (state.time > duration + 0.35) state.time = 0; // a short rest on the last frame before the next round
+      state.time = player.advance(state.time, passed);
+      // A short rest on the last frame before the next round; none where every motion loops by itself.
+      if (state.time > duration + (state.loop ? 1 / rate : 0.35)) state.time = 0;
       stale = true;
-    }
+    } else player.rest();
     if (stale) {
       stale = false;
       for (const cell of cells) if (cell.visible) paint(cell);
       const shown = Math.min(state.time, duration);
       bar.scrub.value = frame();
-      bar.scrub.setAttribute("aria-valuetext", `${shown.toFixed(2)} seconds`);
+      const segment = lead ? segmentAt(lead.score, localTime(lead)) : null;
+      bar.scrub.setAttribute("aria-valuetext", `${shown.toFixed(2)} seconds${segment ? `, ${segment[2]}` : ""}`);
+      if (strip) strip.mark(lead ? localTime(lead) : state.time);
       bar.time.textContent = `${shown.toFixed(2)} / ${duration.toFixed(2)} s`;
       state.draws += 1;
     }
@@ -158,7 +192,22 @@ function mountViewer(root, data, options) {
     const dark = getComputedStyle(root).colorScheme === "dark";
     document.documentElement.dataset.theme = dark ? "light" : "dark";
   });
-  bar.speed.addEventListener("change", () => { state.speed = Number(bar.speed.value); });
+  const setSpeed = (value) => { state.speed = value; player.setSpeed(value); };
+  bar.speed.addEventListener("change", () => setSpeed(Number(bar.speed.value)));
+  button("sound", () => setSound(!player.on));
+  bar.volume.addEventListener("input", () => {
+    player.setVolume(Number(bar.volume.value));
+    if (!player.on) setSound(true);
+  });
+  const several = new Set(clips.map((clip) => `${clip.sound} ${scores.indexOf(clip.score)}`)).size > 1;
+  for (const cell of cells) {
+    cell.hear.hidden = !several || (cell.clip.sound === undefined && !cell.clip.score);
+    cell.hear.addEventListener("click", () => {
+      const again = cell.clip === lead && player.on;
+      follow(cell.clip);
+      setSound(cell.clip.sound !== undefined && !again);
+    });
+  }
   bar.scrub.addEventListener("input", () => { play(false); setFrame(Number(bar.scrub.value)); });
   for (const name of Object.keys(VIEWS)) {
     button(`view ${name}`, () => { setView(name); bar.close.setAttribute("aria-pressed", "false"); });
@@ -167,13 +216,13 @@ function mountViewer(root, data, options) {
     " ": () => play(!state.playing), ArrowLeft: () => step(-1), ArrowRight: () => step(1),
     Home: () => setFrame(0), End: () => { play(false); setFrame(last); }, "+": () => zoom(1.15), "=": () => zoom(1.15),
     "-": () => zoom(1 / 1.15), f: () => bar.follow.click(), l: () => bar.loop.click(), c: () => bar.close.click(),
-    r: () => bar["view 3/4"].click(), t: () => bar.theme.click(),
+    r: () => bar["view 3/4"].click(), t: () => bar.theme.click(), m: () => setSound(!player.on),
   };
   Object.keys(VIEWS).forEach((name, k) => { actions[k + 1] = () => bar[`view ${name}`].click(); });
   const turns = { ArrowLeft: [12, 0], ArrowRight: [-12, 0], ArrowUp: [0, 12], ArrowDown: [0, -12] };
   (page ? document : root).addEventListener("keydown", (event) => {
     const target = event.target;
-    if (event.ctrlKey || event.metaKey || event.altKey || target.tagName === "SELECT") return;
+    if (event.ctrlKey || event.metaKey || event.altKey || target.tagName === "SELECT" || target === bar.volume) return;
     if (target.tagName === "BUTTON" && event.key === " ") return;
     const act = event.shiftKey && turns[event.key] ? () => turn(...turns[event.key]) : actions[event.key];
     if (!act || (event.shiftKey && !turns[event.key] && event.key !== "+")) return;
@@ -197,20 +246,24 @@ function mountViewer(root, data, options) {
   }, { rootMargin: "80px" });
   for (const cell of cells) { sizes.observe(cell.canvas); sight.observe(cell.canvas); }
 
-  setView("3/4");
-  play(state.playing);
-  rethemed();
-  requestAnimationFrame(tick);
-
   const handle = {
     get frame() { return frame(); }, get time() { return state.time; }, get playing() { return state.playing; },
     get draws() { return state.draws; }, get frames() { return last + 1; }, get camera() { return { ...camera }; },
     get follow() { return state.follow; }, get loop() { return state.loop; },
     play, setFrame, setView, zoom, turn, toggle: (name) => toggle(name, name),
-    setSpeed(value) { state.speed = value; },
+    get sound() { return player.on; }, get audio() { return player.audio; },
+    get segment() { return lead && segmentAt(lead.score, localTime(lead)); },
+    setSpeed, setSound, listen: (k) => follow(clips[k]),
   };
   window.__viewers = window.__viewers || [];
   window.__viewers.push(handle);
   window.__viewer = window.__viewers[0];
+
+  setView("3/4");
+  play(state.playing);
+  rethemed();
+  follow(clips.find((clip) => clip.sound !== undefined) || clips.find((clip) => clip.score) || clips[0]);
+  player.turn(false);
+  requestAnimationFrame(tick);
   return handle;
 }

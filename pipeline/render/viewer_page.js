@@ -27,16 +27,20 @@ function buildCells(clips) {
       const count = element("span", { className: "mlv-count" });
       const stage = element("div", { className: "mlv-stage" }, canvas, count);
       if (clip.label) stage.append(element("span", { className: "mlv-label", textContent: clip.label }));
+      const now = buildCaption();
+      const hear = element("button", { type: "button", className: "mlv-hear", textContent: "♪", title: "Hear and follow this motion's music", hidden: true });
+      hear.setAttribute("aria-label", hear.title);
+      stage.append(now.node, hear);
       const figure = element("figure", { className: "mlv-cell" }, stage);
       if (clip.caption) figure.append(element("figcaption", { textContent: clip.caption, title: clip.caption }));
       row.append(figure);
-      cells.push({ clip, canvas, count, room, ctx: canvas.getContext("2d"), visible: true });
+      cells.push({ clip, canvas, count, now, hear, room, ctx: canvas.getContext("2d"), visible: true });
     }
   }
   return { board, cells };
 }
 
-function buildBar(root, last, duration) {
+function buildBar(root, last, duration, strip, sounding) {
   const button = (textContent, title, pressed) => {
     const node = element("button", { type: "button", textContent, title });
     node.setAttribute("aria-label", title);
@@ -54,10 +58,15 @@ function buildBar(root, last, duration) {
     loop: button("Loop each", "Shorter motions start again instead of holding their last frame (L)", false),
     close: button("Close-up", "Close-up of the head (C)", false),
     theme: button("◐", "Dark or light (T)"),
+    sound: button("♪ Sound", "Sound on (M)", false),
+    volume: element("input", { type: "range", min: 0, max: 1, step: 0.05, value: 1, className: "mlv-volume", title: "Volume" }),
   };
   bar.play.classList.add("mlv-play");
   bar.scrub.setAttribute("aria-label", "Time");
   bar.speed.setAttribute("aria-label", "Speed");
+  bar.volume.setAttribute("aria-label", "Volume");
+  const sound = sounding ? [element("span", { className: "mlv-line mlv-sound" }, bar.sound, bar.volume)] : [];
+  const track = strip ? [element("span", { className: "mlv-track" }, strip.strip, bar.scrub)] : [];
   for (const speed of SPEEDS) bar.speed.append(element("option", { value: speed, textContent: `${speed}×`, selected: speed === 1 }));
   const views = element("span", { className: "mlv-set", role: "group" });
   views.setAttribute("aria-label", "View");
@@ -69,9 +78,12 @@ function buildBar(root, last, duration) {
     element("i", { className: "mlv-left" }), "left ", element("i", { className: "mlv-right" }), "right");
   root.append(
     element("div", { className: "mlv-bar", role: "toolbar" },
-      element("span", { className: "mlv-line" }, bar.play, bar.back, bar.forth, bar.scrub, bar.time),
+      ...track,
+      element("span", { className: strip ? "mlv-line mlv-tight" : "mlv-line" },
+        bar.play, bar.back, bar.forth, ...(strip ? [] : [bar.scrub]), bar.time),
+      ...sound,
       element("span", { className: "mlv-line mlv-wrap" }, bar.speed, views, bar.close, bar.follow, bar.loop, bar.theme, legend)),
-    element("p", { className: "mlv-help", textContent: `Drag to orbit · Shift-drag or right-drag to pan · wheel or pinch to zoom · double-click to reset · ${KEYS}` }));
+    element("p", { className: "mlv-help", textContent: `Drag to orbit · Shift-drag or right-drag to pan · wheel or pinch to zoom · double-click to reset · ${KEYS}${sounding ? " · M sound" : ""}` }));
   return bar;
 }
 

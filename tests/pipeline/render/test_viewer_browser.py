@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,30 +18,6 @@ PARENTS = Skeleton.named("smplx52").parents
 NASTY = "</script><img src=x onerror='window.hacked=1'><b>bold</b> & \"q\""
 
 pytestmark = pytest.mark.browser
-
-
-@pytest.fixture
-def visit(browser: Any, until: Callable[..., None]) -> Iterator[Callable[..., Any]]:
-    """Opens a file and fails the test if the page ever complains or asks for anything."""
-    trouble: list[str] = []
-    pages = []
-
-    def go(path: Path, width: int = 900, height: int = 760, **options: Any) -> Any:
-        page = browser.new_page(viewport={"width": width, "height": height}, **options)
-        page.on("console", lambda m: trouble.append(m.text) if m.type in ("error", "warning") else None)
-        page.on("pageerror", lambda e: trouble.append(str(e)))
-        page.on(
-            "request", lambda r: trouble.append(r.url) if not r.url.startswith(("file:", "data:")) else None
-        )
-        page.goto(path.as_uri())
-        until(page, "window.__viewer && window.__viewer.draws > 0")
-        pages.append(page)
-        return page
-
-    yield go
-    for page in pages:
-        page.close()
-    assert not trouble
 
 
 @pytest.fixture(scope="module")

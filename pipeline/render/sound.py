@@ -1,0 +1,149 @@
+"""Sound beside pictures: cut to a motion's length, compressed for a page, or as a WAV for the film's muxer.
+
+Pages carry MP3 at a constant bit rate. Why this format **[ours]**:
+
+* Every browser plays it: also Safari before 18.4, which has no Opus in Ogg, and Chromium built without AAC.
+* A constant rate makes a seek exact: Chromium finds a place in an MP3 by arithmetic on the bytes, which is
+  only right where all frames are equally long.
+* The encoder's delay stands in its header, so players skip it: sample 0 is heard at 0 s, with frame 0.
+
+Where libsndfile was built without MP3 the page carries 16-bit PCM in a WAV, which plays everywhere too but
+takes seven times the room.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import wave
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.audio.sound import resample_sound
+from motionloom.datasets.schema import UserError
+
+RATE = 44_100
+"""Hz of every sound written: one that MP3, AAC and all players know, whatever rate the features asked for."""
+BIT_RATE = 96_000
+"""Bits a second in a page: transparent enough for mono, 0.7 MB a minute (0.96 MB as base64)."""
+_BLOCK = 2**16
+
+
+class Soundtrack(Protocol):
+    """Mono sound: `samples` float [S] in -1..1 at `rate` Hz; sample 0 sounds with frame 0."""
+
+    @property
+    def samples(self) -> NDArray[np.float32]:
+        """[S] in -1..1."""
+        ...
+
+    @property
+    def rate(self) -> float:
+        """Samples a second."""
+        ...
+
+
+@dataclass(frozen=True)
+class EncodedSound:
+    """A compressed sound: the bytes of a file, its media type and its length."""
+
+    data: bytes
+    mime: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Playing:
+    """One motion's use of a sound: how long the motion lasts, and its name in errors."""
+
+    where: str
+    sound: Soundtrack | None
+    seconds: float
+
+
+def embed_sounds(uses: Sequence[Playing]) -> tuple[list[EncodedSound], list[int | None]]:
+    """Each distinct sound once, as long as the longest motion that plays it; and which one each use plays."""
+    order: dict[tuple[float, bytes], int] = {}
+    found: list[tuple[NDArray[np.float32], float]] = []
+    chosen: list[int | None] = []
+    for use in uses:
+        if use.sound is None:
+            chosen.append(None)
+            continue
+        content = hashlib.sha256(np.ascontiguousarray(use.sound.samples).tobytes()).digest()
+        number = order.setdefault((use.sound.rate, content), len(found))
+        if number == len(found):
+            found.append((playable(use.sound, f"{use.where}: sound"), use.seconds))
+        samples, longest = found[number]
+        found[number] = (samples, max(longest, use.seconds))
+        chosen.append(number)
+    return [_encode(samples[: round(seconds * RATE)]) for samples, seconds in found], chosen
+
+
+def _encode(samples: NDArray[np.float32]) -> EncodedSound:
+    data = _mp3(samples)
+    mime = "audio/mpeg"
+    if data is None:
+        data, mime = wav_bytes(samples), "audio/wav"
+    return EncodedSound(data, mime, len(samples) / RATE)
+
+
+def film_sound(sound: Soundtrack, seconds: float) -> bytes:
+    """A WAV of exactly `seconds`: cut, or filled up with silence."""
+    samples = playable(sound, "sound of the film")
+    wanted = round(seconds * RATE)
+    out = np.zeros(wanted, np.float32)
+    out[: len(samples)] = samples[:wanted]
+    return wav_bytes(out)
+
+
+def playable(sound: Soundtrack, where: str) -> NDArray[np.float32]:
+    """Samples [S] at `RATE` Hz; `UserError`, naming `where`, for what is not mono sound."""
+    samples = np.asarray(sound.samples)
+    if samples.ndim != 1 or not len(samples):
+        raise UserError(f"{where}: samples must be mono, [S] with S > 0, got {list(samples.shape)}")
+    if not np.isfinite(samples).all():
+        raise UserError(f"{where}: samples hold NaN or infinity")
+    rate = float(sound.rate)
+    if not (rate >= 1 and rate.is_integer()):
+        raise UserError(f"{where}: the rate must be a whole number of Hz above 0, got {sound.rate}")
+    return np.clip(resample_sound(samples.astype(np.float32), int(rate), RATE), -1.0, 1.0)
+
+
+def wav_bytes(samples: NDArray[Any]) -> bytes:
+    """A 16-bit mono WAV of samples [S] in -1..1 at `RATE` Hz."""
+    file = io.BytesIO()
+    with wave.open(file, "wb") as out:
+        out.setnchannels(1)
+        out.setsampwidth(2)
+        out.setframerate(RATE)
+        out.writeframes(np.round(np.asarray(samples, np.float64) * 32767).astype("<i2").tobytes())
+    return file.getvalue()
+
+
+def _mp3(samples: NDArray[np.float32]) -> bytes | None:
+    """MP3 of samples [S] at `BIT_RATE`, or None where libsndfile cannot write MP3."""
+    import soundfile  # only pages with sound pay for the import
+
+    if "MP3" not in soundfile.available_formats():
+        return None
+    file = io.BytesIO()
+    # libsndfile spreads its 0..1 evenly over MPEG-1's rates, 320 down to 32 kbit/s.
+    level = (320_000 - BIT_RATE) / (320_000 - 32_000)
+    with soundfile.SoundFile(
+        file,
+        "w",
+        samplerate=RATE,
+        channels=1,
+        format="MP3",
+        subtype="MPEG_LAYER_III",
+        bitrate_mode="CONSTANT",
+        compression_level=level,
+    ) as out:
+        for start in range(0, len(samples), _BLOCK):
+            out.write(samples[start : start + _BLOCK])
+    return file.getvalue()

@@ -1,0 +1,256 @@
+"""Sound, beats and segments in pages and films, without a browser."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import soundfile
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.inference.bundle import GeneratedMotion
+from motionloom.pipeline.inference.outputs import write_motions
+from motionloom.pipeline.render.page import Page
+from motionloom.pipeline.render.score import Score, Segment, score_data
+from motionloom.pipeline.render.sound import RATE, Playing, embed_sounds, film_sound, playable
+from motionloom.pipeline.render.video import write_mp4
+from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
+
+SMPLX = Skeleton.named("smplx52")
+Make = Callable[..., Any]
+
+
+def data_of(page: Path) -> dict[str, Any]:
+    return json.loads(re.search(r'id="viewer-data">(.*?)</script>', page.read_text("utf-8"), re.S)[1])
+
+
+def policy_of(text: str) -> str:
+    return re.search(r'Content-Security-Policy" content="(.*?)"', text)[1]
+
+
+def lag(made: np.ndarray, wanted: np.ndarray) -> int:
+    """Samples by which `made` comes later, by the peak of their correlation."""
+    n = min(len(made), len(wanted))
+    spectrum = np.fft.rfft(made[:n], 2 * n) * np.conj(np.fft.rfft(wanted[:n], 2 * n))
+    k = int(np.argmax(np.fft.irfft(spectrum)))
+    return k if k < n else k - 2 * n
+
+
+def frame_lengths(mp3: bytes) -> list[int]:
+    """Bytes of each frame of an MPEG-1 layer III stream, by the 4-byte headers (ISO 11172-3, 2.4.2.3)."""
+    rates = [0, 32, 40, 48, 56, 64, 80, 96, 112, 128, 160, 192, 224, 256, 320]
+    at, out = 0, []
+    while at + 4 <= len(mp3):
+        assert mp3[at] == 0xFF and mp3[at + 1] & 0xFE == 0xFA, f"no frame at byte {at}"
+        assert (mp3[at + 2] >> 2) & 3 == 0  # 44.1 kHz
+        out.append(144_000 * rates[mp3[at + 2] >> 4] // RATE + ((mp3[at + 2] >> 1) & 1))
+        at += out[-1]
+    return out
+
+
+# ---- what a page carries
+
+
+def test_sound_for_a_page_is_mp3_of_constant_rate_in_its_place(song: Make) -> None:
+    tune = song(3.0)
+    (made,), chosen = embed_sounds([Playing("m", tune, 2.0)])
+    assert chosen == [0] and made.mime == "audio/mpeg" and made.seconds == 2.0
+    lengths = frame_lengths(made.data)
+    assert set(lengths) <= {313, 314}  # 96 kbit/s, with and without padding
+    heard, rate = soundfile.read(io.BytesIO(made.data))
+    wanted = playable(tune, "tune")
+    assert rate == RATE and abs(len(heard) - 2 * RATE) <= 1
+    assert abs(lag(heard, wanted)) <= 1
+    error = heard - wanted[: len(heard)]
+    assert np.square(error).mean() < 0.02 * np.square(wanted).mean()
+
+
+def test_one_sound_is_carried_once_and_as_long_as_its_longest_motion(song: Make) -> None:
+    tune, other = song(4.0), song(1.0, beat=0.3)
+    again = replace(tune, samples=tune.samples.copy())
+    uses = [("a", tune, 1.5), ("b", None, 9.0), ("c", other, 3.0), ("d", again, 2.5)]
+    made, chosen = embed_sounds([Playing(*use) for use in uses])
+    assert chosen == [0, None, 1, 0]
+    assert [m.seconds for m in made] == [2.5, 1.0]
+    slower = replace(tune, rate=tune.rate // 2)  # equal numbers at another rate are another sound
+    assert embed_sounds([Playing("a", tune, 1.0), Playing("b", slower, 1.0)])[1] == [0, 1]
+
+
+def test_without_an_mp3_encoder_the_page_carries_a_wav(song: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(soundfile, "available_formats", lambda: {"WAV": "WAV"})
+    tune = song(1.0)
+    (made,), _ = embed_sounds([Playing("m", tune, 0.5)])
+    assert made.mime == "audio/wav"
+    heard, rate = soundfile.read(io.BytesIO(made.data))
+    assert rate == RATE and soundfile.info(io.BytesIO(made.data)).subtype == "PCM_16"
+    np.testing.assert_allclose(heard, playable(tune, "m")[: RATE // 2], atol=2 / 32767)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"samples": np.zeros((4, 2), np.float32)}, r"mono, \[S\] with S > 0, got \[4, 2\]"),
+        ({"samples": np.zeros(0, np.float32)}, "S > 0"),
+        ({"samples": np.array([0, np.nan], np.float32)}, "NaN"),
+        ({"rate": 0}, "rate"),
+        ({"rate": 22050.5}, "whole number of Hz"),
+    ],
+)
+def test_what_is_not_sound_is_refused_by_name(
+    tmp_path: Path, song: Make, walk: Make, change: dict, words: str
+) -> None:
+    motion = ViewerMotion(walk(3), 20, SMPLX.parents, "mine", sound=replace(song(1.0), **change))
+    with pytest.raises(UserError, match=words) as caught:
+        write_viewer(tmp_path / "v.html", [motion], "t")
+    assert "'mine'" in str(caught.value)
+    with pytest.raises(UserError, match=words):
+        write_mp4(tmp_path / "v.mp4", walk(3), SMPLX, 20, size=(64, 64), sound=motion.sound)
+    assert not list(tmp_path.iterdir())
+
+
+# ---- the score
+
+
+def test_score_keeps_what_lies_within_the_motion() -> None:
+    beats = [1.0, -0.2, 0.5, 2.0, 2.5, 0.5]
+    segments = [(0, 1.2, "walks"), Segment(1.2, 9.0, "song", "music"), (2.0, 3.0, "too late")]
+    made = score_data(beats, segments, 2.0, "m")
+    assert made["beats"] == [0.5, 1.0, 2.0]
+    assert made["segments"] == [[0.0, 1.2, "walks", "text"], [1.2, 2.0, "song", "music"]]
+
+
+@pytest.mark.parametrize(
+    ("beats", "segments", "words"),
+    [
+        ([np.nan], [], "finite seconds"),
+        ([[1.0]], [], "finite seconds"),
+        ([], [(1.0, 1.0, "x")], "'x' must start at 0 s or later and end after it starts"),
+        ([], [(-1.0, 1.0, "x")], "start at 0 s"),
+        ([], [(0.0, np.inf, "x")], "end after"),
+        ([], [(0.0, 1.0, "x", "dance")], "kind 'dance'; known: text, music"),
+    ],
+)
+def test_scores_that_mean_nothing_are_refused(beats: list, segments: list, words: str) -> None:
+    with pytest.raises(UserError, match=words) as caught:
+        score_data(beats, segments, 2.0, "motion 3 ('mine')")
+    assert "motion 3 ('mine')" in str(caught.value)
+
+
+def test_page_data_names_sounds_and_scores_by_number(tmp_path: Path, song: Make, walk: Make) -> None:
+    tune = song(1.0)
+    motions = [
+        ViewerMotion(walk(20), 20, SMPLX.parents, "a", sound=tune, beats=[0.5]),
+        ViewerMotion(walk(20), 20, SMPLX.parents, "b"),
+        ViewerMotion(walk(20), 20, SMPLX.parents, "c", sound=tune, beats=np.array([0.5])),
+        ViewerMotion(walk(20), 20, SMPLX.parents, "d", segments=[(0, 1, "</script>")]),
+    ]
+    write_viewer(tmp_path / "v.html", motions, "t")
+    data = data_of(tmp_path / "v.html")
+    assert [m.get("sound") for m in data["motions"]] == [0, None, 0, None]
+    assert [m.get("score") for m in data["motions"]] == [0, None, 0, 1]
+    assert [s["beats"] for s in data["scores"]] == [[0.5], []]
+    assert data["scores"][1]["segments"] == [[0, 1, "</script>", "text"]]
+    (sound,) = data["sounds"]
+    assert len(frame_lengths(base64.b64decode(sound["data"]))) > 30
+
+
+def test_only_pages_with_sound_allow_media_and_only_their_own(tmp_path: Path, song: Make, walk: Make) -> None:
+    still = ViewerMotion(walk(5), 20, SMPLX.parents, "a", beats=[0.1])
+    sounding = replace(still, sound=song(1.0))
+    bare = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
+    write_viewer(tmp_path / "a.html", [still], "t")
+    write_viewer(tmp_path / "b.html", [sounding], "t")
+    assert policy_of((tmp_path / "a.html").read_text("utf-8")) == bare
+    assert policy_of((tmp_path / "b.html").read_text("utf-8")) == bare + "; media-src blob:"
+    assert policy_of(Page("p").add_viewer([still]).html()) == bare
+    assert (
+        policy_of(Page("p").add_viewer([still]).add_viewer([sounding]).html()) == bare + "; media-src blob:"
+    )
+    assert not {"sounds", "scores"} & set(data_of_silent(tmp_path, replace(still, beats=())))
+
+
+def data_of_silent(folder: Path, motion: ViewerMotion) -> dict[str, Any]:
+    write_viewer(folder / "silent.html", [motion], "t")
+    data = data_of(folder / "silent.html")
+    assert not {"sound", "score"} & set(data["motions"][0])
+    return data
+
+
+def test_five_minutes_of_motion_and_music_stay_below_15_mb(tmp_path: Path, song: Make) -> None:
+    joints = np.random.default_rng(0).normal(size=(9000, 52, 3))
+    motion = ViewerMotion(joints, 30, SMPLX.parents, sound=song(300.0), beats=np.arange(0, 300, 0.5))
+    write_viewer(tmp_path / "v.html", [motion], "long")
+    assert (tmp_path / "v.html").stat().st_size < 15_000_000
+
+
+# ---- films
+
+
+def heard_in(film: Path) -> tuple[np.ndarray, str]:
+    """The film's decoded sound at `RATE` Hz, and what ffmpeg says of the file."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-i", str(film), "-map", "0:a"]
+    done = subprocess.run([*command, "-f", "f32le", "-"], capture_output=True, check=True)
+    return np.frombuffer(done.stdout, "<f4"), done.stderr.decode()
+
+
+@pytest.mark.parametrize("seconds", [5.0, 1.0])
+def test_film_has_sound_in_its_place_and_no_longer_than_the_motion(
+    tmp_path: Path, song: Make, walk: Make, seconds: float
+) -> None:
+    tune = song(seconds)
+    path = tmp_path / "a film.mp4"
+    write_mp4(path, walk(50), SMPLX, 20, size=(64, 64), sound=tune)
+    heard, said = heard_in(path)
+    assert "Audio: aac" in said and "mono" in said
+    # AAC comes in frames of 1024 samples; players cut the last by the container's length.
+    assert 0 <= len(heard) - 2.5 * RATE < 1024 and "Duration: 00:00:02.5" in said
+    wanted = np.frombuffer(film_sound(tune, 2.5)[44:], "<i2") / 32767
+    assert len(wanted) == 2.5 * RATE and abs(lag(heard, wanted)) <= 1
+    if seconds < 2.5:
+        assert np.abs(wanted[round(seconds * RATE) + 1 :]).max() == 0
+    frames = imageio_ffmpeg.read_frames(str(path))
+    next(frames)
+    assert sum(1 for _ in frames) == 50
+    assert [p.name for p in tmp_path.iterdir()] == ["a film.mp4"]
+
+
+def test_broken_film_with_sound_leaves_no_file(tmp_path: Path, song: Make, walk: Make) -> None:
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_mp4(tmp_path / "a.mp4", walk(5), SMPLX, 20, size=(64, 64), sound=song(1.0), progress=stop)
+    assert not list(tmp_path.iterdir())
+
+
+# ---- from a generated motion to its files
+
+
+def test_generated_motions_pass_their_scores_to_film_and_page(tmp_path: Path, song: Make, walk: Make) -> None:
+    layout = MotionLayout.named("tomato623")
+    motions = [
+        GeneratedMotion(name, name, np.zeros((8, 1), np.float32), walk(8), None, layout) for name in "ab"
+    ]
+    scores = [Score(song(1.0), [0.1], [(0, 0.2, "walks")]), Score()]
+    write_motions(tmp_path / "out", motions, ["mp4", "html"], title="t", seed=0, scores=scores)
+    data = data_of(tmp_path / "out" / "index.html")
+    assert [m.get("sound") for m in data["motions"]] == [0, None]
+    assert data["scores"][0]["segments"] == [[0, 0.2, "walks", "text"]]
+    heard, _ = heard_in(tmp_path / "out" / "00-a.mp4")
+    assert np.abs(heard).max() > 0.1
+    with pytest.raises(subprocess.CalledProcessError):
+        heard_in(tmp_path / "out" / "01-b.mp4")  # has no sound
+    with pytest.raises(UserError, match="1 scores for 2 motions"):
+        write_motions(tmp_path / "no", motions, ["html"], title="t", seed=0, scores=scores[:1])
