@@ -6,8 +6,9 @@ step by step, for sampling, and give the same numbers.
 
 - The transformer lets the prefix see all of itself (full attention) and no motion; motion sees the prefix
   and, causally, motion (section 3.3: "we don't mask the region of conditions").
-- The GRU reads prefix and motion one after another, the recurrent reading of the same input; its blocks are
-  pre-norm with a residual path, without which eight of them hardly train [ours].
+- The GRU reads prefix and motion one after another, the recurrent reading of the same input. It reads the
+  global embedding, the prefix's first position, last, so that a long sequence does not make it forget it
+  [ours]; its blocks are pre-norm with a residual path, without which eight of them hardly train [ours].
 
 Legend: B batch, S prefix, L inputs, N inputs so far, D width.
 """
@@ -81,7 +82,9 @@ class PrefixGru(nn.Module):
 
     def begin(self, prefix: Tensor, mask: Tensor, size: int) -> State:
         """Read the prefix; a GRU needs no room, so `size` plays no part."""
-        # Real positions first, in order: what stands behind them then cannot be read any more.
+        # The first position last, before it the others' real ones, in order; padding goes behind them all,
+        # where it is not read any more.
+        prefix, mask = prefix.roll(-1, dims=1), mask.roll(-1, dims=1)
         order = (~mask).long().argsort(dim=1, stable=True)
         x = prefix.gather(1, order[..., None].expand_as(prefix))
         last = (mask.sum(1) - 1).clamp(min=0)[:, None, None].expand(-1, 1, x.shape[2])
@@ -90,7 +93,7 @@ class PrefixGru(nn.Module):
             out, _ = layer(norm(x))
             hidden.append(out.gather(1, last).transpose(0, 1))
             x = x + self.dropout(out)
-        return State(mask, hidden=hidden)
+        return State(mask.roll(1, dims=1), hidden=hidden)
 
     def extend(self, x: Tensor, state: State) -> Tensor:
         """As `PrefixTransformer.extend`."""
