@@ -67,7 +67,7 @@ class MotionDiffusion(nn.Module):
             told: bool [B], False hides the text.
         """
         condition = self.text(text) * told[:, None] + self.time(
-            _waves(step, self.config.dim).to(self.text.weight.dtype)
+            step_waves(step, self.config.dim).to(self.text.weight.dtype)
         )
         frames = self.enter(noisy)
         x = torch.cat([condition[:, None].to(frames.dtype), frames], dim=1)
@@ -77,7 +77,7 @@ class MotionDiffusion(nn.Module):
         return out * mask[..., None]
 
 
-def _waves(step: Tensor, dim: int) -> Tensor:
+def step_waves(step: Tensor, dim: int) -> Tensor:
     """Sinusoidal embedding [B, dim] of time steps [B]."""
     half = torch.arange(dim // 2, device=step.device)
     angle = step[:, None].float() * torch.exp(-math.log(10_000.0) * half / (dim // 2))

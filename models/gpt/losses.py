@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import PAD
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tma.network import Tma
@@ -59,7 +60,7 @@ def group_counts(tokens: Tensor, kinds: Tensor, ends: Tensor, group: int) -> Ten
 
 
 def soft_codes(
-    gpt: InterleavedGPT, logits: Tensor, groups: Tensor, *, temperature: float, sample: bool
+    gpt: TokenNetwork, logits: Tensor, groups: Tensor, *, temperature: float, sample: bool
 ) -> dict[str, Tensor]:
     """One-hot code weights per stream [B, G * per_group, K] of logits [B, L, V], differentiable straight
     through.

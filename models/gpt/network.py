@@ -27,7 +27,8 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.models.gpt.tokens import closing_length, kind_of_slot, stream_names
+from motionloom.models.gpt.token_network import TokenNetwork
+from motionloom.models.gpt.tokens import closing_length
 from motionloom.models.layers.transformer import KVCache, Transformer
 from motionloom.models.tokenizer.base import Stream
 
@@ -58,7 +59,7 @@ class GptConfig(Config):
         return self
 
 
-class InterleavedGPT(nn.Module):
+class InterleavedGPT(TokenNetwork):
     """Autoregressive model of token sequences whose slots belong to several codebooks.
 
     Args:
@@ -68,36 +69,22 @@ class InterleavedGPT(nn.Module):
         text_dim: Width of the text prior (256 for TMA).
     """
 
-    slots: Tensor
-    ends: Tensor
-
     def __init__(
         self, config: GptConfig, streams: Sequence[Stream], pattern: Sequence[str], text_dim: int
     ) -> None:
-        super().__init__()
+        super().__init__(streams, pattern)
         self.config = config
-        self.pattern = tuple(pattern)
         self.text_dim = text_dim
-        sizes = {stream.name: stream.num_codes for stream in streams}
-        missing = [name for name in stream_names(pattern) if name not in sizes]
-        if missing:
-            raise UserError(
-                f"the token pattern {self.pattern} names {missing}; the streams are {list(sizes)}"
-            )
-        self.names = stream_names(pattern)
         needed = 1 + len(self.pattern) + len(self.names)
         if config.block_size < needed:
             raise UserError(
                 f"block_size {config.block_size} holds no motion: the text, {len(self.pattern)} tokens and "
                 f"{len(self.names)} End tokens take {needed}"
             )
-        self.num_codes = {name: sizes[name] for name in self.names}
-        """Codes per stream, which is also the stream's End token."""
-        self.vocabulary = max(self.num_codes.values()) + 1
         self.text_in = nn.Linear(text_dim, config.dim)
         self.null_text = nn.Parameter(torch.randn(config.dim) * 0.02)
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
-        self.embeddings = nn.ModuleList(nn.Embedding(k + 1, config.dim) for k in self.num_codes.values())
+        self.embeddings = self._tables(config.dim)
         self.dropout = nn.Dropout(config.dropout)
         self.stack = Transformer(
             config.layers,
@@ -107,11 +94,8 @@ class InterleavedGPT(nn.Module):
             dropout=config.dropout,
             attention_dropout=config.attention_dropout,
         )
-        self.heads = nn.ModuleList(nn.Linear(config.dim, k + 1) for k in self.num_codes.values())
-        for layer in (*self.embeddings, *self.heads):
-            nn.init.normal_(layer.weight, std=0.02)
-        self.register_buffer("slots", torch.tensor(kind_of_slot(pattern)), persistent=False)
-        self.register_buffer("ends", torch.tensor(list(self.num_codes.values())), persistent=False)
+        self.heads = self._outputs(config.dim)
+        self._start_tables()
 
     @property
     def max_groups(self) -> int:
@@ -163,48 +147,9 @@ class InterleavedGPT(nn.Module):
             x = torch.where(drop[:, None], self.null_text.to(x.dtype), x)
         return x[:, None]
 
-    def embed(self, tokens: Tensor, kinds: Tensor) -> Tensor:
-        """Token embeddings [B, L, D]; each stream looks up its own table, padding reads as code 0."""
-        out: Tensor | None = None
-        for kind, table in enumerate(self.embeddings):
-            here = kinds == kind
-            vectors = table(torch.where(here, tokens, 0).clamp(min=0))
-            out = vectors if out is None else torch.where(here[..., None], vectors, out)
-        assert out is not None  # a pattern has at least one stream
-        return out
-
     def hidden(self, x: Tensor, cache: KVCache | None = None) -> Tensor:
         """Causal states [B, L, D] of inputs x [B, L, D]; with a cache, x continues what it holds."""
         start = 0 if cache is None else cache.length
         x = self.dropout(x + self.positions[start : start + x.shape[1]].to(x.dtype))
         out: Tensor = self.stack(x, causal=True, cache=cache)
         return out
-
-    def logits(self, hidden: Tensor, kinds: Tensor, legal: Tensor) -> Tensor:
-        """Hidden states [B, L, D], kinds [B, L], legal bool [B, L, V] -> float32 [B, L, V], -inf where
-        illegal.
-        """
-        out = torch.full((*kinds.shape, self.vocabulary), -torch.inf, device=hidden.device)
-        for kind, head in enumerate(self.heads):
-            values = head(hidden).float()
-            padded = nn.functional.pad(values, (0, self.vocabulary - values.shape[-1]), value=-torch.inf)
-            out = torch.where((kinds == kind)[..., None], padded, out)
-        return out.masked_fill(~legal, -torch.inf)
-
-    def legal(self, tokens: Tensor, kinds: Tensor) -> Tensor:
-        """Bool [B, L, V]: what the grammar allows at each position of sequences [B, L]."""
-        batch, size = tokens.shape
-        end = self.ends[kinds]
-        is_end = tokens == end
-        closing = (is_end.cumsum(1) - is_end.long()) > 0
-        first = (torch.arange(size, device=tokens.device) % len(self.pattern) == 0).expand(batch, size)
-        return self.legal_at(end, first, closing)
-
-    def legal_at(self, end: Tensor, first: Tensor, closing: Tensor) -> Tensor:
-        """Bool [..., V] for positions with End token `end`, at a group's first slot or not, behind an End or
-        not.
-        """
-        code = torch.arange(self.vocabulary, device=end.device)
-        codes = (code < end[..., None]) & ~closing[..., None]
-        ending = (code == end[..., None]) & (first | closing)[..., None]
-        return codes | ending

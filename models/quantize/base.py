@@ -17,6 +17,7 @@ class QuantizerOutput(NamedTuple):
     """int64 [B, L], or [B, L, levels]; meaningless where the mask is False."""
     penalty: Tensor
     """Commitment |z - sg(z_hat)|^2, mean over valid elements, float32 scalar; summed over residual levels.
+    A codebook learnt by gradient adds the term that teaches it, and weighs both.
     While training, this rank's share: the mean over ranks is that of the global batch."""
     metrics: dict[str, Tensor]
     """float32 scalars ([levels] for a residual quantizer): `penalty`; `perplexity` of this batch's codes;
@@ -39,10 +40,12 @@ class Codebook(Protocol):
         """Never update again, in training mode neither."""
 
 
-def usage_metrics(counts: Tensor) -> dict[str, Tensor]:
-    """`perplexity` and `usage` of how often each code was used, [K]."""
+def usage_metrics(counts: Tensor, *, eps: float = 1e-7) -> dict[str, Tensor]:
+    """`perplexity` and `usage` of how often each code was used, [K]; `eps` is within the logarithm (T2M-GPT's
+    1e-7; UDE has 1e-10).
+    """
     share = counts / counts.sum().clamp(min=1)
     return {
-        "perplexity": torch.exp(-(share * torch.log(share + 1e-7)).sum()),
+        "perplexity": torch.exp(-(share * torch.log(share + eps)).sum()),
         "usage": (counts > 0).float().mean(),
     }

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.tokenizer.config import AnyTokenizerConfig, FsqConfig, H2VQConfig, SeparateConfig
+from motionloom.models.tokenizer.config import (
+    AnyTokenizerConfig,
+    FsqConfig,
+    H2VQConfig,
+    MqConfig,
+    SeparateConfig,
+)
 from motionloom.models.tokenizer.fsq import FsqTokenizer
 from motionloom.models.tokenizer.h2vq import H2VQ
+from motionloom.models.tokenizer.mq import MotionQuantizer
 from motionloom.models.tokenizer.separate import SeparateVQ
 from motionloom.models.tokenizer.single import SingleTokenizer
 
@@ -19,4 +26,6 @@ def build_tokenizer(config: AnyTokenizerConfig, layout: MotionLayout) -> Tokeniz
         return SeparateVQ(config, layout)
     if isinstance(config, FsqConfig):
         return FsqTokenizer(config, layout)
+    if isinstance(config, MqConfig):
+        return MotionQuantizer(config, layout)
     return SingleTokenizer(config, layout)

@@ -1,4 +1,4 @@
-"""Configs of the tokenizers; the defaults are the paper's sizes (HumanTOMATO B.2)."""
+"""Configs of the tokenizers; the defaults are the papers' sizes (HumanTOMATO B.2, UDE section 4.2)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pydantic import Field, field_validator
 from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.quantize.ema import QuantizerConfig
+from motionloom.models.quantize.gradient import GradientQuantizerConfig, Start
 
 Recon = Literal["l2", "smooth_l1"]
 
@@ -117,13 +118,61 @@ class FsqConfig(BaseTokenizerConfig):
         return steps
 
 
-AnyTokenizerConfig = H2VQConfig | VqConfig | RvqConfig | SeparateConfig | FsqConfig
+class MqConfig(BaseTokenizerConfig):
+    """UDE's motion quantization (section 3.1): one codebook at 4x between three-layer convolutions."""
+
+    kind: Literal["mq"] = "mq"
+    part: Part = "bodyhand"
+    width: int = Field(default=1024, ge=1)
+    depth: int = Field(default=1, ge=0)
+    """Residual blocks behind each layer that changes the rate: 1 in public UDE code, 0 is the bare text."""
+    dilation_growth: int = Field(default=1, ge=1)
+    code_dim: int = Field(default=1024, ge=1)
+    num_codes: int = Field(default=2048, ge=2)
+    quantizer: Literal["gradient", "ema"] = "gradient"
+    """How the codebook is learnt: by gradient (the paper), or by moving averages with Code Reset [ours]."""
+    codebook_weight: float = Field(default=1.0, gt=0)
+    """beta_1 of equation 2; moving averages need none."""
+    commitment_weight: float = Field(default=1.0, ge=0)
+    """beta_2 of equation 2."""
+    start: Start = "uniform"
+    """Where codes learnt by gradient start: `uniform` in +-1/K (public UDE), or `data`, on latents of the
+    first batch [ours], which short trainings need."""
+    decay: float = Field(default=0.99, gt=0, lt=1)
+    reset_below: float = Field(default=1.0, gt=0)
+    """EMA count of uses below which a code is reset (`ema`), or counted as dead (`gradient`)."""
+
+    def commitment(self) -> float:
+        """Weight of the penalty; the gradient quantizer's is weighted already."""
+        return 1.0 if self.quantizer == "gradient" else self.commitment_weight
+
+    def gradient_quantizer(self) -> GradientQuantizerConfig:
+        """Config of the codebook learnt by gradient."""
+        return GradientQuantizerConfig(
+            num_codes=self.num_codes,
+            dim=self.code_dim,
+            codebook_weight=self.codebook_weight,
+            commitment_weight=self.commitment_weight,
+            start=self.start,
+            decay=self.decay,
+            dead_below=self.reset_below,
+        )
+
+    def ema_quantizer(self) -> QuantizerConfig:
+        """Config of the codebook learnt by moving averages."""
+        return QuantizerConfig(
+            num_codes=self.num_codes, dim=self.code_dim, decay=self.decay, reset_below=self.reset_below
+        )
+
+
+AnyTokenizerConfig = H2VQConfig | VqConfig | RvqConfig | SeparateConfig | FsqConfig | MqConfig
 _KINDS: dict[str, type[AnyTokenizerConfig]] = {
     "h2vq": H2VQConfig,
     "vq": VqConfig,
     "rvq": RvqConfig,
     "separate": SeparateConfig,
     "fsq": FsqConfig,
+    "mq": MqConfig,
 }
 
 

@@ -16,6 +16,7 @@ from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import (
     FsqConfig,
     H2VQConfig,
+    MqConfig,
     RvqConfig,
     SeparateConfig,
     VqConfig,
@@ -32,6 +33,8 @@ CONFIGS = {
     "rvq face": RvqConfig(**SMALL, part="face", levels=3),
     "separate": SeparateConfig(**SMALL),
     "fsq": FsqConfig(width=16, depth=2, code_dim=8, steps=(4, 4)),
+    "mq": MqConfig(**SMALL, start="data"),
+    "mq by moving averages": MqConfig(**SMALL, quantizer="ema"),
 }
 
 

@@ -46,6 +46,7 @@ from motionloom.models.tokenizer.config import (
     AnyTokenizerConfig,
     FsqConfig,
     H2VQConfig,
+    MqConfig,
     RvqConfig,
     SeparateConfig,
 )
@@ -208,6 +209,7 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "separate": lambda: tokenizer(SeparateConfig(**BOOK)),
     "rvq": lambda: tokenizer(RvqConfig(**BOOK)),
     "fsq": lambda: tokenizer(FsqConfig(**SMALL, steps=(5, 4))),
+    "mq": lambda: tokenizer(MqConfig(**SMALL, num_codes=12, start="data")),
     "tma": tma,
     "tma, compiled": tma,
     "gpt": gpt,

@@ -1,0 +1,1 @@
+"""Encoders of what a motion is conditioned on."""

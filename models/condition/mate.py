@@ -1,0 +1,161 @@
+"""`Mate`: UDE's modality-agnostic transformer encoder (MATE, section 3.2).
+
+Every modality of a batch's `Conditions` goes through one linear layer to a common width and gets its learned
+modality token on each position (equation 3); an aggregation token stands in front; full attention runs over
+all. The output of the aggregation token is the global embedding, the others are the sequential embedding.
+
+Notable choices:
+- A row may have any subset of the modalities; with several, their positions stand one after another (in the
+  order that the network was built with), so one attention sees them all [ours]: the paper has one a sample.
+- The paper has an aggregation token per modality. Here it is a common token plus one of each modality the row
+  has: for one modality that is the paper's, for several and for none it is defined as well [ours]. A row
+  without a modality is the unconditional input that guidance needs.
+- Positions are sinusoidal, counted within each modality from 1 on (0 is the aggregation token). Counting over
+  the whole would make a row's result depend on how far other rows' texts pad it [ours].
+- Audio features differ by orders of magnitude (MFCC to beat flags): they must arrive normalised.
+
+Legend: B batch, L positions of one modality, S positions of all, F its features, E width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from motionloom.datasets.conditions import Condition, Conditions
+from motionloom.datasets.schema import Config, UserError
+from motionloom.models.layers.transformer import Transformer, sinusoid
+
+
+class MateConfig(Config):
+    """Sizes; the defaults are the paper's (section 4.2)."""
+
+    dim: int = Field(default=256, ge=2, multiple_of=2)
+    layers: int = Field(default=6, ge=1)
+    heads: int = Field(default=8, ge=1)
+    ff: int = Field(default=1024, ge=1)
+    dropout: float = Field(default=0.1, ge=0, lt=1)
+    attention_dropout: float = Field(default=0.1, ge=0, lt=1)
+
+    @model_validator(mode="after")
+    def _heads_divide(self) -> Self:
+        if self.dim % self.heads:
+            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
+        return self
+
+
+class Encoded(NamedTuple):
+    """What MATE makes of a batch's conditions."""
+
+    glob: Tensor
+    """[B, E], global embedding."""
+    seq: Tensor
+    """[B, S, E], sequential embedding; zero where `mask` is false."""
+    mask: Tensor
+    """bool [B, S]."""
+
+    def rows(self, index: Tensor | slice) -> Encoded:
+        """Some rows."""
+        return Encoded(self.glob[index], self.seq[index], self.mask[index])
+
+
+class Mate(nn.Module):
+    """Conditions of any modalities to one embedding space.
+
+    Args:
+        config: Sizes.
+        widths: Modality -> F, e.g. {"text": 384, "audio": 438}; their order is that of the sequence.
+    """
+
+    def __init__(self, config: MateConfig, widths: Mapping[str, int]) -> None:
+        super().__init__()
+        if not widths:
+            raise UserError("MATE needs at least one modality to read")
+        self.config = config
+        self.widths = dict(widths)
+        dim = config.dim
+        self.project = nn.ModuleDict({name: nn.Linear(width, dim) for name, width in widths.items()})
+        self.modality = nn.ParameterDict({name: _token(dim) for name in widths})
+        self.aggregate = _token(dim)
+        self.aggregate_of = nn.ParameterDict({name: _token(dim) for name in widths})
+        self.dropout = nn.Dropout(config.dropout)
+        self.stack = Transformer(
+            config.layers,
+            dim,
+            config.heads,
+            config.ff,
+            dropout=config.dropout,
+            attention_dropout=config.attention_dropout,
+        )
+
+    def forward(self, conditions: Conditions, batch: int | None = None) -> Encoded:
+        """Encode the conditions of a batch; modalities that the mapping lacks count as absent in every row.
+
+        Args:
+            conditions: Features [B, L, F] and masks [B, L] of each modality.
+            batch: B, needed only where `conditions` is empty.
+        """
+        unknown = [name for name in conditions if name not in self.widths]
+        if unknown:
+            raise UserError(f"MATE was built for {list(self.widths)}, not for {unknown}")
+        size = next((len(c.mask) for c in conditions.values()), batch)
+        if size is None:
+            raise ValueError("without any modality the size of the batch must be given")
+        first = self.aggregate.expand(size, -1)
+        parts, masks = [], []
+        for name, width in self.widths.items():
+            features, mask = self._modality(conditions.get(name), name, width, size)
+            x = self.project[name](features.to(self.aggregate.dtype)) + self.modality[name]
+            parts.append(x + sinusoid(x.shape[1] + 1, x.shape[2], x.device)[1:].to(x.dtype))
+            masks.append(mask)
+            first = first + mask.any(1)[:, None] * self.aggregate_of[name]
+        origin = sinusoid(1, first.shape[1], first.device).to(first.dtype)
+        x = torch.cat([(first + origin)[:, None], *parts], dim=1)
+        mask = torch.cat(masks, dim=1)
+        x = self.stack(self.dropout(x), torch.cat([mask.new_ones(size, 1), mask], dim=1))
+        return Encoded(x[:, 0], x[:, 1:].masked_fill(~mask[..., None], 0.0), mask)
+
+    def unconditional(self, batch: int) -> Encoded:
+        """What rows without any modality are encoded as, S = 0."""
+        out: Encoded = self({}, batch)
+        return out
+
+    def _modality(
+        self, condition: Condition | None, name: str, width: int, size: int
+    ) -> tuple[Tensor, Tensor]:
+        if condition is None:
+            # Empty, so that its parameters still are in the graph, with zero gradients: distributed training
+            # wants the same parameters used on every rank.
+            device = self.aggregate.device
+            return (
+                self.aggregate.new_zeros(size, 0, width),
+                torch.zeros(size, 0, dtype=torch.bool, device=device),
+            )
+        if condition.features.shape[-1] != width:
+            raise UserError(
+                f"MATE was built for {width} {name} features, the data has {condition.features.shape[-1]}"
+            )
+        return condition.features.masked_fill(~condition.mask[..., None], 0.0), condition.mask
+
+
+def drop_conditions(conditions: Conditions, drop: Tensor) -> dict[str, Condition]:
+    """The conditions with every modality removed from the rows where `drop`, bool [B], is true.
+
+    Training some rows so is what classifier-free guidance needs.
+    """
+    out = {}
+    for name, (features, mask, pooled) in conditions.items():
+        out[name] = Condition(
+            features.masked_fill(drop[:, None, None], 0.0),
+            mask & ~drop[:, None],
+            None if pooled is None else pooled.masked_fill(drop[:, None], 0.0),
+        )
+    return out
+
+
+def _token(dim: int) -> nn.Parameter:
+    return nn.Parameter(torch.randn(dim) * dim**-0.5)

@@ -1,0 +1,184 @@
+"""`Dmd`: UDE's diffusion motion decoder (section 3.4), which turns motion tokens into varied motions.
+
+A token encoder reads the code streams once; a diffusion decoder reads the noisy frames, the time step and
+what the encoder said, and predicts the noise.
+
+Notable choices:
+- Encoded tokens join the frames by place, not by cross-attention [ours]: each group of tokens belongs to
+  four known frames, so a linear layer writes each group out as its four frames and is added there. Nothing
+  about that alignment has to be learnt, it costs nothing, and a stretch of frames carries its own tokens,
+  which is what long motions in windows need (`dmd_sampling.py`).
+- Any streams and pattern of `gpt/tokens.py`: every token of a group is one position of the encoder.
+- The time step is added to every frame. Positions are sinusoidal.
+
+Legend: B batch, T frames, D motion features, G groups of four frames, P slots of a group, C width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from motionloom.datasets.schema import Config
+from motionloom.models.diffusion.network import step_waves
+from motionloom.models.diffusion.schedule import ScheduleConfig
+from motionloom.models.gpt.tokens import stream_names
+from motionloom.models.layers.transformer import Transformer, length_mask, sinusoid
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
+from motionloom.models.training.distributed import masked_mean
+
+
+class DmdConfig(Config):
+    """Sizes; the defaults are the paper's (section 4.2), at the public demo's width of 512."""
+
+    dim: int = Field(default=512, ge=2, multiple_of=2)
+    ff: int = Field(default=1024, ge=1)
+    encoder_layers: int = Field(default=8, ge=1)
+    decoder_layers: int = Field(default=8, ge=1)
+    heads: int = Field(default=8, ge=1)
+    dropout: float = Field(default=0.1, ge=0, lt=1)
+    attention_dropout: float = Field(default=0.1, ge=0, lt=1)
+    schedule: ScheduleConfig = ScheduleConfig(betas="linear", predicts="epsilon")
+
+    @model_validator(mode="after")
+    def _heads_divide(self) -> Self:
+        if self.dim % self.heads:
+            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
+        return self
+
+
+class Dmd(nn.Module):
+    """Denoiser of normalised motions [B, T, D] given the tokens of each.
+
+    Args:
+        config: Sizes and the noising process.
+        streams: The tokenizer's streams.
+        pattern: Stream of every slot of a group.
+        motion_dim: D.
+    """
+
+    def __init__(
+        self, config: DmdConfig, streams: Sequence[Stream], pattern: Sequence[str], motion_dim: int
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.pattern = tuple(pattern)
+        self.names = stream_names(pattern)
+        self.motion_dim = motion_dim
+        sizes = {stream.name: stream.num_codes for stream in streams}
+        dim = config.dim
+        self.embeddings = nn.ModuleDict({name: nn.Embedding(sizes[name], dim) for name in self.names})
+        for table in self.embeddings.values():
+            nn.init.normal_(table.weight, std=dim**-0.5)
+        self.slot = nn.Parameter(torch.randn(len(self.pattern), dim) * dim**-0.5)
+        self.encoder = self._stack(config.encoder_layers)
+        self.to_frames = nn.Linear(len(self.pattern) * dim, GROUP_FRAMES * dim)
+        self.enter = nn.Linear(motion_dim, dim)
+        self.time = nn.Sequential(nn.Linear(dim, dim), nn.SiLU(), nn.Linear(dim, dim))
+        self.decoder = self._stack(config.decoder_layers)
+        self.leave = nn.Linear(dim, motion_dim)
+
+    def forward(
+        self,
+        noisy: Tensor,
+        step: Tensor,
+        codes: Mapping[str, Tensor],
+        length: Tensor,
+        absent: Mapping[str, Tensor] | None = None,
+    ) -> Tensor:
+        """`denoise` of noisy [B, T, D] at step [B], given the tokens of clips of `length` [B] frames."""
+        groups = (length + GROUP_FRAMES - 1) // GROUP_FRAMES
+        condition = self.encode_tokens(codes, groups, absent)
+        return self.denoise(noisy, step, condition, length_mask(length, noisy.shape[1]))
+
+    def encode_tokens(
+        self, codes: Mapping[str, Tensor], groups: Tensor, absent: Mapping[str, Tensor] | None = None
+    ) -> Tensor:
+        """What the tokens say about each frame, [B, 4 G, C]; once a motion, not at each step.
+
+        Args:
+            codes: Per stream int64 [B, G * per_group].
+            groups: int64 [B], groups that count; the others are padding.
+            absent: Bool [B] per stream that a clip may lack: its tokens are read as zero.
+        """
+        slots = []
+        for index, name in enumerate(self.pattern):
+            here = codes[name].unflatten(1, (-1, self.pattern.count(name)))
+            vectors = self.embeddings[name](here[:, :, self.pattern[:index].count(name)])
+            if absent is not None and name in absent:
+                vectors = vectors.masked_fill(absent[name][:, None, None], 0.0)
+            slots.append(vectors)
+        x = torch.stack(slots, dim=2) + self.slot
+        x = x + sinusoid(x.shape[1], x.shape[3], x.device)[:, None].to(x.dtype)
+        mask = length_mask(groups, x.shape[1]).repeat_interleave(len(self.pattern), dim=1)
+        states = self.encoder(x.flatten(1, 2), mask).unflatten(1, (-1, len(self.pattern))).flatten(2)
+        out: Tensor = self.to_frames(states).unflatten(2, (GROUP_FRAMES, -1)).flatten(1, 2)
+        return out
+
+    def denoise(self, noisy: Tensor, step: Tensor, condition: Tensor, mask: Tensor) -> Tensor:
+        """The noise in `noisy` (or the clean motion, as the schedule says); zero where masked.
+
+        Args:
+            noisy: [B, T, D].
+            step: int64 [B], time step of each row.
+            condition: [B, T or more, C], of `encode_tokens`.
+            mask: bool [B, T], True = real frame.
+        """
+        if noisy.shape[-1] != self.motion_dim:
+            raise ValueError(f"the DMD was built for {self.motion_dim} features, got {noisy.shape[-1]}")
+        frames = noisy.shape[1]
+        if condition.shape[1] < frames:
+            raise ValueError(f"tokens of {condition.shape[1]} frames were given for {frames} frames")
+        dtype = self.enter.weight.dtype
+        time = self.time(step_waves(step, self.config.dim).to(dtype))
+        x = self.enter(noisy.to(dtype)) + condition[:, :frames] + time[:, None]
+        x = x + sinusoid(frames, x.shape[2], x.device).to(x.dtype)
+        out: Tensor = self.leave(self.decoder(x, mask))
+        out = out.to(torch.promote_types(out.dtype, torch.float32))
+        return out.masked_fill(~mask[..., None], 0.0)
+
+    def _stack(self, layers: int) -> Transformer:
+        config = self.config
+        return Transformer(
+            layers,
+            config.dim,
+            config.heads,
+            config.ff,
+            dropout=config.dropout,
+            attention_dropout=config.attention_dropout,
+        )
+
+
+def dmd_loss(
+    net: Dmd,
+    noiser: Any,
+    motion: Tensor,
+    codes: Mapping[str, Tensor],
+    length: Tensor,
+    step: Tensor,
+    noise: Tensor,
+    *,
+    absent: Mapping[str, Tensor] | None = None,
+    held: Tensor | None = None,
+) -> Tensor:
+    """Squared error of the predicted noise, mean over the real frames of all ranks (equation 10).
+
+    Args:
+        net: The denoiser.
+        noiser: `config.schedule.noiser()`.
+        motion: [B, T, D], normalised.
+        codes: Its tokens, per stream int64 [B, G * per_group], 4 G >= T.
+        length: int64 [B], frames.
+        step: int64 [B], time steps.
+        noise: [B, T, D], standard normal.
+        absent: As in `Dmd.encode_tokens`.
+        held: bool [B, D], columns that count (None = all).
+    """
+    found = net(noiser.add_noise(motion, noise, step), step, codes, length, absent)
+    target = motion if net.config.schedule.predicts == "sample" else noise
+    error = (found - target.to(found.dtype)).square()
+    return masked_mean(error, length_mask(length, motion.shape[1]), held)

@@ -1,0 +1,180 @@
+"""Motions from tokens by a trained `Dmd` and diffusers' samplers; long ones in overlapping windows.
+
+A window of frames carries its own tokens, so a motion of any length is cut into windows of the size that the
+network was trained on. At every denoising step each window's noise is predicted, overlapping predictions are
+averaged with weights that rise and fall linearly across the overlap, and one step is taken on the whole motion
+[ours]. Averaging noise is averaging x0, which is linear in it at a given x_t. Since all windows are denoised
+together from one noise, no seam is left; a motion that fits into one window is denoised as it is.
+
+Every motion draws from its own seed, and motions of one length are denoised together, so a motion does not
+depend on what it is generated with.
+
+Legend: n motions, T frames, D features, K windows, W frames of a window.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.dmd import Dmd
+from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.gpt.tokens import Codes
+from motionloom.models.layers.transformer import length_mask
+from motionloom.models.tokenizer.base import GROUP_FRAMES
+
+
+@torch.no_grad()
+def decode_motions(
+    net: Dmd,
+    codes: Codes,
+    *,
+    seeds: Sequence[int],
+    frames: Sequence[int] | None = None,
+    sampler: Sampler = "ddpm",
+    steps: int = 50,
+    window: int = 160,
+    overlap: int = 32,
+    absent: Mapping[str, Tensor] | None = None,
+) -> list[Tensor]:
+    """Normalised motions [T, D] of n token sequences, one seed each (UDE section 3.4).
+
+    Args:
+        net: The denoiser; runs in evaluation mode and is left as it was.
+        codes: Tokens, n rows.
+        seeds: One per row; repeat a row with other seeds for more motions of one token sequence.
+        frames: Frames of each motion (default: all of its tokens').
+        sampler: One of diffusers'.
+        steps: Denoising steps, at most those of the training.
+        window: Frames denoised at once, a multiple of 4: what the network was trained on.
+        overlap: Frames that neighbouring windows share, a multiple of 4 below `window`.
+        absent: Bool [n] per stream whose tokens say nothing.
+    """
+    count = len(codes.groups)
+    if len(seeds) != count or (frames is not None and len(frames) != count):
+        raise UserError(f"{len(seeds)} seeds and {count} token sequences; each motion needs its own")
+    if window % GROUP_FRAMES or overlap % GROUP_FRAMES or not 0 <= overlap < window:
+        raise UserError(
+            f"window {window} and overlap {overlap} must be multiples of {GROUP_FRAMES}, the overlap smaller"
+        )
+    available = [int(g) * GROUP_FRAMES for g in codes.groups]
+    wanted = available if frames is None else list(frames)
+    for row, (size, most) in enumerate(zip(wanted, available, strict=True)):
+        if not 1 <= size <= most:
+            raise UserError(f"motion {row} was asked for {size} frames; its tokens are {most} frames")
+    rows_of: dict[int, list[int]] = defaultdict(list)
+    for row, size in enumerate(wanted):
+        rows_of[size].append(row)
+    out: dict[int, Tensor] = {}
+    was_training = net.training
+    net.eval()
+    try:
+        for size, rows in rows_of.items():
+            index = torch.tensor(rows, device=codes.groups.device)
+            mine = {name: values[index] for name, values in codes.codes.items()}
+            gone = None if absent is None else {name: values[index] for name, values in absent.items()}
+            windows = _Windows(net, mine, gone, size, window, overlap)
+            made = _denoise(net, windows, size, [seeds[row] for row in rows], sampler, steps)
+            out.update(zip(rows, made, strict=True))
+    finally:
+        net.train(was_training)
+    return [out[row] for row in range(count)]
+
+
+def window_starts(frames: int, window: int, overlap: int) -> list[int]:
+    """First frames of the windows that cover `frames`; the last one ends with the last group."""
+    last = -(-frames // GROUP_FRAMES) * GROUP_FRAMES - window
+    if last <= 0:
+        return [0]
+    return [*range(0, last, window - overlap), last]
+
+
+def blend_weights(starts: Sequence[int], window: int, overlap: int, frames: int) -> Tensor:
+    """Share of each window in each frame, float64 [K, frames], summing to 1 over K.
+
+    A window's weight rises linearly over its first `overlap` frames and falls over its last, but not at the
+    ends of the motion.
+    """
+    place = torch.arange(window, dtype=torch.float64)
+    weights = torch.zeros(len(starts), max(frames, starts[-1] + window), dtype=torch.float64)
+    for row, start in enumerate(starts):
+        weight = torch.ones(window, dtype=torch.float64)
+        if row > 0:
+            weight = torch.minimum(weight, (place + 1) / (overlap + 1))
+        if row < len(starts) - 1:
+            weight = torch.minimum(weight, (window - place) / (overlap + 1))
+        weights[row, start : start + window] = weight
+    weights = weights[:, :frames]
+    return weights / weights.sum(0)
+
+
+class _Windows:
+    """The windows of n motions of one length, their tokens encoded once."""
+
+    def __init__(
+        self,
+        net: Dmd,
+        codes: Mapping[str, Tensor],
+        absent: Mapping[str, Tensor] | None,
+        frames: int,
+        window: int,
+        overlap: int,
+    ) -> None:
+        self.net = net
+        self.frames = frames
+        self.starts = window_starts(frames, window, overlap)
+        self.size = min(window, -(-frames // GROUP_FRAMES) * GROUP_FRAMES)
+        count, number = len(next(iter(codes.values()))), len(self.starts)
+        cut = {}
+        for name, values in codes.items():
+            per = net.pattern.count(name)
+            pieces = [
+                values[:, start // GROUP_FRAMES * per : (start + self.size) // GROUP_FRAMES * per]
+                for start in self.starts
+            ]
+            cut[name] = torch.stack(pieces, dim=1).flatten(0, 1)
+        device = next(iter(codes.values())).device
+        self.length = torch.tensor([min(self.size, frames - s) for s in self.starts], device=device).repeat(
+            count
+        )
+        gone = None if absent is None else {k: v.repeat_interleave(number) for k, v in absent.items()}
+        groups = (self.length + GROUP_FRAMES - 1) // GROUP_FRAMES
+        self.condition = net.encode_tokens(cut, groups, gone)
+        self.weights = blend_weights(self.starts, self.size, overlap, frames).float().to(device)
+
+    def denoise(self, x: Tensor, step: Tensor) -> Tensor:
+        """The network's prediction for motions x [n, T, D] at one time step."""
+        count, number = len(x), len(self.starts)
+        padded = torch.nn.functional.pad(x, (0, 0, 0, max(0, self.starts[-1] + self.size - self.frames)))
+        cut = torch.stack([padded[:, s : s + self.size] for s in self.starts], dim=1).flatten(0, 1)
+        mask = length_mask(self.length, self.size)
+        found = self.net.denoise(cut, step.to(x.device).expand(len(cut)), self.condition, mask)
+        if number == 1:
+            return found[:, : self.frames]
+        found = found.unflatten(0, (count, number))
+        out = torch.zeros_like(padded, dtype=found.dtype)
+        for k, start in enumerate(self.starts):
+            stop = min(start + self.size, self.frames)
+            out[:, start:stop] += self.weights[k, start:stop, None] * found[:, k, : stop - start]
+        return out[:, : self.frames]
+
+
+def _denoise(
+    net: Dmd, windows: _Windows, frames: int, seeds: Sequence[int], sampler: Sampler, steps: int
+) -> Tensor:
+    """Motions [n, T, D] from noise."""
+    noise = [torch.Generator().manual_seed(seed) for seed in seeds]
+    x = torch.stack([torch.randn(frames, net.motion_dim, generator=g) for g in noise])
+    x = x.to(windows.condition.device)
+    scheduler = net.config.schedule.sampler(sampler, steps)
+    x = x * scheduler.init_noise_sigma
+    extra = {} if sampler == "dpm++" else {"generator": noise}
+    for step in scheduler.timesteps:
+        found = windows.denoise(scheduler.scale_model_input(x, step), step)
+        stepped: Tensor = scheduler.step(found.to(x.dtype), step, x, **extra).prev_sample
+        x = stepped
+    return x

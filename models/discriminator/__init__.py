@@ -1,0 +1,1 @@
+"""The discriminator that UDE trains against, and its losses."""

@@ -1,0 +1,90 @@
+"""`PatchDiscriminator`: how real a motion is, patch by patch, given its condition (UDE section 3.3).
+
+Temporal convolutions bring a motion to a quarter of its frames; a linear layer brings the global embedding to
+the same width and is added to every patch; two transformer layers and one linear layer give a validity score
+a patch, after PatchGAN.
+
+Frames behind a clip's length are zeroed before anything reads them, so padding says nothing about which
+motions were generated, and a clip in a padded batch gives what it gives alone.
+
+Legend: B batch, T frames, D motion features, E condition width, P = ceil(T / 4) patches, C width.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils.parametrizations import spectral_norm
+
+from motionloom.datasets.schema import Config
+from motionloom.models.layers.strided import StridedEncoder
+from motionloom.models.layers.transformer import Transformer, length_mask, sinusoid
+
+PATCH = 4
+"""Frames of a patch."""
+
+
+class DiscriminatorConfig(Config):
+    """Sizes; two transformer layers and patches of 4 frames are the paper's, the rest the public code's."""
+
+    dim: int = Field(default=1024, ge=2, multiple_of=2)
+    """Width of convolutions and transformer."""
+    depth: int = Field(default=1, ge=0)
+    """Residual blocks behind each strided convolution."""
+    layers: int = Field(default=2, ge=1)
+    heads: int = Field(default=8, ge=1)
+    ff: int = Field(default=1024, ge=1)
+    dropout: float = Field(default=0.1, ge=0, lt=1)
+    spectral_norm: bool = False
+    """Divide every linear and convolution weight by its largest singular value [ours]."""
+
+    @model_validator(mode="after")
+    def _heads_divide(self) -> Self:
+        if self.dim % self.heads:
+            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
+        return self
+
+
+class Validity(NamedTuple):
+    """What the discriminator says."""
+
+    score: Tensor
+    """float32 [B, P], higher is more real; zero where `mask` is false."""
+    mask: Tensor
+    """bool [B, P]: patches with a real frame."""
+
+
+class PatchDiscriminator(nn.Module):
+    """Scores of motions [B, T, D] given global embeddings [B, E]."""
+
+    def __init__(self, config: DiscriminatorConfig, motion_dim: int, glob_dim: int) -> None:
+        super().__init__()
+        self.config = config
+        self.motion_dim = motion_dim
+        self.patches = StridedEncoder(motion_dim, config.dim, width=config.dim, depth=config.depth)
+        self.condition = nn.Linear(glob_dim, config.dim)
+        self.stack = Transformer(config.layers, config.dim, config.heads, config.ff, dropout=config.dropout)
+        self.score = nn.Linear(config.dim, 1)
+        if config.spectral_norm:
+            for layer in [m for m in self.modules() if isinstance(m, nn.Linear | nn.Conv1d)]:
+                spectral_norm(layer)
+
+    def forward(self, motion: Tensor, glob: Tensor, length: Tensor) -> Validity:
+        """Scores of motion [B, T, D] of `length` [B] frames, conditioned on glob [B, E]."""
+        if motion.shape[-1] != self.motion_dim:
+            raise ValueError(f"built for {self.motion_dim} motion features, got {motion.shape[-1]}")
+        frames = motion.shape[1]
+        motion = motion.masked_fill(~length_mask(length, frames)[..., None], 0.0)
+        motion = functional.pad(motion, (0, 0, 0, -frames % PATCH))
+        groups = (length + PATCH - 1) // PATCH
+        x = self.patches(motion.to(self.score.weight.dtype), groups * PATCH)
+        x = x + self.condition(glob.to(x.dtype))[:, None]
+        x = x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype)
+        mask = length_mask(groups, x.shape[1])
+        score = self.score(self.stack(x, mask))[..., 0]
+        score = score.to(torch.promote_types(score.dtype, torch.float32))
+        return Validity(score.masked_fill(~mask, 0.0), mask)

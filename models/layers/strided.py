@@ -1,0 +1,85 @@
+"""Plain strided 1-D convolutions between frames and a quarter of their rate (UDE sections 3.1 and 3.3).
+
+UDE names "three-layer temporal 1D convolution networks": down are two stride-2 layers and one that keeps the
+rate, up is the mirror. Behind each stride-2 layer stand `depth` residual blocks (one in public UDE code, none
+is the bare text). Borders, padding and the residual blocks are those of `layers/conv.py`: a clip in a padded
+batch gives what it gives alone. Activations are leaky ReLU with slope 0.2, as public.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from motionloom.models.layers.conv import ResidualStack, frame_padding
+
+SLOPE = 0.2
+"""Of the leaky ReLU below zero."""
+
+
+def _active(x: Tensor) -> Tensor:
+    return functional.leaky_relu(x, SLOPE)
+
+
+def _zero(x: Tensor, padding: Tensor | None) -> Tensor:
+    return x if padding is None else x.masked_fill(padding, 0.0)
+
+
+def _start(net: nn.Module) -> None:
+    """He's weights for the leaky ReLU; residual branches start small, as in `layers/conv.py`."""
+    for name, layer in net.named_modules():
+        if isinstance(layer, nn.Conv1d):
+            nn.init.kaiming_normal_(layer.weight, a=SLOPE, nonlinearity="leaky_relu")
+            assert layer.bias is not None
+            nn.init.zeros_(layer.bias)
+            if name.endswith(".mix"):
+                with torch.no_grad():
+                    layer.weight.mul_(0.1)
+
+
+class StridedEncoder(nn.Module):
+    """Frames to latents, [B, T, dim] -> [B, T / 4, out_dim]."""
+
+    def __init__(self, dim: int, out_dim: int, *, width: int, depth: int, dilation_growth: int = 1) -> None:
+        super().__init__()
+        widths = [dim, width, width]
+        self.down = nn.ModuleList(nn.Conv1d(a, b, 4, stride=2, padding=1) for a, b in pairwise(widths))
+        self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(2))
+        self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
+        _start(self)
+
+    def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
+        """`valid` [B] = frames that are not padding; T and `valid` are multiples of 4."""
+        padding = [frame_padding(valid, x.shape[1], 2**i) for i in range(3)]
+        hidden = x.transpose(1, 2)
+        for i, (down, stack) in enumerate(zip(self.down, self.stacks, strict=True)):
+            hidden = stack(_active(down(_zero(hidden, padding[i]))), padding[i + 1])
+        latents: Tensor = self.leave(_zero(hidden, padding[2]))
+        return latents.transpose(1, 2)
+
+
+class StridedDecoder(nn.Module):
+    """Latents to frames, [B, L, dim] -> [B, 4 L, out_dim]; up-sampling repeats the nearest."""
+
+    def __init__(self, dim: int, out_dim: int, *, width: int, depth: int, dilation_growth: int = 1) -> None:
+        super().__init__()
+        widths = [dim, width, width]
+        self.up = nn.ModuleList(nn.Conv1d(a, b, 3, padding=1) for a, b in pairwise(widths))
+        self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(2))
+        self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
+        _start(self)
+        with torch.no_grad():
+            self.leave.weight.mul_(0.1)  # near the mean pose, which is zero
+
+    def forward(self, z: Tensor, valid: Tensor | None = None) -> Tensor:
+        """`valid` [B] = *frames* that are not padding, a multiple of 4; padded frames come out as zero."""
+        padding = [frame_padding(valid, z.shape[1] * 4, 2**i) for i in range(3)]
+        hidden = z.transpose(1, 2)
+        for i, (up, stack) in enumerate(zip(self.up, self.stacks, strict=True)):
+            level = 1 - i
+            wide = _zero(hidden, padding[level + 1]).repeat_interleave(2, dim=2)
+            hidden = stack(_active(up(wide)), padding[level])
+        return _zero(self.leave(_zero(hidden, padding[0])), padding[0]).transpose(1, 2)

@@ -1,0 +1,156 @@
+"""`GradientQuantizer`: a codebook learnt by gradient, as UDE's (UDE section 3.1, equation 2).
+
+Penalty: beta_1 |sg z - e|^2 + beta_2 |z - sg e|^2. The first term moves the codes to the latents, the second
+the latents to the codes; both means are squared errors over elements, as in the public UDE code, which this
+equals on codes, loss and perplexity.
+
+Choices of ours:
+- Codes start uniform in +-1/K, as public; `start: data` takes random rows of the first training batch
+  instead, the same on every rank, as `EmaQuantizer` does [ours]. From the tiny uniform start nearly all
+  latents share few codes for long, so short trainings use `data`.
+- An EMA of uses per step is kept for the `dead` figure alone; no code is ever reset, so `resets` stays 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from motionloom.datasets.schema import Config
+from motionloom.models.quantize.base import QuantizerOutput, usage_metrics
+from motionloom.models.quantize.draws import draw_rows
+from motionloom.models.quantize.ema import nearest
+from motionloom.models.training.distributed import sum_over_ranks, world_size
+
+Start = Literal["uniform", "data"]
+
+
+class GradientQuantizerConfig(Config):
+    """One codebook; the defaults are UDE's (section 4.2)."""
+
+    num_codes: int = Field(default=2048, ge=2)
+    dim: int = Field(default=1024, ge=1)
+    codebook_weight: float = Field(default=1.0, gt=0)
+    """beta_1: how strongly codes are pulled to their latents."""
+    commitment_weight: float = Field(default=1.0, ge=0)
+    """beta_2: how strongly latents are pulled to their codes."""
+    start: Start = "uniform"
+    """Where codes start: within +-1/K (public UDE), or on rows of the first batch [ours]."""
+    decay: float = Field(default=0.99, gt=0, lt=1)
+    """EMA constant of the count of uses."""
+    dead_below: float = Field(default=1.0, gt=0)
+    """A code whose EMA count is not above this counts as dead."""
+
+
+class GradientQuantizer(nn.Module):
+    """Nearest code, straight-through; see the module docstring.
+
+    The codebook is a parameter. It gets its gradient from the penalty alone: the output passes its gradient
+    on to z. A vector that is not finite counts as padding, as in `EmaQuantizer`.
+
+    Args:
+        config: Sizes and weights.
+        salt: Number of this quantizer among those of one network, for the draws of `start: data`.
+    """
+
+    ema_count: Tensor
+    initialised: Tensor
+    draws: Tensor
+
+    def __init__(self, config: GradientQuantizerConfig, *, salt: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        self.salt = salt
+        self.frozen = False
+        bound = 1 / config.num_codes
+        self.codebook = nn.Parameter(torch.empty(config.num_codes, config.dim).uniform_(-bound, bound))
+        self.register_buffer("ema_count", torch.full((config.num_codes,), config.dead_below))
+        self.register_buffer("initialised", torch.tensor(config.start == "uniform"))
+        self.register_buffer("draws", torch.tensor(0))
+        # Mirror of `initialised`: reading the buffer at every step would wait for the device.
+        self._is_initialised = config.start == "uniform"
+
+    def freeze(self) -> None:
+        """Never update again, in training mode neither."""
+        self.frozen = True
+        self.codebook.requires_grad_(False)
+
+    def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
+        """Quantize z [B, L, d].
+
+        Args:
+            z: Latents of any float type; the output has the same.
+            mask: [B, L], False = padding: not counted, and outside the penalty.
+            update: False keeps the counts as they are. They also stay in eval mode and when frozen.
+
+        Returns:
+            `penalty` is the weighted sum of both terms.
+        """
+        update = update and self.training and not self.frozen
+        with torch.autocast(z.device.type, enabled=False):
+            full = z.to(torch.promote_types(z.dtype, torch.float32))
+            rows = full.detach().reshape(-1, full.shape[-1])
+            real = rows.isfinite().all(1)
+            if mask is not None:
+                real = real & mask.reshape(-1)
+            rows = rows.masked_fill(~real[:, None], 0.0)
+            if update and not self._is_initialised:
+                self._initialise(rows, real)
+            codebook = self.codebook.to(full.dtype)
+            codes = nearest(rows, codebook.detach())
+            chosen = functional.embedding(codes, codebook).view_as(full)
+            counts = real.new_zeros(self.config.num_codes, dtype=torch.float32).index_add_(
+                0, codes, real.float()
+            )
+            if update:
+                counts = sum_over_ranks(counts)
+                self._count(counts)
+            # Global counts over ranks: the mean over ranks is then the penalty of the whole batch.
+            number = counts.sum() * full.shape[-1] / (world_size() if update else 1)
+            # Both sides are masked before they meet: a padded NaN would otherwise be in the gradient.
+            outside = ~real.view(z.shape[:-1])[..., None]
+            latents, near = full.masked_fill(outside, 0.0), chosen.masked_fill(outside, 0.0)
+
+            def mean_square(error: Tensor) -> Tensor:
+                return error.square().sum() / number.clamp(min=1)
+
+            to_latents = mean_square(near - latents.detach())
+            to_codes = mean_square(latents - near.detach())
+            penalty = self.config.codebook_weight * to_latents + self.config.commitment_weight * to_codes
+            metrics = {
+                "penalty": penalty.detach().float(),
+                **usage_metrics(counts, eps=1e-10),
+                "dead": (self.ema_count <= self.config.dead_below).sum().float(),
+                "resets": counts.new_zeros(()),
+            }
+            straight = full + (chosen - full).detach()
+        return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
+
+    def vectors(self, codes: Tensor) -> Tensor:
+        """Code vectors, int64 [...] -> [..., d], float32 or the wider type of the codebook."""
+        chosen = functional.embedding(codes, self.codebook)
+        return chosen.to(torch.promote_types(chosen.dtype, torch.float32))
+
+    @torch.no_grad()
+    def _count(self, counts: Tensor) -> None:
+        # A batch without vectors says nothing about which codes are used.
+        rate = torch.where(counts.sum() > 0, 1 - self.config.decay, 0.0).to(self.ema_count.dtype)
+        self.ema_count.lerp_(counts.to(self.ema_count.dtype), rate)
+
+    @torch.no_grad()
+    def _initialise(self, rows: Tensor, mask: Tensor) -> None:
+        drawn = draw_rows(rows, mask, self.config.num_codes, salt=self.salt, step=self.draws)
+        self.draws.add_(1)
+        drawn = sum_over_ranks(drawn)
+        some = sum_over_ranks(mask.any().float()) > 0
+        self.codebook.copy_(torch.where(some, drawn.to(self.codebook.dtype), self.codebook))
+        self.initialised.fill_(True)
+        self._is_initialised = True
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._is_initialised = bool(self.initialised)

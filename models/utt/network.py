@@ -1,0 +1,180 @@
+"""`Utt`: UDE's unified token transformer (section 3.3).
+
+The input is [glob + MLP(z), seq, start, token 0, token 1, ...]: what MATE made of the conditions, then motion
+tokens shifted by one; the output at token i - 1 (at `start` for the first) is the distribution of token i.
+
+Notable choices:
+- Any streams and pattern of `tokens.py`, with its grammar and End tokens; UDE's own is one stream. A learned
+  `start` vector stands where the public code has its SOS token.
+- MATE's embeddings become the network's width by one linear layer for glob and seq alike [ours]: the paper's
+  numbers, 256 for MATE and 512 here, leave a step open.
+- Motion positions are learned and counted from the first token, so padding of the prefix plays no part; the
+  prefix has MATE's positions.
+- Without conditions (MATE's unconditional embedding) the same network is the unconditional model that
+  guidance needs; `condition_dropout` is the share of rows that training makes so.
+
+Legend: B batch, L tokens, S prefix, D width, E MATE's width, V largest vocabulary (K + 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.models.condition.mate import Encoded
+from motionloom.models.gpt.token_network import TokenNetwork
+from motionloom.models.gpt.tokens import closing_length
+from motionloom.models.tokenizer.base import Stream
+from motionloom.models.utt.backbone import PrefixGru, PrefixTransformer, State
+
+
+class UttConfig(Config):
+    """Sizes; the defaults are the paper's (section 4.2), at the public demo's width of 512."""
+
+    kind: Literal["gpt", "gru"] = "gpt"
+    """Transformer, or the GRU of Table 3."""
+    layers: int = Field(default=8, ge=1)
+    dim: int = Field(default=512, ge=2)
+    heads: int = Field(default=8, ge=1)
+    """Of the transformer."""
+    ff: int = Field(default=1024, ge=1)
+    """Of the transformer."""
+    dropout: float = Field(default=0.1, ge=0, lt=1)
+    attention_dropout: float = Field(default=0.1, ge=0, lt=1)
+    block_size: int = Field(default=160, ge=2)
+    """Motion tokens that the network sees at once, End tokens included; longer motions slide."""
+    z_dim: int = Field(default=256, ge=0)
+    """Width of the noise z; 0 = a network without it."""
+    condition_dropout: float = Field(default=0.1, ge=0, lt=1)
+    """Share of samples trained without conditions, for guidance [ours]; 0 turns guidance off."""
+    pkeep: float = Field(default=1.0, gt=0, le=1)
+    """Probability that an input token is kept; the others become random codes of their stream [ours]."""
+
+    @model_validator(mode="after")
+    def _heads_divide(self) -> Self:
+        if self.kind == "gpt" and self.dim % self.heads:
+            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
+        return self
+
+
+class Utt(TokenNetwork):
+    """Autoregressive model of motion tokens given MATE's embeddings and noise.
+
+    Args:
+        config: Sizes.
+        streams: The tokenizer's streams.
+        pattern: Stream of every slot of a group.
+        glob_dim: E, width of MATE's embeddings.
+    """
+
+    def __init__(
+        self, config: UttConfig, streams: Sequence[Stream], pattern: Sequence[str], glob_dim: int
+    ) -> None:
+        super().__init__(streams, pattern)
+        self.config = config
+        self.glob_dim = glob_dim
+        needed = len(self.pattern) + closing_length(pattern)
+        if config.block_size < needed:
+            raise UserError(
+                f"block_size {config.block_size} holds no motion: a group of {len(self.pattern)} tokens and "
+                f"its End tokens take {needed}"
+            )
+        self.condition_in = nn.Linear(glob_dim, config.dim)
+        self.z_in: nn.Module | None = None
+        if config.z_dim:
+            self.z_in = nn.Sequential(
+                nn.Linear(config.z_dim, glob_dim), nn.GELU(), nn.Linear(glob_dim, glob_dim)
+            )
+        self.start = nn.Parameter(torch.randn(config.dim) * 0.02)
+        self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
+        self.embeddings = self._tables(config.dim)
+        self.dropout = nn.Dropout(config.dropout)
+        self.backbone: PrefixTransformer | PrefixGru
+        if config.kind == "gpt":
+            self.backbone = PrefixTransformer(
+                config.layers,
+                config.dim,
+                config.heads,
+                config.ff,
+                dropout=config.dropout,
+                attention_dropout=config.attention_dropout,
+            )
+        else:
+            self.backbone = PrefixGru(config.layers, config.dim, dropout=config.dropout)
+        self.heads = self._outputs(config.dim)
+        self._start_tables()
+
+    @property
+    def max_groups(self) -> int:
+        """Longest closed sequence that one block holds, in groups."""
+        return (self.config.block_size - closing_length(self.pattern)) // len(self.pattern)
+
+    def forward(
+        self,
+        tokens: Tensor,
+        kinds: Tensor,
+        condition: Encoded,
+        z: Tensor | None = None,
+        *,
+        inputs: Tensor | None = None,
+        known: Tensor | None = None,
+    ) -> Tensor:
+        """Logits of every token given the conditions, the noise and the tokens before it.
+
+        Args:
+            tokens: int64 [B, L], padded with -1.
+            kinds: int64 [B, L], stream of each token.
+            condition: MATE's embeddings of B rows.
+            z: Noise [B, z_dim]; None injects none.
+            inputs: What the network reads instead of `tokens` (corrupted tokens); legality follows `tokens`.
+            known: Bool [B, L], false at codes of a stream that the clip lacks: read as zero. None = all.
+
+        Returns:
+            float32 [B, L, V]; -inf where a token is illegal. At padded positions the values mean nothing.
+        """
+        size = tokens.shape[1]
+        if size > self.config.block_size:
+            raise UserError(
+                f"a sequence of {size} tokens is longer than the UTT's block_size {self.config.block_size}; "
+                "raise block_size or shorten max_frames"
+            )
+        seen = tokens if inputs is None else inputs
+        embedded = self.embed(seen[:, :-1], kinds[:, :-1])
+        if known is not None:
+            embedded = embedded.masked_fill(~known[:, :-1, None], 0.0)
+        prefix, mask = self.prefix(condition, z)
+        hidden = self.backbone(prefix, mask, self.motion_inputs(embedded, 0))
+        return self.logits(hidden, kinds, self.legal(tokens, kinds))
+
+    def prefix(self, condition: Encoded, z: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """[glob + MLP(z), seq] as inputs [B, 1 + S, D], and which of them are real, bool [B, 1 + S]."""
+        if condition.glob.shape[-1] != self.glob_dim:
+            raise ValueError(f"the UTT was built for width {self.glob_dim}, got {condition.glob.shape[-1]}")
+        dtype = self.condition_in.weight.dtype
+        glob = condition.glob.to(dtype)
+        if z is not None:
+            if self.z_in is None:
+                raise UserError("this UTT has no z: it was built with z_dim 0")
+            glob = glob + self.z_in(z.to(dtype))
+        x = self.condition_in(torch.cat([glob[:, None], condition.seq.to(dtype)], dim=1))
+        mask = torch.cat([condition.mask.new_ones(len(x), 1), condition.mask], dim=1)
+        return self.dropout(x), mask
+
+    def motion_inputs(self, embedded: Tensor, at: int) -> Tensor:
+        """Embedded tokens [B, L, D] with their positions from `at` on; at 0 the start vector comes first."""
+        if at == 0:
+            first = self.start.to(embedded.dtype).expand(len(embedded), 1, -1)
+            embedded = torch.cat([first, embedded], dim=1)
+        x = embedded + self.positions[at : at + embedded.shape[1]].to(embedded.dtype)
+        out: Tensor = self.dropout(x)
+        return out
+
+    def begin(self, condition: Encoded, z: Tensor | None = None) -> State:
+        """Read the conditions for step-by-step decoding of up to `block_size` inputs."""
+        prefix, mask = self.prefix(condition, z)
+        return self.backbone.begin(prefix, mask, self.config.block_size)

@@ -1,0 +1,230 @@
+"""Sampling motion tokens from a `Utt`: cached, guided, of any length, and continuing other tokens.
+
+Notable choices:
+- Noise and draws come from counter-based streams keyed by each sample's own seed, as in `gpt/sampling.py`: a
+  sample depends on its conditions, its seed and the settings, and on nothing else in the batch.
+- `start` gives tokens that stand before the first new one, e.g. those of a segment with other conditions, so
+  that a motion goes on across a change from text to music (UDE section 4.4) [ours].
+- When the block is full, the older half of the groups in it is dropped and the rest is read again from the
+  first position on [ours]. Where that happens depends on the number of tokens alone.
+
+Legend: B batch, G groups, P slots of a group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.condition.mate import Encoded
+from motionloom.models.gpt.sampling import draw, sample_seeds
+from motionloom.models.gpt.tokens import Codes
+from motionloom.models.utt.backbone import State
+from motionloom.models.utt.continuing import last_groups, window_start
+from motionloom.models.utt.network import Utt
+
+
+class _How(NamedTuple):
+    """How one token is taken from a distribution; see `generate`."""
+
+    temperature: float
+    top_k: int | None
+    top_p: float
+    cfg_scale: float
+
+
+def draw_z(seeds: Sequence[int], dim: int) -> Tensor:
+    """z ~ N(0, I), float32 [B, dim], each row from its own seed; not the numbers its tokens are drawn by."""
+    rows = [
+        np.random.Generator(np.random.Philox(key=seed + (1 << 64))).standard_normal(dim) for seed in seeds
+    ]
+    return torch.from_numpy(np.stack(rows)).float() if rows else torch.zeros(0, dim)
+
+
+@torch.no_grad()
+def generate(
+    utt: Utt,
+    condition: Encoded,
+    *,
+    null: Encoded | None = None,
+    inject_z: bool = True,
+    start: Codes | None = None,
+    context: int | None = None,
+    max_groups: int | None = None,
+    groups: Tensor | None = None,
+    temperature: float = 1.0,
+    top_k: int | None = None,
+    top_p: float = 1.0,
+    cfg_scale: float = 1.0,
+    seed: int | Sequence[int] = 0,
+) -> Codes:
+    """Sample code streams for embedded conditions (UDE section 3.3).
+
+    Args:
+        utt: The model; runs in evaluation mode and is left as it was.
+        condition: MATE's embeddings of B rows.
+        null: MATE's unconditional embeddings of B rows; guidance needs them.
+        inject_z: Draw z by each sample's seed; False generates without noise (Tables 3 and 5).
+        start: Tokens before the first new one, B rows.
+        context: Groups of `start` that count, the last ones (default: all).
+        max_groups: Most new groups (default: what one block holds). Longer ones slide.
+        groups: int64 [B], requested numbers of new groups: End is forbidden before and forced there. None:
+            the model decides.
+        temperature: 0 is greedy.
+        top_k: Keep the k most likely tokens.
+        top_p: Keep the smallest set of tokens with this mass.
+        cfg_scale: Guidance; 1 is off. Needs a model trained with condition dropout.
+        seed: One seed, from which `sample_seeds` makes one per row, or one per sample.
+
+    Returns:
+        The new codes per stream int64 [B, G * per_group], 0 behind each sample's `groups`.
+    """
+    batch, device = len(condition.glob), condition.glob.device
+    how = _How(temperature, top_k, top_p, cfg_scale)
+    _check(utt, how, null, max_groups, context)
+    limit = _limits(utt, batch, max_groups, groups, device)
+    seeds = sample_seeds(seed, batch) if isinstance(seed, int) else list(seed)
+    if len(seeds) != batch:
+        raise UserError(f"{len(seeds)} seeds were given for {batch} conditions")
+    if start is None:
+        none = torch.zeros(batch, 0, dtype=torch.int64, device=device)
+        start = Codes(dict.fromkeys(utt.names, none), torch.zeros_like(limit))
+    if len(start.groups) != batch:
+        raise UserError(f"{len(start.groups)} starts were given for {batch} conditions")
+    given, before = last_groups(start, utt.pattern, context)
+    size = len(utt.pattern)
+    most = int(limit.max()) * size if batch else 0
+    numbers = [np.random.Generator(np.random.Philox(key=s)).random(most) for s in seeds]
+    uniform = torch.from_numpy(np.stack(numbers)).to(device) if numbers else torch.zeros(0, 0)
+    z = draw_z(seeds, utt.config.z_dim).to(device) if inject_z and utt.config.z_dim else None
+    if how.cfg_scale != 1 and null is not None:
+        condition = _stacked(condition, null)
+        z = None if z is None else torch.cat([z, z])
+    was_training = utt.training
+    utt.eval()
+    try:
+        tokens, counts = _decode(utt, condition, z, given, before, limit, uniform, groups is None, how)
+    finally:
+        utt.train(was_training)
+    longest = int(counts.max()) if batch else 0
+    at = before[:, None] * size + torch.arange(longest * size, device=device)
+    rows = tokens.gather(1, at.clamp(max=max(0, tokens.shape[1] - 1))).view(batch, longest, size)
+    rows = torch.where(torch.arange(longest, device=device)[None, :, None] < counts[:, None, None], rows, 0)
+    codes = {name: rows[:, :, utt.slots == kind].flatten(1) for kind, name in enumerate(utt.names)}
+    return Codes(codes, counts)
+
+
+def _decode(
+    utt: Utt,
+    condition: Encoded,
+    z: Tensor | None,
+    given: Tensor,
+    before: Tensor,
+    limit: Tensor,
+    uniform: Tensor,
+    free: bool,
+    how: _How,
+) -> tuple[Tensor, Tensor]:
+    """All tokens int64 [B, N * P], `given` ones included, and the numbers of new groups int64 [B].
+
+    given [B, N * P] holds the tokens of `before` [B] groups a row; the others are drawn.
+    """
+    batch, size, device = len(limit), len(utt.pattern), limit.device
+    guided = len(condition.glob) > batch
+    total = int((before + limit).max()) * size if batch else 0
+    tokens = pad(given, (0, max(0, total - given.shape[1])))
+    counts = torch.zeros_like(limit)
+    ended = torch.zeros(batch, dtype=torch.bool, device=device)
+    no = torch.zeros_like(ended)
+    state: State | None = None
+    seen = opened = 0
+    for step in range(int(before.min()) * size if batch else 0, total):
+        group, slot = divmod(step, size)
+        new = group >= before
+        alive = new & (group < before + limit) & ~ended
+        if slot == 0 and not bool((alive | ~new).any()):
+            break
+        first = window_start(step, utt.config.block_size, size)
+        fresh = state is None or first != opened
+        if state is None or fresh:
+            state, seen, opened = utt.begin(condition, z), first, first
+        kinds = utt.slots[torch.arange(seen, step, device=device) % size].expand(batch, -1)
+        x = utt.embed(tokens[:, seen:step], kinds)
+        at = 0 if fresh else seen - first + 1
+        x = utt.motion_inputs(x.repeat(2, 1, 1) if guided else x, at)
+        hidden = utt.backbone.extend(x, state)[:, -1:]
+        seen = step
+        # A segment is never empty, so its first group cannot be End.
+        may_end = alive & (group > before) if free and slot == 0 else no
+        legal = utt.legal_at(utt.ends[utt.slots[slot]].expand(batch), may_end, no)
+        rows = legal.repeat(2, 1) if guided else legal
+        logits = utt.logits(hidden, utt.slots[slot].expand(len(rows), 1), rows[:, None])[:, 0]
+        if guided:
+            on, off = logits.chunk(2)
+            logits = torch.where(legal, off + how.cfg_scale * (on - off), -torch.inf)
+        index = (step - before * size).clamp(0, uniform.shape[1] - 1)
+        token = draw(
+            logits,
+            uniform.gather(1, index[:, None])[:, 0],
+            temperature=how.temperature,
+            top_k=how.top_k,
+            top_p=how.top_p,
+        )
+        if slot == 0:
+            stops = alive & (token == utt.ends[utt.slots[0]])
+            ended, alive = ended | stops, alive & ~stops
+            counts = counts + alive
+        tokens[:, step] = torch.where(new, torch.where(alive, token, 0), tokens[:, step])
+    return tokens, counts
+
+
+def _stacked(condition: Encoded, null: Encoded) -> Encoded:
+    """Conditional rows, then the unconditional ones, padded to the longer sequence."""
+    size = max(condition.seq.shape[1], null.seq.shape[1])
+    rows = [
+        Encoded(
+            c.glob, pad(c.seq, (0, 0, 0, size - c.seq.shape[1])), pad(c.mask, (0, size - c.mask.shape[1]))
+        )
+        for c in (condition, null)
+    ]
+    return Encoded(*(torch.cat(part) for part in zip(*rows, strict=True)))
+
+
+def _limits(
+    utt: Utt, batch: int, max_groups: int | None, groups: Tensor | None, device: torch.device
+) -> Tensor:
+    """Most new groups of each row, int64 [B]."""
+    if groups is None:
+        return torch.full((batch,), max_groups or utt.max_groups, dtype=torch.int64, device=device)
+    limit = groups.to(device=device, dtype=torch.int64)
+    if limit.shape != (batch,):
+        raise UserError(f"{tuple(limit.shape)} requested lengths were given for {batch} conditions")
+    if batch and int(limit.min()) < 1:
+        raise UserError(f"requested lengths must be 1 group or more; got {int(limit.min())}")
+    if batch and max_groups is not None and int(limit.max()) > max_groups:
+        raise UserError(f"a length of {int(limit.max())} groups was requested, max_groups is {max_groups}")
+    return limit
+
+
+def _check(utt: Utt, how: _How, null: Encoded | None, max_groups: int | None, context: int | None) -> None:
+    if how.temperature < 0:
+        raise UserError(f"temperature {how.temperature} must not be negative; 0 is greedy")
+    if how.top_k is not None and how.top_k < 1:
+        raise UserError(f"top_k {how.top_k} must be at least 1; leave it out to keep every token")
+    if not 0 < how.top_p <= 1:
+        raise UserError(f"top_p {how.top_p} must be above 0 and at most 1")
+    if max_groups is not None and max_groups < 1:
+        raise UserError(f"max_groups {max_groups} must be at least 1")
+    if context is not None and context < 0:
+        raise UserError(f"context {context} must not be negative; 0 starts afresh")
+    if how.cfg_scale != 1 and (utt.config.condition_dropout == 0 or null is None):
+        raise UserError(
+            "guidance needs a UTT trained with condition_dropout > 0 and its unconditional embedding; set "
+            "cfg_scale to 1"
+        )

@@ -1,0 +1,240 @@
+"""The DMD: golden steps, padding, windows without seams, seeds, streams, sizes, learning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.dmd import Dmd, DmdConfig, dmd_loss
+from motionloom.models.diffusion.dmd_sampling import blend_weights, decode_motions, window_starts
+from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.gpt.tokens import Codes
+from motionloom.models.tokenizer.base import Stream
+
+SMALL = DmdConfig(
+    dim=16, ff=32, encoder_layers=1, decoder_layers=2, heads=4, dropout=0.0, attention_dropout=0.0
+)
+STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
+PATTERN = ("body", "body", "hand")
+
+
+@pytest.fixture
+def net() -> Dmd:
+    torch.manual_seed(0)
+    return Dmd(SMALL, STREAMS, PATTERN, 6).eval()
+
+
+def random_codes(groups: list[int]) -> Codes:
+    generator, most = torch.Generator().manual_seed(0), max(groups)
+    return Codes(
+        {
+            s.name: torch.randint(s.num_codes, (len(groups), most * s.per_group), generator=generator)
+            for s in STREAMS
+        },
+        torch.tensor(groups),
+    )
+
+
+def test_golden_ude_steps(shared: Path) -> None:
+    """Tables, q_sample, x0 from the noise and the mean of a reverse step, as the public UDE code has them."""
+    with np.load(shared / "golden" / "t9_diffusion_A.npz", allow_pickle=False) as file:
+        golden = {k: torch.from_numpy(np.atleast_1d(file[k])) for k in file.files if not k.startswith("mdm")}
+    schedule = DmdConfig().schedule
+    assert (schedule.steps, schedule.betas, schedule.predicts) == (1000, "linear", "epsilon")
+    noiser = schedule.noiser()
+    # diffusers keeps float32 tables, and the product of a thousand factors rounds in each
+    torch.testing.assert_close(noiser.betas, golden["ude_linear__betas"].float(), rtol=2e-5, atol=1e-7)
+    torch.testing.assert_close(
+        noiser.alphas_cumprod, golden["ude_linear__alphas_cumprod"].float(), rtol=5e-4, atol=1e-7
+    )
+    x0, noise, t = golden["x0"], golden["eps"], golden["t"]
+    torch.testing.assert_close(
+        noiser.add_noise(x0, noise, t), golden["ude_linear__x_t"], rtol=1e-4, atol=2e-5
+    )
+    noiser.set_timesteps(1000)
+    for row, step in enumerate(t.tolist()):
+        x_t, out = golden["ude_linear__x_t"][row], golden["model_out"][row]
+        taken = noiser.step(out, step, x_t, generator=torch.Generator().manual_seed(0))
+        torch.testing.assert_close(
+            taken.pred_original_sample, golden["ude_linear__x0_from_eps"][row], rtol=1e-3, atol=2e-3
+        )
+        mean = taken.prev_sample
+        if step > 0:
+            drawn = torch.randn(x_t.shape, generator=torch.Generator().manual_seed(0))
+            mean = mean - golden["ude_linear__post_var"][row] ** 0.5 * drawn
+        torch.testing.assert_close(mean, golden["ude_linear__p_mean"][row], rtol=1e-3, atol=2e-3)
+
+
+def test_padded_batch_equals_each_clip_alone(net: Dmd) -> None:
+    net.double()
+    codes, length = random_codes([5, 2, 1]), torch.tensor([19, 8, 3])
+    noisy, step = torch.randn(3, 20, 6).double(), torch.tensor([3, 500, 999])
+    noisy[torch.arange(20) >= length[:, None]] = 1e3
+    together = net(noisy, step, codes.codes, length)
+    for row, (frames, groups) in enumerate(zip(length.tolist(), [5, 2, 1], strict=True)):
+        mine = {s.name: codes.codes[s.name][row : row + 1, : groups * s.per_group] for s in STREAMS}
+        alone = net(noisy[row : row + 1, :frames], step[row : row + 1], mine, length[row : row + 1])
+        torch.testing.assert_close(together[row, :frames], alone[0], rtol=1e-9, atol=1e-9)
+        assert (together[row, frames:] == 0).all()
+
+
+def test_every_token_and_the_step_matter(net: Dmd) -> None:
+    codes, length = random_codes([3]), torch.tensor([12])
+    noisy, step = torch.randn(1, 12, 6), torch.tensor([100])
+    plain = net(noisy, step, codes.codes, length)
+    assert not torch.allclose(plain, net(noisy, step + 300, codes.codes, length), atol=1e-4)
+    for s in STREAMS:
+        for at in range(3 * s.per_group):
+            other = {name: values.clone() for name, values in codes.codes.items()}
+            other[s.name][0, at] = (other[s.name][0, at] + 1) % s.num_codes
+            changed = (net(noisy, step, other, length) - plain).abs()[0].amax(1)
+            assert changed.max() > 1e-4
+            assert int(changed.argmax()) // 4 == at // s.per_group  # most at its own four frames
+
+
+def test_absent_streams_say_nothing(net: Dmd) -> None:
+    codes, length = random_codes([3, 3]), torch.tensor([12, 12])
+    noisy, step = torch.randn(2, 12, 6), torch.tensor([100, 100])
+    other = {**codes.codes, "hand": (codes.codes["hand"] + 1) % 5}
+    absent = {"hand": torch.tensor([True, False])}
+    a, b = (net(noisy, step, c, length, absent) for c in (codes.codes, other))
+    assert torch.equal(a[0], b[0])
+    assert not torch.allclose(a[1], b[1], atol=1e-4)
+
+
+def test_loss_counts_real_frames_and_columns(net: Dmd) -> None:
+    codes, length = random_codes([4, 2]), torch.tensor([16, 7])
+    motion, noise, step = torch.randn(2, 16, 6), torch.randn(2, 16, 6), torch.tensor([10, 900])
+    noiser = net.config.schedule.noiser()
+    held = torch.ones(2, 6, dtype=torch.bool)
+    held[1, 4:] = False
+    loss = dmd_loss(net, noiser, motion, codes.codes, length, step, noise, held=held)
+    found = net(noiser.add_noise(motion, noise, step), step, codes.codes, length)
+    error = (found - noise).square()
+    total = error[0].sum() + error[1, :7, :4].sum()
+    assert loss.item() == pytest.approx(total.item() / (16 * 6 + 7 * 4), rel=1e-5)
+
+
+def test_sizes_of_the_paper() -> None:
+    net = Dmd(DmdConfig(), (Stream("code", 2048, 1),), ("code",), 75)
+    block = 4 * 512 * 512 + 4 * 512 + 2 * 512 * 1024 + 1024 + 512 + 4 * 512
+    small = 2048 * 512 + 512 + 513 * 2048 + 76 * 512 + 2 * 513 * 512 + 513 * 75
+    assert sum(p.numel() for p in net.parameters()) == 16 * block + 2 * 2 * 512 + small
+    assert all(b.attention.heads == 8 for b in (*net.encoder.blocks, *net.decoder.blocks))
+
+
+def test_windows_cover_and_weights_add_up() -> None:
+    assert window_starts(160, 160, 32) == [0]
+    assert window_starts(13, 160, 32) == [0]
+    assert window_starts(161, 160, 32) == [0, 4]
+    assert window_starts(400, 160, 32) == [0, 128, 240]
+    for frames in (161, 288, 289, 1203):
+        starts = window_starts(frames, 160, 32)
+        weights = blend_weights(starts, 160, 32, frames)
+        torch.testing.assert_close(weights.sum(0), torch.ones(frames, dtype=torch.float64))
+        for row, start in enumerate(starts):
+            assert (weights[row, :start] == 0).all()
+            assert (weights[row, start + 160 :] == 0).all()
+        assert weights.diff(dim=1).abs().max() <= 1 / 33 + 1e-9  # no window comes or goes at once
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
+def test_a_motion_does_not_depend_on_its_batch(net: Dmd, sampler: Sampler) -> None:
+    codes, frames = random_codes([3, 12, 3, 9]), [12, 45, 11, 36]
+    together = decode_motions(
+        net, codes, frames=frames, seeds=[4, 5, 6, 7], sampler=sampler, steps=4, window=16, overlap=8
+    )
+    for row, size in enumerate(frames):
+        mine = Codes({k: v[row : row + 1] for k, v in codes.codes.items()}, codes.groups[row : row + 1])
+        alone = decode_motions(
+            net, mine, frames=[size], seeds=[4 + row], sampler=sampler, steps=4, window=16, overlap=8
+        )
+        assert together[row].shape == (size, 6)
+        torch.testing.assert_close(together[row], alone[0], atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
+def test_a_short_motion_is_as_without_windows(net: Dmd, sampler: Sampler) -> None:
+    codes = random_codes([5, 3])
+    wide = decode_motions(net, codes, frames=[18, 12], seeds=[1, 2], sampler=sampler, steps=5)
+    tight = decode_motions(
+        net, codes, frames=[18, 12], seeds=[1, 2], sampler=sampler, steps=5, window=20, overlap=8
+    )
+    for a, b in zip(wide, tight, strict=True):
+        assert torch.equal(a, b)
+    # by hand: one pass over the whole motion at each step
+    scheduler = net.config.schedule.sampler(sampler, 5)
+    generator = torch.Generator().manual_seed(1)
+    x = torch.randn(18, 6, generator=generator)[None]
+    extra = {} if sampler == "dpm++" else {"generator": [generator]}
+    mine = {name: values[:1] for name, values in codes.codes.items()}
+    with torch.no_grad():
+        for step in scheduler.timesteps:
+            x = scheduler.step(net(x, step[None], mine, torch.tensor([18])), step, x, **extra).prev_sample
+    torch.testing.assert_close(wide[0], x[0], atol=1e-4, rtol=1e-4)
+
+
+def wave(codes: Tensor) -> Tensor:
+    """Motion [B, 4 G, 2] whose phase moves by what each token says: smooth across tokens."""
+    speed = (codes.repeat_interleave(4, dim=1).float() + 1) * 0.1
+    phase = speed.cumsum(1) - speed / 2
+    return torch.stack([speed * 5 - 1, phase.sin() * 0], dim=-1)[..., :1].expand(-1, -1, 2)
+
+
+def test_learns_and_leaves_no_seams() -> None:
+    """Trained on 16 frames at random places, it decodes 90 frames: right everywhere, borders included."""
+    torch.manual_seed(0)
+    config = DmdConfig(dim=32, ff=64, encoder_layers=1, decoder_layers=2, heads=4, dropout=0.0,
+                       attention_dropout=0.0)  # fmt: skip
+    net = Dmd(config, (Stream("code", 4, 1),), ("code",), 2)
+    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
+    noiser, length = config.schedule.noiser(), torch.full((32,), 16)
+    for _ in range(300):
+        codes = torch.randint(4, (32, 4))
+        step, noise = torch.randint(1000, (32,)), torch.randn(32, 16, 2)
+        optimizer.zero_grad()
+        dmd_loss(net, noiser, wave(codes), {"code": codes}, length, step, noise).backward()
+        optimizer.step()
+    tokens = torch.full((6, 23), 2)
+    made = torch.stack(
+        decode_motions(
+            net, Codes({"code": tokens}, torch.full((6,), 23)), frames=[90] * 6, seeds=range(6),
+            sampler="ddim", steps=20, window=16, overlap=8,
+        )
+    )  # fmt: skip
+    assert (made - wave(tokens)[:, :90]).abs().mean() < 0.15
+    jumps = made.diff(dim=1).abs().amax(-1)
+    starts = window_starts(90, 16, 8)
+    borders = sorted(
+        {b - 1 for s in starts[1:] for b in (s, s + 8, s + 16) if b < 90} | {s + 7 for s in starts}
+    )
+    inside = [i for i in range(89) if i not in borders]
+    assert jumps[:, borders].mean() < 1.3 * jumps[:, inside].mean()
+    assert jumps[:, borders].max() < 1.3 * jumps[:, inside].max()
+
+
+def test_more_motions_of_one_token_sequence_differ(net: Dmd) -> None:
+    codes = random_codes([4])
+    thirty = Codes({k: v.expand(3, -1) for k, v in codes.codes.items()}, codes.groups.expand(3))
+    made = decode_motions(net, thirty, seeds=[1, 2, 1], steps=3)
+    assert torch.allclose(made[0], made[2], atol=1e-5)
+    assert not torch.allclose(made[0], made[1], atol=0.1)
+
+
+def test_mistakes_are_named(net: Dmd) -> None:
+    codes = random_codes([4, 4])
+    with pytest.raises(UserError, match="1 seeds and 2 token sequences"):
+        decode_motions(net, codes, seeds=[1])
+    with pytest.raises(UserError, match="motion 1 was asked for 17 frames; its tokens are 16"):
+        decode_motions(net, codes, seeds=[1, 2], frames=[16, 17])
+    with pytest.raises(UserError, match="window 16 and overlap 16 must be multiples of 4"):
+        decode_motions(net, codes, seeds=[1, 2], window=16, overlap=16)
+    with pytest.raises(UserError, match="2000 denoising steps"):
+        decode_motions(net, codes, seeds=[1, 2], steps=2000)
+    with pytest.raises(ValueError, match="tokens of 12 frames were given for 16"):
+        net(torch.zeros(1, 16, 6), torch.tensor([1]), random_codes([3]).codes, torch.tensor([12]))

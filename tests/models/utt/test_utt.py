@@ -1,0 +1,221 @@
+"""The UTT: prefix mask, causality, padding, z, GRU, cached = uncached, sizes, the way to motion."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.models.condition.mate import Encoded
+from motionloom.models.discriminator.losses import generator_loss
+from motionloom.models.discriminator.patch import DiscriminatorConfig, PatchDiscriminator
+from motionloom.models.gpt.losses import cross_entropy
+from motionloom.models.gpt.tokens import interleave
+from motionloom.models.tokenizer.base import Stream
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import H2VQConfig, MqConfig
+from motionloom.models.utt.backbone import prefix_mask
+from motionloom.models.utt.losses import soft_motion
+from motionloom.models.utt.network import Utt, UttConfig
+
+PATTERN = ("body", "body", "hand")
+STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
+TINY = UttConfig(layers=2, dim=16, heads=4, ff=32, block_size=30, dropout=0.0, attention_dropout=0.0, z_dim=3)
+
+
+@pytest.fixture(params=["gpt", "gru"])
+def utt(request: pytest.FixtureRequest) -> Utt:
+    torch.manual_seed(0)
+    net = Utt(TINY.model_copy(update={"kind": request.param}), STREAMS, PATTERN, glob_dim=6)
+    for head in net.heads:
+        torch.nn.init.normal_(head.weight, std=0.5)
+    return net.double().eval()
+
+
+def conditions(batch: int, size: int = 5, lengths: list[int] | None = None) -> Encoded:
+    generator = torch.Generator().manual_seed(1)
+    glob = torch.randn(batch, 6, generator=generator, dtype=torch.float64)
+    seq = torch.randn(batch, size, 6, generator=generator, dtype=torch.float64)
+    mask = torch.arange(size) < torch.tensor(lengths or [size] * batch)[:, None]
+    return Encoded(glob, seq, mask)
+
+
+def sequences(batch: int, groups: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(2)
+    most = max(groups)
+    codes = {
+        "body": torch.randint(7, (batch, 2 * most), generator=generator),
+        "hand": torch.randint(5, (batch, most), generator=generator),
+    }
+    return tuple(interleave(codes, PATTERN, ends={"body": 7, "hand": 5}, groups=torch.tensor(groups)))
+
+
+def hidden(utt: Utt, tokens: Tensor, kinds: Tensor, condition: Encoded, z: Tensor | None = None) -> Tensor:
+    """States in float64, of which `forward` gives float32 logits."""
+    prefix, mask = utt.prefix(condition, z)
+    return utt.backbone(prefix, mask, utt.motion_inputs(utt.embed(tokens[:, :-1], kinds[:, :-1]), 0))
+
+
+def test_prefix_mask_written_out() -> None:
+    mask = torch.tensor([[True, True, False], [True, True, True]])
+    expected = [
+        ["110000", "110000", "110000", "110100", "110110", "110111"],
+        ["111000", "111000", "111000", "111100", "111110", "111111"],
+    ]
+    found = prefix_mask(mask, 3).int()
+    assert [["".join(map(str, row)) for row in rows] for rows in found.tolist()] == expected
+
+
+def test_a_row_depends_on_nothing_but_itself(utt: Utt) -> None:
+    tokens, kinds, _ = sequences(3, [5, 2, 3])
+    condition, z = conditions(3, 5, [5, 0, 2]), torch.randn(3, 3).double()
+    condition = condition._replace(seq=condition.seq.masked_fill(~condition.mask[..., None], 1e3))
+    together = hidden(utt, tokens, kinds, condition, z)
+    for row, groups in enumerate([5, 2, 3]):
+        size, real = 3 * groups + 2, int(condition.mask[row].sum())
+        mine = Encoded(*(x[row : row + 1] for x in condition))
+        mine = Encoded(mine.glob, mine.seq[:, :real], mine.mask[:, :real])
+        alone = hidden(utt, tokens[row : row + 1, :size], kinds[row : row + 1, :size], mine, z[row : row + 1])
+        torch.testing.assert_close(together[row, :size], alone[0], rtol=1e-10, atol=1e-10)
+
+
+def test_motion_is_causal_and_sees_the_whole_prefix(utt: Utt) -> None:
+    tokens, kinds, _ = sequences(1, [4])
+    condition = conditions(1)
+    condition.seq.requires_grad_()
+    embedded = utt.embed(tokens[:, :-1], kinds[:, :-1]).detach().requires_grad_()
+    prefix, mask = utt.prefix(condition)
+    out = utt.backbone(prefix, mask, utt.motion_inputs(embedded, 0))
+    for at in (0, 4, 13):
+        seq_grad, grad = torch.autograd.grad(
+            out[0, at].square().sum(), [condition.seq, embedded], retain_graph=True
+        )
+        assert (seq_grad[0].abs().sum(1) > 0).all()
+        assert ((grad[0].abs().sum(1) > 0) == (torch.arange(13) < at)).all()
+
+
+def test_z_is_added_to_the_global_embedding(utt: Utt) -> None:
+    condition, z = conditions(2), torch.randn(2, 3).double()
+    assert utt.z_in is not None
+    moved = condition._replace(glob=condition.glob + utt.z_in(z))
+    for a, b in zip(utt.prefix(condition, z), utt.prefix(moved), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+    tokens, kinds, _ = sequences(2, [3, 3])
+    plain, noisy = hidden(utt, tokens, kinds, condition), hidden(utt, tokens, kinds, condition, z)
+    assert (plain - noisy).abs().amax(-1).min() > 1e-6
+    still = Utt(TINY.model_copy(update={"z_dim": 0}), STREAMS, PATTERN, glob_dim=6)
+    assert still.z_in is None
+    with pytest.raises(UserError, match="z_dim 0"):
+        still.prefix(conditions(2), z)
+
+
+@pytest.mark.parametrize("chunks", [[1] * 14, [5, 1, 8], [14]])
+def test_step_by_step_equals_at_once(utt: Utt, chunks: list[int]) -> None:
+    tokens, kinds, _ = sequences(3, [4, 4, 4])
+    condition, z = conditions(3, 5, [5, 0, 2]), torch.randn(3, 3).double()
+    whole = hidden(utt, tokens, kinds, condition, z)
+    prefix, mask = utt.prefix(condition, z)
+    inputs = utt.motion_inputs(utt.embed(tokens[:, :-1], kinds[:, :-1]), 0)
+    state = utt.backbone.begin(prefix, mask, 14)
+    out = torch.cat([utt.backbone.extend(x, state) for x in inputs.split(chunks, dim=1)], dim=1)
+    torch.testing.assert_close(out, whole, rtol=1e-10, atol=1e-10)
+
+
+def test_prefix_states_of_the_transformer_do_not_see_motion() -> None:
+    torch.manual_seed(0)
+    utt = Utt(TINY, STREAMS, PATTERN, glob_dim=6).double().eval()
+    prefix, mask = utt.prefix(conditions(2, 5, [5, 3]))
+    stack = utt.backbone.stack
+    with_motion = stack(torch.cat([prefix, torch.randn(2, 4, 16).double()], dim=1), prefix_mask(mask, 4))
+    torch.testing.assert_close(with_motion[:, :6], stack(prefix, mask), rtol=1e-10, atol=1e-10)
+
+
+def test_logits_keep_the_grammar(utt: Utt) -> None:
+    tokens, kinds, _ = sequences(2, [4, 2])
+    logits = utt(tokens, kinds, conditions(2))
+    assert torch.equal(torch.isfinite(logits), utt.legal(tokens, kinds))
+    loss = cross_entropy(logits, tokens)
+    real = [(0, 14), (1, 8)]
+    by_hand = [
+        functional.cross_entropy(logits[row, :size], tokens[row, :size], reduction="none")
+        for row, size in real
+    ]
+    by_hand = torch.cat([values[:-1] for values in by_hand])  # the second End is certain
+    torch.testing.assert_close(loss, by_hand.mean().to(loss), rtol=1e-5, atol=1e-6)
+
+
+def test_codes_that_a_clip_lacks_are_read_as_zero(utt: Utt) -> None:
+    tokens, kinds, _ = sequences(1, [4])
+    known = kinds == 0
+    other = torch.where(known, tokens, (tokens + 1) % 5)
+    condition = conditions(1)
+    a = utt(tokens, kinds, condition, inputs=tokens, known=known)
+    b = utt(tokens, kinds, condition, inputs=other, known=known)
+    assert torch.equal(a, b)
+    assert not torch.equal(a, utt(tokens, kinds, condition, inputs=other))
+
+
+def test_sizes_of_the_paper() -> None:
+    utt = Utt(UttConfig(), (Stream("code", 2048, 1),), ("code",), glob_dim=256)
+    block = 4 * 512 * 512 + 4 * 512 + 2 * 512 * 1024 + 1024 + 512 + 4 * 512
+    tables = 2049 * 512 + 2049 * 513
+    inputs = 257 * 512 + 2 * 257 * 256 + 512 + 160 * 512
+    assert sum(p.numel() for p in utt.parameters()) == 8 * block + 2 * 512 + tables + inputs
+    assert utt.max_groups == 159
+    gru = Utt(UttConfig(kind="gru"), (Stream("code", 2048, 1),), ("code",), glob_dim=256)
+    cells = 8 * (6 * 512 * 512 + 6 * 512 + 2 * 512) + 2 * 512
+    assert sum(p.numel() for p in gru.parameters()) == cells + tables + inputs
+
+
+def test_mistakes_are_named(utt: Utt) -> None:
+    tokens, kinds, _ = sequences(1, [10])
+    with pytest.raises(UserError, match="32 tokens is longer than the UTT's block_size 30"):
+        utt(tokens, kinds, conditions(1))
+    with pytest.raises(UserError, match="holds no motion"):
+        Utt(TINY.model_copy(update={"block_size": 4}), STREAMS, PATTERN, 6)
+    with pytest.raises(ValueError, match="built for width 6"):
+        utt.prefix(Encoded(torch.zeros(1, 5), torch.zeros(1, 2, 5), torch.ones(1, 2) > 0))
+
+
+@pytest.mark.parametrize("sample", [True, False])
+@pytest.mark.parametrize("kind", ["mq", "h2vq"])
+def test_the_adversarial_gradient_reaches_every_parameter(kind: str, sample: bool) -> None:
+    """Logits -> one-hots -> frozen decoder -> discriminator -> back to the UTT and MATE's embeddings."""
+    torch.manual_seed(0)
+    layout = MotionLayout.named("smpl75" if kind == "mq" else "wholebody313")
+    small = {"width": 16, "depth": 1, "code_dim": 8, "num_codes": 9}
+    tokenizer = build_tokenizer(MqConfig(**small) if kind == "mq" else H2VQConfig(**small), layout)
+    for book in tokenizer.codebooks().values():
+        torch.nn.init.normal_(book.codebook)
+    tokenizer.freeze()
+    net = Utt(TINY, tokenizer.streams, tokenizer.pattern, glob_dim=6)
+    critic = PatchDiscriminator(DiscriminatorConfig(dim=16, heads=4, ff=32), tokenizer.dim, 6)
+    groups = torch.tensor([5, 2])
+    codes = {s.name: torch.randint(9, (2, 5 * s.per_group)) for s in tokenizer.streams}
+    tokens, kinds, _ = interleave(codes, net.pattern, ends=net.num_codes, groups=groups)
+    condition = Encoded(*(x.float() if x.is_floating_point() else x for x in conditions(2, 4, [4, 2])))
+    condition.glob.requires_grad_()
+    logits = net(tokens, kinds, condition, torch.randn(2, 3))
+    made = soft_motion(net, logits, tokens, kinds, tokenizer=tokenizer, gumbel_temperature=1.0, sample=sample)
+    assert made.length.tolist() == [20, 8]
+    assert (made.motion[1, 8:] == 0).all()
+    if not sample:
+        size = 5 * len(net.pattern)
+        steps = logits[:, :size].view(2, 5, len(net.pattern), -1)[..., :9].argmax(-1)
+        hard = {
+            name: steps[:, :, [i for i, s in enumerate(net.pattern) if s == name]].flatten(1)
+            for name in net.names
+        }
+        expected = tokenizer.decode(hard, made.length)
+        torch.testing.assert_close(made.motion[:, :20], expected, rtol=1e-4, atol=1e-5)
+        assert (made.motion[:, 20:] == 0).all()
+    generator_loss(critic(made.motion, condition.glob.detach(), made.length)).backward()
+    assert condition.glob.grad is not None
+    assert condition.glob.grad.abs().sum() > 0
+    for name, parameter in net.named_parameters():
+        if name.startswith(("heads", "backbone", "condition_in", "z_in", "start", "positions")):
+            assert parameter.grad is not None, name
+            assert parameter.grad.abs().sum() > 0, name

@@ -1,0 +1,279 @@
+"""Sampling from the UTT: windows, continuation, seeds, batches, lengths, guidance, a toy that it learns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from motionloom.datasets.conditions import Condition
+from motionloom.datasets.schema import UserError
+from motionloom.models.condition.mate import Encoded, Mate, MateConfig, drop_conditions
+from motionloom.models.gpt.losses import cross_entropy
+from motionloom.models.gpt.sampling import draw, sample_seeds
+from motionloom.models.gpt.tokens import Codes, interleave
+from motionloom.models.tokenizer.base import Stream
+from motionloom.models.utt.continuing import join, last_groups, window_start
+from motionloom.models.utt.network import Utt, UttConfig
+from motionloom.models.utt.sampling import draw_z, generate
+
+PATTERN = ("body", "body", "hand")
+STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
+TINY = UttConfig(layers=2, dim=16, heads=4, ff=32, block_size=14, dropout=0.0, attention_dropout=0.0, z_dim=3)
+
+
+@pytest.fixture(params=["gpt", "gru"])
+def utt(request: pytest.FixtureRequest) -> Utt:
+    torch.manual_seed(0)
+    net = Utt(TINY.model_copy(update={"kind": request.param}), STREAMS, PATTERN, glob_dim=6)
+    for head in net.heads:
+        torch.nn.init.normal_(head.weight, std=0.7)  # peaked, so that a mixed-up draw would show
+    torch.nn.init.normal_(net.condition_in.weight, std=2.0)
+    net.heads[0].bias.data[-1] = 2.0  # End is likely
+    return net.double()
+
+
+def conditions(batch: int, lengths: list[int] | None = None) -> Encoded:
+    generator = torch.Generator().manual_seed(1)
+    glob = torch.randn(batch, 6, generator=generator, dtype=torch.float64)
+    seq = torch.randn(batch, 5, 6, generator=generator, dtype=torch.float64)
+    return Encoded(glob, seq, torch.arange(5) < torch.tensor(lengths or [5] * batch)[:, None])
+
+
+def null(batch: int) -> Encoded:
+    zero = torch.full((batch, 6), 0.3, dtype=torch.float64)
+    return Encoded(zero, zero.new_zeros(batch, 0, 6), torch.zeros(batch, 0, dtype=torch.bool))
+
+
+def random_codes(groups: list[int]) -> Codes:
+    generator, most = torch.Generator().manual_seed(3), max(groups)
+    number = torch.tensor(groups)
+    codes = {}
+    for s in STREAMS:
+        values = torch.randint(s.num_codes, (len(groups), most * s.per_group), generator=generator)
+        codes[s.name] = values * (torch.arange(most * s.per_group) < number[:, None] * s.per_group)
+    return Codes(codes, number)
+
+
+def row(codes: Codes, index: int) -> dict[str, list[int]]:
+    count = int(codes.groups[index])
+    return {s.name: codes.codes[s.name][index, : count * s.per_group].tolist() for s in STREAMS}
+
+
+@torch.no_grad()
+def slow(
+    utt: Utt, condition: Encoded, seed: int, groups: int, *, start: list[int], guide: Encoded | None = None,
+    scale: float = 1.0, **settings: Any,
+) -> list[int]:  # fmt: skip
+    """One row without a cache: every token from a full pass over its window."""
+    utt.eval()
+    import numpy as np
+
+    uniform = np.random.Generator(np.random.Philox(key=seed)).random(groups * 3)
+    z = draw_z([seed], 3)
+    tokens = list(start)
+    for i in range(groups * 3):
+        first = window_start(len(tokens), 14, 3)
+        window = torch.tensor([[*tokens[first:], 0]])
+        kinds = utt.slots[torch.arange(window.shape[1]) % 3][None]
+        logits = [utt(window, kinds, c, z)[:, -1] for c in (condition, guide) if c is not None]
+        logits = [x.scatter(1, utt.ends[kinds[:, -1:]], -torch.inf) for x in logits]
+        mixed = logits[0] if guide is None else logits[1] + scale * (logits[0] - logits[1])
+        mixed = torch.where(torch.isfinite(logits[0]), mixed, -torch.inf)
+        tokens.append(int(draw(mixed, torch.tensor([uniform[i]]), **settings)))
+    return tokens[len(start) :]
+
+
+def test_window_slides_by_halves_when_full() -> None:
+    starts = [window_start(n, 14, 3) for n in range(30)]
+    assert starts[:14] == [0] * 14
+    assert starts[14] == 6  # a block of 14 holds four groups of 3; two of them go
+    for n in range(1, 30):
+        first = starts[n]
+        assert first % 3 == 0
+        assert n - first + 1 <= 14
+        assert first == starts[n - 1] or n - first + 1 > 14 - 6 - 3
+    assert window_start(10_000, 160, 1) + 160 > 10_000
+
+
+@pytest.mark.parametrize("groups", [3, 11])
+@pytest.mark.parametrize("settings", [{}, {"temperature": 0}, {"top_k": 3, "top_p": 0.8, "temperature": 1.3}])
+def test_cached_equals_uncached_over_several_windows(utt: Utt, groups: int, settings: dict[str, Any]) -> None:
+    condition, seeds = conditions(2, [5, 2]), sample_seeds(7, 2)
+    out = generate(utt, condition, groups=torch.full((2,), groups), seed=7, **settings)
+    sequence = interleave(out.codes, PATTERN, groups=out.groups)
+    for index in range(2):
+        mine = condition.rows(slice(index, index + 1))
+        assert sequence.tokens[index].tolist() == slow(utt, mine, seeds[index], groups, start=[], **settings)
+
+
+def test_continues_given_tokens_of_different_lengths(utt: Utt) -> None:
+    start, groups = random_codes([2, 6, 0, 9]), torch.tensor([4, 2, 5, 1])
+    condition, seeds = conditions(4, [5, 2, 0, 3]), sample_seeds(5, 4)
+    out = generate(utt, condition, start=start, groups=groups, seed=5)
+    assert out.groups.tolist() == groups.tolist()
+    given, counts = last_groups(start, PATTERN)
+    new = interleave(out.codes, PATTERN, groups=out.groups)
+    for index in range(4):
+        mine = condition.rows(slice(index, index + 1))
+        before = given[index, : 3 * int(counts[index])].tolist()
+        expected = slow(utt, mine, seeds[index], int(groups[index]), start=before)
+        assert new.tokens[index, : int(new.length[index])].tolist() == expected
+    other = generate(utt, condition, groups=groups, seed=5)
+    assert any(row(other, i) != row(out, i) for i in (0, 1, 3))
+    assert row(other, 2) == row(out, 2)  # the row that has no start
+
+
+def test_context_limits_what_is_read_of_the_start(utt: Utt) -> None:
+    start, groups, condition = random_codes([6, 4]), torch.tensor([3, 3]), conditions(2)
+    short = Codes(
+        {s.name: torch.stack([start.codes[s.name][i, (n - 2) * s.per_group : n * s.per_group]
+                              for i, n in enumerate((6, 4))]) for s in STREAMS},
+        torch.tensor([2, 2]),
+    )  # fmt: skip
+    a = generate(utt, condition, start=start, context=2, groups=groups, seed=1)
+    b = generate(utt, condition, start=short, groups=groups, seed=1)
+    assert all(row(a, i) == row(b, i) for i in range(2))
+    c = generate(utt, condition, start=start, context=0, groups=groups, seed=1)
+    assert all(row(c, i) == row(generate(utt, condition, groups=groups, seed=1), i) for i in range(2))
+
+
+def test_segments_are_one_motion(utt: Utt) -> None:
+    """Two calls with the same conditions, greedy: as one call."""
+    condition, groups = conditions(2), torch.tensor([4, 4])
+    settings: dict[str, Any] = {"temperature": 0, "inject_z": False}
+    whole = generate(utt, condition, groups=torch.tensor([7, 7]), **settings)
+    first = generate(utt, condition, groups=groups, **settings)
+    second = generate(utt, condition, start=first, groups=torch.tensor([3, 3]), **settings)
+    both = join(first, second, PATTERN)
+    assert both.groups.tolist() == [7, 7]
+    assert all(row(both, i) == row(whole, i) for i in range(2))
+
+
+def test_join_of_rows_of_different_lengths() -> None:
+    a, b = random_codes([2, 5, 0]), random_codes([4, 1, 3])
+    both = join(a, b, PATTERN)
+    assert both.groups.tolist() == [6, 6, 3]
+    for index in range(3):
+        assert row(both, index) == {
+            name: values + row(b, index)[name] for name, values in row(a, index).items()
+        }
+    assert (both.codes["body"][2, 6:] == 0).all()
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_alone_equals_in_a_batch(utt: Utt, scale: float) -> None:
+    condition, seeds = conditions(6, [5, 0, 2, 5, 1, 3]), sample_seeds(3, 6)
+    start = random_codes([2, 0, 1, 3, 5, 0])
+    settings: dict[str, Any] = {"cfg_scale": scale, "max_groups": 8}
+    together = generate(utt, condition, null=null(6), start=start, seed=3, **settings)
+    assert len(set(together.groups.tolist())) > 1
+    assert together.groups.min() >= 1
+    for index in range(6):
+        mine = slice(index, index + 1)
+        codes = Codes({name: values[mine] for name, values in start.codes.items()}, start.groups[mine])
+        alone = generate(
+            utt, condition.rows(mine), null=null(1), start=codes, seed=[seeds[index]], **settings
+        )
+        assert row(alone, 0) == row(together, index)
+    other = generate(utt, condition, null=null(6), start=start, seed=4, **settings)
+    assert any(row(other, i) != row(together, i) for i in range(6))
+
+
+def test_guidance_equals_the_slow_mix(utt: Utt) -> None:
+    condition, seeds = conditions(1), sample_seeds(2, 1)
+    out = generate(
+        utt, condition, null=null(1), cfg_scale=3.0, groups=torch.tensor([6]), seed=2, temperature=0.8
+    )
+    expected = slow(utt, condition, seeds[0], 6, start=[], guide=null(1), scale=3.0, temperature=0.8)
+    assert interleave(out.codes, PATTERN).tokens[0].tolist() == expected
+
+
+def test_z_makes_samples_differ_and_is_the_seeds_alone(utt: Utt) -> None:
+    condition = Encoded(*(x[:1].expand(8, *x.shape[1:]) for x in conditions(1)))
+    groups = torch.full((8,), 4)
+    with torch.no_grad():
+        assert utt.z_in is not None
+        utt.z_in[-1].weight.mul_(30)
+    noisy = generate(utt, condition, groups=groups, temperature=0)
+    still = generate(utt, condition, groups=groups, temperature=0, inject_z=False)
+    assert len({str(row(noisy, i)) for i in range(8)}) > 2
+    assert len({str(row(still, i)) for i in range(8)}) == 1
+    seeds = sample_seeds(0, 8)
+    assert torch.equal(draw_z(seeds, 3)[5:], draw_z(seeds[5:], 3))
+    many = draw_z(sample_seeds(1, 4000), 2)
+    assert many.mean().abs() < 0.05
+    assert many.std().item() == pytest.approx(1, abs=0.03)
+
+
+def test_bad_settings_are_refused(utt: Utt) -> None:
+    condition = conditions(2)
+    for settings, message in (
+        ({"temperature": -1.0}, "temperature"),
+        ({"top_k": 0}, "top_k"),
+        ({"top_p": 0.0}, "top_p"),
+        ({"max_groups": 0}, "max_groups 0"),
+        ({"context": -1}, "context -1"),
+        ({"seed": [1]}, "1 seeds were given for 2"),
+        ({"groups": torch.tensor([1, 0])}, "1 group or more; got 0"),
+        ({"groups": torch.tensor([1])}, "requested lengths were given for 2"),
+        ({"groups": torch.tensor([1, 9]), "max_groups": 4}, "9 groups was requested, max_groups is 4"),
+        ({"cfg_scale": 2.0}, "guidance needs"),
+        ({"start": random_codes([1])}, "1 starts were given for 2"),
+    ):
+        with pytest.raises(UserError, match=message):
+            generate(utt, condition, **settings)
+
+
+@pytest.mark.parametrize("kind", ["gpt", "gru"])
+def test_learns_which_tokens_a_text_or_a_sound_means(kind: str) -> None:
+    """MATE + UTT end to end: a text names a motion and its length, a sound names each of its codes."""
+    torch.manual_seed(0)
+    mate = Mate(MateConfig(dim=32, layers=1, heads=4, ff=64, dropout=0.0, attention_dropout=0.0), {
+        "text": 4, "audio": 5})  # fmt: skip
+    config = UttConfig(
+        kind=kind, layers=2, dim=32, heads=4, ff=64, block_size=12, dropout=0.0, attention_dropout=0.0,
+        z_dim=2, condition_dropout=0.1,
+    )  # fmt: skip
+    utt = Utt(config, (Stream("code", 5, 1),), ("code",), glob_dim=32)
+    optimizer = torch.optim.Adam([*mate.parameters(), *utt.parameters()], lr=3e-3)
+    text = torch.eye(4)[:, None]
+    groups = torch.tensor([2, 3, 4, 5, 5, 5, 5, 5])
+
+    def batch(seed: int) -> tuple[dict[str, Condition], Tensor]:
+        generator = torch.Generator().manual_seed(seed)
+        sound = torch.randint(5, (4, 5), generator=generator)
+        codes = torch.cat([torch.stack([(torch.arange(5) * (k + 1) + k) % 5 for k in range(4)]), sound])
+        given = {
+            "text": Condition(torch.cat([text, torch.zeros(4, 1, 4)]), (torch.arange(8) < 4)[:, None]),
+            "audio": Condition(
+                torch.cat([torch.zeros(4, 5, 5), torch.eye(5)[sound]]),
+                (torch.arange(8) >= 4)[:, None].expand(-1, 5),
+            ),
+        }
+        return given, codes
+
+    for step in range(250):
+        given, codes = batch(step)
+        tokens, kinds, _ = interleave({"code": codes}, ("code",), ends={"code": 5}, groups=groups)
+        drop = torch.rand(8, generator=torch.Generator().manual_seed(step)) < config.condition_dropout
+        logits = utt(tokens, kinds, mate(drop_conditions(given, drop)), torch.randn(8, 2))
+        optimizer.zero_grad()
+        cross_entropy(logits, tokens).backward()
+        optimizer.step()
+    mate.eval()
+    given, codes = batch(10_000)
+    with torch.no_grad():
+        condition, without = mate(given), mate.unconditional(8)
+    for settings in ({"temperature": 0}, {"top_p": 0.7, "null": without, "cfg_scale": 1.5}):
+        out = generate(utt, condition, **settings)
+        assert out.groups[:4].tolist() == [2, 3, 4, 5]
+        rows = range(8 if kind == "gpt" else 4)  # a GRU does not learn to copy a sound in so few steps
+        right = [
+            a == b
+            for i in rows
+            for a, b in zip(out.codes["code"][i, : groups[i]].tolist(), codes[i].tolist(), strict=False)
+        ]
+        assert sum(right) >= 0.9 * len(right), settings
