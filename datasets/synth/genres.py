@@ -52,6 +52,12 @@ class Genre:
     """Degrees (from 0) of the chords of four bars, for each kind of section."""
     octave: float
     """Octaves of the chords above 110 Hz."""
+    tone: tuple[float, float, float]
+    """How it is mixed: decibels below 250 Hz, from there to 2.5 kHz, and above."""
+    drive: float
+    """Overdrive of the mix; 1 leaves it nearly clean."""
+    air: float
+    """Level of steady noise: the crackle of a record, a hall."""
 
 
 _MAJOR = (0, 2, 4, 5, 7, 9, 11)
@@ -86,6 +92,9 @@ GENRES: dict[str, Genre] = {
             scale=_MINOR,
             progressions=((0, 5, 2, 6), (0, 3, 5, 4)),
             octave=1.0,
+            tone=(3.0, -6.0, 6.0),
+            drive=1.2,
+            air=0.0,
         ),
         Genre(
             "disco",
@@ -107,6 +116,9 @@ GENRES: dict[str, Genre] = {
             scale=_MAJOR,
             progressions=((0, 5, 3, 4), (3, 4, 2, 5)),
             octave=2.0,
+            tone=(-6.0, 4.0, 6.0),
+            drive=1.0,
+            air=0.002,
         ),
         Genre(
             "hiphop",
@@ -134,6 +146,9 @@ GENRES: dict[str, Genre] = {
             scale=_MINOR,
             progressions=((0, 0, 5, 5), (0, 5, 3, 4)),
             octave=2.0,
+            tone=(8.0, -2.0, -14.0),
+            drive=1.3,
+            air=0.012,
         ),
         Genre(
             "rock",
@@ -155,6 +170,9 @@ GENRES: dict[str, Genre] = {
             scale=_MAJOR,
             progressions=((0, 4, 5, 3), (5, 3, 0, 4)),
             octave=0.0,
+            tone=(-2.0, 6.0, 0.0),
+            drive=4.0,
+            air=0.0,
         ),
         Genre(
             "ballad",
@@ -176,6 +194,9 @@ GENRES: dict[str, Genre] = {
             scale=_MAJOR,
             progressions=((0, 2, 5, 3), (5, 3, 0, 4)),
             octave=1.0,
+            tone=(-2.0, 4.0, -12.0),
+            drive=0.8,
+            air=0.0005,
         ),
         Genre(
             "reggae",
@@ -203,6 +224,9 @@ GENRES: dict[str, Genre] = {
             scale=_MAJOR,
             progressions=((0, 3, 0, 4), (0, 1, 3, 0)),
             octave=1.0,
+            tone=(6.0, 2.0, -5.0),
+            drive=1.0,
+            air=0.0,
         ),
     )
 }

@@ -6,6 +6,7 @@ Every function returns float64 samples of one stroke or one note, about 1 at its
 from __future__ import annotations
 
 import numpy as np
+from scipy import signal
 
 from motionloom.datasets.synth.genres import Wave
 from motionloom.datasets.synth.maths import Array
@@ -75,6 +76,14 @@ def note(rate: int, wave: Wave, hertz: float, seconds: float) -> Array:
         if strength:
             out += strength * harmonic.imag
     return out * _envelope(t, _ATTACK[wave], _DECAY[wave]) / sum(_PARTIALS[wave])
+
+
+def equalize(sound: Array, rate: int, decibels: tuple[float, float, float]) -> Array:
+    """Low, middle and high bands (edges at 250 Hz and 2.5 kHz) of samples made louder by `decibels`."""
+    edges = [signal.butter(1, hertz, fs=rate, output="sos") for hertz in (250.0, 2500.0)]
+    low, below = (np.asarray(signal.sosfilt(edge, sound)) for edge in edges)
+    bands = (low, below - low, sound - below)
+    return sum((10 ** (gain / 20) * band for gain, band in zip(decibels, bands, strict=True)), np.zeros(1))
 
 
 def _envelope(t: Array, attack: float, decay: float) -> Array:

@@ -103,9 +103,10 @@ def render_song(song: Song, rate: int) -> NDArray[np.float32]:
                 _add(out, round((begin + step * sixteenth) * rate), drums[2][1], 0.1)
         degree = genre.progressions[kind][bar % 4]
         _harmony(out, song, degree, kind, begin, rate)
-    out = out[:total]
-    # A gentle limiter instead of clipping, which would add harmonics.
-    out = np.tanh(out)
+    out = out[:total] + genre.air * rng.standard_normal(total)
+    out = instruments.equalize(out, rate, genre.tone)
+    # A soft limiter; driven hard it is the distortion of rock.
+    out = 0.95 * np.tanh(genre.drive * out)
     samples = np.asarray(out, dtype=np.float32)
     samples.setflags(write=False)
     return samples
