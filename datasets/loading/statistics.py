@@ -114,7 +114,7 @@ class FeatureStats:
             "frames": str(self.frames),
         }
         with atomic_file(path) as file:
-            file.write(_sorted_header(save({"mean": self.mean, "std": self.std}, metadata=about)))
+            file.write(sorted_header(save({"mean": self.mean, "std": self.std}, metadata=about)))
 
     @staticmethod
     def load(path: Path, *, expect: MotionLayout | None = None) -> FeatureStats:
@@ -160,7 +160,7 @@ class FeatureStats:
         return {**self.__dict__, "_tensors": {}}
 
 
-def _sorted_header(raw: bytes) -> bytes:
+def sorted_header(raw: bytes) -> bytes:
     """The same safetensors file, its header's keys in order: the library writes metadata in random order."""
     end = 8 + int.from_bytes(raw[:8], "little")
     header = json.dumps(json.loads(raw[8:end]), sort_keys=True, separators=(",", ":")).encode()

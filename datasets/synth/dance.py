@@ -35,7 +35,7 @@ def dance(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     even = np.where(np.arange(len(beats)) % 2 == 0, 1.0, -1.0)
     side_to_side = keys(track.t, beats, even)
     if truth.style == "step":
-        _side_steps(track, beats, beat, 0.12 * amount)
+        side_steps(track, beats, beat, 0.12 * amount)
     wide = {"step": 0.0, "bounce": 0.03, "sway": 0.08}[truth.style or "bounce"] * amount
     track.root[:, 0] += wide * side_to_side
     deep = {"step": 0.05, "bounce": 0.1, "sway": 0.05}[truth.style or "bounce"] * amount
@@ -66,7 +66,7 @@ def _arms(track: Track, beats: Array, even: Array, rng: np.random.Generator) -> 
         play(track, side, holds)
 
 
-def _side_steps(track: Track, beats: Array, beat: float, far: float) -> None:
+def side_steps(track: Track, beats: Array, beat: float, far: float) -> None:
     """Step out with one foot and bring the other to it, two beats each way; each foot lands on its beat."""
     where = np.zeros((2, len(beats)))
     for k in range(1, len(beats)):

@@ -14,8 +14,16 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
+from motionloom.datasets.audio.features import VERSION as AUDIO_VERSION
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features import encode
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
@@ -23,13 +31,19 @@ from motionloom.datasets.schema import Caption, Config, Manifest, Split
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth import arms, legs, locomotion
+from motionloom.datasets.synth.choreography import choreograph, dancing_face, dancing_hands
 from motionloom.datasets.synth.dance import dance
+from motionloom.datasets.synth.dance_plan import Dance, DanceConfig, DanceTruth, plan_dance
+from motionloom.datasets.synth.dance_words import dance_captions
 from motionloom.datasets.synth.face import express
 from motionloom.datasets.synth.grammar import body_captions, face_captions
 from motionloom.datasets.synth.hands import shape_hand
 from motionloom.datasets.synth.maths import Array
 from motionloom.datasets.synth.music import SAMPLE_RATE, render
+from motionloom.datasets.synth.music_rows import settings_for, song_rows
 from motionloom.datasets.synth.pose import Track
+from motionloom.datasets.synth.smpl75 import smpl75_of
+from motionloom.datasets.synth.song import render_song
 from motionloom.datasets.synth.truth import ACTIONS, HANDS, Span, Truth, draw
 
 CONVERTER_VERSION = 1
@@ -60,9 +74,9 @@ class SynthConfig(Config):
 
     clips: int = Field(512, ge=1)
     seed: int = Field(0, ge=0)
-    layout: Literal["body133", "wholebody313", "wholebody363"] = "wholebody363"
+    layout: Literal["body133", "wholebody313", "wholebody363", "smpl75"] = "wholebody363"
     fps: float | None = Field(None, gt=4, le=240)
-    """None = the layout's usual frame rate (30 for whole body, 20 for body only)."""
+    """None = the layout's usual frame rate (30 for whole body, 20 for body only and SMPL)."""
     actions: list[str] | None = None
     """None = all; otherwise names of `truth.ACTIONS`."""
     hand_shapes: list[str] | None = None
@@ -74,11 +88,23 @@ class SynthConfig(Config):
     captions: int = Field(3, ge=1, le=8)
     """Different wordings per clip."""
     music: bool = False
-    """Give every dance its audio."""
+    """Give every dance its audio: a click on every beat over chords. For music that decides the dance, see
+    `dances`."""
     size_spread: float = Field(0.02, ge=0, le=0.15)
-    """Standard deviation of body size, as a fraction; 0 = all clips on the uniform skeleton."""
+    """Standard deviation of body size, as a fraction; 0 = all clips on the uniform skeleton, as always in
+    `smpl75`, which holds no shape."""
     hold_out: list[dict[str, Any]] = Field(default_factory=list)
     """Combinations of truth values kept for testing, for example `[{"action": "kick", "side": "left"}]`."""
+    dances: DanceConfig | None = None
+    """Dances to songs of several genres, each genre with its own way of dancing. None = to clicks."""
+
+    @model_serializer(mode="wrap")
+    def _as_before(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without `dances` a config says what it did before there were any: its shards stay as they are."""
+        data: dict[str, Any] = handler(self)
+        if data.get("dances") is None:
+            data.pop("dances", None)
+        return data
 
     @field_validator("actions", "hand_shapes")
     @classmethod
@@ -92,7 +118,7 @@ class SynthConfig(Config):
     @field_validator("hold_out")
     @classmethod
     def _attributes(cls, combinations: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        known = Truth.__dataclass_fields__
+        known = DanceTruth.__dataclass_fields__
         for combination in combinations:
             wrong = sorted(set(combination) - set(known))
             if wrong or not combination:
@@ -109,7 +135,25 @@ class SynthConfig(Config):
             )
         if self.val_fraction + self.test_fraction >= 1:
             raise ValueError("val_fraction and test_fraction leave nothing to train on")
+        if self.dances is not None:
+            self._check_dances(self.dances)
         return self
+
+    def _check_dances(self, dances: DanceConfig) -> None:
+        if self.music:
+            raise ValueError("dances have their own music: leave `music` out where `dances` is given")
+        danced = self.actions is None or "dance" in self.actions
+        if not danced and dances.share is None:
+            raise ValueError("`dances` is given but `actions` has no dance; add it, or give dances.share")
+        if dances.share is not None and dances.share < 1 and not self.other_actions:
+            raise ValueError("dances.share below 1 needs other actions than dance")
+        if dances.song_seconds < self.min_seconds:
+            raise ValueError("dances.song_seconds is below min_seconds: no clip fits into a song")
+
+    @property
+    def other_actions(self) -> list[str]:
+        """The actions without dance."""
+        return [action for action in self.actions or ACTIONS if action != "dance"]
 
     @property
     def motion_layout(self) -> MotionLayout:
@@ -130,48 +174,119 @@ class Clip:
     truth: dict[str, Any]
     wav: tuple[NDArray[np.float32], int] | None
     """Mono samples and their rate; only dances have it."""
+    audio: NDArray[np.float32] | None = None
+    """Audio features [T, 438], one row per frame; only dances to songs have them."""
+    smpl: NDArray[np.float32] | None = None
+    """SMPL columns [T, 75] that pose the joints; only in layout `smpl75`."""
 
 
 def make_clip(index: int, config: SynthConfig) -> Clip:
     """Clip `index` of a config; a pure function of (config, index)."""
     layout = config.motion_layout
-    truth = truth_of(index, config)
+    planned = dance_of(index, config)
+    truth = planned.truth if planned else truth_of(index, config)
     hands, has_face = layout.num_joints > BODY_JOINTS, layout.has("face")
     motion, shape, words, sound = (np.random.default_rng([config.seed, index, k]) for k in range(1, 5))
-    track = ANIMATORS[truth.action](truth, Span(config.min_seconds, config.max_seconds), layout.fps, motion)
-    if hands:
+    if planned:
+        begin = planned.seconds(layout.fps)
+        track = choreograph(planned.song, begin, planned.frames, layout.fps, motion)
+    else:
+        span = Span(config.min_seconds, config.max_seconds)
+        track = ANIMATORS[truth.action](truth, span, layout.fps, motion)
+    if hands and planned:
+        track.fingers = dancing_hands(planned.song, begin, track.t, shape)
+    elif hands:
         track.fingers = np.stack([shape_hand(truth.hand(side), track.t, shape) for side in (0, 1)])
-    joints = track.solve()[:, : layout.num_joints]
-    joints = joints * np.clip(1 + config.size_spread * shape.standard_normal(), 0.8, 1.2)
-    wav = None
-    if config.music and truth.action == "dance":
-        seconds = len(joints) / layout.fps
+    solved = track.solve()
+    size = float(np.clip(1 + config.size_spread * shape.standard_normal(), 0.8, 1.2))
+    smpl = None
+    if layout.name == "smpl75":
+        size, smpl = 1.0, smpl75_of(track.rotations(), solved)
+    face = (
+        dancing_face(planned.song, begin, track.t, shape) if planned else express(truth.face, track.t, shape)
+    )
+    audio, wav = None, None
+    if planned:
+        audio, wav = _music_of(planned, layout.fps, config)
+    elif config.music and truth.action == "dance":
+        seconds = len(solved) / layout.fps
         wav = (render(float(truth.bpm or 120), track.first_beat, seconds, sound), SAMPLE_RATE)
+    if isinstance(truth, DanceTruth):
+        texts = dance_captions(truth, words, config.captions)
+    else:
+        texts = body_captions(truth, words, config.captions, hands)
+    said = planned is None or planned.comes in ("text", "both")
     return Clip(
-        joints=canonicalize(joints),
-        face=express(truth.face, track.t, shape),
-        texts=body_captions(truth, words, config.captions, hands),
-        face_texts=face_captions(truth, words) if has_face else [],
+        joints=canonicalize(solved[:, : layout.num_joints] * size),
+        face=face,
+        texts=texts if said else [],
+        face_texts=face_captions(truth, words) if has_face and said else [],
         truth=truth.record(hands=hands, face=has_face),
         wav=wav,
+        audio=audio,
+        smpl=smpl,
     )
+
+
+def _music_of(
+    dance: Dance, fps: float, config: SynthConfig
+) -> tuple[NDArray[np.float32] | None, tuple[NDArray[np.float32], int] | None]:
+    """Features [T, 438] and sound of a dance, where it comes with them."""
+    if config.dances is None or dance.comes not in ("audio", "both"):
+        return None, None
+    rate = config.dances.sample_rate
+    rows = song_rows(dance.song, rate, fps)[dance.start : dance.start + dance.frames]
+    if not config.dances.sound:
+        return rows, None
+    first = round(dance.start / fps * rate)
+    samples = render_song(dance.song, rate)[first : first + round(dance.frames / fps * rate)]
+    return rows, (samples, rate)
+
+
+def dance_of(index: int, config: SynthConfig) -> Dance | None:
+    """The dance to a song that clip `index` is; None for another action, or where dances have no songs."""
+    if config.dances is None:
+        return None
+    action, number = _action_of(index, config)
+    if action != "dance":
+        return None
+    span = Span(config.min_seconds, config.max_seconds)
+    return plan_dance(number, index, config.dances, config.seed, span, config.motion_layout.fps)
 
 
 def truth_of(index: int, config: SynthConfig) -> Truth:
     """What clip `index` does. Actions come in shuffled rounds, so any number of clips is balanced."""
-    actions = config.actions or list(ACTIONS)
-    block, place = divmod(index, len(actions))
-    order = np.random.default_rng([config.seed, block, 101]).permutation(len(actions))
+    planned = dance_of(index, config)
+    if planned:
+        return planned.truth
     rng = np.random.default_rng([config.seed, index, 0])
-    return draw(actions[int(order[place])], rng, config.hand_shapes or HANDS[1:])
+    return draw(_action_of(index, config)[0], rng, config.hand_shapes or HANDS[1:])
+
+
+def _action_of(index: int, config: SynthConfig) -> tuple[str, int]:
+    """Action of clip `index`, and which round of the actions (for a dance: which dance) it is."""
+    actions, rank = config.actions or list(ACTIONS), index
+    share = config.dances.share if config.dances else None
+    if share is not None:
+        before = int(np.floor(index * share + 1e-9))
+        if int(np.floor((index + 1) * share + 1e-9)) > before:
+            return "dance", before
+        actions, rank = config.other_actions, index - before
+    block, place = divmod(rank, len(actions))
+    order = np.random.default_rng([config.seed, block, 101]).permutation(len(actions))
+    return actions[int(order[place])], block
 
 
 def split_of(index: int, config: SynthConfig) -> Split:
-    """Split of a clip: held-out combinations test, the rest by a low-discrepancy sequence."""
-    truth = truth_of(index, config)
+    """Split of a clip: held-out combinations test, dances to songs by their song, the others by a
+    low-discrepancy sequence."""
+    planned = dance_of(index, config)
+    truth = planned.truth if planned else truth_of(index, config)
     for combination in config.hold_out:
-        if all(getattr(truth, key) == value for key, value in combination.items()):
+        if all(getattr(truth, key, None) == value for key, value in combination.items()):
             return "test"
+    if planned and config.dances:
+        return config.dances.split(planned.song, config.test_fraction, config.val_fraction)
     share = (index * _GOLDEN + 0.5 + config.seed * 0.7548776662466927) % 1.0
     if share < config.test_fraction:
         return "test"
@@ -183,7 +298,9 @@ def make_sample(index: int, config: SynthConfig) -> Sample:
     layout = config.motion_layout
     clip = make_clip(index, config)
     has_face = layout.has("face")
-    motion = encode(clip.joints, layout, face=clip.face if has_face else None)
+    motion = clip.smpl
+    if motion is None:
+        motion = encode(clip.joints, layout, face=clip.face if has_face else None)
     meta = layout.clip_meta(
         f"synth-{config.seed}-{index:06d}",
         source=f"synthetic seed {config.seed} clip {index}",
@@ -199,13 +316,18 @@ def make_sample(index: int, config: SynthConfig) -> Sample:
         motion=motion,
         texts=[Caption(text=text, source="synthetic") for text in clip.texts],
         face_texts=[Caption(text=text, source="synthetic") for text in clip.face_texts],
-        audio=None,
+        audio=clip.audio,
         wav=clip.wav,
     )
 
 
 def synthesize(config: SynthConfig, out: Path, workers: int = 1, progress: bool = True) -> Manifest:
     """Write the clips of a config as shards under `out`; the same config gives the same bytes."""
+    options = config.dump()
+    audio = None
+    if config.dances is not None:
+        options["audio_version"] = AUDIO_VERSION
+        audio = settings_for(config.motion_layout.fps).dump()
     return write_dataset(
         out,
         [(split_of(index, config), index) for index in range(config.clips)],
@@ -215,9 +337,10 @@ def synthesize(config: SynthConfig, out: Path, workers: int = 1, progress: bool 
         licence=LICENCE,
         converter="synth",
         converter_version=CONVERTER_VERSION,
-        options=config.dump(),
+        options=options,
         workers=workers,
         seed=config.seed,
         strict=True,
+        audio=audio,
         progress=progress,
     )

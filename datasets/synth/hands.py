@@ -45,6 +45,20 @@ def shape_hand(shape: str, t: Array, rng: np.random.Generator) -> Array:
         on = np.ones(n)
     else:
         on = ease((t - rng.uniform(-0.1, 0.1)) / rng.uniform(0.25, 0.45))
+    return _turned((flex, fan, thumb), shape, t, on, rng)
+
+
+def grip_hand(shape: str, t: Array, grip: Array, rng: np.random.Generator) -> Array:
+    """Local finger rotations [T, 15, 3, 3] of a hand that goes from relaxed (`grip` [T] 0) to `shape` (1)."""
+    return _turned(_angles("relaxed", rng), shape, t, grip, rng)
+
+
+def _turned(
+    relaxed: tuple[Array, Array, Array], shape: str, t: Array, on: Array, rng: np.random.Generator
+) -> Array:
+    """Rotations [T, 15, 3, 3] on the way `on` [T] from a relaxed hand's angles to a shape."""
+    flex, fan, thumb = relaxed
+    n = len(t)
     to_flex, to_fan, to_thumb = _angles(shape, rng)
     mix = on[:, None, None]
     bends = flex + mix * (to_flex - flex)

@@ -18,6 +18,7 @@ from scipy.signal import find_peaks
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth import face as faces
+from motionloom.datasets.synth.measure_dance import measure_dance
 from motionloom.datasets.synth.measure_hands import hand_shape
 from motionloom.datasets.synth.signals import Signals, rise_time, runs, signals_of, tempo
 from motionloom.datasets.synth.truth import SIDES
@@ -77,7 +78,7 @@ def agrees(
     """For each attribute of a truth record that applies: does the motion do it?
 
     truth is `ClipMeta.truth`; joints [T, 22 or 52, 3]; face [T, 50] or None (the face is then not judged).
-    A tempo agrees within 5 %.
+    A tempo agrees within 5 %. Of a dance to a song style and genre are judged too (`measure_dance`).
     """
     if "action" not in truth:
         raise UserError("truth has no 'action'; judge only clips of the synthetic source")
@@ -94,6 +95,9 @@ def agrees(
             out[name] = got is not None and wanted is not None and abs(got - wanted) <= 0.05 * wanted
         else:
             out[name] = bool(got == wanted)
+    if truth.get("genre") is not None:
+        danced = measure_dance(joints, fps)
+        out |= {"style": danced.style == truth.get("style"), "genre": danced.genre == truth["genre"]}
     if joints.shape[1] >= 52:
         for side, name in enumerate(SIDES):
             if truth.get(f"{name}_hand") is not None:

@@ -1,0 +1,260 @@
+"""Dances to songs: music decides the dance, both can be read back, songs are kept apart, bytes repeat."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.audio.features import audio_features, beats
+from motionloom.datasets.motion.canonical import canonicalize, facing
+from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.sample import encode_sample
+from motionloom.datasets.synth.dance_plan import DanceConditions, DanceConfig, beats_of
+from motionloom.datasets.synth.generate import (
+    Clip,
+    SynthConfig,
+    dance_of,
+    make_clip,
+    make_sample,
+    split_of,
+    synthesize,
+)
+from motionloom.datasets.synth.genres import GENRES
+from motionloom.datasets.synth.measure import agrees
+from motionloom.datasets.synth.measure_dance import kinetic_beats, measure_dance
+from motionloom.datasets.synth.music_rows import settings_for, song_rows
+from motionloom.datasets.synth.song import render_song
+from motionloom.datasets.synth.truth import FACES, HANDS
+
+FPS = 20.0
+CONFIG = SynthConfig(
+    seed=11,
+    fps=FPS,
+    actions=["dance"],
+    min_seconds=5.0,
+    max_seconds=8.0,
+    clips=48,
+    dances=DanceConfig(songs=24, song_seconds=16.0),
+)
+
+
+@pytest.fixture(scope="module")
+def clips() -> list[Clip]:
+    return [make_clip(index, CONFIG) for index in range(CONFIG.clips)]
+
+
+def test_the_table_is_sound() -> None:
+    for genre in GENRES.values():
+        assert genre.hand in HANDS
+        assert genre.face in FACES
+        for rhythm in (genre.kick, genre.snare, genre.hat, genre.bass, genre.chord):
+            assert len(rhythm) == 16
+            assert set(rhythm) <= set("xo.")
+    assert Counter(genre.style for genre in GENRES.values()) == {"step": 2, "bounce": 2, "sway": 2}
+
+
+def test_motion_says_its_genre_tempo_hands_and_face(clips: list[Clip]) -> None:
+    assert {clip.truth["genre"] for clip in clips} == set(GENRES)
+    right: dict[str, list[bool]] = defaultdict(list)
+    for clip in clips:
+        for attribute, good in agrees(clip.truth, clip.joints, clip.face, FPS).items():
+            right[attribute].append(good)
+    assert set(right) == {"action", "bpm", "style", "genre", "left_hand", "right_hand", "face"}
+    assert {name: np.mean(values) for name, values in right.items() if np.mean(values) < 0.97} == {}
+
+
+def test_kinetic_beats_lie_on_the_beats_of_the_music(clips: list[Clip]) -> None:
+    away = []
+    for clip in clips:
+        true = np.array(beats_of(clip.truth, (len(clip.joints) - 1) / FPS))
+        found = kinetic_beats(clip.joints, FPS)
+        away += np.abs(true[:, None] - found).min(1)[1:-1].tolist()
+    # Half a frame is what sampling at 20 frames a second leaves open.
+    assert np.median(away) < 0.5 / FPS
+    assert np.mean(np.array(away) < 1.5 / FPS) > 0.97
+
+
+def test_beats_of_the_sound_are_heard_where_the_truth_has_them(clips: list[Clip]) -> None:
+    recall, precision = [], []
+    for clip in clips:
+        assert clip.wav is not None
+        true = np.array(beats_of(clip.truth, len(clip.joints) / FPS))
+        gap = np.abs(true[:, None] - beats(*clip.wav))
+        # The tracker leaves weak beats out at the ends of a cut.
+        recall.append(np.mean(gap.min(1)[1:-1] < 0.07))
+        precision.append(np.mean(gap.min(0) < 0.07))
+    # All beats are found, slow songs at double tempo now and then, fast ones at half: trackers lean to 120.
+    assert np.mean(recall) > 0.9
+    assert np.mean(precision) > 0.85
+
+
+def test_the_genre_is_heard_in_songs_never_heard_before(clips: list[Clip]) -> None:
+    def timbre(clip: Clip) -> np.ndarray:
+        assert clip.audio is not None
+        rows = clip.audio[:, :20].astype(np.float64)  # MFCC: the timbre
+        return np.concatenate([rows.mean(0), rows.std(0)])
+
+    features = np.stack([timbre(clip) for clip in clips])
+    genres = np.array([clip.truth["genre"] for clip in clips])
+    songs = np.array([clip.truth["song"] for clip in clips])
+    new = songs < 12
+    features = (features - features[~new].mean(0)) / (features[~new].std(0) + 1e-6)
+    centres = {name: features[~new & (genres == name)].mean(0) for name in GENRES}
+    guess = [min(centres, key=lambda name: float(np.linalg.norm(x - centres[name]))) for x in features[new]]
+    # From two songs of each genre only; one in six would be chance.
+    assert np.mean(np.array(guess) == genres[new]) > 0.8
+
+
+def test_audio_rows_belong_to_motion_frames(clips: list[Clip]) -> None:
+    for index, clip in enumerate(clips[:6]):
+        dance = dance_of(index, CONFIG)
+        assert dance is not None
+        assert clip.audio is not None
+        assert clip.wav is not None
+        assert clip.audio.shape == (len(clip.joints), 438)
+        whole = audio_features(render_song(dance.song, 16_000), 16_000, settings_for(FPS))
+        assert np.array_equal(clip.audio, whole[dance.start : dance.start + dance.frames])
+        sound, rate = clip.wav
+        first = round(dance.start / FPS * rate)
+        assert np.array_equal(sound, render_song(dance.song, rate)[first : first + len(sound)])
+        assert abs(len(sound) / rate - len(clip.joints) / FPS) < 1 / rate + 1e-9
+
+
+def test_a_frame_rate_without_whole_samples_takes_the_nearest_published_rows() -> None:
+    dance = dance_of(0, CONFIG)
+    assert dance is not None
+    rows = song_rows(dance.song, 16_000, 29.97)
+    published = audio_features(render_song(dance.song, 16_000), 16_000)
+    at = [min(round(t / 29.97 * 60), len(published) - 1) for t in range(len(rows))]
+    assert len(rows) == int(16.0 * 29.97)
+    assert np.array_equal(rows, published[at])
+
+
+def test_songs_never_cross_splits() -> None:
+    dances = DanceConfig(songs=40, hold_out_songs=0.25, hold_out_tempi=[(110, 119)])
+    config = SynthConfig(actions=["dance"], clips=400, val_fraction=0.1, dances=dances)
+    songs: dict[str, set[int]] = defaultdict(set)
+    bpm: dict[str, set[int]] = defaultdict(set)
+    for index in range(400):
+        dance = dance_of(index, config)
+        assert dance is not None
+        split = split_of(index, config)
+        songs[split].add(dance.song.number)
+        bpm[split].add(dance.song.bpm)
+    assert sum(map(len, songs.values())) == len(set.union(*songs.values())) == 40
+    assert set(range(10)) <= songs["test"]
+    assert not any(110 <= tempo <= 119 for split in ("train", "val") for tempo in bpm[split])
+    assert any(110 <= tempo <= 119 for tempo in bpm["test"])
+    assert songs["val"] <= set(range(10, 14))
+
+
+def test_clips_come_with_what_the_shares_say() -> None:
+    conditions = DanceConditions(text=1, audio=2, both=4, none=1)
+    found = Counter(conditions.of(number) for number in range(800))
+    for name, share in {"text": 100, "audio": 200, "both": 400, "none": 100}.items():
+        assert abs(found[name] - share) <= 2  # type: ignore[index]
+    dances = DanceConfig(songs=3, song_seconds=6.0, share=0.5, conditions=conditions, sound=False)
+    config = SynthConfig(layout="body133", actions=["walk", "clap"], clips=16, dances=dances)
+    kinds = Counter()
+    for index in range(16):
+        sample = make_sample(index, config)
+        kinds[bool(sample.texts), sample.audio is not None] += 1
+        assert sample.wav is None
+        assert ("genre" in (sample.meta.truth or {})) == (index % 2 == 1)
+    assert set(kinds) == {(True, True), (True, False), (False, True), (False, False)}
+
+
+def test_music_decides_the_dance_and_words_name_it(clips: list[Clip]) -> None:
+    for clip in clips:
+        genre = GENRES[clip.truth["genre"]]
+        assert clip.truth["style"] == genre.style
+        assert len(set(clip.texts)) == 3
+        for text in clip.texts:
+            assert any(word in text for word in (*genre.words, *genre.moves))
+
+
+def test_shards_of_dances_are_the_same_whoever_makes_them(tmp_path: Path) -> None:
+    config = SynthConfig(
+        layout="body133",
+        actions=["dance"],
+        clips=8,
+        dances=DanceConfig(songs=4, song_seconds=8.0, hold_out_songs=0.25),
+    )
+    one = synthesize(config, tmp_path / "one", workers=1, progress=False)
+    two = synthesize(config, tmp_path / "two", workers=2, progress=False)
+    assert [shard.sha256 for shard in one.shards] == [shard.sha256 for shard in two.shards]
+    assert one.audio == settings_for(20.0).dump()
+    data = ShardDataset(tmp_path / "one", "train")
+    audio = data.audio(0)
+    assert audio is not None
+    assert audio.shape == (data.frames[0], 438)
+    truth = data.meta(0).truth
+    assert truth is not None
+    assert {"genre", "song", "bpm", "first_beat", "bar_beat", "song_start"} <= set(truth)
+
+
+def test_configs_without_songs_stay_as_they_were() -> None:
+    """Digests of clips made before there were songs."""
+    assert "dances" not in SynthConfig().dump()
+    assert SynthConfig.parse(SynthConfig().dump(), "config") == SynthConfig()
+    assert _digest(SynthConfig(seed=2024, music=True, clips=60), 42) == "40c11a64af26819e5b6af2bd"
+    held_out: list[dict[str, Any]] = [{"action": "kick"}]
+    assert _digest(SynthConfig(seed=3, layout="body133", hold_out=held_out), 42) == "683313e4d715c35b984d535f"
+
+
+def _digest(config: SynthConfig, count: int) -> str:
+    out = hashlib.sha256()
+    for index in range(count):
+        sample = make_sample(index, config)
+        members = encode_sample(
+            sample, split=sample.meta.split, layout=config.motion_layout, motion_type="float32"
+        )
+        for name, content in sorted(members.items()):
+            out.update(name.encode() + content)
+    return out.hexdigest()[:24]
+
+
+def test_smpl_columns_pose_the_joints_of_the_clip() -> None:
+    body = BodyModel.neutral("smpl22")
+    config = SynthConfig(
+        layout="smpl75", clips=28, seed=4, dances=DanceConfig(songs=2, song_seconds=8.0, share=0.25)
+    )
+    assert config.motion_layout.fps == 20
+    for index in range(28):
+        clip, sample = make_clip(index, config), make_sample(index, config)
+        values = sample.motion.astype(np.float64)
+        assert values.shape == (len(clip.joints), 75)
+        assert not sample.meta.has_hands
+        joints = smpl_joints(values[:, 3:].reshape(-1, 24, 3)[:, :22], values[:, :3], body)
+        # float32 columns: 2e-3 mm is rounding, nothing is fitted.
+        assert np.abs(joints - clip.joints).max() < 2e-6
+        assert np.abs(joints - canonicalize(joints)).max() < 2e-6
+        assert abs(float(facing(joints[:1])[0])) < 1e-5
+        assert np.linalg.norm(values[:, 3:].reshape(-1, 3), axis=-1).max() < np.pi + 1e-6
+        if clip.truth.get("genre"):
+            assert measure_dance(joints, 20.0).genre == clip.truth["genre"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"dances": {"genres": ["polka"]}}, "polka"),
+        ({"dances": {"tempo": [90, 300]}}, "tempi"),
+        ({"dances": {"hold_out_tempi": [[120, 100]]}}, "tempi"),
+        ({"dances": {"conditions": {"both": 0}}}, "weight"),
+        ({"dances": {}, "music": True}, "music"),
+        ({"dances": {}, "actions": ["walk"]}, "share"),
+        ({"dances": {"share": 0.5}, "actions": ["dance"]}, "other actions"),
+        ({"dances": {"song_seconds": 3}, "min_seconds": 4}, "song_seconds"),
+    ],
+)
+def test_wrong_options_are_named(fields: dict[str, Any], named: str) -> None:
+    with pytest.raises(UserError, match=named):
+        SynthConfig.parse(fields, "data synth")

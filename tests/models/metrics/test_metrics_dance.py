@@ -1,0 +1,169 @@
+"""Figures of dances against the published implementations' numbers, and against obvious slow versions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.metrics.dance import (
+    dance_diversity,
+    dance_fid,
+    dance_multimodality,
+    foot_contact_score,
+    foot_skating,
+    normalized_by,
+)
+from motionloom.models.metrics.dance_beats import alignment, beat_align, motion_beats
+from motionloom.models.metrics.dance_choice import accuracy_among
+from motionloom.models.metrics.dance_features import kinetic_features, manual_features, zero_start
+
+
+@pytest.fixture(scope="module")
+def golden(shared: Path) -> dict[str, np.ndarray]:
+    with np.load(shared / "golden" / "t6_dance_A.npz", allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def test_kinetic_features_are_the_published_ones(golden: dict[str, np.ndarray]) -> None:
+    joints = golden["joints24_60fps"]
+    # The published code adds up in float32.
+    assert np.allclose(kinetic_features(joints), golden["kinetic72"], rtol=2e-4)
+    assert np.allclose(kinetic_features(zero_start(joints)), golden["kinetic72_zero"], rtol=2e-4)
+    assert np.allclose(kinetic_features(joints[::3]), golden["kinetic72_20fps_input"], rtol=2e-4)
+
+
+def test_geometric_features_are_the_published_ones(golden: dict[str, np.ndarray]) -> None:
+    joints = golden["joints24_60fps"]
+    assert np.allclose(manual_features(joints), golden["manual32"], atol=1e-6)
+    assert np.allclose(manual_features(zero_start(joints)), golden["manual32_zero"], atol=1e-6)
+
+
+def test_energy_as_it_is_meant_does_not_depend_on_the_place() -> None:
+    rng = np.random.default_rng(0)
+    joints = rng.standard_normal((30, 5, 3)).cumsum(0)
+    meant = kinetic_features(joints, published=False)
+    assert np.allclose(meant, kinetic_features(joints + 7.0, published=False), rtol=1e-9)
+    assert not np.allclose(kinetic_features(joints), kinetic_features(joints + 7.0), rtol=1e-2)
+    # The obvious version, joint 2: windows of five steps, cut at the ends.
+    spent = []
+    for i in range(1, 30):
+        change = [
+            (joints[j + 1, 2] - 2 * joints[j, 2] + joints[j - 1, 2]) * 3600
+            for j in range(i - 2, i + 3)
+            if 1 <= j <= 28
+        ]
+        spent.append(np.linalg.norm(np.mean(change, axis=0)))
+    assert np.isclose(meant[3 * 2 + 2], np.mean(spent), rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["k", "m"])
+def test_distances_and_diversity_are_the_published_ones(golden: dict[str, np.ndarray], kind: str) -> None:
+    true, made = golden[f"feat_{kind}_gt"], golden[f"feat_{kind}_pred"]
+    got = dance_fid(true, made)
+    assert np.isclose(got, golden[f"bailando_fid_{kind}"], rtol=1e-5)
+    assert np.isclose(got, golden[f"mint_fid_{kind}"], rtol=1e-5)
+    assert np.isclose(dance_diversity(true, made), golden[f"bailando_div_{kind}_pred"], rtol=1e-5)
+    assert np.isclose(dance_diversity(true, true), golden[f"bailando_div_{kind}_gt"], rtol=1e-5)
+
+
+def test_a_statement_that_is_always_true_does_not_explode() -> None:
+    rng = np.random.default_rng(1)
+    true, made = rng.random((40, 3)), rng.random((40, 3))
+    true[:, 1] = 1.0
+    made[:, 1] = 0.5
+    assert np.array_equal(normalized_by(true, made)[:, 1], np.full(40, -0.5))
+    assert dance_fid(true, made) < 10
+
+
+def test_multimodality_is_the_mean_of_each_input() -> None:
+    rng = np.random.default_rng(2)
+    true, made = rng.standard_normal((20, 4)), rng.standard_normal((3, 5, 4))
+    scaled = (made - true.mean(0)) / true.std(0)
+    wanted = np.mean(
+        [np.linalg.norm(rows[i] - rows[j]) for rows in scaled for i in range(5) for j in range(i)]
+    )
+    assert np.isclose(dance_multimodality(true, made), wanted, rtol=1e-8)
+
+
+def test_beats_and_alignment_are_the_published_ones(golden: dict[str, np.ndarray]) -> None:
+    joints = golden["joints24_60fps"]
+    for name in ("bailando", "mint"):
+        found = np.round(motion_beats(joints, 60.0, name) * 60).astype(int)
+        assert found.tolist() == golden[f"motion_beats_{name}"].tolist()
+    own, other = golden["music_beats_bailando"] / 60, golden["music_beats_mint"] / 60
+    assert np.isclose(beat_align(joints, own, 60.0), golden["bas_bailando"], rtol=1e-5)
+    assert np.isclose(beat_align(joints, other, 60.0), golden["bas_bailando_mintbeats"], rtol=1e-5)
+    assert np.isclose(beat_align(joints, other, 60.0, "mint"), golden["bas_mint"], rtol=1e-5)
+    assert np.isclose(beat_align(joints, own, 60.0, "mint"), golden["bas_mint_bailandobeats"], rtol=1e-5)
+    assert beat_align(joints, own, 60.0, "ude") == beat_align(joints, own, 60.0, "bailando")
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0, 60.0])
+@pytest.mark.parametrize("name", ["bailando", "mint"])
+def test_a_body_that_stops_on_each_beat_is_aligned_at_any_rate(fps: float, name: str) -> None:
+    beat, late = 0.6, 0.011  # beats between frames: no two steps are equally slow
+    time = np.arange(round(6 * fps)) / fps - late
+    swing = np.cos(np.pi * time / beat)[:, None, None] * np.ones((1, 3, 3))
+    music = np.arange(1, 9) * beat + late
+    on, off = (beat_align(swing, music + shift, fps, name) for shift in (0.0, beat / 2))
+    # mint counts a step for its later frame: half a frame, which is half a sigma at 20 frames a second.
+    assert on > 0.6
+    assert off < 0.05
+
+
+def test_alignment_without_beats() -> None:
+    still = np.zeros((60, 3, 3))
+    assert beat_align(still, np.array([0.5]), 60.0) == 0
+    assert alignment(np.array([1.0]), np.array([1.0, 5.0]), "music", 0.05) == 1
+    assert np.isclose(alignment(np.array([1.0]), np.array([1.0, 5.0]), "motion", 0.05), 0.5)
+    with pytest.raises(UserError, match="beat of the music"):
+        beat_align(still, np.array([5.0]), 60.0)
+    with pytest.raises(UserError, match="bailando, ude"):
+        beat_align(still, np.array([0.5]), 60.0, "beatles")
+
+
+def test_the_foot_contact_score_is_the_published_one(golden: dict[str, np.ndarray]) -> None:
+    joints = golden["joints24_60fps"]
+    assert np.isclose(foot_contact_score(joints[::2], 30.0), golden["pfc_edge"], rtol=1e-4)
+    assert foot_contact_score(np.zeros((9, 12, 3)), 30.0) == 0
+
+
+def test_sliding_feet_are_counted() -> None:
+    joints = np.zeros((21, 12, 3))
+    joints[:, 0, 1] = 1.0
+    assert foot_skating(joints, 20.0) == 0
+    joints[10:, 10, 0] = np.arange(11) * 0.05  # 1 m/s for ten of twenty steps of one of two feet
+    assert foot_skating(joints, 20.0) == 0.25
+    assert foot_skating(joints, 20.0, speed=1.5) == 0
+    joints[:, 10, 1] = 0.2
+    assert foot_skating(joints, 20.0) == 0
+
+
+def test_accuracy_among_candidates() -> None:
+    generator = torch.Generator().manual_seed(3)
+    text = torch.randn(80, 16, generator=generator)
+    assert accuracy_among(text, text) == {"top-1": 1.0, "top-5": 1.0}
+    assert accuracy_among(torch.ones(80, 4), torch.ones(80, 4)) == {"top-1": 0.0, "top-5": 0.0}
+    chance = accuracy_among(torch.randn(80, 16, generator=generator), text, candidates=5, tops=(1, 5))
+    assert chance["top-5"] == 1
+    assert 0.05 < chance["top-1"] < 0.4
+    # All texts among the candidates: the rank in the whole matrix.
+    motion = text + 2.0 * torch.randn(80, 16, generator=generator)
+    near = (
+        torch.nn.functional.normalize(motion.double(), dim=-1)
+        @ torch.nn.functional.normalize(text.double(), dim=-1).T
+    )
+    first = float((near.argmax(1) == torch.arange(80)).double().mean())
+    assert accuracy_among(motion, text, candidates=80)["top-1"] == first
+    same = torch.zeros(80, 80, dtype=torch.bool)
+    same[:, :40] = True
+    with pytest.raises(UserError, match="evaluate more clips"):
+        accuracy_among(motion, text, same=same)
+    twins = torch.cat([text, text])
+    equal = torch.eye(80, dtype=torch.bool).repeat(2, 2)
+    assert accuracy_among(twins, twins, candidates=150, same=equal)["top-1"] == 1
+    assert accuracy_among(twins, twins, candidates=150)["top-1"] < 1
