@@ -1,0 +1,44 @@
+"""Training of the diffusion motion decoder on tokens of real motion (UDE section 3.4)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from motionloom.models.diffusion.dmd import Dmd, dmd_loss
+from motionloom.models.gpt.frozen import Frozen
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
+from motionloom.models.training.stage_module import OptimConfig, StageModule
+
+
+class DmdModule(StageModule):
+    """Trains a `Dmd` on windows of motion; the tokenizer that makes their tokens is frozen."""
+
+    net: Dmd
+
+    def __init__(
+        self, net: Dmd, optim: OptimConfig, *, seed: int, max_steps: int, tokenizer: Tokenizer
+    ) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.noiser = net.config.schedule.noiser()
+        self.tokenizer = Frozen(tokenizer)
+
+    def on_fit_start(self) -> None:
+        """The frozen tokenizer follows to this module's device."""
+        self.tokenizer.to(self.device)
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Loss of one batch: "motion" [B, T, D] (the tokenizer's columns), "length" [B], "held" bool [B, D]
+        (optional: all). Time steps and noise are drawn anew each call.
+        """
+        motion, held = batch["motion"], batch.get("held")
+        groups = (batch["length"] // GROUP_FRAMES).clamp(min=1)
+        length = groups * GROUP_FRAMES
+        with torch.no_grad():
+            codes = self.tokenizer.module.encode(motion, length, held)
+        step = torch.randint(0, self.net.config.schedule.steps, (len(motion),), device=motion.device)
+        noise = torch.randn_like(motion)
+        loss = dmd_loss(self.net, self.noiser, motion, codes, length, step, noise, held=held)
+        return {"loss": loss}

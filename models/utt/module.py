@@ -1,0 +1,192 @@
+"""Training of MATE and UTT end to end, against a conditional patch discriminator (UDE section 3.3).
+
+L = L_ce + beta_adv L_adv (equation 4): cross-entropy of the tokens of real motion, and what a discriminator
+says of the motion that the predicted tokens decode to. Tokens are made on the way, by the frozen tokenizer, so
+every window of a clip is tokenized as it stands.
+
+Notable choices [ours]:
+- The adversarial term begins at `adversarial_start` and rises over `adversarial_ramp` steps; the discriminator
+  learns from `adversarial_start` on. Before, predictions are noise that teaches it nothing.
+- With the term off there is no discriminator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from motionloom.datasets.schema import Config
+from motionloom.models.condition.mate import Encoded, drop_conditions
+from motionloom.models.discriminator.losses import (
+    AdversarialConfig,
+    discriminator_loss,
+    generator_loss,
+    gradient_penalty,
+)
+from motionloom.models.discriminator.patch import DiscriminatorConfig, PatchDiscriminator
+from motionloom.models.gpt.frozen import Frozen
+from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy
+from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
+from motionloom.models.training.optim import OptimConfig
+from motionloom.models.training.players import Player, PlayersModule
+from motionloom.models.utt.conditioned import ConditionedUtt
+from motionloom.models.utt.losses import SoftMotion, soft_motion
+
+
+class UttLossConfig(Config):
+    """The loss of MATE and UTT."""
+
+    adversarial: AdversarialConfig = AdversarialConfig()
+    adversarial_start: int = Field(0, ge=0)
+    """First step with the adversarial term, and the discriminator's first step."""
+    adversarial_ramp: int = Field(0, ge=0)
+    """Steps over which its weight rises from 0."""
+    discriminator: DiscriminatorConfig = DiscriminatorConfig()
+    discriminator_optim: OptimConfig = OptimConfig(optimizer="adam", betas=(0.5, 0.99))
+
+    def weight(self, step: int) -> float:
+        """Weight of the adversarial term in a step."""
+        since = step - self.adversarial_start
+        if since < 0:
+            return 0.0
+        rise = 1.0 if self.adversarial_ramp == 0 else min(1.0, (since + 1) / self.adversarial_ramp)
+        return self.adversarial.weight * rise
+
+
+def closed_sequences(
+    codes: Mapping[str, Tensor],
+    groups: Tensor,
+    closed: Tensor,
+    pattern: Sequence[str],
+    ends: Mapping[str, int],
+) -> TokenSequence:
+    """One sequence a row, with its End tokens where `closed` [B]; open rows are clips that go on."""
+    sequence = interleave(codes, pattern, ends=ends, groups=groups)
+    body = groups * len(pattern)
+    place = torch.arange(sequence.tokens.shape[1], device=groups.device)[None]
+    gone = ~closed[:, None] & (place >= body[:, None])
+    return TokenSequence(
+        sequence.tokens.masked_fill(gone, PAD),
+        sequence.kinds.masked_fill(gone, 0),
+        torch.where(closed, sequence.length, body),
+    )
+
+
+class UttModule(PlayersModule):
+    """Trains a `ConditionedUtt` on the batches of `ConditionBatches`; the tokenizer is only looked through."""
+
+    net: ConditionedUtt
+
+    def __init__(
+        self,
+        net: ConditionedUtt,
+        optim: OptimConfig,
+        *,
+        seed: int,
+        max_steps: int,
+        tokenizer: Tokenizer,
+        loss: UttLossConfig | None = None,
+    ) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.loss_config = loss or UttLossConfig()
+        self.tokenizer = Frozen(tokenizer)
+        self.discriminator: PatchDiscriminator | None = None
+        if self.loss_config.adversarial.weight:
+            self.discriminator = PatchDiscriminator(
+                self.loss_config.discriminator, tokenizer.dim, net.mate.config.dim
+            )
+
+    def on_fit_start(self) -> None:
+        """The frozen tokenizer follows to this module's device."""
+        self.tokenizer.to(self.device)
+
+    def players(self) -> list[Player]:
+        """The token model, then the discriminator of what it has made."""
+        players = [Player("tokens", (self.net,), self.optim_config)]
+        if self.discriminator is not None:
+            config = self.loss_config
+            players.append(
+                Player(
+                    "critic",
+                    (self.discriminator,),
+                    config.discriminator_optim,
+                    start_step=config.adversarial_start,
+                )
+            )
+        return players
+
+    def play(self, player: str, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A player's loss of one batch.
+
+        "motion" [B, T, D] (the tokenizer's columns), "length" [B], "closed" bool [B] (whether the clip ends
+        with the window), "conditions", "held" bool [B, D] (optional: all).
+        """
+        if player == "critic":
+            return self._critic(batch, shared)
+        return self._tokens(batch, shared)
+
+    def sequences(self, batch: dict[str, Any]) -> TokenSequence:
+        """Tokens of a batch's motion, as the frozen tokenizer makes them."""
+        tokenizer, net = self.tokenizer.module, self.net.utt
+        groups = (batch["length"] // GROUP_FRAMES).clamp(min=1)
+        with torch.no_grad():
+            codes = tokenizer.encode(batch["motion"], groups * GROUP_FRAMES, batch.get("held"))
+        return closed_sequences(codes, groups, batch["closed"], net.pattern, net.num_codes)
+
+    def _tokens(self, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+        net, config = self.net.utt, self.net.utt.config
+        tokens, kinds, _ = self.sequences(batch)
+        conditions, inputs, z = batch["conditions"], None, None
+        size, device = len(tokens), tokens.device
+        if self.training:
+            drop = torch.rand(size, device=device) < config.condition_dropout
+            conditions = drop_conditions(conditions, drop)
+            if config.pkeep < 1:
+                inputs = corrupt(tokens, kinds, net.ends, config.pkeep)
+        encoded: Encoded = self.net.mate(conditions, size)
+        if config.z_dim:
+            z = torch.randn(size, config.z_dim, device=device)
+        logits = net(tokens, kinds, encoded, z, inputs=inputs)
+        ce = cross_entropy(logits, tokens)
+        values = {"loss": ce, "ce": ce}
+        for kind, name in enumerate(net.names):
+            values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind)
+        weight = self.loss_config.weight(self.global_step)
+        if self.discriminator is None or (weight == 0 and self.training):
+            return values
+        fake = self._soft(batch, logits, tokens, kinds)
+        shared["motion"], shared["length"], shared["glob"] = fake.motion, fake.length, encoded.glob
+        values["adversarial"] = generator_loss(self.discriminator(fake.motion, encoded.glob, fake.length))
+        values["loss"] = ce + weight * values["adversarial"]
+        return values
+
+    def _soft(self, batch: dict[str, Any], logits: Tensor, tokens: Tensor, kinds: Tensor) -> SoftMotion:
+        config = self.loss_config.adversarial
+        return soft_motion(
+            self.net.utt,
+            logits,
+            tokens,
+            kinds,
+            tokenizer=self.tokenizer.module,
+            gumbel_temperature=config.gumbel_temperature,
+            sample=config.sample and self.training,
+            held=batch.get("held"),
+        )
+
+    def _critic(self, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+        critic = self.discriminator
+        assert critic is not None
+        glob, length = shared["glob"].detach(), shared["length"]
+        real = batch["motion"][:, : shared["motion"].shape[1]]
+        fake = critic(shared["motion"].detach(), glob, length)
+        values = discriminator_loss(critic(real, glob, length), fake)
+        weight = self.loss_config.adversarial.gradient_penalty
+        if weight and self.training:
+            values["penalty"] = gradient_penalty(critic, real, glob, length)
+            values["loss"] = values["loss"] + weight * values["penalty"]
+        return values
