@@ -84,7 +84,7 @@ class PlayersModule(StageModule):
         for player in self.players():
             values = self.play(player.name, batch, shared)
             shared = {name: value.detach() for name, value in shared.items()}
-            out = {"loss": values["loss"], **out} if not out else out
+            out = out or {"loss": values["loss"]}
             out |= _named(player, values)
         return out
 

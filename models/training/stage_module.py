@@ -38,8 +38,8 @@ class StageModule(L.LightningModule, ABC):
         self.gauges: dict[str, float | Tensor] = {}
         """Learning rate and gradient norm of the step that the newest row of the log ends with."""
         self.fused = True
-        """Whether the optimizer is one kernel. False for "16-mixed": a fused step also removes the scale of the
-        gradients, and they could not be clipped before it."""
+        """Whether the optimizer is one kernel. False for "16-mixed": a fused step also removes the scale of
+        the gradients, and they could not be clipped before it."""
 
     @abstractmethod
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:

@@ -15,7 +15,6 @@ from pydantic import Field
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.launch.process import local_rank
 
-
 LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow", "trackio"]
 
 
