@@ -36,8 +36,8 @@ def bar(console: Console) -> Progress:
 class StepProgress(Callback):
     """Steps done of all steps, loss and speed: a bar on a terminal, a line every 15 s elsewhere."""
 
-    def __init__(self, name: str, steps: int, console: Console) -> None:
-        self.name, self.steps, self.console = name, steps, console
+    def __init__(self, name: str, steps: int, console: Console, *, longer: bool = False) -> None:
+        self.name, self.steps, self.console, self.longer = name, steps, console, longer
         self.progress: Progress | None = None
         self.began = self.printed = time.monotonic()
         self.first = 0
@@ -48,7 +48,9 @@ class StepProgress(Callback):
         self.first = trainer.global_step
         if not trainer.is_global_zero:
             return
-        if self.first:
+        if self.first and self.longer:
+            self.console.print(f"    {self.name} goes on from step {self.first} to {self.steps}")
+        elif self.first:
             self.console.print(f"    resuming {self.name} at step {self.first} of {self.steps}")
         self.progress = bar(self.console)
         self.progress.start()

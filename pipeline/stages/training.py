@@ -11,7 +11,7 @@ import json
 import warnings
 from collections.abc import Callable, Iterator, Sized
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import lightning as L
 import torch
@@ -168,7 +168,7 @@ def fit(
     hardware = context.hardware
     if hardware.threads:
         torch.set_num_threads(hardware.threads)
-    newest, chunk = start_of(context.folder / "checkpoints", config)
+    newest, chunk, longer = start_of(context.folder / "checkpoints", config)
     data = _Data(train, validation, config, chunk, hardware)
     checkpoints = ModelCheckpoint(
         dirpath=context.folder / "checkpoints",
@@ -208,7 +208,7 @@ def fit(
             checkpoints,
             ResumeBetweenChunks(config, chunk),
             MetricLog(context.folder, loggers),
-            StepProgress(context.name, config.steps, context.console),
+            StepProgress(context.name, config.steps, context.console, longer=longer),
             *([average] if average else []),
         ],
     )
@@ -217,7 +217,10 @@ def fit(
         module.compile_losses()
     net = module.net
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
+        with warnings.catch_warnings():
+            # Lightning compares steps with batches, and a step of players takes several.
+            warnings.filterwarnings("ignore", ".*ended before the epoch ended.*")
+            trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise KeyboardInterrupt from None
     except RuntimeError as error:
@@ -254,11 +257,11 @@ class ResumeBetweenChunks(Callback):
     """
 
     def __init__(self, config: TrainConfig, chunk: int) -> None:
-        self.every, self.chunk = config.checkpoint_every, chunk
+        self.steps, self.every, self.chunk = config.steps, config.checkpoint_every, chunk
 
     def state_dict(self) -> dict[str, Any]:
-        """The interval that the config names, and the one in use."""
-        return {"every": self.every, "chunk": self.chunk}
+        """Length of the training, the interval that its config names, and the one in use."""
+        return {"steps": self.steps, "every": self.every, "chunk": self.chunk}
 
     def on_load_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
@@ -331,23 +334,38 @@ def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
     )
 
 
-def start_of(folder: Path, config: TrainConfig) -> tuple[Path | None, int]:
-    """The checkpoint to go on from, None for the beginning, and the steps of a chunk.
+class Start(NamedTuple):
+    """Where a training begins."""
 
-    A training keeps the chunks that it began with as long as `checkpoint_every` is the same, also when
-    `steps` has been raised. Its last chunk may then have been cut short: it is trained again, so that the
-    validations and checkpoints of the longer training lie where they would have without a pause.
+    checkpoint: Path | None
+    """What to go on from; None for the beginning."""
+    chunk: int
+    """Steps of a chunk."""
+    longer: bool = False
+    """Whether the checkpoint is of a training of fewer steps."""
+
+
+def start_of(folder: Path, config: TrainConfig) -> Start:
+    """Where a training with these checkpoints begins.
+
+    It keeps the chunks that it began with as long as `checkpoint_every` is the same, also when `steps` has
+    been raised. Its last chunk may then have been cut short: it is trained again, so that the validations and
+    checkpoints of the longer training lie where they would have without a pause.
     """
     chunk = min(config.checkpoint_every, config.steps)
-    fallback: tuple[Path, int] | None = None
+    short: Start | None = None
     for path, checkpoint in _readable(folder):
         state = checkpoint.get("callbacks", {}).get(ResumeBetweenChunks.__qualname__)
-        if state is None or state["every"] != config.checkpoint_every:
-            return path, chunk
+        if state is None:
+            return Start(path, chunk)
+        longer = state["steps"] < config.steps
+        if state["every"] != config.checkpoint_every:
+            return Start(path, chunk, longer)
+        start = Start(path, state["chunk"], longer)
         if checkpoint["global_step"] >= config.steps or checkpoint["global_step"] % state["chunk"] == 0:
-            return path, state["chunk"]
-        fallback = fallback or (path, state["chunk"])
-    return fallback or (None, chunk)
+            return start
+        short = short or start
+    return short or Start(None, chunk)
 
 
 def newest_checkpoint(folder: Path) -> Path | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,9 +27,17 @@ class Vectors(Dataset[dict[str, Tensor]]):
     """Item k is this rank's rows of batch k."""
 
     def __init__(
-        self, batch: int, rank: int = 0, world: int = 1, *, parts: int = 1, size: int = 10**6, dtype: Any = None
+        self,
+        batch: int,
+        rank: int = 0,
+        world: int = 1,
+        *,
+        parts: int = 1,
+        size: int = 10**6,
+        dtype: Any = None,
+        dies_at: int | None = None,
     ) -> None:
-        self.batch, self.parts, self.size, self.dtype = batch, parts, size, dtype
+        self.batch, self.parts, self.size, self.dtype, self.dies_at = batch, parts, size, dtype, dies_at
         self.rows = slice(rank * batch // world, (rank + 1) * batch // world)
 
     def __len__(self) -> int:
@@ -38,11 +47,13 @@ class Vectors(Dataset[dict[str, Tensor]]):
         if index >= self.size:
             raise IndexError(index)
         step, part = divmod(index, self.parts)
+        if step == self.dies_at:
+            raise ConnectionResetError("killed")
         generator = torch.Generator().manual_seed(step)
         # The same rows whether they come at once or in parts.
         rows = torch.randn(self.parts * self.batch, DIM, generator=generator, dtype=torch.float64)
         rows = rows[part * self.batch :][: self.batch][self.rows].to(self.dtype or torch.float32)
-        return {"x": rows, "length": torch.ones(len(rows))}
+        return {"x": rows, "length": torch.ones(len(rows)), "reader": torch.tensor(os.getpid())}
 
 
 class Duel(PlayersModule):
@@ -59,7 +70,11 @@ class Duel(PlayersModule):
         self.critic.append(nn.Identity())
         self.critic.register_parameter("idle", self.unused)
         self.critic_optim, self.start = critic, start
-        self.turns: list[tuple[int, str]] = []
+        self.readers: set[int] = set()
+
+    def on_train_batch_start(self, batch: dict[str, Any], batch_idx: int) -> None:
+        """Note which process has read the batch."""
+        self.readers.add(int(batch["reader"]))
 
     def players(self) -> Sequence[Player]:
         """Generator, then critic."""
@@ -95,9 +110,10 @@ def train(
     hardware: dict[str, Any] | None = None,
     dtype: torch.dtype = torch.float32,
     module: dict[str, Any] | None = None,
+    dies_at: int | None = None,
     **settings: Any,
 ) -> Duel:
-    """Train a duel in `folder`, from its newest checkpoint."""
+    """Train a duel in `folder`, from its newest checkpoint; `dies_at` a step all ends with an error."""
     given: dict[str, Any] = {
         "steps": 24, "batch_size": 8, "checkpoint_every": 6, "validate_every": 12, **settings
     }  # fmt: skip
@@ -107,7 +123,9 @@ def train(
         context(folder, **(hardware or {})),
         duel,
         config,
-        lambda batch, rank, world: Vectors(batch, rank, world, parts=config.accumulate, dtype=dtype),
+        lambda batch, rank, world: Vectors(
+            batch, rank, world, parts=config.accumulate, dtype=dtype, dies_at=dies_at
+        ),
         lambda: Vectors(8, size=2, dtype=dtype),
         0.0,
     )
