@@ -7,12 +7,12 @@ gradients over ranks, and training then equals one process with the whole batch.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
+from torch import Tensor, nn
 
 _alone = False
 
@@ -93,3 +93,25 @@ def gather_rows_with_grad(x: Tensor) -> Tensor:
     rows = list(torch.split(gather_rows(x.detach()), len(x)))
     rows[rank()] = x + (world_size() - 1) * (x - x.detach())
     return torch.cat(rows)
+
+
+def mean_gradients(params: Sequence[nn.Parameter]) -> None:
+    """Average gradients over ranks in place, as DDP does; every rank calls it with the same parameters.
+
+    A parameter without a gradient on some ranks counts as 0 there, and stays without one if all lack it: an
+    optimizer passes it over, as in one process. One collective for each dtype.
+    """
+    if not is_distributed():
+        return
+    for dtype in dict.fromkeys(param.dtype for param in params):
+        group = [param for param in params if param.dtype == dtype]
+        present = torch.tensor([float(p.grad is not None) for p in group], dtype=dtype).to(group[0].device)
+        grads = [(p.grad if p.grad is not None else torch.zeros_like(p)).reshape(-1) for p in group]
+        flat = torch.cat([present, *grads])
+        dist.all_reduce(flat)
+        means = (flat[len(group) :] / world_size()).split([p.numel() for p in group])
+        # Read only where this rank lacks one: on a GPU that waits for the collective.
+        lacking = any(param.grad is None for param in group)
+        counts = flat[: len(group)].tolist() if lacking else [1.0] * len(group)
+        for param, count, mean in zip(group, counts, means, strict=True):
+            param.grad = mean.view_as(param) if count else None

@@ -7,33 +7,20 @@ bit. Codebooks draw by themselves, the same on every rank (`quantize/draws.py`).
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from typing import Any, Literal
+from typing import Any
 
 import lightning as L
 import torch
-from pydantic import Field
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 
-from motionloom.datasets.schema import Config
 from motionloom.models.training.distributed import alone
+from motionloom.models.training.optim import OptimConfig as OptimConfig
 from motionloom.models.training.sharding import sharded
 
 LOG_EVERY = 10
 """Steps that a row of the log averages; averaging over ranks costs a collective each."""
-
-
-class OptimConfig(Config):
-    """AdamW and its learning-rate schedule."""
-
-    lr: float = Field(1e-4, gt=0)
-    betas: tuple[float, float] = (0.9, 0.99)
-    weight_decay: float = Field(0.0, ge=0)
-    warmup_steps: int = Field(0, ge=0)
-    schedule: Literal["constant", "cosine"] = "constant"
-    grad_clip: float = Field(1.0, ge=0)
-    """Largest gradient norm; 0 turns clipping off."""
 
 
 class StageModule(L.LightningModule, ABC):
@@ -45,11 +32,14 @@ class StageModule(L.LightningModule, ABC):
         self.optim_config = optim
         self.seed = seed
         self.max_steps = max_steps
-        self._since: Tensor | None = None
-        self._count = 0
+        self._since: dict[tuple[str, ...], tuple[Tensor, int]] = {}
+        self.row: tuple[str, ...] = ()
+        """Names of the figures in the newest row of the log."""
+        self.gauges: dict[str, float | Tensor] = {}
+        """Learning rate and gradient norm of the step that the newest row of the log ends with."""
         self.fused = True
-        """Whether AdamW is one kernel. False for "16-mixed": a fused step also removes the scale of the
-        gradients, and they could not be clipped before it."""
+        """Whether the optimizer is one kernel. False for "16-mixed": a fused step also removes the scale of
+        the gradients, and they could not be clipped before it."""
 
     @abstractmethod
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
@@ -72,26 +62,48 @@ class StageModule(L.LightningModule, ABC):
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """One step; seeds torch from (seed, step, part of the step, rank) first."""
         part = batch_idx % self.trainer.accumulate_grad_batches
-        key = (self.seed * 1_000_003 + self.global_step) * 4099 + self.global_rank
-        torch.manual_seed((key + (part << 48)) % 2**63)
+        self.seed_draws(part)
         values = self.losses(batch)
-        self._average(values, last=part == self.trainer.accumulate_grad_batches - 1)
+        self.average(values)
+        if part == self.trainer.accumulate_grad_batches - 1:
+            self.log_row()
         self.log("loss", values["loss"].detach(), prog_bar=True, logger=False)
         return values["loss"]
 
+    def seed_draws(self, part: int, turn: int = 0) -> None:
+        """Seed torch for one part of a step, and one of several losses that are computed on it in turn."""
+        key = (self.seed * 1_000_003 + self.global_step) * 4099 + self.global_rank
+        torch.manual_seed((key + (part << 48) + (turn << 56)) % 2**63)
+
+    @property
+    def ends_row(self) -> bool:
+        """Whether a row of the log ends with the step that is being taken."""
+        return (self.global_step + 1) % LOG_EVERY == 0
+
     def on_train_epoch_start(self) -> None:
         """Averages begin anew with a chunk, as they do in a run that goes on from its checkpoint."""
-        self._since, self._count = None, 0
+        self._since = {}
 
-    def _average(self, values: dict[str, Tensor], *, last: bool) -> None:
-        """Log the means over the steps, and parts of steps, since the last row."""
+    def average(self, values: dict[str, Tensor]) -> None:
+        """Add figures of a step, or of a part of one, to the means of the next row."""
+        names = tuple(values)
         figures = torch.stack([v.detach().float() for v in values.values()])
-        self._since = figures if self._since is None else self._since + figures
-        self._count += 1
-        if last and (self.global_step + 1) % LOG_EVERY == 0:
-            means = (self._since / self._count).unbind()
-            self.log_dict({f"train/{k}": v for k, v in zip(values, means, strict=True)}, sync_dist=True)
-            self._since, self._count = None, 0
+        if names in self._since:
+            sums, count = self._since[names]
+            self._since[names] = (sums + figures, count + 1)
+        else:
+            self._since[names] = (figures, 1)
+
+    def log_row(self) -> None:
+        """Where a row ends with this step: log the means of what was added since the last one."""
+        if not self.ends_row:
+            return
+        means: dict[str, Any] = {}
+        for names, (sums, count) in self._since.items():
+            means |= {f"train/{k}": v for k, v in zip(names, (sums / count).unbind(), strict=True)}
+        self.log_dict(means, sync_dist=True)
+        self.row = tuple(means)
+        self._since = {}
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """The same losses on held-out data; every rank gets the same batches and the same figures.
@@ -114,24 +126,28 @@ class StageModule(L.LightningModule, ABC):
 
         Lightning's own would refuse a fused optimizer in every mixed precision, bfloat16 included.
         """
-        if gradient_clip_val:
-            torch.nn.utils.clip_grad_norm_(self.net.parameters(), gradient_clip_val)
+        self.gauges = {}
+        norm = self.clip(list(self.net.parameters()), gradient_clip_val)
+        if norm is not None:
+            self.gauges = {"lr": optimizer.param_groups[0]["lr"], "grad_norm": norm}
+
+    def clip(self, params: list[nn.Parameter], largest: float | None) -> Tensor | None:
+        """Clip by the norm of all gradients, if there is a largest one; the norm before, where a row ends."""
+        if largest:
+            norm = torch.nn.utils.clip_grad_norm_(params, largest)
+        elif self.ends_row:
+            norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
+        else:
+            return None
+        if not self.ends_row:
+            return None
+        return norm.full_tensor() if isinstance(norm, DTensor) else norm
 
     def configure_optimizers(self) -> Any:
-        """AdamW over the trainable parameters, linear warm-up, then constant or cosine."""
+        """The optimizer of the trainable parameters, linear warm-up, then constant or cosine."""
         config = self.optim_config
-        params = [p for p in self.net.parameters() if p.requires_grad]
-        optimizer = torch.optim.AdamW(
-            params, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay, fused=self.fused
+        optimizer = config.build([p for p in self.net.parameters() if p.requires_grad], fused=self.fused)
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda step: config.factor(step, self.max_steps)
         )
-
-        def factor(step: int) -> float:
-            if step < config.warmup_steps:
-                return (step + 1) / config.warmup_steps
-            if config.schedule == "constant":
-                return 1.0
-            done = (step - config.warmup_steps) / max(1, self.max_steps - config.warmup_steps)
-            return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
-
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

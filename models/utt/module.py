@@ -1,12 +1,12 @@
 """Training of MATE and UTT end to end, against a conditional patch discriminator (UDE section 3.3).
 
 L = L_ce + beta_adv L_adv (equation 4): cross-entropy of the tokens of real motion, and what a discriminator
-says of the motion that the predicted tokens decode to. Tokens are made on the way, by the frozen tokenizer, so
-every window of a clip is tokenized as it stands.
+says of the motion that the predicted tokens decode to. Tokens are made on the way, by the frozen tokenizer,
+so every window of a clip is tokenized as it stands.
 
 Notable choices [ours]:
-- The adversarial term begins at `adversarial_start` and rises over `adversarial_ramp` steps; the discriminator
-  learns from `adversarial_start` on. Before, predictions are noise that teaches it nothing.
+- The adversarial term begins at `adversarial_start` and rises over `adversarial_ramp` steps; the
+  discriminator learns from `adversarial_start` on. Before, predictions are noise that teaches it nothing.
 - With the term off there is no discriminator.
 """
 

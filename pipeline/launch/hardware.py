@@ -15,6 +15,8 @@ from pydantic import Field
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.launch.process import local_rank
 
+LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow", "trackio"]
+
 
 class Hardware(Config):
     """Machine settings of a recipe (`hardware:`)."""
@@ -29,6 +31,8 @@ class Hardware(Config):
     """Processes that convert or synthesise shards."""
     threads: int = Field(0, ge=0)
     """CPU threads per process; 0 leaves torch's choice."""
+    loggers: tuple[LoggerName, ...] = ("tensorboard", "csv")
+    """Where the figures of trainings go, besides `metrics.jsonl`; wandb, mlflow and trackio are extras."""
 
     def resolved_accelerator(self) -> Literal["cpu", "gpu"]:
         """`auto` made concrete."""

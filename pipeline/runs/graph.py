@@ -30,6 +30,7 @@ from motionloom.pipeline.contract.stage import Finished, Shelf
 from motionloom.pipeline.contract.stage import Stage, StageContext, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
+from motionloom.pipeline.runs.extend import extendable, extension
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.launch.team import Team
 
@@ -60,6 +61,8 @@ class PlannedStage:
     reason: str
     asked: bool = False
     """The selection names it to run again (`--from`, `--force`)."""
+    extendable: dict[str, Any] | None = None
+    """What a longer training would be compared with."""
 
 
 def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
@@ -72,11 +75,18 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
     plan: list[PlannedStage] = []
     rows: dict[str, PlannedStage] = {}
     for stage in recipe.stages:
-        fingerprint = _fingerprint(recipe, stage, rows)
+        facts = _facts(recipe, stage, rows)
+        fingerprint, others = digest(facts), extendable(stage, facts)
         action, reason = _decide(stage, fingerprint, run, rows, forced, select)
+        if action == "run" and stage.name not in forced:
+            longer = extension(stage, others, stage_folder(run, stage.name))
+            if longer is not None:
+                action, reason = ("resume" if longer[0] else "run"), longer[1]
         if stage.name not in wanted and action != "skip":
             action, reason = "leave", "not selected"
-        rows[stage.name] = PlannedStage(stage, fingerprint, action, reason, stage.name in forced)
+        rows[stage.name] = PlannedStage(
+            stage, fingerprint, action, reason, stage.name in forced, others
+        )
         plan.append(rows[stage.name])
     if select.only:
         for role, name in recipe.stage(select.only).inputs.items():
@@ -125,17 +135,16 @@ def replaced_trainings(run: Path, plan: Sequence[PlannedStage]) -> tuple[list[st
     return finished, started
 
 
-def _fingerprint(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> str:
-    return digest(
-        {
-            "kind": stage.kind.name,
-            "version": stage.kind.version,
-            "seed": recipe.seed,
-            "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
-            "external": stage.kind.external(stage.config),
-            "inputs": {role: rows[name].fingerprint for role, name in stage.inputs.items()},
-        }
-    )
+def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> dict[str, Any]:
+    """What a stage's fingerprint is the digest of."""
+    return {
+        "kind": stage.kind.name,
+        "version": stage.kind.version,
+        "seed": recipe.seed,
+        "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
+        "external": stage.kind.external(stage.config),
+        "inputs": {role: rows[name].fingerprint for role, name in stage.inputs.items()},
+    }
 
 
 def _decide(
@@ -152,10 +161,12 @@ def _decide(
         return "run", "forced" if select.force else f"from {select.first}"
     if artifact is None:
         started = folder / "started.json"
-        if started.is_file() and json.loads(started.read_text())["fingerprint"] == fingerprint:
+        if _started(folder) == fingerprint:
             return "resume", "started earlier, not finished"
         return "run", "never run" if not started.is_file() else "settings changed before it finished"
     if artifact.fingerprint != fingerprint:
+        if _started(folder) == fingerprint:
+            return "resume", "started earlier, not finished"
         return "run", _difference(artifact, stage, rows)
     gone = artifact.missing(folder)
     if gone:
@@ -164,6 +175,12 @@ def _decide(
     if above:
         return "run", f"below {above[0]}"
     return "skip", "finished"
+
+
+def _started(folder: Path) -> str | None:
+    """Fingerprint of what was begun last in a stage's folder."""
+    started = folder / "started.json"
+    return str(json.loads(started.read_text())["fingerprint"]) if started.is_file() else None
 
 
 def _difference(artifact: Artifact, stage: Stage, rows: dict[str, PlannedStage]) -> str:
@@ -297,7 +314,9 @@ def _prepare(folder: Path, row: PlannedStage) -> None:
     if row.action == "run":
         remove_tree(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "started.json", {"fingerprint": row.fingerprint})
+    write_json(folder / "started.json", {"fingerprint": row.fingerprint, "extendable": row.extendable})
+    # A training that is made longer is not finished any more.
+    (folder / "artifact.json").unlink(missing_ok=True)
 
 
 def _artifact(recipe: Recipe, row: PlannedStage, plan: Sequence[PlannedStage]) -> Artifact:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from lightning.pytorch.callbacks import Callback
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from motionloom.models.training.stage_module import LOG_EVERY
+from motionloom.models.training.stage_module import LOG_EVERY, StageModule
+from motionloom.pipeline.stages.loggers import Loggers
 
 _LINE_EVERY_SECONDS = 15.0
 
@@ -34,8 +36,8 @@ def bar(console: Console) -> Progress:
 class StepProgress(Callback):
     """Steps done of all steps, loss and speed: a bar on a terminal, a line every 15 s elsewhere."""
 
-    def __init__(self, name: str, steps: int, console: Console) -> None:
-        self.name, self.steps, self.console = name, steps, console
+    def __init__(self, name: str, steps: int, console: Console, *, longer: bool = False) -> None:
+        self.name, self.steps, self.console, self.longer = name, steps, console, longer
         self.progress: Progress | None = None
         self.began = self.printed = time.monotonic()
         self.first = 0
@@ -46,7 +48,9 @@ class StepProgress(Callback):
         self.first = trainer.global_step
         if not trainer.is_global_zero:
             return
-        if self.first:
+        if self.first and self.longer:
+            self.console.print(f"    {self.name} goes on from step {self.first} to {self.steps}")
+        elif self.first:
             self.console.print(f"    resuming {self.name} at step {self.first} of {self.steps}")
         self.progress = bar(self.console)
         self.progress.start()
@@ -84,36 +88,58 @@ class StepProgress(Callback):
 
 
 class MetricLog(Callback):
-    """`metrics.jsonl`: one row every 10 steps and one per validation.
+    """`metrics.jsonl`: one row every 10 steps and one per validation; the loggers get the same rows.
 
     Rows are kept in memory and in the checkpoint, and the file is rewritten at checkpoints, so after a kill
-    the log holds each step once.
+    the log holds each step once. Loggers also get learning rates, gradient norms and the time of a step; the
+    file is an output of the stage, and equal runs have equal ones.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, loggers: Loggers) -> None:
         self.path = folder / "metrics.jsonl"
+        self.loggers = loggers
         self.rows: list[dict[str, float]] = []
+        self.gauges: list[dict[str, float]] = []
+        """What only the loggers get, for each row."""
+        self._since = (0, 0.0)
 
     def state_dict(self) -> dict[str, Any]:
         """Rows so far, as text (plain types only in checkpoints)."""
-        return {"rows": json.dumps(self.rows)}
+        return {"rows": json.dumps(self.rows), "gauges": json.dumps(self.gauges)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Rows up to the checkpoint."""
         self.rows = json.loads(state_dict["rows"])
+        self.gauges = json.loads(state_dict.get("gauges", "[]")) or [{} for _ in self.rows]
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Open the loggers with the rows up to the checkpoint."""
+        self._since = (trainer.global_step, time.monotonic())
+        if trainer.is_global_zero:
+            rows = [row | more for row, more in zip(self.rows, self.gauges, strict=True)]
+            self.loggers.open(trainer.global_step, rows)
+
+    def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Validations and checkpoints do not count in the time of a step."""
+        self._since = (trainer.global_step, time.monotonic())
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Take a row every 10 steps."""
+        assert isinstance(pl_module, StageModule)
         step = trainer.global_step
-        if step % LOG_EVERY == 0 and (not self.rows or self.rows[-1]["step"] < step):
-            self._take(trainer, "train/")
+        first, begin = self._since
+        if step % LOG_EVERY == 0 and step > first and (not self.rows or self.rows[-1]["step"] < step):
+            now = time.monotonic()
+            gauges = {name: float(value) for name, value in pl_module.gauges.items()}
+            self._since = (step, now)
+            self._take(trainer, pl_module.row, gauges | {"step_seconds": (now - begin) / (step - first)})
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Take a row of validation figures."""
         if not trainer.sanity_checking:
-            self._take(trainer, "val/")
+            self._take(trainer, [name for name in trainer.callback_metrics if name.startswith("val/")], {})
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Bring the file up to the checkpoint."""
@@ -122,11 +148,23 @@ class MetricLog(Callback):
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Bring the file up to the end."""
         self._write(trainer)
+        if trainer.is_global_zero:
+            self.loggers.close("success")
 
-    def _take(self, trainer: L.Trainer, prefix: str) -> None:
-        values = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith(prefix)}
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
+        """Close the loggers; rows that no checkpoint holds come again when the run goes on."""
+        if trainer.is_global_zero:
+            self.loggers.close("failed")
+
+    def _take(self, trainer: L.Trainer, names: Sequence[str], gauges: dict[str, float]) -> None:
+        values = {name: float(trainer.callback_metrics[name]) for name in names}
         if values:
             self.rows.append({"step": trainer.global_step, **values})
+            self.gauges.append(gauges)
+            if trainer.is_global_zero:
+                self.loggers.take(self.rows[-1] | gauges)
 
     def _write(self, trainer: L.Trainer) -> None:
         if trainer.is_global_zero:
@@ -134,3 +172,4 @@ class MetricLog(Callback):
             temporary = self.path.with_name(".metrics.jsonl.tmp")
             temporary.write_text("".join(json.dumps(row, sort_keys=True) + "\n" for row in self.rows))
             temporary.replace(self.path)
+            self.loggers.save()

@@ -11,23 +11,26 @@ import json
 import warnings
 from collections.abc import Callable, Iterator, Sized
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy, Strategy
-from pydantic import Field
+from pydantic import BaseModel, Field
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.layers.transformer import Transformer
+from motionloom.models.training.averaging import AveragedWeights
+from motionloom.models.training.players import PlayersModule
 from motionloom.models.training.sharding import make_whole
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 from motionloom.pipeline.contract.stage import RUNTIME, StageConfig, StageContext
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import environment
+from motionloom.pipeline.stages.loggers import Loggers, require_loggers
 from motionloom.pipeline.stages.progress import MetricLog, StepProgress
 
 _KEPT = 2
@@ -56,6 +59,9 @@ class TrainConfig(Config):
     One process holds all; the results are the same."""
     compile: bool = False
     """Compile networks and losses with torch.compile, as one graph."""
+    ema: float | None = Field(None, ge=0, lt=1)
+    """Decay a step of an average of the weights, such as 0.999; validation and the saved model take the
+    average. null or 0 turns it off."""
     checkpoint_activations: bool = Field(False, json_schema_extra=RUNTIME)
     """Keep only the borders of transformer blocks for the backward pass and compute the rest again there:
     less memory, about a third more time, the same figures."""
@@ -87,8 +93,16 @@ class TrainedStageConfig(StageConfig):
     def require_fit(self, hardware: Hardware) -> None:
         """The global batch must divide over the processes, and FSDP suit the network and the arithmetic."""
         self.train.local_batch(hardware.world())
+        require_loggers(hardware.loggers)
         if self.train.strategy == "fsdp":
             self._require_shardable()
+
+    def schedule_of_length(self) -> str | None:
+        """The learning-rate schedule that depends on `train.steps`, as one says it; None if none does.
+
+        Without one, more steps only add to those of a shorter training.
+        """
+        return _schedule_of_length(self)
 
     def _require_shardable(self) -> None:
         if not self.shardable:
@@ -101,8 +115,24 @@ class TrainedStageConfig(StageConfig):
                 "train.compile makes one graph and train.strategy fsdp gathers weights between the blocks; "
                 "set one of them back"
             )
+        if self.train.ema:
+            raise UserError(
+                "train.ema averages whole weights and train.strategy fsdp keeps each in several processes; "
+                "set train.ema: null or strategy: ddp"
+            )
         if self.train.precision == "16-mixed":
             raise UserError("train.strategy fsdp has no gradient scaler; set train.precision: bf16-mixed")
+
+
+def _schedule_of_length(config: BaseModel, prefix: str = "") -> str | None:
+    for name in type(config).model_fields:
+        value = getattr(config, name)
+        if isinstance(value, OptimConfig) and value.schedule != "constant":
+            return f"{prefix}{name}.schedule {value.schedule}"
+        found = _schedule_of_length(value, f"{prefix}{name}.") if isinstance(value, BaseModel) else None
+        if found:
+            return found
+    return None
 
 
 class ChunkSampler(Sampler[int]):
@@ -138,7 +168,7 @@ def fit(
     hardware = context.hardware
     if hardware.threads:
         torch.set_num_threads(hardware.threads)
-    chunk = min(config.checkpoint_every, config.steps)
+    newest, chunk, longer = start_of(context.folder / "checkpoints", config)
     data = _Data(train, validation, config, chunk, hardware)
     checkpoints = ModelCheckpoint(
         dirpath=context.folder / "checkpoints",
@@ -150,6 +180,9 @@ def fit(
         enable_version_counter=False,  # a torn file is written again under its own name
     )
     validate = max(1, -(-config.validate_every // chunk)) if config.validate_every and validation else None
+    players = isinstance(module, PlayersModule)
+    average = AveragedWeights(config.ema) if config.ema else None
+    loggers = Loggers(hardware.loggers, context.folder, context.recipe, f"{context.recipe}/{context.name}")
     if hardware.resolved_accelerator() == "gpu":
         hardware.device()  # refuses in one sentence where there is no GPU
     trainer = L.Trainer(
@@ -161,8 +194,9 @@ def fit(
         strategy=_strategy(hardware, config),
         precision=config.precision,
         max_steps=config.steps,
-        accumulate_grad_batches=config.accumulate,
-        gradient_clip_val=grad_clip or None,
+        # Players gather the parts of a step themselves, and clip the gradients of each.
+        accumulate_grad_batches=1 if players else config.accumulate,
+        gradient_clip_val=None if players else grad_clip or None,
         check_val_every_n_epoch=validate or 1,
         limit_val_batches=1.0 if validate else 0,
         num_sanity_val_steps=0,
@@ -172,18 +206,21 @@ def fit(
         use_distributed_sampler=False,
         callbacks=[
             checkpoints,
-            ResumeBetweenChunks(),
-            MetricLog(context.folder),
-            StepProgress(context.name, config.steps, context.console),
+            ResumeBetweenChunks(config, chunk),
+            MetricLog(context.folder, loggers),
+            StepProgress(context.name, config.steps, context.console, longer=longer),
+            *([average] if average else []),
         ],
     )
     prepare_module(module, config)
     if config.compile:
         module.compile_losses()
-    newest = newest_checkpoint(context.folder / "checkpoints")
     net = module.net
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
+        with warnings.catch_warnings():
+            # Lightning compares steps with batches, and a step of players takes several.
+            warnings.filterwarnings("ignore", ".*ended before the epoch ended.*")
+            trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise KeyboardInterrupt from None
     except RuntimeError as error:
@@ -193,6 +230,8 @@ def fit(
     if module.net is not net:  # the strategy has trained a sharded copy
         make_whole(module.net, net)
         module.net = net
+    if average is not None:
+        average.fill(net)
     if trainer.is_global_zero:
         for path in sorted((context.folder / "checkpoints").glob("*.ckpt"))[:-_KEPT]:
             path.unlink()  # Lightning forgets the checkpoint that a killed run was resumed from
@@ -201,6 +240,8 @@ def fit(
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
     """Apply the settings that concern how the network computes."""
     module.fused = config.precision != "16-mixed"
+    if isinstance(module, PlayersModule):
+        module.accumulate = config.accumulate
     for part in module.modules():
         if isinstance(part, Transformer):
             part.checkpointed = config.checkpoint_activations
@@ -211,7 +252,16 @@ class ResumeBetweenChunks(Callback):
 
     Lightning would go back into the finished epoch and, where that did not end with a validation, train one
     more batch in it: the steps of all later validations and checkpoints would move.
+
+    Keeps in the checkpoint how the training was cut into chunks, for `start_of`.
     """
+
+    def __init__(self, config: TrainConfig, chunk: int) -> None:
+        self.steps, self.every, self.chunk = config.steps, config.checkpoint_every, chunk
+
+    def state_dict(self) -> dict[str, Any]:
+        """Length of the training, the interval that its config names, and the one in use."""
+        return {"steps": self.steps, "every": self.every, "chunk": self.chunk}
 
     def on_load_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
@@ -261,7 +311,7 @@ def _loader(dataset: Dataset[Any], sampler: Any, hardware: Hardware) -> DataLoad
         sampler=sampler,
         num_workers=workers,
         pin_memory=hardware.resolved_accelerator() == "gpu",
-        persistent_workers=False,
+        persistent_workers=workers > 0,  # from chunk to chunk; their start takes seconds
         multiprocessing_context="spawn" if workers else None,
     )
 
@@ -284,16 +334,54 @@ def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
     )
 
 
+class Start(NamedTuple):
+    """Where a training begins."""
+
+    checkpoint: Path | None
+    """What to go on from; None for the beginning."""
+    chunk: int
+    """Steps of a chunk."""
+    longer: bool = False
+    """Whether the checkpoint is of a training of fewer steps."""
+
+
+def start_of(folder: Path, config: TrainConfig) -> Start:
+    """Where a training with these checkpoints begins.
+
+    It keeps the chunks that it began with as long as `checkpoint_every` is the same, also when `steps` has
+    been raised. Its last chunk may then have been cut short: it is trained again, so that the validations and
+    checkpoints of the longer training lie where they would have without a pause.
+    """
+    chunk = min(config.checkpoint_every, config.steps)
+    short: Start | None = None
+    for path, checkpoint in _readable(folder):
+        state = checkpoint.get("callbacks", {}).get(ResumeBetweenChunks.__qualname__)
+        if state is None:
+            return Start(path, chunk)
+        longer = state["steps"] < config.steps
+        if state["every"] != config.checkpoint_every:
+            return Start(path, chunk, longer)
+        start = Start(path, state["chunk"], longer)
+        if checkpoint["global_step"] >= config.steps or checkpoint["global_step"] % state["chunk"] == 0:
+            return start
+        short = short or start
+    return short or Start(None, chunk)
+
+
 def newest_checkpoint(folder: Path) -> Path | None:
     """The newest checkpoint that loads; a torn one is passed over."""
+    return next((path for path, _ in _readable(folder)), None)
+
+
+def _readable(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Checkpoints that load, newest first."""
     for path in sorted(folder.glob("*.ckpt"), reverse=True):
         try:
-            torch.load(path, map_location="cpu", weights_only=True)
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # a torn file fails in many ways, all of which mean the same
             warnings.warn(f"{path}: cannot be read ({type(error).__name__}), passed over", stacklevel=2)
             continue
-        return path
-    return None
+        yield path, checkpoint
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:

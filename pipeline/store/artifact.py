@@ -19,7 +19,7 @@ from motionloom.pipeline.store.files import sha256_file, write_json
 FILE_NAME = "artifact.json"
 
 # What no result depends on: a stage's own notes, and settings that a later run may change.
-_PRIVATE = {"checkpoints", "started.json", "timing.json", "reader.json", FILE_NAME}
+_PRIVATE = {"checkpoints", "logs", "started.json", "timing.json", "reader.json", FILE_NAME}
 
 
 class OutputFile(Config):

@@ -1,0 +1,42 @@
+"""An optimizer, its learning-rate schedule and the largest gradient it takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import nn
+from torch.optim import Optimizer
+
+from motionloom.datasets.schema import Config
+
+
+class OptimConfig(Config):
+    """Adam or AdamW and its learning-rate schedule."""
+
+    optimizer: Literal["adamw", "adam"] = "adamw"
+    """`adam` adds the weight decay to the gradient (L2), `adamw` takes it from the weights."""
+    lr: float = Field(1e-4, gt=0)
+    betas: tuple[float, float] = (0.9, 0.99)
+    weight_decay: float = Field(0.0, ge=0)
+    warmup_steps: int = Field(0, ge=0)
+    schedule: Literal["constant", "cosine"] = "constant"
+    grad_clip: float = Field(1.0, ge=0)
+    """Largest gradient norm; 0 turns clipping off."""
+
+    def build(self, params: Sequence[nn.Parameter], *, fused: bool) -> Optimizer:
+        """The optimizer of these parameters; `fused` computes a step in one kernel."""
+        kind = torch.optim.AdamW if self.optimizer == "adamw" else torch.optim.Adam
+        return kind(params, lr=self.lr, betas=self.betas, weight_decay=self.weight_decay, fused=fused)
+
+    def factor(self, step: int, max_steps: int) -> float:
+        """What `lr` is multiplied by in step `step` of `max_steps`: linear warm-up, then the schedule."""
+        if step < self.warmup_steps:
+            return (step + 1) / self.warmup_steps
+        if self.schedule == "constant":
+            return 1.0
+        done = (step - self.warmup_steps) / max(1, max_steps - self.warmup_steps)
+        return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))

@@ -1,0 +1,196 @@
+"""Training with several optimizers: players that take turns in every step, such as a generator and a critic.
+
+A step gives each player its turn, in order: its gradients over all parts of the batch, their mean over ranks,
+clipping, one step of its optimizer. The next player sees the weights that the last one has stepped to, with
+accumulation too, so parts equal the whole batch where they do with one optimizer. Steps are counted once,
+however many optimizers step, so batches, seeds, schedules, checkpoints and logs go by training steps.
+
+Gradients are averaged over ranks here and not by DDP: its reducer waits for a gradient of every parameter in
+every backward pass, and a player's pass reaches its own alone.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.amp import GradScaler
+from torch.nn.parallel import DistributedDataParallel
+from torch.optim import Optimizer
+
+from motionloom.models.training.distributed import mean_gradients
+from motionloom.models.training.optim import OptimConfig
+from motionloom.models.training.stage_module import StageModule
+
+
+@dataclass(frozen=True)
+class Player:
+    """Who takes a turn: the networks it trains, its optimizer and when it plays."""
+
+    name: str
+    nets: tuple[nn.Module, ...]
+    optim: OptimConfig
+    every: int = 1
+    """Steps from one turn to the next."""
+    start_step: int = 0
+    """First step with a turn; its warm-up and schedule begin there."""
+
+    def plays(self, step: int) -> bool:
+        """Whether it has a turn in this step."""
+        return step >= self.start_step and (step - self.start_step) % self.every == 0
+
+    def params(self) -> list[nn.Parameter]:
+        """What it trains."""
+        return [p for net in self.nets for p in net.parameters() if p.requires_grad]
+
+
+class PlayersModule(StageModule):
+    """Networks of several players. Subclasses implement `players()` and `play(...)`.
+
+    `net` is the network that the stage saves. The others are further attributes of the module: they are in
+    its checkpoints, and not in the saved model.
+    """
+
+    def __init__(self, net: nn.Module, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.automatic_optimization = False
+        self.accumulate = 1
+        """Parts that the batch of a step is cut into; they are gathered until the last is here."""
+        self._parts: list[dict[str, Any]] = []
+        self._trained: list[list[nn.Parameter]] = []
+
+    @abstractmethod
+    def players(self) -> Sequence[Player]:
+        """The players in the order of their turns; no parameter may belong to two."""
+
+    @abstractmethod
+    def play(self, player: str, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A player's losses and metrics on one batch: "loss" is minimised, the others are only logged.
+
+        `shared` is empty in the first turn on a batch. What a player puts there the next ones get, without
+        its gradient: a critic judges what the generator has made instead of having it made again. A player
+        whose forerunner had no turn must do without it.
+        """
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Figures of all players, each under its name, and the first one's loss as "loss" (validation)."""
+        shared: dict[str, Tensor] = {}
+        out: dict[str, Tensor] = {}
+        for player in self.players():
+            values = self.play(player.name, batch, shared)
+            shared = {name: value.detach() for name, value in shared.items()}
+            out = out or {"loss": values["loss"]}
+            out |= _named(player, values)
+        return out
+
+    def compile_losses(self) -> None:
+        """Compile each player's networks and losses as one graph."""
+        torch.compiler.reset()
+        self.play = torch.compile(self.play, fullgraph=True)  # type: ignore[method-assign]
+
+    def configure_optimizers(self) -> list[Optimizer]:
+        """One optimizer a player; learning rates are set in every turn, as a function of the step."""
+        players = self.players()
+        self._trained = [player.params() for player in players]
+        every = [id(param) for params in self._trained for param in params]
+        if len(every) != len(set(every)):
+            raise ValueError("a parameter belongs to two players")
+        return [
+            player.optim.build(params, fused=self.fused)
+            for player, params in zip(players, self._trained, strict=True)
+        ]
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:  # type: ignore[override]
+        """Gather the parts of a step; with the last one every player takes its turn."""
+        self._parts.append(batch)
+        if len(self._parts) < self.accumulate:
+            return
+        parts, self._parts = self._parts, []
+        shared: list[dict[str, Tensor]] = [{} for _ in parts]
+        optimizers = self.optimizers(use_pl_optimizer=False)
+        scaler: GradScaler | None = getattr(self.trainer.precision_plugin, "scaler", None)
+        self.gauges, first, stepped = {}, None, False
+        for turn, player in enumerate(self.players()):
+            if not player.plays(self.global_step):
+                continue
+            optimizer = optimizers[turn] if isinstance(optimizers, list) else optimizers
+            with self._alone_trains(turn):
+                optimizer.zero_grad()
+                for number, part in enumerate(parts):
+                    loss = self._backward(player, turn, number, part, shared)
+                    first = loss if first is None else first
+                stepped |= self._step(player, turn, optimizer, scaler)
+        if scaler is not None and stepped:
+            scaler.update()
+        self.log_row()
+        if first is not None:
+            self.log("loss", first, prog_bar=True, logger=False)
+        # Lightning would count the optimizers' steps.
+        progress = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
+        progress.increment_ready()
+        progress.increment_completed()
+
+    def _backward(
+        self, player: Player, turn: int, number: int, part: dict[str, Any], shared: list[dict[str, Tensor]]
+    ) -> Tensor:
+        self.seed_draws(number, turn)
+        values = self.play(player.name, part, shared[number])
+        shared[number] = {name: value.detach() for name, value in shared[number].items()}
+        named = _named(player, values)
+        self.average({"loss": values["loss"], **named} if turn == 0 else named)
+        with self._outside_forward():
+            self.manual_backward(values["loss"] / self.accumulate)
+        return values["loss"].detach()
+
+    def _step(self, player: Player, turn: int, optimizer: Optimizer, scaler: GradScaler | None) -> bool:
+        """A player's step with the gradients that it has; False if it has none."""
+        params = self._trained[turn]
+        mean_gradients(params)
+        if all(param.grad is None for param in params):
+            return False
+        step = self.global_step - player.start_step
+        rate = player.optim.lr * player.optim.factor(step, self.max_steps - player.start_step)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        if scaler is not None:
+            scaler.unscale_(optimizer)
+        norm = self.clip(params, player.optim.grad_clip)
+        if norm is not None:
+            self.gauges |= {f"lr/{player.name}": rate, f"grad_norm/{player.name}": norm}
+        with self._outside_forward():
+            if scaler is None:
+                optimizer.step()
+            else:
+                scaler.step(optimizer)
+        return True
+
+    @contextmanager
+    def _alone_trains(self, turn: int) -> Iterator[None]:
+        """Inside, no other player's parameters get gradients; those of none of them are left as they are."""
+        others = [p for other, params in enumerate(self._trained) if other != turn for p in params]
+        for param in others:
+            param.requires_grad_(False)
+        try:
+            yield
+        finally:
+            for param in others:
+                param.requires_grad_(True)
+
+    @contextmanager
+    def _outside_forward(self) -> Iterator[None]:
+        """What Lightning does around a loss that it minimises itself: no autocast, no reducer of DDP's."""
+        model = self.trainer.model
+        alone: AbstractContextManager[Any] = (
+            model.no_sync() if isinstance(model, DistributedDataParallel) else nullcontext()
+        )
+        with alone, torch.autocast(self.device.type, enabled=False):
+            yield
+
+
+def _named(player: Player, values: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {f"{player.name}_{name}": value for name, value in values.items()}

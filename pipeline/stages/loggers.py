@@ -1,0 +1,194 @@
+"""Where the figures of a training go besides `metrics.jsonl`: Lightning's loggers, and trackio's.
+
+All of them get the same names. Those that write files get a row when it is taken, and after a kill the files
+show every step once: the CSV file is written anew from the rows in the checkpoint, and TensorBoard is told to
+drop what lies behind it. Those with a server cannot take rows back, so they get them with the checkpoint.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers.logger import Logger, rank_zero_experiment
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch.hardware import LoggerName
+from motionloom.pipeline.store.files import write_json
+
+FOLDER = "logs"
+"""Of a stage's folder; no result depends on it."""
+_EXTRAS: dict[str, str] = {"wandb": "wandb", "mlflow": "mlflow", "trackio": "trackio"}
+"""Loggers that need a package of their own, and that package."""
+
+
+def require_loggers(names: Sequence[LoggerName]) -> None:
+    """Refuse, before anything runs, loggers whose package is not installed."""
+    for name in names:
+        package = _EXTRAS.get(name)
+        if package is not None and importlib.util.find_spec(package) is None:
+            raise UserError(
+                f"hardware.loggers names {name}, which is not installed: pip install 'motionloom[{name}]'"
+            )
+
+
+class Loggers:
+    """The loggers of one training; made when its first row comes, so that an import costs nothing before."""
+
+    def __init__(self, names: Sequence[LoggerName], folder: Path, project: str, title: str) -> None:
+        self.names, self.folder = tuple(dict.fromkeys(names)), folder / FOLDER
+        self.project, self.title = project, title
+        self._files: list[Logger] = []
+        self._servers: list[Logger] = []
+        self._waiting: list[tuple[int, dict[str, float]]] = []
+
+    def open(self, step: int, rows: Sequence[dict[str, float]]) -> None:
+        """Begin behind step `step`, with the rows up to it."""
+        for name in self.names:
+            logger = _MAKERS[name](self, step)
+            (self._servers if name in _EXTRAS else self._files).append(logger)
+            if name == "csv":
+                for row in rows:
+                    _log(logger, row)
+
+    def take(self, row: dict[str, float]) -> None:
+        """A row: "step" and figures."""
+        for logger in self._files:
+            _log(logger, row)
+        if self._servers:
+            self._waiting.append((int(row["step"]), row))
+
+    def save(self) -> None:
+        """Bring all up to a checkpoint."""
+        for _, row in self._waiting:
+            for logger in self._servers:
+                _log(logger, row)
+        self._waiting = []
+        for logger in self._files:
+            logger.save()
+
+    def close(self, status: str) -> None:
+        """End; `status` is "success" or "failed"."""
+        for logger in (*self._files, *self._servers):
+            logger.finalize(status)
+        self._files, self._servers = [], []
+
+    def identity(self, server: str) -> dict[str, str]:
+        """What a server knows this training by; the same when it goes on after a kill."""
+        path = self.folder / f"{server}.json"
+        if not path.is_file():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_json(path, {"id": uuid.uuid4().hex})
+        found: dict[str, str] = json.loads(path.read_text())
+        return found
+
+
+def _log(logger: Logger, row: dict[str, float]) -> None:
+    logger.log_metrics({k: v for k, v in row.items() if k != "step"}, step=int(row["step"]))
+
+
+def _csv(loggers: Loggers, step: int) -> Logger:
+    from lightning.pytorch.loggers import CSVLogger
+
+    path = loggers.folder / "csv" / "metrics.csv"
+    path.unlink(missing_ok=True)  # Lightning would do it too, with a warning
+    return CSVLogger(loggers.folder, name="", version="csv")
+
+
+def _tensorboard(loggers: Loggers, step: int) -> Logger:
+    from lightning.pytorch.loggers import TensorBoardLogger
+
+    return TensorBoardLogger(
+        loggers.folder,
+        name="",
+        version="tensorboard",
+        default_hp_metric=False,
+        purge_step=step + 1 if step else None,
+    )
+
+
+def _wandb(loggers: Loggers, step: int) -> Logger:
+    from lightning.pytorch.loggers import WandbLogger
+
+    return WandbLogger(
+        project=loggers.project,
+        name=loggers.title,
+        id=loggers.identity("wandb")["id"],
+        resume="allow",
+        save_dir=loggers.folder,
+    )
+
+
+def _mlflow(loggers: Loggers, step: int) -> Logger:
+    from lightning.pytorch.loggers import MLFlowLogger
+
+    path = loggers.folder / "mlflow.json"
+    known = json.loads(path.read_text())["id"] if path.is_file() else None
+    logger = MLFlowLogger(experiment_name=loggers.project, run_name=loggers.title, run_id=known)
+    if known is None:  # the server gives the name
+        loggers.folder.mkdir(parents=True, exist_ok=True)
+        write_json(path, {"id": str(logger.run_id)})
+    return logger
+
+
+def _trackio(loggers: Loggers, step: int) -> Logger:
+    return TrackioLogger(loggers.project, f"{loggers.title}-{loggers.identity('trackio')['id'][:8]}")
+
+
+_MAKERS: dict[str, Callable[[Loggers, int], Logger]] = {
+    "csv": _csv,
+    "tensorboard": _tensorboard,
+    "wandb": _wandb,
+    "mlflow": _mlflow,
+    "trackio": _trackio,
+}
+
+
+class TrackioLogger(Logger):
+    """Logs to trackio, which Lightning has no logger for; a run of the same name is gone on with."""
+
+    def __init__(self, project: str, title: str) -> None:
+        super().__init__()
+        self._project, self._title = project, title
+        self._run: Any = None
+
+    @property
+    def name(self) -> str:
+        """The project."""
+        return self._project
+
+    @property
+    def version(self) -> str:
+        """The run."""
+        return self._title
+
+    @property
+    @rank_zero_experiment
+    def experiment(self) -> Any:
+        """The module `trackio` with a run in progress."""
+        import trackio
+
+        if self._run is None:
+            self._run = trackio.init(project=self._project, name=self._title, resume="allow")
+        return trackio
+
+    @rank_zero_only
+    def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
+        """Nothing: the run folder holds the recipe."""
+
+    @rank_zero_only
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
+        """One row."""
+        self.experiment.log(metrics, step=step)
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """End the run."""
+        if self._run is not None:
+            self.experiment.finish()
+            self._run = None

@@ -1,0 +1,210 @@
+"""Trainings that stop and go on: after a kill, for more steps, on two ranks; with all that has a state.
+
+Two optimizers (one begins late and plays every second step), parts, averaged weights, dropout. The processes
+of the two ranks run this file as a script.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_players import Duel, train
+from torch import Tensor
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.gpt import GptStageConfig
+from motionloom.pipeline.stages.training import TrainConfig, read_metrics, start_of
+
+# A constant schedule for both: a cosine would depend on the number of steps.
+CONSTANT: dict[str, Any] = {"critic": Duel(seed=0, max_steps=1).optim_config}
+FULL: dict[str, Any] = {"ema": 0.9, "accumulate": 2}
+
+
+def newest(folder: Path) -> dict[str, Any]:
+    """What training goes on from, without the clock and the paths in it."""
+    path = max((folder / "checkpoints").iterdir())
+    checkpoint: dict[str, Any] = torch.load(path, weights_only=True)
+    kept = {name: checkpoint[name] for name in ("global_step", "epoch", "state_dict", "optimizer_states")}
+    average = checkpoint["callbacks"].get("AveragedWeights")
+    return {**kept, "average": average, "rows": checkpoint["callbacks"]["MetricLog"]["rows"]}
+
+
+def assert_equal(one: Any, two: Any, where: str = "") -> None:
+    """Bit for bit, through all levels."""
+    if isinstance(one, Tensor):
+        assert torch.equal(one, two), where
+    elif isinstance(one, dict):
+        assert one.keys() == two.keys(), where
+        for name in one:
+            assert_equal(one[name], two[name], f"{where}.{name}")
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(two), where
+        for index, pair in enumerate(zip(one, two, strict=True)):
+            assert_equal(*pair, f"{where}[{index}]")
+    else:
+        assert one == two, where
+
+
+def assert_same_stage(one: Path, two: Path, first: Duel, second: Duel) -> None:
+    """The same saved weights, checkpoint and log."""
+    assert_equal(first.state_dict(), second.state_dict())
+    assert_equal(newest(one), newest(two))
+    assert read_metrics(one) == read_metrics(two)
+
+
+@pytest.mark.parametrize("settings", [FULL, {**FULL, "precision": "bf16-mixed", "accumulate": 1}])
+def test_killed_twice_equals_undisturbed(settings: dict[str, Any], tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", **settings)
+    for step in (9, 20):
+        with pytest.raises(ConnectionResetError):
+            train(tmp_path / "killed", dies_at=step, **settings)
+    assert newest(tmp_path / "killed")["global_step"] == 18
+    again = train(tmp_path / "killed", **settings)
+    assert_same_stage(tmp_path / "whole", tmp_path / "killed", whole, again)
+
+
+def test_killed_behind_the_last_step_hands_over_the_average(tmp_path: Path) -> None:
+    first = train(tmp_path, ema=0.9)
+    again = train(tmp_path, ema=0.9)
+    assert_equal(first.net.state_dict(), again.net.state_dict())
+
+
+def test_the_average_is_that_of_the_weights(tmp_path: Path) -> None:
+    """Of every step, from the first; validation sees it, training does not."""
+    plain = train(tmp_path / "plain")
+    weights = []
+    for steps in range(1, 9):  # the weights after each step: without schedule they begin every training
+        weights.append(train(tmp_path / str(steps), steps=steps, module=CONSTANT).net[0].weight.detach())
+    expected = weights[0].double()
+    for weight in weights[1:]:
+        expected = 0.9 * expected + 0.1 * weight.double()
+    averaged = train(tmp_path / "averaged", steps=8, ema=0.9, checkpoint_every=8, module=CONSTANT)
+    torch.testing.assert_close(averaged.net[0].weight.double(), expected, rtol=0, atol=1e-6)
+    trained = newest(tmp_path / "averaged")["state_dict"]["net.0.weight"]
+    assert torch.equal(trained, weights[-1])
+    train(tmp_path / "watched", ema=0.9)
+    assert_equal(newest(tmp_path / "watched")["state_dict"], plain.state_dict())
+    rows = [read_metrics(tmp_path / name) for name in ("plain", "watched")]
+    for one, two in zip(*rows, strict=True):
+        assert (one == two) == ("train/loss" in one)
+
+
+def test_an_average_of_cut_weights_is_refused() -> None:
+    config = GptStageConfig(train=TrainConfig(strategy="fsdp", ema=0.99))
+    with pytest.raises(UserError, match=r"train\.ema averages whole weights"):
+        config.require_fit(Hardware(accelerator="cpu", devices=2))
+
+
+@pytest.mark.parametrize(
+    ("short", "every", "first"),
+    [(12, 6, 12), (16, 6, 12), (8, 6, 6)],  # whole chunks, and a last one that was cut short
+)
+def test_longer_equals_long(short: int, every: int, first: int, tmp_path: Path) -> None:
+    settings = {**FULL, "checkpoint_every": every, "validate_every": 6, "module": CONSTANT}
+    long = train(tmp_path / "long", **settings)
+    train(tmp_path / "longer", steps=short, **settings)
+    path, chunk, more = start_of(
+        tmp_path / "longer/checkpoints", TrainConfig(steps=24, checkpoint_every=every)
+    )
+    assert path is not None and path.stem == f"step={first:08d}" and chunk == every and more
+    with pytest.raises(ConnectionResetError):
+        train(tmp_path / "longer", dies_at=20, **settings)
+    longer = train(tmp_path / "longer", **settings)
+    assert_same_stage(tmp_path / "long", tmp_path / "longer", long, longer)
+
+
+def test_longer_than_a_training_of_less_than_a_chunk(tmp_path: Path) -> None:
+    """Its length stays the interval, so the end is validated; the weights are those of the long one."""
+    settings = {**FULL, "checkpoint_every": 100, "validate_every": 24, "module": CONSTANT}
+    long = train(tmp_path / "long", **settings)
+    train(tmp_path / "longer", steps=8, **settings)
+    longer = train(tmp_path / "longer", **settings)
+    assert_equal(long.state_dict(), longer.state_dict())
+    steps = [row["step"] for row in read_metrics(tmp_path / "longer") if "val/loss" in row]
+    assert steps == [24]
+
+
+def test_workers_change_nothing(tmp_path: Path) -> None:
+    """They live from chunk to chunk, and each chunk begins at its own batch."""
+    settings = {"steps": 8, "checkpoint_every": 2, "validate_every": 0}
+    alone = train(tmp_path / "alone", **settings)
+    other = train(tmp_path / "other", hardware={"workers": 1}, **settings)
+    assert_same_stage(tmp_path / "alone", tmp_path / "other", alone, other)
+    assert alone.readers == {os.getpid()} and len(other.readers - alone.readers) == 1
+
+
+def worker(out: Path) -> None:
+    torch.set_num_threads(1)
+    pair = {"hardware": {"devices": 2}, "module": {"dropout": 0.0}}
+    for name, settings in PAIRS.items():
+        duel = train(out / name, **pair, **settings)
+        torch.save(duel.state_dict(), out / f"{name}-{os.environ['RANK']}.pt")
+    torch.distributed.barrier()
+    os._exit(0)  # without destructors, as the program does
+
+
+PAIRS: dict[str, dict[str, Any]] = {
+    "float32": {"ema": 0.9},
+    "float64": {"dtype": torch.float64, "ema": 0.9, "accumulate": 2},
+}
+BOUNDS = {"float32": 1e-5, "float64": 1e-12}
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders of the trainings on two ranks."""
+    folder = tmp_path_factory.mktemp("pair")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    path = os.pathsep.join([os.environ.get("PYTHONPATH", ""), str(Path(__file__).parents[2] / "helpers")])
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-P", __file__, str(folder)],
+            env={
+                **os.environ,
+                "PYTHONPATH": path,
+                "RANK": str(number),
+                "LOCAL_RANK": str(number),
+                "WORLD_SIZE": "2",
+                "LOCAL_WORLD_SIZE": "2",
+                "MASTER_ADDR": "127.0.0.1",
+                "MASTER_PORT": str(port),
+                "OMP_NUM_THREADS": "1",
+            },
+        )
+        for number in range(2)
+    ]
+    try:
+        assert [process.wait(timeout=200) for process in ranks] == [0, 0]
+    finally:
+        for process in ranks:
+            process.kill()
+    return folder
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("name", list(PAIRS))
+def test_two_ranks_equal_one_with_two_optimizers(name: str, pair: Path, tmp_path: Path) -> None:
+    one = train(tmp_path, module={"dropout": 0.0}, **PAIRS[name])
+    first, second = (torch.load(pair / f"{name}-{rank}.pt", weights_only=True) for rank in range(2))
+    assert_equal(first, second)
+    for key, value in one.state_dict().items():
+        torch.testing.assert_close(first[key], value, rtol=BOUNDS[name], atol=BOUNDS[name])
+    rows = [read_metrics(folder) for folder in (tmp_path, pair / name)]
+    assert json.dumps([sorted(r) for r in rows[0]]) == json.dumps([sorted(r) for r in rows[1]])
+    for row, other in zip(*rows, strict=True):
+        assert other == pytest.approx(row, rel=1e-5, abs=1e-6)
+
+
+if __name__ == "__main__":
+    worker(Path(sys.argv[1]))
