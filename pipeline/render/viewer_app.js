@@ -73,6 +73,7 @@ function mountViewer(root, data, options) {
 
   // ---- sound and score: those of one motion at a time
   let lead = null;
+  const leads = (clip) => clip.sound === lead.sound && clip.score === lead.score;
   const player = makePlayer(sounds, {
     laps: (time) => {
       if (!state.loop || !lead || lead.frames < 2) return [0, 0];
@@ -85,7 +86,7 @@ function mountViewer(root, data, options) {
       bar.sound.title = player.failed ? "This browser cannot play the sound" : player.on ? "Sound off (M)" : "Sound on (M)";
       bar.sound.setAttribute("aria-label", bar.sound.title);
       if (player.on) for (const other of window.__viewers) if (other !== handle) other.setSound(false);
-      for (const cell of cells) cell.hear.setAttribute("aria-pressed", String(player.on && cell.clip.sound === lead.sound));
+      for (const { clip, hear } of cells) hear.setAttribute("aria-pressed", String(leads(clip) && (player.on || clip.sound === undefined)));
       refresh();
     },
     stopped: () => play(false),
@@ -96,7 +97,7 @@ function mountViewer(root, data, options) {
     if (strip) strip.show(clip.score);
     refresh();
   };
-  const setSound = (on) => { if (sounds.length) player.turn(on); };
+  const setSound = (on) => player.turn(on && lead.sound !== undefined);
 
   // ---- camera
   const setView = (name) => {
@@ -203,9 +204,9 @@ function mountViewer(root, data, options) {
   for (const cell of cells) {
     cell.hear.hidden = !several || (cell.clip.sound === undefined && !cell.clip.score);
     cell.hear.addEventListener("click", () => {
-      const again = cell.clip === lead && player.on;
+      const off = player.on && leads(cell.clip);
       follow(cell.clip);
-      setSound(cell.clip.sound !== undefined && !again);
+      setSound(cell.clip.sound !== undefined && !off);
     });
   }
   bar.scrub.addEventListener("input", () => { play(false); setFrame(Number(bar.scrub.value)); });

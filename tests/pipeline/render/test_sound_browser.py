@@ -183,6 +183,8 @@ def test_another_motions_music_is_heard_in_its_place(visit: Make, until: Make, s
     assert page.evaluate(ticks) != first
     pressed = [page.locator(".mlv-hear").nth(k).get_attribute("aria-pressed") for k in (0, 1)]
     assert pressed == ["false", "true"]
+    page.locator(".mlv-hear").nth(1).click()  # once more: silence
+    until(page, "!__viewer.sound && __viewer.audio.paused")
 
 
 def test_a_motion_that_loops_by_itself_takes_its_music_along(visit: Make, until: Make, songs: Path) -> None:
