@@ -107,7 +107,7 @@ class Dmd(nn.Module):
         """
         slots = []
         for index, name in enumerate(self.pattern):
-            here = codes[name].unflatten(1, (-1, self.pattern.count(name)))
+            here = codes[name].unflatten(1, (-1, self.pattern.count(name)))  # type: ignore[no-untyped-call]
             vectors = self.embeddings[name](here[:, :, self.pattern[:index].count(name)])
             if absent is not None and name in absent:
                 vectors = vectors.masked_fill(absent[name][:, None, None], 0.0)

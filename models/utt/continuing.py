@@ -50,7 +50,7 @@ def last_groups(codes: Codes, pattern: Sequence[str], count: int | None = None) 
     slots = []
     for slot, name in enumerate(pattern):
         per = list(pattern).count(name)
-        here = codes.codes[name].unflatten(1, (-1, per))[:, :, list(pattern[:slot]).count(name)]
+        here = codes.codes[name].unflatten(1, (-1, per))[:, :, list(pattern[:slot]).count(name)]  # type: ignore[no-untyped-call]
         slots.append(here.gather(1, at.clamp(max=max(0, here.shape[1] - 1))))
     rows = torch.stack(slots, dim=2)
     valid = torch.arange(most, device=groups.device)[None] < kept[:, None]

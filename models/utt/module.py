@@ -78,7 +78,7 @@ def closed_sequences(
 
 
 class UttModule(PlayersModule):
-    """Trains a `ConditionedUtt` on the batches of `ConditionBatches`; the tokenizer is only looked through."""
+    """Trains a `ConditionedUtt` on `ConditionBatches`; the tokenizer is only looked through."""
 
     net: ConditionedUtt
 

@@ -47,7 +47,7 @@ class PromptEncoder:
         return Condition(*(value.to(self.device) for value in (features, mask, pooled)))
 
     def _sounds(self, prompts: Sequence[Prompt], fps: float) -> Condition:
-        from motionloom.datasets.audio.features import motion_frame_features
+        from motionloom.datasets.audio.lineup import motion_frame_features
 
         rows: list[Tensor | None] = []
         for prompt in prompts:
