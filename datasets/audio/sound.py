@@ -3,7 +3,7 @@
 Notable choices:
 - libsndfile decodes (WAV of 8, 16, 24, 32 bit and float, FLAC, OGG, MP3); what it lets pass is caught by
   `headers`.
-- Sound is read, mixed to mono and resampled block by block: memory is twice that of the samples made.
+- Sound is read, mixed to mono and resampled in blocks: memory is twice that of the samples that come out.
 - Several channels become their mean. Float sound and lossy decoders overshoot a little: clipped to -1..1.
 """
 

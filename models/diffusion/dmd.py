@@ -73,6 +73,7 @@ class Dmd(nn.Module):
         dim = config.dim
         self.embeddings = nn.ModuleDict({name: nn.Embedding(sizes[name], dim) for name in self.names})
         for table in self.embeddings.values():
+            assert isinstance(table, nn.Embedding)
             nn.init.normal_(table.weight, std=dim**-0.5)
         self.slot = nn.Parameter(torch.randn(len(self.pattern), dim) * dim**-0.5)
         self.encoder = self._stack(config.encoder_layers)

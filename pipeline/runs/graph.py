@@ -23,16 +23,15 @@ from rich.table import Table
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
+from motionloom.pipeline.contract.stage import Finished, Shelf, Stage, StageContext, fingerprint_fields
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import process_rank
+from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.runs.extend import extendable, extension
+from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import digest, remove_tree, write_json, write_text
 from motionloom.pipeline.store.run_folder import stage_folder
-from motionloom.pipeline.contract.stage import Finished, Shelf
-from motionloom.pipeline.contract.stage import Stage, StageContext, fingerprint_fields
-from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.launch.process import process_rank
-from motionloom.pipeline.runs.extend import extendable, extension
-from motionloom.pipeline.runs.recipe import Recipe
-from motionloom.pipeline.launch.team import Team
 
 Action = Literal["skip", "run", "resume", "leave"]
 
@@ -84,9 +83,7 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
                 action, reason = ("resume" if longer[0] else "run"), longer[1]
         if stage.name not in wanted and action != "skip":
             action, reason = "leave", "not selected"
-        rows[stage.name] = PlannedStage(
-            stage, fingerprint, action, reason, stage.name in forced, others
-        )
+        rows[stage.name] = PlannedStage(stage, fingerprint, action, reason, stage.name in forced, others)
         plan.append(rows[stage.name])
     if select.only:
         for role, name in recipe.stage(select.only).inputs.items():
