@@ -2,15 +2,9 @@
 
     OMP_NUM_THREADS=1 python -P benchmarks/audio.py [--fps 60] [--rounds 3] [--sound song.ogg] [--first-call]
 
-<<<<<<< HEAD
-Prints medians of CPU time, all in one run (on one thread; a busy machine stretches wall time), the ratio, the
-floor (the transforms alone, on arrays that are ready), the largest difference, what each
-takes of librosa's calls, and the most memory this process has used. `--first-call` adds the CPU time of a first call in a new process,
-=======
 Prints medians of CPU time of one run (a busy machine stretches wall time), the ratio, the floor
 (the transforms alone, on arrays that are ready), the largest difference, what each takes of librosa's calls,
 and the most memory this process has used. `--first-call` adds the CPU time of a first call in a new process,
->>>>>>> wt-audio
 where numba has compiled librosa on this machine and where it has not (a minute).
 """
 

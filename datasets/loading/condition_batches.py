@@ -36,6 +36,8 @@ class ConditionBatch(MotionBatch):
 
     index: Tensor
     """Clip numbers in the dataset, int64 [B]."""
+    closed: Tensor
+    """bool [B]: whether the row ends where its clip, or its caption's stretch, does."""
     valid: Tensor
     """bool [B]; false for the repeats that fill an evaluation batch up to the number of ranks."""
     caption: list[str]
@@ -110,6 +112,7 @@ class ConditionedClips:
         whole = np.array([span.frames for span in spans], dtype=np.int64)
         length = np.minimum(whole, self.max_frames)
         begin = np.array([span.first for span in spans], dtype=np.int64)
+        closed = torch.from_numpy(length == whole)
         begin += (crop * (whole - length + 1)).astype(np.int64)
         motion = np.empty((len(clips), padded_length(length), self.crops.width), dtype=np.float32)
         held = self.dataset.held[clips]
@@ -129,6 +132,7 @@ class ConditionedClips:
             "length": torch.from_numpy(length),
             "held": torch.from_numpy(self.crops.held[held]),
             "index": torch.from_numpy(clips.copy()),
+            "closed": closed,
             "valid": torch.ones(len(clips), dtype=torch.bool),
             "caption": captions,
             "conditions": conditions,

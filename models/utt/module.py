@@ -30,7 +30,7 @@ from motionloom.models.discriminator.losses import (
 from motionloom.models.discriminator.patch import DiscriminatorConfig, PatchDiscriminator
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy
-from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave
+from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave, stream_names
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
@@ -66,15 +66,17 @@ def closed_sequences(
     ends: Mapping[str, int],
 ) -> TokenSequence:
     """One sequence a row, with its End tokens where `closed` [B]; open rows are clips that go on."""
-    sequence = interleave(codes, pattern, ends=ends, groups=groups)
-    body = groups * len(pattern)
-    place = torch.arange(sequence.tokens.shape[1], device=groups.device)[None]
-    gone = ~closed[:, None] & (place >= body[:, None])
-    return TokenSequence(
-        sequence.tokens.masked_fill(gone, PAD),
-        sequence.kinds.masked_fill(gone, 0),
-        torch.where(closed, sequence.length, body),
-    )
+    names, batch, device = stream_names(pattern), len(groups), groups.device
+    tokens, kinds, length = interleave(codes, pattern, groups=groups)
+    tokens = torch.cat([tokens, tokens.new_full((batch, len(names)), PAD)], dim=1)
+    kinds = torch.cat([kinds, kinds.new_zeros(batch, len(names))], dim=1)
+    # The End tokens, behind each row's own.
+    order = torch.arange(len(names), device=device)
+    limits = torch.tensor([ends[name] for name in names], device=device)
+    at = length[:, None] + order
+    tokens = tokens.scatter(1, at, torch.where(closed[:, None], limits, PAD))
+    kinds = kinds.scatter(1, at, torch.where(closed[:, None], order, 0))
+    return TokenSequence(tokens, kinds, torch.where(closed, length + len(names), length))
 
 
 class UttModule(PlayersModule):

@@ -54,6 +54,7 @@ def generate(
     *,
     null: Encoded | None = None,
     inject_z: bool = True,
+    z: Tensor | None = None,
     start: Codes | None = None,
     context: int | None = None,
     max_groups: int | None = None,
@@ -71,6 +72,7 @@ def generate(
         condition: MATE's embeddings of B rows.
         null: MATE's unconditional embeddings of B rows; guidance needs them.
         inject_z: Draw z by each sample's seed; False generates without noise (Tables 3 and 5).
+        z: Noise [B, z_dim] in its place, such as that of the segment before.
         start: Tokens before the first new one, B rows.
         context: Groups of `start` that count, the last ones (default: all).
         max_groups: Most new groups (default: what one block holds). Longer ones slide.
@@ -102,7 +104,10 @@ def generate(
     most = int(limit.max()) * size if batch else 0
     numbers = [np.random.Generator(np.random.Philox(key=s)).random(most) for s in seeds]
     uniform = torch.from_numpy(np.stack(numbers)).to(device) if numbers else torch.zeros(0, 0)
-    z = draw_z(seeds, utt.config.z_dim).to(device) if inject_z and utt.config.z_dim else None
+    if not (inject_z and utt.config.z_dim):
+        z = None
+    elif z is None:
+        z = draw_z(seeds, utt.config.z_dim).to(device)
     if how.cfg_scale != 1 and null is not None:
         condition = _stacked(condition, null)
         z = None if z is None else torch.cat([z, z])

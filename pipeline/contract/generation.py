@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -66,6 +66,16 @@ class GenerationRequest:
         return text.pooled
 
 
+@dataclass(frozen=True)
+class Stretch:
+    """One stretch of a motion's time line: what it is conditioned on, and how long it is."""
+
+    conditions: Conditions
+    """As of a request; timed modalities begin with the stretch."""
+    frames: Sequence[int] | None
+    """Length of each row, or None where the model decides (only where it is the one stretch)."""
+
+
 class MotionGenerator(Protocol):
     """A trained stage that makes motion."""
 
@@ -106,4 +116,15 @@ class MotionGenerator(Protocol):
 
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
         """Features of the part in their own units, [T, C] each, in the order of the rows."""
+        ...
+
+
+@runtime_checkable
+class DrivenGenerator(MotionGenerator, Protocol):
+    """A generator whose conditions may change on the way: one motion, conditioned stretch by stretch."""
+
+    def drive(
+        self, stretches: Sequence[Stretch], seeds: Sequence[int], sampling: SamplingConfig
+    ) -> list[NDArray[np.float32]]:
+        """As `generate`, of several stretches one after another; [T, C] each."""
         ...

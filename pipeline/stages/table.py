@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from motionloom.pipeline.contract.registry import register
+from motionloom.pipeline.stages.audio import AudioStage
 from motionloom.pipeline.stages.convert import CONVERTED, ConvertStage, run_convert
 from motionloom.pipeline.stages.data import (
     DataStage,
@@ -13,6 +14,7 @@ from motionloom.pipeline.stages.data import (
     run_synth,
 )
 from motionloom.pipeline.stages.diffusion import DiffusionStage
+from motionloom.pipeline.stages.dmd import DmdStage
 from motionloom.pipeline.stages.evaluate import EvaluateStage
 from motionloom.pipeline.stages.generate import GenerateStage
 from motionloom.pipeline.stages.gpt import GptStage
@@ -21,6 +23,8 @@ from motionloom.pipeline.stages.report import ReportStage
 from motionloom.pipeline.stages.tma import TmaStage
 from motionloom.pipeline.stages.tokenizer import TOKENIZERS, TokenizerStage
 from motionloom.pipeline.stages.tokens import TokensStage
+from motionloom.pipeline.stages.ude import UdeStage
+from motionloom.pipeline.stages.utt import UttStage
 
 register(DataStage("synth", "synthetic shards", SynthStageConfig, run_synth))
 for name, (title, config) in CONVERTED.items():
@@ -28,12 +32,16 @@ for name, (title, config) in CONVERTED.items():
 register(ShardsStage("shards", "existing shards", ShardsStageConfig, run_shards))
 register(StatsStage())
 register(TextStage())
+register(AudioStage())
 for name, summary, config in TOKENIZERS:
     register(TokenizerStage(name, summary, config))
 register(TmaStage())
 register(DiffusionStage())
 register(TokensStage())
 register(GptStage())
+register(UttStage())
+register(DmdStage())
+register(UdeStage())
 register(GenerateStage())
 register(EvaluateStage())
 register(ReportStage())

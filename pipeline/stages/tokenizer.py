@@ -18,6 +18,7 @@ from motionloom.models.tokenizer.config import (
     EmaTokenizerConfig,
     FsqConfig,
     H2VQConfig,
+    MqConfig,
     RvqConfig,
     SeparateConfig,
     VqConfig,
@@ -87,6 +88,12 @@ class FsqStageConfig(TokenizerStageConfig):
     """Finite scalar quantization."""
 
     net: FsqConfig = FsqConfig()
+
+
+class MqStageConfig(TokenizerStageConfig):
+    """UDE's motion quantization."""
+
+    net: MqConfig = MqConfig()
 
 
 class TokenizerStage(TrainedStage):
@@ -184,4 +191,5 @@ TOKENIZERS: tuple[tuple[str, str, type[TokenizerStageConfig]], ...] = (
     ("rvq", "RVQ tokenizer", RvqStageConfig),
     ("separate", "body and hands apart", SeparateStageConfig),
     ("fsq", "FSQ tokenizer", FsqStageConfig),
+    ("mq", "UDE's motion quantization", MqStageConfig),
 )

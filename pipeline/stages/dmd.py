@@ -1,0 +1,139 @@
+"""DMD stage: the diffusion decoder of motion tokens (UDE section 3.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from pydantic import Field
+from torch import nn
+from torch.utils.data import Dataset
+
+from motionloom.datasets.loading.batches import EvalBatches, WindowBatches
+from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.dmd import Dmd, DmdConfig
+from motionloom.models.diffusion.dmd_module import DmdModule
+from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import Given
+from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
+from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+
+
+class DmdStageConfig(TrainedStageConfig):
+    """A diffusion decoder of the tokens of one tokenizer."""
+
+    net: DmdConfig = DmdConfig()
+    optim: OptimConfig = OptimConfig(optimizer="adam")
+    train: TrainConfig = TrainConfig(steps=200_000, batch_size=64)
+    window: int = Field(160, ge=8, multiple_of=4)
+    """Frames of a training window; longer motions are decoded in overlapping windows of this size."""
+    windows_per_clip: int = Field(1, ge=1)
+    """Windows cut from one read of a clip."""
+
+
+@dataclass(frozen=True)
+class LoadedDmd:
+    """A trained decoder."""
+
+    net: Dmd
+    window: int
+    given: Mapping[str, Any]
+    """What its stage was given; "tokenizer" of it."""
+
+
+class DmdStage(TrainedStage):
+    """Tokens to varied motion."""
+
+    name = "dmd"
+    summary = "diffusion decoder of motion tokens"
+    config = DmdStageConfig
+    takes = ("data", "stats", "tokenizer")
+
+    def gives(self, config: Any) -> frozenset[str]:
+        """Motion of tokens."""
+        return super().gives(config) | {"decoder"}
+
+    def facts(self, config: DmdStageConfig, given: Given) -> ModelFacts:
+        """Config and the tokenizer's streams."""
+        tokenizer = given["tokenizer"].net
+        extra = {
+            "streams": {s.name: s.num_codes for s in tokenizer.streams},
+            "pattern": list(tokenizer.pattern),
+            "window": config.window,
+        }
+        layout = LayoutFacts.of(given["data"].layout)
+        return ModelFacts(kind="dmd", config=config.net.dump(), layout=layout, extra=extra)
+
+    def network(self, facts: ModelFacts, given: Given) -> Dmd:
+        """The denoiser of the tokenizer's columns given its tokens."""
+        tokenizer = given["tokenizer"].net
+        expected = {s.name: s.num_codes for s in tokenizer.streams}
+        if facts.fact("streams", dict) != expected:
+            raise UserError(
+                f"{facts.where}: this decoder was trained on streams {facts.extra['streams']}, the tokenizer "
+                f"has {expected}; train it again on this tokenizer"
+            )
+        config = DmdConfig.parse(facts.config, facts.where)
+        return Dmd(config, tokenizer.streams, tokenizer.pattern, tokenizer.dim)
+
+    def module(self, config: DmdStageConfig, net: Any, given: Given, seed: int) -> DmdModule:
+        """Squared error of the noise."""
+        return DmdModule(
+            net, config.optim, seed=seed, max_steps=config.train.steps, tokenizer=given["tokenizer"].net
+        )
+
+    def batches(self, config: DmdStageConfig, net: nn.Module, given: Given, seed: int, say: Say) -> Batches:
+        """Windows of motion; their tokens are made as they come."""
+        data, stats, columns = given["data"], given["stats"], given["tokenizer"].columns
+        dataset = data.split("train", training=True)
+
+        def train(batch: int, rank: int, world: int) -> Dataset[Any]:
+            return WindowBatches(
+                dataset,
+                stats,
+                window=config.window,
+                batch_size=batch,
+                windows_per_clip=config.windows_per_clip,
+                seed=seed,
+                rank=rank,
+                world=world,
+                columns=columns,
+            )
+
+        def validation() -> Dataset[Any]:
+            return EvalBatches(
+                data.held_out(),
+                stats,
+                batch_size=32,
+                max_frames=config.window,
+                min_frames=GROUP_FRAMES,
+                columns=columns,
+            )
+
+        return Batches(train, validation)
+
+    def example(self, config: DmdStageConfig, net: Any, given: Given, batch: int) -> Example:
+        """The longest windows."""
+        return Example(
+            {
+                "motion": torch.empty(batch, config.window, net.motion_dim),
+                "length": torch.full((batch,), config.window),
+            }
+        )
+
+    def loaded(self, net: Dmd, facts: ModelFacts, given: Given) -> LoadedDmd:
+        """The network and its window."""
+        return LoadedDmd(net, facts.fact("window", int), given)
+
+    def exported(self, config: Any) -> tuple[str, ...]:
+        """The tokenizer, whose statistics turn what it makes into metres."""
+        return ("tokenizer",)
+
+    def curves(self, config: Any) -> tuple[Curve, ...]:
+        """The error."""
+        return (Curve("loss"),)

@@ -1,0 +1,190 @@
+"""The UDE engine: tokens of text, music or both in turn, decoded to one motion (UDE section 3.5, 4.4).
+
+Nothing is trained here: a `utt` stage makes tokens, a `dmd` stage decodes them, or the tokenizer's own
+decoder where the recipe has none (Table 5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.dmd_sampling import decode_motions
+from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.gpt.tokens import Codes
+from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator, Stretch
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import (
+    GENERATOR,
+    Finished,
+    Given,
+    Stage,
+    StageConfig,
+    StageContext,
+    StageKind,
+)
+from motionloom.pipeline.inference.timeline import TokenTimeline
+from motionloom.pipeline.stages.dmd import LoadedDmd
+from motionloom.pipeline.stages.utt import LoadedUtt
+from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.networks import TrainedTokenizer
+
+
+class UdeConfig(StageConfig):
+    """How tokens are carried on and decoded."""
+
+    inject_z: bool = True
+    """Draw z; without it a model trained with z is conditioned on its inputs alone (Tables 3 and 5)."""
+    context_frames: int = Field(40, ge=0, multiple_of=4)
+    """Frames of motion that a new stretch, or the next window of a long one, sees of what came before."""
+    sampler: Sampler = "dpm++"
+    """Of the diffusion decoder, unless a request says otherwise."""
+    denoising_steps: int = Field(20, ge=1)
+    overlap_frames: int = Field(32, ge=0, multiple_of=4)
+    """Frames that neighbouring windows of the diffusion decoder share."""
+
+
+class UdeStage(StageKind):
+    """A token model and a decoder as one generator."""
+
+    name = "ude"
+    summary = "text, music or both in turn to motion"
+    config = UdeConfig
+    takes = ("utt", "dmd?")
+
+    def gives(self, config: Any) -> frozenset[str]:
+        """Motion."""
+        return frozenset({GENERATOR})
+
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
+        """Both halves must speak of the same tokens, and the context must leave room in a window."""
+        utt, dmd = others.get(stage.inputs.get("utt", "")), others.get(stage.inputs.get("dmd", ""))
+        if utt is None:
+            return
+        if dmd is not None and utt.inputs.get("tokenizer") != dmd.inputs.get("tokenizer"):
+            raise UserError(
+                f"stage '{stage.name}': '{utt.name}' makes tokens of '{utt.inputs.get('tokenizer')}' and "
+                f"'{dmd.name}' decodes those of '{dmd.inputs.get('tokenizer')}'; name one tokenizer for both"
+            )
+        window = getattr(utt.config, "max_frames", None)
+        if window is not None and stage.config.context_frames >= window:
+            raise UserError(
+                f"stage '{stage.name}': context_frames {stage.config.context_frames} fill the window of "
+                f"{window} frames that '{utt.name}' is trained on; lower them"
+            )
+
+    def run(self, context: StageContext) -> None:
+        """Write the settings down; there is nothing to train."""
+        write_json(context.folder / "ude.json", context.config.dump())
+
+    def generator(self, stage: Finished, given: Given, device: torch.device) -> MotionGenerator:
+        """The engine."""
+        return UdeGenerator(given["utt"], given.get("dmd"), stage.config)
+
+    def exported(self, config: Any) -> tuple[str, ...]:
+        """Both halves."""
+        return ("utt", "dmd")
+
+    def export(self, stage: Finished, target: Path) -> None:
+        """Its settings are in the list of stages."""
+        target.mkdir(parents=True, exist_ok=True)
+
+
+@dataclass(frozen=True)
+class UdeGenerator:
+    """Motion of text, music or both, of any length."""
+
+    utt: LoadedUtt
+    dmd: LoadedDmd | None
+    config: UdeConfig
+    method = "ude"
+    max_frames = None
+
+    @property
+    def tokenizer(self) -> TrainedTokenizer:
+        """Whose tokens these are."""
+        tokenizer: TrainedTokenizer = self.utt.given["tokenizer"]
+        return tokenizer
+
+    @property
+    def layout(self) -> MotionLayout:
+        """Layout of whole frames."""
+        return self.tokenizer.layout
+
+    @property
+    def part(self) -> Part:
+        """The columns that the tokenizer models."""
+        return self.tokenizer.net.part
+
+    @property
+    def modalities(self) -> frozenset[str]:
+        """What the token model was trained on."""
+        return self.utt.modalities
+
+    @property
+    def settings(self) -> frozenset[str]:
+        """How tokens are drawn and decoded."""
+        of_decoder = {"sampler", "denoising_steps"} if self.dmd is not None else set()
+        return frozenset({"temperature", "top_k", "top_p", "cfg_scale"} | of_decoder)
+
+    @property
+    def unit_frames(self) -> int:
+        """A group of tokens."""
+        return GROUP_FRAMES
+
+    @cached_property
+    def timeline(self) -> TokenTimeline:
+        """What makes tokens window by window."""
+        return TokenTimeline(
+            self.utt.net,
+            window=self.utt.max_frames // GROUP_FRAMES,
+            context=self.config.context_frames // GROUP_FRAMES,
+            audio=self.utt.given.get("audio"),
+            inject_z=self.config.inject_z,
+        )
+
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        """One stretch."""
+        stretch = Stretch(request.conditions, request.frames)
+        return self.drive([stretch], request.seeds, request.sampling)
+
+    def drive(
+        self, stretches: Sequence[Stretch], seeds: Sequence[int], sampling: SamplingConfig
+    ) -> list[NDArray[np.float32]]:
+        """Tokens that go on from stretch to stretch, then all of them decoded at once."""
+        codes = self.timeline.tokens(stretches, seeds, sampling)
+        given = [stretch.frames for stretch in stretches]
+        motions = self.decode(codes, seeds, sampling)
+        if any(frames is None for frames in given):
+            return motions
+        totals = np.sum([list(frames) for frames in given if frames is not None], axis=0).tolist()
+        return [motion[:count] for motion, count in zip(motions, totals, strict=True)]
+
+    def decode(
+        self, codes: Codes, seeds: Sequence[int], sampling: SamplingConfig
+    ) -> list[NDArray[np.float32]]:
+        """Features in their own units, [T, C] a row."""
+        if self.dmd is None:
+            return self.tokenizer.decode(codes.codes, codes.groups.tolist())
+        asked = sampling.model_fields_set
+        made = decode_motions(
+            self.dmd.net,
+            codes,
+            seeds=seeds,
+            sampler=sampling.sampler if "sampler" in asked else self.config.sampler,
+            steps=sampling.denoising_steps if "denoising_steps" in asked else self.config.denoising_steps,
+            window=self.dmd.window,
+            overlap=min(self.config.overlap_frames, self.dmd.window - GROUP_FRAMES),
+        )
+        return [self.tokenizer.own_units(motion) for motion in made]
