@@ -2,9 +2,9 @@
 
 A window of frames carries its own tokens, so a motion of any length is cut into windows of the size that the
 network was trained on. At every denoising step each window's noise is predicted, overlapping predictions are
-averaged with weights that rise and fall linearly across the overlap, and one step is taken on the whole motion
-[ours]. Averaging noise is averaging x0, which is linear in it at a given x_t. Since all windows are denoised
-together from one noise, no seam is left; a motion that fits into one window is denoised as it is.
+averaged with weights that rise and fall linearly across the overlap, and one step is taken on the whole
+motion [ours]. Averaging noise is averaging x0, which is linear in it at a given x_t. Since all windows are
+denoised together from one noise, no seam is left; a motion that fits into one window is denoised as it is.
 
 Every motion draws from its own seed, and motions of one length are denoised together, so a motion does not
 depend on what it is generated with.
