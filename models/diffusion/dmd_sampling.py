@@ -155,7 +155,7 @@ class _Windows:
         found = self.net.denoise(cut, step.to(x.device).expand(len(cut)), self.condition, mask)
         if number == 1:
             return found[:, : self.frames]
-        found = found.unflatten(0, (count, number))
+        found = found.view(count, number, *found.shape[1:])
         out = torch.zeros_like(padded, dtype=found.dtype)
         for k, start in enumerate(self.starts):
             stop = min(start + self.size, self.frames)

@@ -111,9 +111,9 @@ def test_loss_counts_real_frames_and_columns(net: Dmd) -> None:
     codes, length = random_codes([4, 2]), torch.tensor([16, 7])
     motion, noise, step = torch.randn(2, 16, 6), torch.randn(2, 16, 6), torch.tensor([10, 900])
     noiser = net.config.schedule.noiser()
-    held = torch.ones(2, 6, dtype=torch.bool)
-    held[1, 4:] = False
-    loss = dmd_loss(net, noiser, motion, codes.codes, length, step, noise, held=held)
+    present = torch.ones(2, 6, dtype=torch.bool)
+    present[1, 4:] = False
+    loss = dmd_loss(net, noiser, motion, codes.codes, length, step, noise, present=present)
     found = net(noiser.add_noise(motion, noise, step), step, codes.codes, length)
     error = (found - noise).square()
     total = error[0].sum() + error[1, :7, :4].sum()
