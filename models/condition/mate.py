@@ -106,15 +106,15 @@ class Mate(nn.Module):
         if size is None:
             raise ValueError("without any modality the size of the batch must be given")
         first = self.aggregate.expand(size, -1)
-        parts, masks = [], []
+        pieces, masks = [], []
         for name, width in self.widths.items():
             features, mask = self._modality(conditions.get(name), name, width, size)
             x = self.project[name](features.to(self.aggregate.dtype)) + self.modality[name]
-            parts.append(x + sinusoid(x.shape[1] + 1, x.shape[2], x.device)[1:].to(x.dtype))
+            pieces.append(x + sinusoid(x.shape[1] + 1, x.shape[2], x.device)[1:].to(x.dtype))
             masks.append(mask)
             first = first + mask.any(1)[:, None] * self.aggregate_of[name]
         origin = sinusoid(1, first.shape[1], first.device).to(first.dtype)
-        x = torch.cat([(first + origin)[:, None], *parts], dim=1)
+        x = torch.cat([(first + origin)[:, None], *pieces], dim=1)
         mask = torch.cat(masks, dim=1)
         x = self.stack(self.dropout(x), torch.cat([mask.new_ones(size, 1), mask], dim=1))
         return Encoded(x[:, 0], x[:, 1:].masked_fill(~mask[..., None], 0.0), mask)

@@ -71,17 +71,17 @@ class Dmd(nn.Module):
         self.motion_dim = motion_dim
         sizes = {stream.name: stream.num_codes for stream in streams}
         dim = config.dim
-        self.embeddings = nn.ModuleDict({name: nn.Embedding(sizes[name], dim) for name in self.names})
-        for table in self.embeddings.values():
-            assert isinstance(table, nn.Embedding)
+        tables = {name: nn.Embedding(sizes[name], dim) for name in self.names}
+        for table in tables.values():
             nn.init.normal_(table.weight, std=dim**-0.5)
+        self.embeddings = nn.ModuleDict(tables)
         self.slot = nn.Parameter(torch.randn(len(self.pattern), dim) * dim**-0.5)
         self.encoder = self._stack(config.encoder_layers)
         self.to_frames = nn.Linear(len(self.pattern) * dim, GROUP_FRAMES * dim)
-        self.enter = nn.Linear(motion_dim, dim)
+        self.motion_in = nn.Linear(motion_dim, dim)
         self.time = nn.Sequential(nn.Linear(dim, dim), nn.SiLU(), nn.Linear(dim, dim))
         self.decoder = self._stack(config.decoder_layers)
-        self.leave = nn.Linear(dim, motion_dim)
+        self.motion_out = nn.Linear(dim, motion_dim)
 
     def forward(
         self,
@@ -108,7 +108,8 @@ class Dmd(nn.Module):
         """
         slots = []
         for index, name in enumerate(self.pattern):
-            here = codes[name].unflatten(1, (-1, self.pattern.count(name)))  # type: ignore[no-untyped-call]
+            per = self.pattern.count(name)
+            here = codes[name].reshape(len(groups), codes[name].shape[1] // per, per)
             vectors = self.embeddings[name](here[:, :, self.pattern[:index].count(name)])
             if absent is not None and name in absent:
                 vectors = vectors.masked_fill(absent[name][:, None, None], 0.0)
@@ -116,8 +117,9 @@ class Dmd(nn.Module):
         x = torch.stack(slots, dim=2) + self.slot
         x = x + sinusoid(x.shape[1], x.shape[3], x.device)[:, None].to(x.dtype)
         mask = length_mask(groups, x.shape[1]).repeat_interleave(len(self.pattern), dim=1)
-        states = self.encoder(x.flatten(1, 2), mask).unflatten(1, (-1, len(self.pattern))).flatten(2)
-        out: Tensor = self.to_frames(states).unflatten(2, (GROUP_FRAMES, -1)).flatten(1, 2)
+        batch, count = x.shape[:2]
+        states = self.encoder(x.flatten(1, 2), mask).reshape(batch, count, -1)
+        out: Tensor = self.to_frames(states).reshape(batch, count * GROUP_FRAMES, -1)
         return out
 
     def denoise(self, noisy: Tensor, step: Tensor, condition: Tensor, mask: Tensor) -> Tensor:
@@ -134,11 +136,11 @@ class Dmd(nn.Module):
         frames = noisy.shape[1]
         if condition.shape[1] < frames:
             raise ValueError(f"tokens of {condition.shape[1]} frames were given for {frames} frames")
-        dtype = self.enter.weight.dtype
+        dtype = self.motion_in.weight.dtype
         time = self.time(step_waves(step, self.config.dim).to(dtype))
-        x = self.enter(noisy.to(dtype)) + condition[:, :frames] + time[:, None]
+        x = self.motion_in(noisy.to(dtype)) + condition[:, :frames] + time[:, None]
         x = x + sinusoid(frames, x.shape[2], x.device).to(x.dtype)
-        out: Tensor = self.leave(self.decoder(x, mask))
+        out: Tensor = self.motion_out(self.decoder(x, mask))
         out = out.to(torch.promote_types(out.dtype, torch.float32))
         return out.masked_fill(~mask[..., None], 0.0)
 
@@ -164,7 +166,7 @@ def dmd_loss(
     noise: Tensor,
     *,
     absent: Mapping[str, Tensor] | None = None,
-    held: Tensor | None = None,
+    present: Tensor | None = None,
 ) -> Tensor:
     """Squared error of the predicted noise, mean over the real frames of all ranks (equation 10).
 
@@ -177,9 +179,9 @@ def dmd_loss(
         step: int64 [B], time steps.
         noise: [B, T, D], standard normal.
         absent: As in `Dmd.encode_tokens`.
-        held: bool [B, D], columns that count (None = all).
+        present: bool [B, D], columns that count (None = all).
     """
     found = net(noiser.add_noise(motion, noise, step), step, codes, length, absent)
     target = motion if net.config.schedule.predicts == "sample" else noise
     error = (found - target.to(found.dtype)).square()
-    return masked_mean(error, length_mask(length, motion.shape[1]), held)
+    return masked_mean(error, length_mask(length, motion.shape[1]), present)

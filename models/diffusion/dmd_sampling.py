@@ -1,8 +1,8 @@
 """Motions from tokens by a trained `Dmd` and diffusers' samplers; long ones in overlapping windows.
 
-A window of frames carries its own tokens, so a motion of any length is cut into windows of the size that
-the network was trained on. At every denoising step each window's noise is predicted, overlapping predictions
-are averaged with weights that rise and fall linearly across the overlap, and one step is taken on the whole
+A window of frames carries its own tokens, so a motion of any length is cut into windows of the size that the
+network was trained on. At every denoising step each window's noise is predicted, overlapping predictions are
+averaged with weights that rise and fall linearly across the overlap, and one step is taken on the whole
 motion [ours]. Averaging noise is averaging x0, which is linear in it at a given x_t. Since all windows are
 denoised together from one noise, no seam is left; a motion that fits into one window is denoised as it is.
 
@@ -155,7 +155,7 @@ class _Windows:
         found = self.net.denoise(cut, step.to(x.device).expand(len(cut)), self.condition, mask)
         if number == 1:
             return found[:, : self.frames]
-        found = found.unflatten(0, (count, number))  # type: ignore[no-untyped-call]
+        found = found.view(count, number, *found.shape[1:])
         out = torch.zeros_like(padded, dtype=found.dtype)
         for k, start in enumerate(self.starts):
             stop = min(start + self.size, self.frames)

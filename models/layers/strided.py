@@ -48,7 +48,7 @@ class StridedEncoder(nn.Module):
         widths = [dim, width, width]
         self.down = nn.ModuleList(nn.Conv1d(a, b, 4, stride=2, padding=1) for a, b in pairwise(widths))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(2))
-        self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
+        self.out = nn.Conv1d(width, out_dim, 3, padding=1)
         _start(self)
 
     def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
@@ -57,7 +57,7 @@ class StridedEncoder(nn.Module):
         hidden = x.transpose(1, 2)
         for i, (down, stack) in enumerate(zip(self.down, self.stacks, strict=True)):
             hidden = stack(_active(down(_zero(hidden, padding[i]))), padding[i + 1])
-        latents: Tensor = self.leave(_zero(hidden, padding[2]))
+        latents: Tensor = self.out(_zero(hidden, padding[2]))
         return latents.transpose(1, 2)
 
 
@@ -69,10 +69,10 @@ class StridedDecoder(nn.Module):
         widths = [dim, width, width]
         self.up = nn.ModuleList(nn.Conv1d(a, b, 3, padding=1) for a, b in pairwise(widths))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(2))
-        self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
+        self.out = nn.Conv1d(width, out_dim, 3, padding=1)
         _start(self)
         with torch.no_grad():
-            self.leave.weight.mul_(0.1)  # near the mean pose, which is zero
+            self.out.weight.mul_(0.1)  # near the mean pose, which is zero
 
     def forward(self, z: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = *frames* that are not padding, a multiple of 4; padded frames come out as zero."""
@@ -82,4 +82,4 @@ class StridedDecoder(nn.Module):
             level = 1 - i
             wide = _zero(hidden, padding[level + 1]).repeat_interleave(2, dim=2)
             hidden = stack(_active(up(wide)), padding[level])
-        return _zero(self.leave(_zero(hidden, padding[0])), padding[0]).transpose(1, 2)
+        return _zero(self.out(_zero(hidden, padding[0])), padding[0]).transpose(1, 2)

@@ -34,7 +34,7 @@ def soft_motion(
     tokenizer: Tokenizer,
     gumbel_temperature: float,
     sample: bool,
-    held: Tensor | None = None,
+    present: Tensor | None = None,
 ) -> SoftMotion:
     """Decode what logits [B, L, V] predict for the clips of tokens [B, L], kinds [B, L].
 
@@ -46,9 +46,9 @@ def soft_motion(
         tokenizer: Frozen.
         gumbel_temperature: Of the softmax behind the one-hots.
         sample: Draw from the distribution; false takes the likeliest codes.
-        held: bool [B, dim], columns of the tokenizer that the clip has (None = all).
+        present: bool [B, dim], columns of the tokenizer that the clip has (None = all).
     """
     groups = group_counts(tokens, kinds, net.ends, len(net.pattern))
     weights = soft_codes(net, logits, groups, temperature=gumbel_temperature, sample=sample)
     frames = groups * tokenizer.group_frames
-    return SoftMotion(tokenizer.decode_soft(weights, frames, held), frames)
+    return SoftMotion(tokenizer.decode_soft(weights, frames, present), frames)

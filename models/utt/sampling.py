@@ -198,7 +198,7 @@ def _stacked(condition: Encoded, null: Encoded) -> Encoded:
         )
         for c in (condition, null)
     ]
-    return Encoded(*(torch.cat(part) for part in zip(*rows, strict=True)))
+    return Encoded(*(torch.cat(both) for both in zip(*rows, strict=True)))
 
 
 def _limits(

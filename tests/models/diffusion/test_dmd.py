@@ -111,9 +111,9 @@ def test_loss_counts_real_frames_and_columns(net: Dmd) -> None:
     codes, length = random_codes([4, 2]), torch.tensor([16, 7])
     motion, noise, step = torch.randn(2, 16, 6), torch.randn(2, 16, 6), torch.tensor([10, 900])
     noiser = net.config.schedule.noiser()
-    held = torch.ones(2, 6, dtype=torch.bool)
-    held[1, 4:] = False
-    loss = dmd_loss(net, noiser, motion, codes.codes, length, step, noise, held=held)
+    present = torch.ones(2, 6, dtype=torch.bool)
+    present[1, 4:] = False
+    loss = dmd_loss(net, noiser, motion, codes.codes, length, step, noise, present=present)
     found = net(noiser.add_noise(motion, noise, step), step, codes.codes, length)
     error = (found - noise).square()
     total = error[0].sum() + error[1, :7, :4].sum()
@@ -140,7 +140,7 @@ def test_windows_cover_and_weights_add_up() -> None:
         for row, start in enumerate(starts):
             assert (weights[row, :start] == 0).all()
             assert (weights[row, start + 160 :] == 0).all()
-        assert weights.diff(dim=1).abs().max() <= 1 / 33 + 1e-9  # no window comes or goes at once
+        assert weights.diff(dim=1).abs().max() <= 2 / 33  # no window comes or goes at once
 
 
 @pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
@@ -179,43 +179,57 @@ def test_a_short_motion_is_as_without_windows(net: Dmd, sampler: Sampler) -> Non
     torch.testing.assert_close(wide[0], x[0], atol=1e-4, rtol=1e-4)
 
 
-def wave(codes: Tensor) -> Tensor:
-    """Motion [B, 4 G, 2] whose phase moves by what each token says: smooth across tokens."""
-    speed = (codes.repeat_interleave(4, dim=1).float() + 1) * 0.1
-    phase = speed.cumsum(1) - speed / 2
-    return torch.stack([speed * 5 - 1, phase.sin() * 0], dim=-1)[..., :1].expand(-1, -1, 2)
+def toy(codes: Tensor, generator: torch.Generator) -> Tensor:
+    """Motion [B, 4 G, 2]: what its token says, and a wave of any phase, which no token tells."""
+    phase = torch.rand(len(codes), 1, generator=generator) * 6.2832 + 0.4 * torch.arange(4 * codes.shape[1])
+    return torch.stack([codes.repeat_interleave(4, 1).float() - 1, 1.4 * phase.sin()], dim=-1)
 
 
+@pytest.mark.slow
 def test_learns_and_leaves_no_seams() -> None:
-    """Trained on 16 frames at random places, it decodes 90 frames: right everywhere, borders included."""
+    """Trained on 16 frames, it decodes 90: tokens are obeyed, and the wave, whose phase only neighbouring
+    frames fix, goes on across the borders of windows as within them. Without overlap it does not.
+    """
     torch.manual_seed(0)
-    config = DmdConfig(dim=32, ff=64, encoder_layers=1, decoder_layers=2, heads=4, dropout=0.0,
-                       attention_dropout=0.0)  # fmt: skip
-    net = Dmd(config, (Stream("code", 4, 1),), ("code",), 2)
-    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
-    noiser, length = config.schedule.noiser(), torch.full((32,), 16)
-    for _ in range(300):
-        codes = torch.randint(4, (32, 4))
-        step, noise = torch.randint(1000, (32,)), torch.randn(32, 16, 2)
-        optimizer.zero_grad()
-        dmd_loss(net, noiser, wave(codes), {"code": codes}, length, step, noise).backward()
-        optimizer.step()
-    tokens = torch.full((6, 23), 2)
-    made = torch.stack(
-        decode_motions(
-            net, Codes({"code": tokens}, torch.full((6,), 23)), frames=[90] * 6, seeds=range(6),
-            sampler="ddim", steps=20, window=16, overlap=8,
-        )
-    )  # fmt: skip
-    assert (made - wave(tokens)[:, :90]).abs().mean() < 0.15
-    jumps = made.diff(dim=1).abs().amax(-1)
-    starts = window_starts(90, 16, 8)
-    borders = sorted(
-        {b - 1 for s in starts[1:] for b in (s, s + 8, s + 16) if b < 90} | {s + 7 for s in starts}
+    config = DmdConfig(
+        dim=32, ff=64, encoder_layers=1, decoder_layers=1, heads=4, dropout=0.0, attention_dropout=0.0
     )
-    inside = [i for i in range(89) if i not in borders]
-    assert jumps[:, borders].mean() < 1.3 * jumps[:, inside].mean()
-    assert jumps[:, borders].max() < 1.3 * jumps[:, inside].max()
+    net = Dmd(config, (Stream("code", 3, 1),), ("code",), 2)
+    steps = 700
+    optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
+    decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda i: min(1.0, 2 * (1 - i / steps)))
+    noiser, length, generator = (
+        config.schedule.noiser(),
+        torch.full((64,), 16),
+        torch.Generator().manual_seed(0),
+    )
+    for _ in range(steps):
+        codes = torch.randint(3, (64, 4), generator=generator)
+        step = torch.randint(1000, (64,), generator=generator)
+        noise = torch.randn(64, 16, 2, generator=generator)
+        optimizer.zero_grad()
+        dmd_loss(net, noiser, toy(codes, generator), {"code": codes}, length, step, noise).backward()
+        optimizer.step()
+        decay.step()
+    tokens = Codes({"code": torch.randint(3, (12, 23), generator=generator)}, torch.full((12,), 23))
+    bends = {}
+    for overlap in (0, 8):
+        made = torch.stack(
+            decode_motions(
+                net, tokens, frames=[90] * 12, seeds=range(12), sampler="ddim", steps=20, window=16,
+                overlap=overlap,
+            )
+        )  # fmt: skip
+        wanted = toy(tokens.codes["code"], generator)[:, :90, 0]
+        assert (made[..., 0] - wanted).abs().median() < 0.1
+        bend = made[..., 1].diff(dim=1).diff(dim=1).abs()
+        edges = {e for s in window_starts(90, 16, overlap)[1:] for e in (s, s + overlap)}
+        near = sorted({i for e in edges for i in (e - 2, e - 1) if i < 88})
+        inside = [i for i in range(88) if i not in near]
+        # The median over motions: a toy this small throws one far off now and then, in one window too.
+        bends[overlap] = (bend[:, near].mean(1).median() / bend[:, inside].mean(1).median()).item()
+    assert bends[8] < 1.3
+    assert bends[0] > 2
 
 
 def test_more_motions_of_one_token_sequence_differ(net: Dmd) -> None:

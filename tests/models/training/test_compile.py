@@ -18,7 +18,7 @@ from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import FsqConfig, H2VQConfig, RvqConfig, SeparateConfig
+from motionloom.models.tokenizer.config import FsqConfig, H2VQConfig, MqConfig, RvqConfig, SeparateConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
@@ -53,6 +53,7 @@ def tokenizer(kind: str) -> tuple[StageModule, dict[str, Any]]:
         "rvq": RvqConfig(**BOOK),
         "separate": SeparateConfig(**BOOK),
         "fsq": FsqConfig(**SMALL, steps=(4, 4)),
+        "mq": MqConfig(**SMALL, num_codes=12, start="data"),
     }[kind]
     net = build_tokenizer(config, LAYOUT)
     return TokenizerModule(net, OPTIM, seed=0, max_steps=1, **config.loss_terms()), windows(net.dim)
@@ -85,7 +86,7 @@ def gpt() -> tuple[StageModule, dict[str, Any]]:
 
 
 CASES: dict[str, Callable[[], tuple[StageModule, dict[str, Any]]]] = {
-    **{kind: (lambda kind=kind: tokenizer(kind)) for kind in ("h2vq", "rvq", "separate", "fsq")},
+    **{kind: (lambda kind=kind: tokenizer(kind)) for kind in ("h2vq", "rvq", "separate", "fsq", "mq")},
     "tma": tma,
     "diffusion": diffusion,
     "gpt with alignment": gpt,
