@@ -35,7 +35,7 @@ def choreograph(song: Song, start: float, frames: int, fps: float, rng: np.rando
     track = Track.standing(frames / fps, fps, rng, width=rng.uniform(0.0, 0.05))
     first = beat_number(song, start)
     numbers = np.arange(first - first % BEATS - BEATS, first + int(frames / fps / song.beat) + 3)
-    beats: Array = numbers * song.beat - start
+    beats: Array = np.asarray(numbers * song.beat - start, dtype=np.float64)
     track.first_beat = float(first * song.beat - start)
     amount = rng.uniform(0.85, 1.15)
     aside, down, roll, twist = (amount * value for value in _LEGS[genre.style])
@@ -82,7 +82,8 @@ def accents(song: Song, start: float, t: Array, high: float, low: float) -> Arra
     end = start + float(t[-1])
     bar = BEATS * song.beat
     halves = np.arange(int(np.floor(start / bar)) * 2, int(np.ceil(end / bar)) * 2 + 2)
-    return keys(t + start, halves * (bar / 2), np.where(halves % 2 == 0, high, low))
+    at = np.asarray(halves * (bar / 2), dtype=np.float64)
+    return keys(t + start, at, np.where(halves % 2 == 0, high, low))
 
 
 def beat_number(song: Song, start: float) -> int:
