@@ -82,9 +82,8 @@ def accents(song: Song, start: float, t: Array, high: float, low: float) -> Arra
     end = start + float(t[-1])
     bar = BEATS * song.beat
     halves = np.arange(int(np.floor(start / bar)) * 2, int(np.ceil(end / bar)) * 2 + 2)
-    return keys(
-        t + start, np.asarray(halves * (bar / 2), dtype=np.float64), np.where(halves % 2 == 0, high, low)
-    )
+    at = np.asarray(halves * (bar / 2), dtype=np.float64)
+    return keys(t + start, at, np.where(halves % 2 == 0, high, low))
 
 
 def beat_number(song: Song, start: float) -> int:

@@ -1,9 +1,12 @@
 """The sounds that songs are made of: drums, a bass and chords, all synthesised, at any sample rate.
 
-Every function returns float64 samples of one stroke or one note, about 1 at its loudest.
+Every function returns float64 samples of one stroke or one note, about 1 at its loudest. Bars repeat, so the
+last notes are kept; they are not to be changed.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 from scipy import signal
@@ -23,6 +26,9 @@ _DECAY: dict[str, float] = {"saw": 3.0, "square": 1.2, "organ": 0.4, "string": 0
 """How fast a note fades, 1 / seconds."""
 _ATTACK: dict[str, float] = {"saw": 0.005, "square": 0.003, "organ": 0.01, "string": 0.03, "bell": 0.002}
 """Seconds to the loudest."""
+
+_KEPT = 96
+"""Notes: the four chords of a section, with their bass and upper voice."""
 
 
 def kick(rate: int) -> Array:
@@ -53,6 +59,7 @@ def tick(rate: int, rng: np.random.Generator, high: bool) -> Array:
     return np.asarray(0.5 * tone * np.exp(-60 * t) + 0.5 * rng.standard_normal(len(t)) * np.exp(-90 * t))
 
 
+@lru_cache(maxsize=_KEPT)
 def bass(rate: int, hertz: float, seconds: float) -> Array:
     """A bass note: few harmonics, a soft start, a fading end."""
     t = np.arange(max(2, int(seconds * rate))) / rate
@@ -62,6 +69,7 @@ def bass(rate: int, hertz: float, seconds: float) -> Array:
     return np.asarray(wave * _envelope(t, 0.006, 2.5))
 
 
+@lru_cache(maxsize=_KEPT)
 def note(rate: int, wave: Wave, hertz: float, seconds: float) -> Array:
     """A note of a chord instrument; harmonics above half the sample rate are left out."""
     t = np.arange(max(2, int(seconds * rate))) / rate

@@ -94,7 +94,8 @@ def manual_features(joints: NDArray[np.floating], *, frame_seconds: float = MANU
     """Joints [T >= 2, N >= 22, 3], Y up -> [32]: how often each of 32 geometric statements is true."""
     if joints.ndim != 3 or len(joints) < 2 or joints.shape[1] < len(_NAMES):
         raise UserError(f"geometric features need joints [T >= 2, N >= 22, 3], not {list(joints.shape)}")
-    return np.asarray(_Poses(np.asarray(joints, dtype=np.float64), frame_seconds).statements().mean(1))
+    poses = _Poses(np.asarray(joints, dtype=np.float64), frame_seconds)
+    return np.asarray(poses.statements().mean(1))
 
 
 class _Poses:

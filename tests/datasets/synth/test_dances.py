@@ -191,7 +191,7 @@ def test_shards_of_dances_are_the_same_whoever_makes_them(tmp_path: Path) -> Non
     two = synthesize(config, tmp_path / "two", workers=2, progress=False)
     assert [shard.sha256 for shard in one.shards] == [shard.sha256 for shard in two.shards]
     assert one.audio == settings_for(20.0).dump()
-    data = ShardDataset(tmp_path / "one", "train")
+    data = ShardDataset.open(tmp_path / "one", "train")
     audio = data.audio(0)
     assert audio is not None
     assert audio.shape == (data.frames[0], 438)
