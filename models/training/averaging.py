@@ -40,7 +40,8 @@ class AveragedWeights(Callback):
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Copy the network."""
         assert isinstance(pl_module, StageModule)
-        self.average = AveragedModel(pl_module.net, multi_avg_fn=get_ema_multi_avg_fn(self.decay))  # type: ignore[no-untyped-call]
+        average = get_ema_multi_avg_fn(self.decay)  # type: ignore[no-untyped-call]
+        self.average = AveragedModel(pl_module.net, multi_avg_fn=average)
         if self._loaded is not None:
             self.average.load_state_dict(self._loaded)
             self._loaded = None

@@ -109,7 +109,7 @@ def mean_gradients(params: Sequence[nn.Parameter]) -> None:
         grads = [(p.grad if p.grad is not None else torch.zeros_like(p)).reshape(-1) for p in group]
         flat = torch.cat([present, *grads])
         dist.all_reduce(flat)
-        means = (flat[len(group) :] / world_size()).split([p.numel() for p in group])  # type: ignore[no-untyped-call]
+        means = torch.split(flat[len(group) :] / world_size(), [p.numel() for p in group])
         # Read only where this rank lacks one: on a GPU that waits for the collective.
         lacking = any(param.grad is None for param in group)
         counts = flat[: len(group)].tolist() if lacking else [1.0] * len(group)

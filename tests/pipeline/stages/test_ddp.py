@@ -85,7 +85,9 @@ def rows(run: Path, stage: str) -> list[dict[str, float]]:
 
 
 def files(run: Path) -> set[str]:
-    return {p.relative_to(run).as_posix() for p in run.rglob("*") if p.is_file()}
+    """All but TensorBoard's, which are named after time and process."""
+    found = (p for p in run.rglob("*") if p.is_file() and "tfevents" not in p.name)
+    return {p.relative_to(run).as_posix() for p in found}
 
 
 def assert_same_training(one: Path, two: Path, stage: str) -> None:
