@@ -40,5 +40,5 @@ class DmdModule(StageModule):
             codes = self.tokenizer.module.encode(motion, length, held)
         step = torch.randint(0, self.net.config.schedule.steps, (len(motion),), device=motion.device)
         noise = torch.randn_like(motion)
-        loss = dmd_loss(self.net, self.noiser, motion, codes, length, step, noise, held=held)
+        loss = dmd_loss(self.net, self.noiser, motion, codes, length, step, noise, present=held)
         return {"loss": loss}

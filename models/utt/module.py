@@ -177,7 +177,7 @@ class UttModule(PlayersModule):
             tokenizer=self.tokenizer.module,
             gumbel_temperature=config.gumbel_temperature,
             sample=config.sample and self.training,
-            held=batch.get("held"),
+            present=batch.get("held"),
         )
 
     def _critic(self, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -18,7 +18,7 @@ from motionloom.pipeline.runs.graph import execute, make_plan, replaced_training
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.stages import table
 from motionloom.pipeline.stages.stage import StageConfig, StageContext, StageKind
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig, fit
+from motionloom.pipeline.stages.training import TrainedStageConfig, fit
 from motionloom.pipeline.store.artifact import Artifact
 
 
