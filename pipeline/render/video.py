@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of, smooth_path
 from motionloom.pipeline.render.figure import figure_for
-from motionloom.pipeline.render.files import part_path
 from motionloom.pipeline.render.lettering import font, wrap
 from motionloom.pipeline.render.raster import SKY, Pose, draw_ground, draw_pose, halve
 
@@ -41,28 +42,25 @@ def write_mp4(
 
     width, height = (side + side % 2 for side in size)
     frames = render_frames(joints, skeleton, fps, caption, size=(width, height), view=view, follow=follow)
-    part = part_path(path)
-    writer = imageio_ffmpeg.write_frames(
-        str(part),
-        (width, height),
-        fps=fps,
-        codec="libx264",
-        pix_fmt_out="yuv420p",
-        macro_block_size=2,
-        output_params=["-preset", "veryfast", "-crf", "20", "-movflags", "+faststart"],
-        ffmpeg_log_level="error",
-    )
-    try:
-        writer.send(None)
-        for done, frame in enumerate(frames, start=1):
-            writer.send(frame.tobytes())
-            if progress is not None:
-                progress(done, len(joints))
-        writer.close()
-        part.replace(path)
-    finally:
-        writer.close()
-        part.unlink(missing_ok=True)
+    # Named, because the temporary file's ending does not say it.
+    form = ["-f", "mp4", "-movflags", "+faststart"]
+    with atomic_path(path) as temporary:
+        writer = imageio_ffmpeg.write_frames(
+            str(temporary),
+            (width, height),
+            fps=fps,
+            codec="libx264",
+            pix_fmt_out="yuv420p",
+            macro_block_size=2,
+            output_params=["-preset", "veryfast", "-crf", "20", *form],
+            ffmpeg_log_level="error",
+        )
+        with closing(writer):
+            writer.send(None)
+            for done, frame in enumerate(frames, start=1):
+                writer.send(frame.tobytes())
+                if progress is not None:
+                    progress(done, len(joints))
 
 
 def render_frames(

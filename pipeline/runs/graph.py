@@ -8,7 +8,6 @@ fingerprint and runs too.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import time
@@ -24,7 +23,9 @@ from rich.table import Table
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
 from motionloom.pipeline.store.artifact import Artifact, InputStage
-from motionloom.pipeline.store.files import digest, remove_tree, write_json, write_text
+from motionloom.datasets.base.lock import file_lock
+from motionloom.datasets.base.files import write_text
+from motionloom.pipeline.store.files import fingerprint_of, remove_tree, write_json
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.runs.recipe import Recipe, Stage
@@ -130,7 +131,7 @@ def replaced_trainings(run: Path, plan: Sequence[PlannedStage]) -> tuple[list[st
 
 def _fingerprint(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> str:
     external = stage.kind.external(stage.config) if stage.kind.external else None
-    return digest(
+    return fingerprint_of(
         {
             "kind": stage.kind.name,
             "version": stage.kind.version,
@@ -310,13 +311,10 @@ def _lock(run: Path, needed: bool) -> Iterator[None]:
         yield
         return
     run.mkdir(parents=True, exist_ok=True)
-    with (run / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+    with file_lock(run / ".lock", wait=False) as mine:
+        if not mine:
             raise UserError(
                 f"{run}: another motionloom process is working on this run; wait for it or stop it"
-            ) from None
-        file.write(str(os.getpid()))
-        file.flush()
+            )
+        (run / ".lock").write_text(str(os.getpid()))
         yield

@@ -20,8 +20,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.arrays import load_array
-from motionloom.datasets.convert.common.conversion import Conversion, digest
+from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.splits import original_of
@@ -62,11 +63,10 @@ def prepare_humanml3d(
         config=config,
         plan=plan,
         convert=partial(convert_clip, config),
-        describe=HumanMl3dClip.label,
         licence=config.licence or LICENCE,
         converter=CONVERTER,
         version=CONVERTER_VERSION,
-        options=config.options() | {"source_sha256": digest(told)},
+        options=config.options() | {"source_sha256": sha256_of_json(told)},
     )
 
 

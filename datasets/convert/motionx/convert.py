@@ -22,8 +22,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.arrays import load_array
-from motionloom.datasets.convert.common.conversion import Conversion, digest
+from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.motionx.parameters import (
@@ -74,7 +75,6 @@ def prepare_motionx(
         config=config,
         plan=plan,
         convert=partial(convert_clip, config, body),
-        describe=MotionXClip.label,
         licence=config.licence or (next(iter(plan.licences)) if len(plan.licences) == 1 else LICENCE),
         converter=CONVERTER,
         version=CONVERTER_VERSION,
@@ -82,7 +82,7 @@ def prepare_motionx(
         | {
             "splits": bool(config.splits),
             "body_model": body.statement,
-            "source_sha256": digest(told),
+            "source_sha256": sha256_of_json(told),
         },
     )
 

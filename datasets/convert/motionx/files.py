@@ -18,8 +18,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-from motionloom.datasets.convert.common.conversion import drop
 from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.convert.common.splits import check_id
 from motionloom.datasets.schema import Dropped, UserError
 

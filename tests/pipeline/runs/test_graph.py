@@ -16,7 +16,8 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.artifact import Artifact
-from motionloom.pipeline.store.files import atomic, write_json
+from motionloom.datasets.base.files import atomic_path
+from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.runs.graph import Selection, execute, make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.stages.stage import RUNTIME, StageConfig, StageContext, StageKind
@@ -131,7 +132,7 @@ def test_artifact_lists_outputs_and_inputs(tmp_path: Path) -> None:
 
 
 def test_atomic_leaves_nothing_on_error(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), atomic(tmp_path / "file") as temporary:
+    with pytest.raises(RuntimeError), atomic_path(tmp_path / "file") as temporary:
         temporary.write_text("half")
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,8 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.inference.bundle import Bundle, part_folders
-from motionloom.pipeline.store.files import write_json, write_text
+from motionloom.datasets.base.files import write_text
+from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.runs.graph import Selection
 from motionloom.pipeline.evaluation.retrieval import retrieve
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe
