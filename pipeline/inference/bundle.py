@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -46,6 +45,7 @@ from motionloom.pipeline.store.artifact import Artifact, require_consistent
 from motionloom.pipeline.store.encoder_files import BUILT_IN, place_of
 from motionloom.pipeline.store.networks import CPU, LoadedTma, device_of, load_gpt, load_tokenizer
 from motionloom.pipeline.store.weights import LayoutFacts
+from motionloom.pipeline.store.yaml import read_yaml
 
 PARTS = (
     "stats", "text", "tokenizer", "tma", "gpt", "face_tokenizer", "face_gpt", "face_vae", "face_diffusion",
@@ -325,10 +325,7 @@ def stages_of(run: Path) -> dict[str, dict]:
     """The stages of a run's resolved recipe, as they are written there."""
     require_run(run)
     path = run / "recipe.yaml"
-    try:
-        recipe = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
+    recipe = read_yaml(path)
     stages = recipe.get("stages") if isinstance(recipe, dict) else None
     if not isinstance(stages, dict) or not all(isinstance(e, dict) and "kind" in e for e in stages.values()):
         raise UserError(f"{path}: holds no stages; run the recipe again into this folder")
