@@ -73,7 +73,7 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
     """Write one shard and its index."""
     from webdataset.writer import TarWriter  # imports torch: two seconds that kept shards do not pay
 
-    told: list[tuple[str, int]] = []
+    written: list[tuple[str, int]] = []
     dropped: list[Dropped] = []
     with atomic_file(task.path) as file:
         hashing = HashingFile(file)
@@ -84,10 +84,10 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
                     dropped.append(samples)
                     continue
                 for source, held, members in samples:
-                    tar.write({"__key__": f"{task.number:06d}-{len(told):06d}", **members})
-                    told.append((source, held))
+                    tar.write({"__key__": f"{task.number:06d}-{len(written):06d}", **members})
+                    written.append((source, held))
     info = None
-    entries = clip_entries(task.path, told)
+    entries = clip_entries(task.path, written)
     if entries:
         info = ShardInfo(
             name=task.path.name,

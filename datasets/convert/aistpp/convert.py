@@ -70,16 +70,16 @@ _KEPT_PIECES = 64
 
 
 def prepare_aistpp(config: AistppConfig, *, workers: int = 1, progress: bool = False) -> Conversion[AistClip]:
-    """Look at the whole source; everything is told, nothing is converted yet."""
+    """Look at the whole source and decide what becomes of every file; nothing is converted yet."""
     body, settings = body_of(config.body_model, "smpl22"), audio_settings(config)
     plan = plan_aistpp(config, progress=progress)
-    told = []
+    content = []
     for _, clip in plan.items:
         size = (config.source / clip.label()).stat().st_size
         sound = (config.sound_folder / clip.sound).stat().st_size if clip.sound else 0
-        told.append([clip.id, clip.split, clip.used, size, clip.sound, sound])
+        content.append([clip.id, clip.split, clip.used, size, clip.sound, sound])
     options = config.options("splits", "ignore_list", "music_folder")
-    options |= {"body_model": body.statement, "source_sha256": sha256_of_json(told)}
+    options |= {"body_model": body.statement, "source_sha256": sha256_of_json(content)}
     options["audio_version"] = VERSION if settings else None
     return Conversion(
         config=config,

@@ -1,4 +1,4 @@
-"""AIST++ conversion, first step: options, and a plan of what becomes of every file of the source.
+"""AIST++ conversion, planning: options, and a plan of what becomes of every file of the source.
 
 Every annotation that is not left out anyway is read (a file is small, and only its content says how long it
 is and whether it can be used); of the music only the headers are.
@@ -250,7 +250,7 @@ def _find_music(config: AistppConfig) -> _Music:
 
 
 def _notes(config: AistppConfig, music: _Music, items: list[tuple[Split, AistClip]], cut: int) -> list[str]:
-    """What a user should know about music, beside single files."""
+    """What a user should know about the music as a whole."""
     notes = []
     if cut:
         notes.append(f"{cut} sequences end with their music, at most {config.max_music_gap:g} s early")

@@ -57,7 +57,7 @@ def prepare_amass(config: AmassConfig, *, workers: int = 1, progress: bool = Fal
     bodies = bodies or {"neutral": BodyModel.neutral(skeleton)}
     statements = {gender: body.statement for gender, body in bodies.items()}
     plan.notes.extend(sorted({str(statement["sentence"]) for statement in statements.values()}))
-    told = [
+    content = [
         [clip.label(), clip.file.size, clip.first, clip.last, [caption.dump() for caption in clip.texts]]
         for _, clip in plan.items
     ]
@@ -70,7 +70,7 @@ def prepare_amass(config: AmassConfig, *, workers: int = 1, progress: bool = Fal
         licence=config.licence or LICENCE,
         converter=CONVERTER,
         version=CONVERTER_VERSION,
-        options=options | {"source_sha256": sha256_of_json(told)},
+        options=options | {"source_sha256": sha256_of_json(content)},
     )
 
 

@@ -1,4 +1,4 @@
-"""AMASS conversion, first step: a plan of what becomes of every file of the source.
+"""AMASS conversion, planning: a plan of what becomes of every file of the source.
 
 Files that may be used are opened, but only for their headers and a few scalars.
 """
@@ -228,7 +228,7 @@ def _index_texts(
 
 
 def _rate(config: AmassConfig, file: AmassFile, header: MotionHeader, draft: _Draft) -> float:
-    """Frames a second; 0, with the file among the broken, when nobody says."""
+    """Frames a second; 0, with the file among the broken, when neither states one."""
     fps = config.source_fps or header.fps or 0.0
     if not fps:
         draft.fail(file.label, UserError("no mocap_framerate and no mocap_frame_rate in it; set source_fps"))

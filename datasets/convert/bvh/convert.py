@@ -71,7 +71,7 @@ def prepare_bvh(
 
 @dataclass(frozen=True)
 class BvhClips:
-    """Makes samples of clips: all that every clip of a conversion has in common."""
+    """Turns clips into samples; holds what all clips of a conversion share."""
 
     config: BvhConfig
     joint_map: JointMap
@@ -150,7 +150,7 @@ class BvhBatch:
         store_batch(_path(folder, self.number), self._made(), dim=dim, fingerprint=fingerprint)
 
     def trial(self, seconds: float) -> int:
-        """Convert clips without keeping them for about so long; how many."""
+        """Convert clips for about this long without keeping them; returns how many."""
         end = time.perf_counter() + seconds
         for count, _ in enumerate(self._made(), start=1):
             if time.perf_counter() > end:

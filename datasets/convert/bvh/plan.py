@@ -1,4 +1,4 @@
-"""BVH conversion, first step: options, and a plan of what becomes of every file of the source."""
+"""BVH conversion, planning: options, and a plan of what becomes of every file of the source."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class BvhConfig(ConvertConfig):
         return layout
 
     def options(self, *local: str) -> dict[str, Any]:
-        """What the output depends on, for the manifest: files by name and digest instead of local paths."""
+        """What the output depends on, for the manifest: files by name and checksum instead of local paths."""
         given = super().options(*local)
         for key in ("joint_map", "captions"):
             path: Path | None = getattr(self, key)

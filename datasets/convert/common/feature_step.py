@@ -41,7 +41,7 @@ class FeatureBatch(Protocol):
         ...
 
     def trial(self, seconds: float) -> int:
-        """Convert clips without keeping them for about so long; how many."""
+        """Convert clips for about this long without keeping them; returns how many."""
         ...
 
 

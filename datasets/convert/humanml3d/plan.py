@@ -1,4 +1,4 @@
-"""HumanML3D conversion, first step: options, and a plan of what becomes of every file of the source.
+"""HumanML3D conversion, planning: options, and a plan of what becomes of every file of the source.
 
 Headers and captions are read, motion data is not. Everything in the folder is accounted for: clips to
 convert, left out, broken or missing, caption lines that are wrong, and a count of the files nobody needs.
@@ -239,8 +239,8 @@ def _scan(
         except UserError as error:
             return replace(found, broken=(drop(label, error),))
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{label} {frames}" for label, frames in lengths.items())
-        reason = f"frames differ ({told}); choose one with --use vecs or --use joints"
+        lengths_found = ", ".join(f"{label} {frames}" for label, frames in lengths.items())
+        reason = f"frames differ ({lengths_found}); choose one with --use vecs or --use joints"
         return replace(found, broken=(Dropped(source=found.files[0], reason=reason),))
     found = replace(found, frames=lengths[found.files[0]])
     if clip_id not in texts.ids:
@@ -251,8 +251,8 @@ def _scan(
         captions, problems = read_humanml_captions(path, seconds=found.frames / FPS, name=label)
     except UserError as error:
         return replace(found, broken=(drop(label, error),))
-    told = "; ".join(problems)
-    return replace(found, texts=tuple(captions), problems=(f"{label}: {told}",) if problems else ())
+    joined = "; ".join(problems)
+    return replace(found, texts=tuple(captions), problems=(f"{label}: {joined}",) if problems else ())
 
 
 def _caption_notes(scanned: dict[str, _Scanned]) -> list[str]:

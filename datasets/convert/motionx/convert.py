@@ -63,14 +63,14 @@ CONVERTER_VERSION = 1
 def prepare_motionx(
     config: MotionXConfig, *, workers: int = 1, progress: bool = False
 ) -> Conversion[MotionXClip]:
-    """Look at the whole source; everything is told, nothing is converted yet."""
+    """Look at the whole source and decide what becomes of every file; nothing is converted yet."""
     body = body_of(config.body_model, config.skeleton)  # a wrong one should fail before the long part
     plan = plan_motionx(config, workers=workers, progress=progress)
-    told = []
+    content = []
     for _, clip in plan.items:
         sizes = [(config.source / file).stat().st_size for file in clip.files]
         texts = [caption.dump() for caption in (*clip.texts, *clip.face_texts)]
-        told.append([clip.id, clip.files, sizes, clip.licence, texts])
+        content.append([clip.id, clip.files, sizes, clip.licence, texts])
     return Conversion(
         config=config,
         plan=plan,
@@ -82,7 +82,7 @@ def prepare_motionx(
         | {
             "splits": bool(config.splits),
             "body_model": body.statement,
-            "source_sha256": sha256_of_json(told),
+            "source_sha256": sha256_of_json(content),
         },
     )
 

@@ -81,12 +81,12 @@ class MotionXFiles:
 
     def notes(self) -> list[str]:
         """Which folders were taken for what."""
-        told = []
+        lines = []
         for kind, folders in self.folders.items():
             named = [f"{folder or '.'}/ ({count} files)" for folder, count in sorted(folders.items())]
-            told.append(f"{kind}: {', '.join(named) if named else 'none in this source'}")
-        told += [f"{kind}: {count} files of clips that have one" for kind, count in self.second.items()]
-        return told
+            lines.append(f"{kind}: {', '.join(named) if named else 'none in this source'}")
+        lines += [f"{kind}: {count} files of clips that have one" for kind, count in self.second.items()]
+        return lines
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Motion-X conversion, first step: options, and a plan of what becomes of every file of the source.
+"""Motion-X conversion, planning: options, and a plan of what becomes of every file of the source.
 
-Headers and texts are read; motion data is not, but for a few `aist/` clips whose scale is told. Nothing is
-required but the motion: splits, captions, face motion and face texts are taken where they are.
+Headers and texts are read; motion data is not, except a few `aist/` clips whose scale is examined. Only the
+motion is required: splits, captions, face motion and face texts are taken where they are.
 """
 
 from __future__ import annotations
@@ -222,11 +222,11 @@ def _read_splits(
     names = [f"{split}.txt" for split in SPLITS]
     if config.splits is not None:
         folder: Path | None = config.splits
-        told = "splits: from the folder given"
+        origin = "splits: from the folder given"
     else:
         found = [name for name in _SPLIT_FOLDERS if any((config.source / name / f).is_file() for f in names)]
         folder = config.source / found[0] if found else None
-        told = f"splits: {found[0] or '.'}/" if found else ""
+        origin = f"splits: {found[0] or '.'}/" if found else ""
     if folder is None:
         hashed, notes = hash_splits(ids)
         return hashed, set(), notes
@@ -246,7 +246,7 @@ def _read_splits(
         inner = folder.relative_to(config.source)
         used = {(inner / name).as_posix() for name in (*names, "all.txt")}
     wanted = {clip_id: split for clip_id, split in splits.items() if _wanted(config, clip_id)}
-    return wanted, used, [f"{told}; {numbers} in the release", *notes]
+    return wanted, used, [f"{origin}; {numbers} in the release", *notes]
 
 
 def _scan(source: Path, files: MotionXFiles, clip_id: str) -> _Scanned:
@@ -311,11 +311,11 @@ def _subset_notes(config: MotionXConfig, files: MotionXFiles, scanned: list[_Sca
         try:
             states[aist_scale(load_array(config.source / path, width=RAW.dim, name=path))] += 1
         except UserError:
-            states["broken"] += 1  # the conversion tells why
+            states["broken"] += 1  # the conversion reports why
     if states:
-        told = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
+        counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
         notes.append(
-            f"aist/: of {states.total()} clips looked at, {told}; raw ones are brought to metres once "
+            f"aist/: of {states.total()} clips looked at, {counts}; raw ones are brought to metres once "
             f"(/ 94, z negated), each judged by itself"
         )
     return notes
