@@ -10,11 +10,12 @@ from typing import Any, get_args
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.store.artifact import require_consistent
-from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
 from motionloom.pipeline.inference.bundle import Bundle, require_run
-from motionloom.pipeline.store.yaml import read_yaml
-from motionloom.pipeline.store.files import require_file_place, require_folder
+from motionloom.pipeline.inference.outputs import Format, write_motions
+from motionloom.pipeline.inference.pretrained import write_bundle
+from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
+from motionloom.pipeline.inference.sampling import SamplingConfig
+from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.runs.graph import (
     Selection,
     execute,
@@ -25,12 +26,11 @@ from motionloom.pipeline.runs.graph import (
     selected,
     stage_folder,
 )
-from motionloom.pipeline.launch.hardware import choose_device
-from motionloom.pipeline.inference.outputs import Format, write_motions
-from motionloom.pipeline.inference.pretrained import write_bundle
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe, nearest
-from motionloom.pipeline.inference.sampling import SamplingConfig
 from motionloom.pipeline.stages.stage import StageContext
+from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.files import require_file_place, require_folder
+from motionloom.pipeline.store.yaml import read_yaml
 
 
 def run_recipe(

@@ -25,11 +25,11 @@ from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.layers.transformer import SelfAttention
 from motionloom.models.quantize.ema import EmaQuantizer
-from motionloom.models.training.stage_module import StageModule
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.runs.recipe import Recipe, Stage
 from motionloom.pipeline.stages.data import ShardsStageConfig
 from motionloom.pipeline.stages.training import TrainedStageConfig, prepare_module

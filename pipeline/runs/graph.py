@@ -20,17 +20,17 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
-from motionloom.pipeline.store.artifact import Artifact, InputStage
-from motionloom.datasets.base.lock import file_lock
-from motionloom.datasets.base.files import write_text
-from motionloom.pipeline.store.files import fingerprint_of, remove_tree, write_json
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
+from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.recipe import Recipe, Stage
 from motionloom.pipeline.stages.stage import StageContext, fingerprint_fields
-from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.store.artifact import Artifact, InputStage
+from motionloom.pipeline.store.files import fingerprint_of, remove_tree, write_json
 
 Action = Literal["skip", "run", "resume", "leave"]
 

@@ -9,9 +9,9 @@ import torch
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.estimate import estimate
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.runs.api import run_recipe
 
 PAPER = """
 name: paper-sizes
@@ -81,10 +81,10 @@ def test_codebooks_are_told(paper: Path) -> None:
 def test_saved_bytes_of_a_known_network() -> None:
     """Against the real thing: sizes of the storages that real tensors keep."""
     from motionloom.datasets.motion.layout import MotionLayout
-    from motionloom.models.training.stage_module import OptimConfig
     from motionloom.models.tokenizer.build import build_tokenizer
     from motionloom.models.tokenizer.config import VqConfig
     from motionloom.models.tokenizer.module import TokenizerModule
+    from motionloom.models.training.stage_module import OptimConfig
     from motionloom.pipeline.runs.estimate import _saved_bytes
 
     config = VqConfig(width=16, depth=1, code_dim=16, num_codes=32)

@@ -14,14 +14,14 @@ import pytest
 from pydantic import Field
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError
-from motionloom.pipeline.store.artifact import Artifact
 from motionloom.datasets.base.files import atomic_path
-from motionloom.pipeline.store.files import write_json
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.runs.graph import Selection, execute, make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
-from motionloom.pipeline.stages.stage import RUNTIME, StageConfig, StageContext, StageKind
 from motionloom.pipeline.stages import table
+from motionloom.pipeline.stages.stage import RUNTIME, StageConfig, StageContext, StageKind
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.files import write_json
 
 
 class AddConfig(StageConfig):

@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError
-from motionloom.pipeline.store.artifact import require_consistent
-from motionloom.pipeline.inference.bundle import Bundle, part_folders
 from motionloom.datasets.base.files import write_text
-from motionloom.pipeline.store.files import write_json
-from motionloom.pipeline.runs.graph import Selection
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.evaluation.retrieval import retrieve
+from motionloom.pipeline.inference.bundle import Bundle, part_folders
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe
-from motionloom.pipeline.stages.stage import StageConfig, StageContext, StageKind
+from motionloom.pipeline.runs.graph import Selection
 from motionloom.pipeline.stages import table
+from motionloom.pipeline.stages.stage import StageConfig, StageContext, StageKind
+from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.files import write_json
 
 RECIPE = """
 name: NAME
