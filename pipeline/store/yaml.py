@@ -55,10 +55,9 @@ def load_yaml(text: str, where: str) -> Any:
     """Plain data from YAML; a `UserError` names `where` (a file or an option)."""
     try:
         return yaml.load(text, Loader=_Loader)
-    except yaml.YAMLError as error:
-        raise UserError(f"{where}: not valid YAML: {error}") from None
-    except ValueError as error:  # a date or a number out of range, under an explicit tag
-        raise UserError(f"{where}: not valid YAML: {error}") from None
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a value that its explicit tag does not allow
+        reason = " ".join(str(error).split()).replace('in "<unicode string>", ', "at ")
+        raise UserError(f"{where}: not valid YAML: {reason}") from None
 
 
 def read_yaml(path: Path) -> Any:
