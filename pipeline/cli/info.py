@@ -6,13 +6,13 @@ import platform
 from importlib import metadata
 
 import torch
-import yaml
 from rich.console import Console
 from rich.table import Table
 
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.recipe import shipped_recipes
+from motionloom.pipeline.store.yaml import read_yaml
 
 _LIBRARIES = (
     "torch",
@@ -45,6 +45,6 @@ def show_info(console: Console) -> None:
     console.print(f"text encoder: {encoder.name}, {encoder.dim}-d, from the installed package")
     table = Table("recipe", "what it does", title="recipes (motionloom run NAME)", title_justify="left")
     for name, path in shipped_recipes().items():
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = read_yaml(path)
         table.add_row(name, str(data.get("description", "")))
     console.print(table)

@@ -98,9 +98,10 @@ class MotionModel(
 
         `script` is a file, or a `Script` whose sound files are seen from the current folder.
         """
-        named = isinstance(script, Path | str)
-        opened = Script.read(Path(script)) if named else script
-        segments = opened.open(Path(script).parent if named else Path())
+        if isinstance(script, Script):
+            segments = script.open(Path())
+        else:
+            segments = Script.read(Path(script)).open(Path(script).parent)
         return self.bundle.perform(segments, samples=samples, seed=seed, sampling=sampling)
 
     def _save_pretrained(self, save_directory: Path) -> None:
