@@ -22,6 +22,18 @@ os.environ["NUMBA_CACHE_DIR"] = str(
 sys.path.append(str(Path(__file__).parent / "helpers"))
 
 
+_NUMERIC = ("models", "datasets/motion")
+"""Folders whose tests compare numbers that torch computes."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks what `make test-numeric` runs once more with other instructions and numbers of threads."""
+    folders = [Path(__file__).parent / name for name in _NUMERIC]
+    for item in items:
+        if any(folder in item.path.parents for folder in folders) and not item.get_closest_marker("slow"):
+            item.add_marker("numeric")
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder of golden vectors and real data: `MOTIONLOOM_SHARED`, else `../shared` beside the repository."""
