@@ -6,7 +6,7 @@ import jsonschema
 import pytest
 import yaml
 
-from motionloom.pipeline.runs.recipe import shipped_recipes
+from motionloom.pipeline.runs.shipped import shipped_recipes
 from motionloom.pipeline.runs.schema import recipe_schema
 
 VALIDATOR = jsonschema.Draft202012Validator(recipe_schema())
