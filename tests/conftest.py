@@ -17,8 +17,9 @@ os.environ["NUMBA_CACHE_DIR"] = str(
     / os.environ.get("PYTEST_XDIST_WORKER", "one")
 )
 
-# As many test processes as cores leave no core for a second thread: threads that wait for one that does not run
-# take several times as long as one thread alone. `make test-numeric` counts with two. torch is not imported yet.
+# As many test processes as cores leave no core for a second thread: threads that wait for one that does not
+# run take several times as long as one thread alone. `make test-numeric` also runs with two. It works because
+# torch is not imported yet.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
