@@ -261,8 +261,12 @@ class Bundle:
         """The conditions of one prompt, encoded once, for `count` rows."""
         once = self._encoder(stage).encode([prompt], [words], self.of(stage).modalities, self.layout.fps)
         return {
-            name: Condition(*(None if v is None else v.expand(count, *v.shape[1:]) for v in condition))
-            for name, condition in once.items()
+            name: Condition(
+                features.expand(count, -1, -1),
+                mask.expand(count, -1),
+                None if pooled is None else pooled.expand(count, -1),
+            )
+            for name, (features, mask, pooled) in once.items()
         }
 
     def _faces(

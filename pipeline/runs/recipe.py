@@ -18,7 +18,6 @@ import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.registry import stage_kinds
 from motionloom.pipeline.contract.stage import Every, Stage
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.runs.shipped import shipped_recipes
 from motionloom.pipeline.store.yaml import dump_yaml, load_yaml, read_yaml
 
 
@@ -101,12 +101,6 @@ def nearest(name: str, valid: Sequence[str]) -> str:
     """A hint to append: did you mean 'x'?, or the list of valid names."""
     near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
     return f"; did you mean '{near[0]}'?" if near else f"; valid names: {', '.join(valid)}"
-
-
-def shipped_recipes() -> dict[str, Path]:
-    """Recipes that come with the package, by name."""
-    folder = Path(str(resources.files("motionloom.configs")))
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def find_recipe(name_or_path: str) -> Path:

@@ -11,7 +11,7 @@ from bvh_clips import write_clip, write_map
 
 # One process imports everything once and forks each try, so that a kill falls into the work and not into
 # imports. A try is killed as soon as so many of its files (batches, shards) are finished, and a random moment
-# later; never so late that it might have finished.
+# later, the last one while a file is half written; never so late that it might have finished.
 SCRIPT = """
 import hashlib, json, os, random, signal, sys, time
 from pathlib import Path
@@ -39,6 +39,20 @@ def finished(out):
 def digests(out):
     return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(out.iterdir())}
 
+def running(pid):
+    return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+
+def into_a_write(pid, out):
+    # Stops the conversion where a file is half written, however slow or busy the machine is.
+    while running(pid):
+        if any(out.rglob("*.tmp")):
+            os.killpg(pid, signal.SIGSTOP)
+            os.waitpid(pid, os.WUNTRACED)
+            if any(out.rglob("*.tmp")):
+                return
+            os.killpg(pid, signal.SIGCONT)
+        time.sleep(0.0005)
+
 source, work, chance = Path(sys.argv[1]), Path(sys.argv[2]), random.Random(int(sys.argv[3]))
 config = BvhConfig(source=source / "clips", joint_map=source / "joint_map.json", licence="CC0")
 whole, out = work / "whole", work / "out"
@@ -48,9 +62,12 @@ moments = sorted(chance.sample(range(total - 6), 5))
 kills = 0
 for moment in moments:
     pid = convert(out)
-    while finished(out) < moment and os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+    while finished(out) < moment and running(pid):
         time.sleep(0.001)
-    time.sleep(chance.uniform(0, 0.015))
+    if moment == moments[-1]:
+        into_a_write(pid, out)
+    else:
+        time.sleep(chance.uniform(0, 0.015))
     os.killpg(pid, signal.SIGKILL)
     kills += os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGKILL
     assert not (out / "manifest.json").exists()
