@@ -49,7 +49,7 @@ def transition_percentiles(
     frames = len(x)
     if x.ndim != 3 or frames < 3 or reach < 1:
         raise UserError(
-            f"transitions need joints [T >= 3, N, 3] and a reach of 1 or more, not {list(x.shape)} and {reach}"
+            f"transitions need joints [T >= 3, N, 3] and a reach of 1 or more, got {list(x.shape)}, {reach}"
         )
     wrong = [border for border in borders if not 1 <= border < frames]
     if wrong or not len(borders):

@@ -73,7 +73,7 @@ def test_where_nothing_changes_borders_are_like_the_inside() -> None:
 
 
 def test_random_borders_are_spread_evenly() -> None:
-    """Over many motions whose borders mean nothing, percentiles are uniform: mean 1/2, deviation 1/sqrt(12)."""
+    """Where borders mean nothing, percentiles are uniform: mean 1/2, deviation 1/sqrt(12)."""
     found = np.concatenate(
         [transition_percentiles(wander(seed=seed), [30, 60, 90], FPS).acceleration for seed in range(60)]
     )

@@ -323,7 +323,7 @@ class Letters(nn.Module):
 @pytest.mark.slow
 @pytest.mark.parametrize("adversarial", [0.0, 0.05])
 def test_conditions_bring_the_cross_entropy_below_the_entropy_of_the_codes(adversarial: float) -> None:
-    """Codes are uniform (ln 6 nats each) and a text or a sound says which: a model of codes alone cannot do it."""
+    """Codes are uniform, ln 6 nats each; a text or a sound says which they are."""
     torch.manual_seed(0)
     tokenizer: Any = Letters()
     net = ConditionedUtt(
