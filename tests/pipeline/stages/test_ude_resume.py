@@ -14,7 +14,7 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
-# When each of the killed runs dies: as soon as this checkpoint is there; the critic has had its turns by then.
+# When each of the killed runs dies: as soon as this checkpoint is there. The critic has had turns by then.
 MOMENTS = {"tokenizer": "step=00000004.ckpt", "utt": "step=00000008.ckpt", "dmd": "step=00000004.ckpt"}
 
 
