@@ -22,7 +22,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.sampling import sample_seeds
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator, Prompt
-from motionloom.pipeline.contract.lookup import finished_stages, generators_of
+from motionloom.pipeline.contract.lookup import generators_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CPU, Finished, Shelf
 from motionloom.pipeline.inference.conditions import PromptEncoder
@@ -70,7 +70,7 @@ class GeneratedMotion:
 
 
 class Bundle:
-    """The generators of a model, each loaded when it is first used, all on one device."""
+    """The generators of a model, loaded at once so that a broken one is found first, all on one device."""
 
     def __init__(self, stages: Sequence[Finished], shelf: Shelf) -> None:
         self.stages = tuple(stages)
@@ -78,7 +78,7 @@ class Bundle:
         self.shelf = shelf
         self._generators: dict[str, MotionGenerator] = {}
         self._encoders: dict[str, PromptEncoder] = {}
-        if not any(self.of(stage).part != "face" for stage in self.stages):
+        if all(part == "face" for part in [self.of(stage).part for stage in self.stages]):
             raise UserError("no finished stage here generates body motion; run the recipe to the end first")
 
     @staticmethod
@@ -95,7 +95,7 @@ class Bundle:
     @staticmethod
     def from_run(run: Path, device: torch.device = CPU) -> Bundle:
         """Open the finished stages of a run."""
-        makers = generators_of(finished_stages(run))
+        makers = generators_of(run)
         require_consistent(run, (stage.name for stage in makers))
         try:
             return Bundle(makers, Shelf(device))
@@ -188,8 +188,6 @@ class Bundle:
             require_words(faces or [], "face_captions")
             require_used(self, faces, sampling)
         prompts = prompts_of(texts, faces, sounds)
-        if strict:
-            require_words([p.text for p in prompts if p.sound is None])
         require_driven(self.generator, prompts)
         frames = self._frames(seconds, prompts)
         # One seed a motion, so that how they are batched plays no part.

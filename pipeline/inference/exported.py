@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,14 @@ def write_exported(stages: Iterable[Finished], layout: LayoutFacts, skeleton: Sk
     for stage in makers:
         _collect(stage, needed)
     entries = {}
+    (out / BUNDLE_FILE).unlink(missing_ok=True)
     for name, stage in needed.items():
-        stage.kind.export(stage, out / name)
+        try:
+            stage.kind.export(stage, out / name)
+        except BaseException:
+            for made in (*entries, name):  # nothing that looks like a model is left
+                shutil.rmtree(out / made, ignore_errors=True)
+            raise
         roles = set(stage.kind.exported(stage.config))
         entries[name] = ExportedStage(
             kind=stage.kind.name,

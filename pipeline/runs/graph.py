@@ -27,7 +27,7 @@ from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import digest, remove_tree, write_json, write_text
 from motionloom.pipeline.store.run_folder import stage_folder
 from motionloom.pipeline.contract.stage import Finished, Shelf
-from motionloom.pipeline.contract.stage import Stage, StageContext, fingerprint_fields
+from motionloom.pipeline.contract.stage import Every, Stage, StageContext, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.runs.recipe import Recipe
@@ -126,16 +126,17 @@ def replaced_trainings(run: Path, plan: Sequence[PlannedStage]) -> tuple[list[st
 
 
 def _fingerprint(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> str:
-    return digest(
-        {
-            "kind": stage.kind.name,
-            "version": stage.kind.version,
-            "seed": recipe.seed,
-            "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
-            "external": stage.kind.external(stage.config),
-            "inputs": {role: rows[name].fingerprint for role, name in stage.inputs.items()},
-        }
-    )
+    facts = {
+        "kind": stage.kind.name,
+        "version": stage.kind.version,
+        "seed": recipe.seed,
+        "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
+        "external": stage.kind.external(stage.config),
+        "inputs": {role: rows[name].fingerprint for role, name in stage.inputs.items()},
+    }
+    if any(isinstance(role, Every) for role in stage.kind.roles()):
+        facts["order"] = list(stage.inputs)  # the first of several generators is the default
+    return digest(facts)
 
 
 def _decide(
@@ -177,7 +178,7 @@ def _difference(artifact: Artifact, stage: Stage, rows: dict[str, PlannedStage])
         old = artifact.inputs.get(role)
         if old is None or old.fingerprint != rows[name].fingerprint:
             return f"input {name} changed"
-    return "seed or source files changed"
+    return "seed, source files or the order of inputs changed"
 
 
 def _changed_fields(old: Any, new: Any, prefix: str = "") -> Iterator[str]:
