@@ -57,7 +57,7 @@ class Role:
 
 @dataclass(frozen=True)
 class Every:
-    """An input filled by every other stage that gives something, or by those the recipe lists, in its order."""
+    """An input filled by every other stage that gives something, or by those the recipe lists, in order."""
 
     name: str
     gives: str
@@ -118,6 +118,8 @@ class Finished:
     config: Any
     folder: Path
     inputs: Mapping[str, Finished]
+    exported: bool = False
+    """In an exported folder, which may come from anywhere: nothing outside `folder` is followed."""
 
     def gives(self, what: str) -> bool:
         """Whether other stages may ask this one for `what`."""
@@ -250,6 +252,10 @@ class StageKind(ABC):
     def exported(self, config: Any) -> tuple[str, ...]:
         """Roles whose stages an export must take along for this stage to load."""
         return ()
+
+    def exported_config(self, config: Any) -> Any:
+        """The config as an export shows it to everybody."""
+        return config
 
     def export(self, stage: Finished, target: Path) -> None:
         """Copy what loading needs into `target`, an empty folder."""

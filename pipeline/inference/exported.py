@@ -14,7 +14,7 @@ from pydantic import Field
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.registry import stage_kind
-from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.contract.stage import GENERATOR, Finished
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.weights import LayoutFacts
 
@@ -63,7 +63,7 @@ def write_exported(stages: Iterable[Finished], layout: LayoutFacts, skeleton: Sk
         entries[name] = ExportedStage(
             kind=stage.kind.name,
             version=stage.kind.version,
-            config=stage.config.dump(),
+            config=stage.kind.exported_config(stage.config).dump(),
             inputs={role: source.name for role, source in stage.inputs.items() if role in roles},
         )
     write_json(out / "skeleton.json", _plain(skeleton))
@@ -111,10 +111,17 @@ def open_exported(folder: Path) -> list[Finished]:
                 )
             inputs = {role: build(source, (*above, name)) for role, source in entry.inputs.items()}
             config = kind.config.parse(entry.config, f"{path}: stages.{name}.config")
-            made[name] = Finished(name, kind, config, folder / name, inputs)
+            made[name] = Finished(name, kind, config, folder / name, inputs, exported=True)
         return made[name]
 
-    return [build(name, ()) for name in facts.generators]
+    makers = [build(name, ()) for name in facts.generators]
+    for stage in makers:
+        if not stage.gives(GENERATOR):
+            raise UserError(
+                f"{path}: its stage '{stage.name}' of kind {stage.kind.name} generates nothing; export the "
+                f"run again"
+            )
+    return makers
 
 
 def _format_of(path: Path) -> Any:

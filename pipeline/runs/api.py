@@ -12,9 +12,8 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import preview_of
-from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import StageContext
+from motionloom.pipeline.contract.stage import Shelf, StageContext
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.outputs import Format, write_motions
 from motionloom.pipeline.inference.pretrained import write_bundle

@@ -23,15 +23,14 @@ from rich.table import Table
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
+from motionloom.pipeline.contract.stage import Every, Finished, Shelf, Stage, StageContext, fingerprint_fields
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import process_rank
+from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import digest, remove_tree, write_json, write_text
 from motionloom.pipeline.store.run_folder import stage_folder
-from motionloom.pipeline.contract.stage import Finished, Shelf
-from motionloom.pipeline.contract.stage import Every, Stage, StageContext, fingerprint_fields
-from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.launch.process import process_rank
-from motionloom.pipeline.runs.recipe import Recipe
-from motionloom.pipeline.launch.team import Team
 
 Action = Literal["skip", "run", "resume", "leave"]
 

@@ -26,9 +26,9 @@ import yaml
 from pydantic import Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.contract.registry import stage_kinds
-from motionloom.pipeline.contract.stage import Every, Stage, StageKind
+from motionloom.pipeline.contract.stage import Every, Stage
+from motionloom.pipeline.launch.hardware import Hardware
 
 
 class RecipeFile(Config):

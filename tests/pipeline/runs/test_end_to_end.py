@@ -19,8 +19,8 @@ from safetensors.numpy import load_file, save_file
 
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.store.artifact import Artifact
 
 pytestmark = pytest.mark.slow
 

@@ -167,7 +167,10 @@ def test_the_order_of_a_list_counts(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("listed.inputs.numbers=[frst]", "numbers: 'frst' is no stage that gives a number; did you mean 'first'"),
+        (
+            "listed.inputs.numbers=[frst]",
+            "numbers: 'frst' is no stage that gives a number; did you mean 'first'",
+        ),
         ("listed.inputs.numbers=[every]", "'every' is no stage that gives a number"),
         ("listed.inputs.numbers=7", r"numbers must list stages, like \[gpt\]"),
         ("listed.inputs.number=[first]", "unknown role 'number'; did you mean 'numbers'"),

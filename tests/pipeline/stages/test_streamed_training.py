@@ -26,7 +26,9 @@ class Recorder(DataPreview):
         raise OpenedError(name, training)
 
 
-@pytest.mark.parametrize(("name", "options"), [("tma", {}), ("diffusion", {}), ("h2vq", {"reset_below": 0.1})])
+@pytest.mark.parametrize(
+    ("name", "options"), [("tma", {}), ("diffusion", {}), ("h2vq", {"reset_below": 0.1})]
+)
 def test_training_clips_are_opened_for_training(name: str, options: dict[str, Any]) -> None:
     kind = stage_kind(name, "here")
     assert isinstance(kind, TrainedStage)
