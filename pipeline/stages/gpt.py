@@ -250,9 +250,9 @@ class GptGenerator:
         return self.tokenizer.layout
 
     @property
-    def text(self) -> TextSource:
+    def text(self) -> TextSource | None:
         """What encodes its words."""
-        text: TextSource = self.given["text"]
+        text: TextSource | None = self.given.get("text")
         return text
 
     @property
