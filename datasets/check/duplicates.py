@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.check.clip import read_meta, read_motion
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.motion.canonical import mirror
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import ClipMeta, ShardInfo
 from motionloom.datasets.shards.tar import TarClip, scan_tar
@@ -159,22 +159,10 @@ class ClipTable:
         first, second = self._motion(a), self._motion(b)
         if first.shape != second.shape:
             return ""
-        here, there = (
-            decode(motion[:, self._joint_columns], self._joint_layout) for motion in (first, second)
-        )
+        here, there = (joints_of(motion, self.layout) for motion in (first, second))
         if _distance(mirror(here, self.layout.skeleton), there) < SAME_METRES:
             return "the mirror image of"
         return "the same recording as" if _distance(here, there) < SAME_METRES else ""
-
-    @property
-    def _joint_layout(self) -> MotionLayout:
-        if not self.layout.has("face"):
-            return self.layout
-        return MotionLayout.named("wholebody313", fps=self.layout.fps, family=self.layout.family)
-
-    @property
-    def _joint_columns(self) -> slice:
-        return slice(0, self._joint_layout.dim)
 
     def _height_hash(self, motion: NDArray[np.floating]) -> int:
         """0 when the heights could belong to any clip."""

@@ -187,6 +187,16 @@ class MotionLayout:
                 out.append(columns[self.slice(field)][per_joint * (BODY_JOINTS - first) :])
         return np.concatenate(out) if out else columns[:0]
 
+    def without_face(self) -> MotionLayout:
+        """The layout of `part("bodyhand")`, which joints can be decoded from; itself where it has no face."""
+        if not self.has("face"):
+            return self
+        fields = tuple((name, size) for name, size in self.fields if name != "face")
+        for name, (skeleton, _, _, known) in _KNOWN.items():
+            if (skeleton, known) == (self.skeleton_name, fields):
+                return MotionLayout.named(name, fps=self.fps, family=self.family)
+        raise UserError(f"layout {self.name} has no counterpart without the face")
+
     def has_part(self, part: Part) -> bool:
         """Whether the layout has columns for a part."""
         return self.has("face") if part == "face" else len(self.part(part)) > 0

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
-from motionloom.datasets.motion.features import decode, face_of
+from motionloom.datasets.motion.features import face_of
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.schema import FACE, HELD_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.pipeline.inference.bundle import joint_layout
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 
@@ -53,7 +53,7 @@ def truth_of(
     return Truth(
         id=dataset.ids[index],
         features=body,
-        joints=decode(body, joint_layout(layout)),
+        joints=joints_of(body, layout),
         face=face_of(motion, layout) if layout.has("face") and held & FACE else None,
         caption=span.text,
         face_caption=max(faces, key=lambda face: _overlap(face, span)).text if faces else span.text,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
 from motionloom.pipeline.contract.stage import (
@@ -21,7 +21,7 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
 )
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, spread, truth_of
-from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion, joint_layout
+from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
@@ -84,7 +84,7 @@ def _motions(
     context: StageContext, truths: list[Truth], generated: list[GeneratedMotion]
 ) -> list[ViewerMotion]:
     tokenizer, face_tokenizer = context.given.get("tokenizer"), context.given.get("face_tokenizer")
-    layout = joint_layout(context.given["data"].layout)
+    layout = context.given["data"].layout
     parents, out = layout.skeleton.parents, []
     for number, (truth, made) in enumerate(zip(truths, generated, strict=True), start=1):
         group = f"{number}"
@@ -96,7 +96,7 @@ def _motions(
             again = face
             if truth.face is not None and face_tokenizer is not None:
                 again = synthetic_face_controls(face_tokenizer.reconstruct(truth.face))
-            rows.append(("reconstruction", decode(reconstruct_truth(tokenizer, truth), layout), again))
+            rows.append(("reconstruction", joints_of(reconstruct_truth(tokenizer, truth), layout), again))
         controls = None if made.face is None else synthetic_face_controls(made.face)
         rows.append(("generated", made.joints, controls))
         for label, joints, controls in rows:
