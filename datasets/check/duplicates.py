@@ -1,4 +1,4 @@
-"""Clips that stand in a set twice: by id, by motion, or as the mirror image of a clip of another split.
+"""Clips that are in a set twice: by id, by motion, or as the mirror image of a clip of another split.
 
 40 bytes a clip are kept while the shards are read (four 64-bit hashes and where the clip lies), so a million
 clips fit easily. A hash only points out candidates: each is read again and compared before anything is said.
@@ -63,7 +63,7 @@ class ClipTable:
         self._row.append(row)
 
     def report(self, findings: Findings) -> None:
-        """Compare everything with everything and tell what is found."""
+        """Compare everything with everything and report what is found."""
         self._same_ids(findings)
         self._families_apart(findings)
         self._same_motions(findings)

@@ -83,7 +83,7 @@ class MotionLayout:
 
     @staticmethod
     def named(name: str, *, fps: float | None = None, family: Family | None = None) -> MotionLayout:
-        """A known layout, at its usual frame rate and family unless told otherwise."""
+        """A known layout, at its usual frame rate and family unless given."""
         if name not in _KNOWN:
             raise UserError(f"no motion layout '{name}'; known: {', '.join(_KNOWN)}")
         skeleton, usual_fps, usual_family, fields = _KNOWN[name]

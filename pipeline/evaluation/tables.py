@@ -24,8 +24,13 @@ def plain(value: Any) -> Any:
 
 def interval(value: Mapping[str, float]) -> str:
     """A mean with its interval, of `plain`; without one where nothing was repeated."""
-    mean, half = value["mean"], value["half_width"]
-    return f"{mean:.3f} ± {half:.3f}" if half else f"{mean:.3f}"
+    mean, half = _number(value["mean"]), value["half_width"]
+    return f"{mean} ± {_number(half)}" if half else mean
+
+
+def _number(value: float) -> str:
+    """Three decimals, of large numbers four digits."""
+    return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3f}"
 
 
 def print_tables(console: Console, tables: Iterable[tuple[str, list[str], list[list[str]]]]) -> None:

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from motionloom.datasets.audio.sound import Sound, require_audible
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.store.yaml import read_yaml
 
 
 class ScriptSegment(Config):
@@ -71,12 +71,7 @@ class Script(Config):
     @staticmethod
     def read(path: Path) -> Script:
         """A YAML file; `UserError` names file, key and fix."""
-        try:
-            data = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise UserError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+        data = read_yaml(path)
         if not isinstance(data, dict):
             raise UserError(f"{path}: a script is a mapping with a list 'segments'")
         return Script.parse(data, str(path))

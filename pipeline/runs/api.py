@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-import yaml
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
@@ -34,6 +33,7 @@ from motionloom.pipeline.runs.recipe import Recipe, load_recipe, nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
+from motionloom.pipeline.store.yaml import read_yaml
 
 
 def run_recipe(
@@ -93,8 +93,8 @@ def _require_same_recipe(run: Path, name: str) -> None:
     """Never replace the stages of another recipe's run unasked."""
     path = run / "recipe.yaml"
     try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
-    except (yaml.YAMLError, UnicodeDecodeError):
+        found = read_yaml(path) if path.is_file() else None
+    except UserError:
         return  # it is about to be written anew
     if isinstance(found, dict) and found.get("name", name) != name:
         raise UserError(

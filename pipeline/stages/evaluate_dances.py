@@ -258,6 +258,8 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
         ("distribution", "div_m"): "Div_m",
         ("multimodality", "mm_k"): "MM_k",
         ("multimodality", "mm_m"): "MM_m",
+    }
+    feet = {
         ("feet", "foot_skating"): "foot skating",
         ("feet", "foot_contact"): "foot contact score",
     }
@@ -267,7 +269,8 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
         rows.append(["always the commonest", *(f"{guess[key]:.3f}" if key in guess else "" for key in seen)])
         out.append((title, columns, rows))
     rate = f"{figures['feature_fps']:g}"
-    out.append(_rows(f"Distance to real dances, variety and feet ({rate} frames a second)", spread, figures))
+    out.append(_rows(f"Distance to real dances and variety, at {rate} frames a second", spread, figures))
+    out.append(_rows("Feet (lower is better)", feet, figures))
     return out
 
 
