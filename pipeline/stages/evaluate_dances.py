@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.dance_beats import DEFINITIONS
 from motionloom.pipeline.contract.sampling import SamplingConfig
@@ -49,6 +50,9 @@ from motionloom.pipeline.store.files import write_json
 _FILE = "dances.json"
 _AT_ONCE = 16
 """Dances generated between two steps of the progress bar."""
+
+KINETIC = 3 * BODY_JOINTS
+"""Kinetic features of a motion."""
 
 Group = dict[str, dict[str, float]]
 """Figures of one set of motions, by group: "beat_align", "recognition", "feet", "distribution"."""
@@ -268,8 +272,11 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
     if rows:
         rows.append(["always the commonest", *(f"{guess[key]:.3f}" if key in guess else "" for key in seen)])
         out.append((title, columns, rows))
-    rate = f"{figures['feature_fps']:g}"
-    out.append(_rows(f"Distance to real dances and variety, at {rate} frames a second", spread, figures))
+    title = f"Distance to real dances and variety, at {figures['feature_fps']:g} frames a second"
+    if figures["clips"] < KINETIC:
+        # Covariances of fewer rows than columns are not of full rank.
+        title += f"; {figures['clips']} clips are few for FID, whose features are up to {KINETIC}"
+    out.append(_rows(title, spread, figures))
     out.append(_rows("Feet (lower is better)", feet, figures))
     return out
 
@@ -277,7 +284,8 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
 def _rows(
     title: str, columns: dict[tuple[str, str], str], figures: dict[str, Any]
 ) -> tuple[str, list[str], list[list[str]]]:
-    rows = []
+    rows, all_rows = [], figures["rows"].values()
+    columns = {(g, f): name for (g, f), name in columns.items() if any(f in r.get(g, {}) for r in all_rows)}
     for key, name in _ROWS:
         found = figures["rows"].get(key, {})
         cells = [found.get(group, {}).get(figure) for group, figure in columns]
