@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.conditions import Condition, Conditions
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.sampling import sample_seeds
@@ -309,7 +309,7 @@ class Bundle:
         segments: tuple[Segment, ...] = (),
     ) -> GeneratedMotion:
         features, with_it = _split(motion, self.generator, self.layout)
-        joints = decode(features, joint_layout(self.layout))
+        joints = joints_of(features, self.layout)
         expression = with_it if face is None else face
         return GeneratedMotion(prompt, features, joints, expression, self.layout, segments)
 
@@ -358,13 +358,6 @@ class Bundle:
                 raise UserError(f"{length:g} s is out of reach: this model makes {longest} {end:.1f} s")
             out.append(units * unit)
         return out
-
-
-def joint_layout(layout: MotionLayout) -> MotionLayout:
-    """The layout of the body-hand columns alone."""
-    if not layout.has("face"):
-        return layout
-    return MotionLayout.named("wholebody313", fps=layout.fps, family=layout.family)
 
 
 def _split(

@@ -16,6 +16,7 @@ from motionloom.pipeline.stages.data import (
 from motionloom.pipeline.stages.diffusion import DiffusionStage
 from motionloom.pipeline.stages.dmd import DmdStage
 from motionloom.pipeline.stages.evaluate import EvaluateStage
+from motionloom.pipeline.stages.evaluate_dances import EvaluateDancesStage
 from motionloom.pipeline.stages.generate import GenerateStage
 from motionloom.pipeline.stages.gpt import GptStage
 from motionloom.pipeline.stages.prepare import StatsStage, TextStage
@@ -44,4 +45,5 @@ register(DmdStage())
 register(UdeStage())
 register(GenerateStage())
 register(EvaluateStage())
+register(EvaluateDancesStage())
 register(ReportStage())
