@@ -25,6 +25,7 @@ from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Split
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
@@ -128,9 +129,12 @@ def main() -> None:
         root = Path(folder)
         items: list[tuple[Split, int]] = [("train", i) for i in range(told.clips)]
         write_dataset(
-            root, items, Noise(), name="noise", layout=LAYOUT, licence="CC0", converter="noise",
-            converter_version=1, options={}, workers=os.cpu_count() or 1,
-        )  # fmt: skip
+            root,
+            items,
+            Noise(),
+            DatasetFacts("noise", LAYOUT, "CC0", converter="noise", converter_version=1, options={}),
+            WriteOptions(workers=os.cpu_count() or 1),
+        )
         dataset = ShardDataset.open(root, "train")
         stats = compute(dataset)
         clips = [dataset.motion(i).copy() for i in range(len(dataset))]

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 SCHEMA_VERSION = 2
 
 HANDS, FACE = 1, 2
-"""Bits of what a clip holds beside its body."""
+"""Bits of what a clip has beside its body."""
 HELD_ALL = HANDS | FACE
 
 Split = Literal["train", "val", "test"]

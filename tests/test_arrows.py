@@ -1,9 +1,12 @@
-"""The import arrows between the folders (docs/architecture.md), and the packaging list."""
+"""The import arrows between folders and files (docs/architecture.md), and the packaging list."""
 
 from __future__ import annotations
 
 import ast
+import sys
 import tomllib
+from collections.abc import Mapping, Set
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("configs", "datasets", "models", "pipeline")
 BOTTOM = ("motionloom.datasets.motion", "motionloom.datasets.schema", "motionloom.datasets.conditions")
+BELOW = ("motionloom.datasets.base.files", "motionloom.datasets.base.randomness")
+"""What the bottom layer itself may use: files of the standard library and numpy alone."""
 BOTTOM_LIBRARIES = {"numpy", "torch", "roma", "scipy", "pydantic", "motionloom"}
 
 
@@ -50,12 +55,84 @@ def test_datasets_import_neither_models_nor_pipeline(path: Path) -> None:
 
 @pytest.mark.parametrize("path", [*files("datasets/motion"), ROOT / "datasets/schema.py"], ids=str)
 def test_bottom_layer_is_small(path: Path) -> None:
-    import sys
-
     for name in imports(path):
         top = name.split(".")[0]
         assert top in BOTTOM_LIBRARIES or top in sys.stdlib_module_names, f"{path} imports {name}"
-        assert not name.startswith("motionloom.") or is_bottom(name), f"{path} imports {name}"
+        assert not name.startswith("motionloom.") or is_bottom(name) or name.startswith(BELOW), (
+            f"{path} imports {name}"
+        )
+
+
+@pytest.mark.parametrize("name", BELOW)
+def test_what_lies_below_needs_nothing_of_ours(name: str) -> None:
+    path = ROOT / (name.removeprefix("motionloom.").replace(".", "/") + ".py")
+    for used in imports(path):
+        top = used.split(".")[0]
+        assert top == "numpy" or top in sys.stdlib_module_names, f"{path} imports {used}"
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(("motionloom", *(parts[:-1] if parts[-1] == "__init__" else parts)))
+
+
+def file_arrows() -> dict[str, set[str]]:
+    """Module -> modules of ours that it imports, inside functions too."""
+    modules = {module_of(path): path for folder in FOLDERS for path in files(folder)}
+    arrows = {}
+    for module, path in modules.items():
+        names = imports(path)
+        # `from package.module import name` is listed as package.module.name.
+        arrows[module] = {
+            name if name in modules else name.rpartition(".")[0] for name in names
+        } & modules.keys() - {module}
+    return arrows
+
+
+def room_of(module: str) -> str:
+    """The folder a module lies in."""
+    path = Path(*module.split(".")[1:])
+    return (path if (ROOT / path).is_dir() else path.parent).as_posix()
+
+
+def room_arrows() -> dict[str, set[str]]:
+    """Room -> other rooms that a file of it imports from."""
+    arrows: dict[str, set[str]] = {}
+    for module, targets in file_arrows().items():
+        room = room_of(module)
+        arrows.setdefault(room, set()).update({room_of(target) for target in targets} - {room})
+    return arrows
+
+
+def circle(arrows: Mapping[str, Set[str]]) -> list[str]:
+    """A circle of arrows; empty when there is none."""
+    try:
+        TopologicalSorter(arrows).prepare()
+    except CycleError as error:
+        found: list[str] = error.args[1]
+        return found
+    return []
+
+
+def test_circles_are_found() -> None:
+    assert circle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    assert set(circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
+    assert "motionloom.datasets.schema" in file_arrows()["motionloom.datasets.motion.layout"]
+    assert "datasets/motion" in room_arrows()["models/tokenizer"]
+
+
+def test_no_file_imports_itself_by_way_of_others() -> None:
+    assert circle(file_arrows()) == []
+
+
+ROOMS_THAT_STILL_CIRCLE = {"pipeline/evaluation", "pipeline/runs", "pipeline/stages"}
+"""Arrows among these are not looked at yet. Empty it, then delete it."""
+
+
+def test_no_room_imports_itself_by_way_of_others() -> None:
+    later = ROOMS_THAT_STILL_CIRCLE
+    arrows = {room: to - later if room in later else to for room, to in room_arrows().items()}
+    assert circle(arrows) == []
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

@@ -16,7 +16,8 @@ import yaml
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.cli.main import app
-from motionloom.pipeline.runs.recipe import load_recipe, shipped_recipes
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.shipped import shipped_recipes
 from motionloom.pipeline.stages.table import STAGES
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -7,11 +7,7 @@ computing waits for it; a process that is killed leaves nothing behind that anyo
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
-import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +16,8 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import DIM, VERSION, AudioSettings, audio_features
 from motionloom.datasets.audio.sound import read_sound
-from motionloom.datasets.base.files import sha256_of, write_with
+from motionloom.datasets.base.files import sha256_of, sha256_of_json, write_with
+from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.schema import UserError
 
@@ -39,7 +36,7 @@ class AudioCache:
             return known
         samples, rate = read_sound(path)  # before anything is made: a broken file leaves no trace
         found.parent.mkdir(parents=True, exist_ok=True)
-        with _alone(found.with_suffix(".lock")):
+        with file_lock(found.with_suffix(".lock")):
             if (known := _load(found)) is not None:
                 return known
             try:
@@ -58,8 +55,7 @@ class AudioCache:
         return [out[position] for position in range(len(paths))]
 
     def _place(self, content: str) -> Path:
-        what = json.dumps([content, self.settings.dump(), VERSION], sort_keys=True)
-        name = hashlib.sha256(what.encode()).hexdigest()
+        name = sha256_of_json([content, self.settings.dump(), VERSION])
         return self.folder / name[:2] / f"{name}.f{DIM}.npy"
 
 
@@ -71,11 +67,3 @@ def _load(path: Path) -> NDArray[np.float32] | None:
         return None
     good = values.dtype == np.float32 and values.ndim == 2 and values.shape[1] == DIM
     return values if good and len(values) else None
-
-
-@contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Hold a lock that the system lets go of when this process ends, however it ends."""
-    with path.open("ab") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield

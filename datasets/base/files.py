@@ -1,4 +1,4 @@
-"""Files that are either whole or absent: atomic writes and checksums."""
+"""Files that are either whole or absent: every atomic write and every checksum of the package."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ class HashingFile:
 
 
 @contextmanager
-def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """A binary file that appears under `path` only when the block ends without error, synced.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A path to write to; the file moves to `path`, synced, only when the block ends without error.
 
-    The temporary name starts with a dot and ends in a random number, so no worker, of an earlier run or on
-    another machine, can rename another's half-written file into place.
+    Parent folders are made. The temporary name starts with a dot and ends in a random number, so no worker,
+    of an earlier run or on another machine, can rename another's half-written file into place.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
-        with temporary.open("wb") as file:
-            yield file
-            file.flush()
+        yield temporary
+        with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
         sync_folder(path.parent)
@@ -52,17 +52,38 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
+    """The same as an open binary file."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        yield file
+
+
 def remove_temporaries(folder: Path) -> None:
-    """Delete what killed writers left in `folder`. Only for who knows that nobody is writing there."""
+    """Delete what killed writers left in `folder`. Call it only while nothing else can be writing there."""
     for path in folder.iterdir():
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
 
 
-def write_json(path: Path, data: Any) -> None:
-    """Write JSON atomically; the same data gives the same bytes."""
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write bytes atomically."""
     with atomic_file(path) as file:
-        file.write(json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False).encode() + b"\n")
+        file.write(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text atomically, newlines as they are."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: Path, data: Any, *, sort_keys: bool = False, allow_nan: bool = False) -> None:
+    """Write JSON atomically; the same data gives the same bytes.
+
+    Keys stay in their order (a manifest reads best as its schema lists it) unless `sort_keys`.
+    """
+    text = json.dumps(data, indent=1, ensure_ascii=False, sort_keys=sort_keys, allow_nan=allow_nan)
+    write_text(path, text + "\n")
 
 
 def write_with(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -84,3 +105,8 @@ def sha256_of(path: Path) -> str:
     """sha256 of a file's content, hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
+
+
+def sha256_of_json(value: Any) -> str:
+    """sha256 of plain JSON data, hex; the order of keys makes no difference."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

@@ -1,10 +1,12 @@
-"""Who may write in a folder: one whole run, or any number of parts of one conversion.
+"""The kernel's file locks: who may write in a folder, who downloads a file, who works on a run.
 
-A lock file rather than the folder itself, because over NFS an exclusive lock needs a file open for writing.
-The kernel frees the lock when the process dies. Limits: `flock` reaches other machines on NFS only from Linux
-2.6.12 on and with a lock service, on Lustre only with `-o flock`; a file system without locks is written
-without, with a warning. Even then nothing is torn: every file is renamed into place whole and every writer of
-one conversion writes the same bytes, so the loss is work done twice.
+A lock file rather than the thing itself, because over NFS an exclusive lock needs a file open for writing.
+The kernel frees the lock when the process dies, however it dies. Limits: `flock` reaches other machines on
+NFS only from Linux 2.6.12 on and with a lock service, on Lustre only with `-o flock`.
+
+Not the `filelock` package: several machines that write shards of one conversion need shared locks, which it
+has only through an SQLite file; where the file system has no locks it falls back to marker files, which a
+killed process leaves behind; and it waits by asking again and again.
 """
 
 from __future__ import annotations
@@ -24,41 +26,61 @@ _CANNOT_LOCK = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 
 
 @contextmanager
+def file_lock(path: Path, *, wait: bool = True) -> Iterator[bool]:
+    """Hold the lock file `path`, made when absent; false when another holds it and we do not `wait`."""
+    try:
+        handle = _locked(path, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        os.close(handle)
+
+
+@contextmanager
 def folder_lock(out: Path, *, shared: bool = False) -> Iterator[None]:
     """Hold `out` for one whole run, or (`shared`) together with other parts; `UserError` when it is taken.
 
-    The lock file is removed at the end of a whole run, so a finished folder holds none.
+    The lock file is removed at the end of a whole run, so a finished folder holds none. A file system without
+    locks is written without, with a warning. Even then nothing is torn: every file is renamed into place
+    whole and every writer of one conversion writes the same bytes, so the loss is work done twice.
     """
     path = out / LOCK_FILE
-    handle = _lock(path, shared)
+    handle: int | None = None
+    try:
+        handle = _locked(path, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UserError(
+            f"{out}: another conversion is writing here; wait for it or choose another folder"
+        ) from None
+    except OSError as error:
+        if error.errno not in _CANNOT_LOCK:
+            raise
+        warnings.warn(
+            f"{out}: this file system has no locks ({error.strerror}); "
+            f"do not start a second conversion into this folder",
+            stacklevel=3,
+        )
     try:
         yield
     finally:
         if not shared:
             path.unlink(missing_ok=True)
-        os.close(handle)
-
-
-def _lock(path: Path, shared: bool) -> int:
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if handle is not None:
             os.close(handle)
-            raise UserError(
-                f"{path.parent}: another conversion is writing here; wait for it or choose another folder"
-            ) from None
-        except OSError as error:
-            if error.errno not in _CANNOT_LOCK:
-                os.close(handle)
-                raise
-            warnings.warn(
-                f"{path.parent}: this file system has no locks ({error.strerror}); "
-                f"do not start a second conversion into this folder",
-                stacklevel=2,
-            )
-            return handle
+
+
+def _locked(path: Path, operation: int) -> int:
+    """An open, locked handle of `path`; `BlockingIOError` when it is taken."""
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, operation)
+        except OSError:
+            os.close(handle)
+            raise
         # The holder before us may have removed the file between our open and our lock.
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(handle), path.stat()):

@@ -1,4 +1,4 @@
-"""Clips that stand in a set twice: by id, by motion, or as the mirror image of a clip of another split.
+"""Clips that are in a set twice: by id, by motion, or as the mirror image of a clip of another split.
 
 40 bytes a clip are kept while the shards are read (four 64-bit hashes and where the clip lies), so a million
 clips fit easily. A hash only points out candidates: each is read again and compared before anything is said.
@@ -63,7 +63,7 @@ class ClipTable:
         self._row.append(row)
 
     def report(self, findings: Findings) -> None:
-        """Compare everything with everything and tell what is found."""
+        """Compare everything with everything and report what is found."""
         self._same_ids(findings)
         self._families_apart(findings)
         self._same_motions(findings)
@@ -159,22 +159,11 @@ class ClipTable:
         first, second = self._motion(a), self._motion(b)
         if first.shape != second.shape:
             return ""
-        here, there = (
-            decode(motion[:, self._joint_columns], self._joint_layout) for motion in (first, second)
-        )
+        layout, columns = self.layout.without_face(), self.layout.part("bodyhand")
+        here, there = (decode(motion[:, columns], layout) for motion in (first, second))
         if _distance(mirror(here, self.layout.skeleton), there) < SAME_METRES:
             return "the mirror image of"
         return "the same recording as" if _distance(here, there) < SAME_METRES else ""
-
-    @property
-    def _joint_layout(self) -> MotionLayout:
-        if not self.layout.has("face"):
-            return self.layout
-        return MotionLayout.named("wholebody313", fps=self.layout.fps, family=self.layout.family)
-
-    @property
-    def _joint_columns(self) -> slice:
-        return slice(0, self._joint_layout.dim)
 
     def _height_hash(self, motion: NDArray[np.floating]) -> int:
         """0 when the heights could belong to any clip."""

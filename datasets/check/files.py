@@ -3,7 +3,7 @@
 | suffix | read as |
 |---|---|
 | `.tar` | a WebDataset shard without manifest (`shards/foreign.py`) |
-| `.npy` | a motion array of the layout asked for (Motion-X's `smplx322` unless told), or joints |
+| `.npy` | a motion array of the layout asked for (Motion-X's `smplx322` unless given), or joints |
 | `.npz` | SMPL parameters as AMASS publishes them |
 | `.pkl` | an AIST++ annotation, through the restricted unpickler |
 | `.bvh` | BVH |

@@ -1,4 +1,4 @@
-"""Tar shards that others wrote: no manifest, no index, any member names. What would a reader get from them?
+"""Tar shards written by other tools: no manifest, no index, any member names. What would a reader get?
 
 `tarfile` and WebDataset read many broken tars without a word: a cut file loses its last samples, a key whose
 members do not stand together becomes two incomplete samples, a key that comes again is trained on twice.

@@ -1,1 +1,1 @@
-"""Converters from raw sources to shards, one file each."""
+"""Converters from raw sources to shards, one folder each."""

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion, ConvertConfig
+from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion
 from motionloom.datasets.schema import UserError
 
 

@@ -1,10 +1,11 @@
 """`MixedDataset`: several data sets of one layout as one, drawn by weight.
 
-Clips are numbered through, data set after data set. How often each data set is drawn is the batch plan's
-affair (`order.mixed_order`): an epoch has as many places as all the data sets together have clips, whatever
-the weights, and each data set gets exactly its share of them. A small data set with a great weight so comes
-several times an epoch (with new windows and captions each time), a large one with a small weight is seen
-once in several epochs. Evaluation does not weigh: it sees every clip of every data set once.
+Clips are numbered consecutively, data set after data set. How often each data set is drawn is up to the
+batch plan (`order.mixed_order`): an epoch has as many places as all the data sets together have clips,
+whatever the weights, and each data set gets exactly its share of them. With a large weight the clips of a
+small data set are drawn several times an epoch (with new windows and captions each time); with a small
+weight it takes several epochs to go once through a large one. Evaluation ignores the weights: it sees every
+clip of every data set once.
 """
 
 from __future__ import annotations
@@ -99,7 +100,7 @@ class MixedDataset:
         return dataset.wav(own)
 
     def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
-        """Each data set is told its own clips."""
+        """Passes each data set the clips that are its own."""
         for dataset, begin, end in self._ranges():
             dataset.prefetch([i - begin for i in clips if begin <= i < end], members)
 

@@ -19,7 +19,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.order import Source, mixed_order, shares, source_order
 
 POOL = 8
-"""Batches sorted by length together. More leave less padding, fewer mix lengths better."""
+"""Batches sorted by length together. More of them mean less padding, fewer mix lengths better."""
 
 
 class BatchPlan:

@@ -33,6 +33,8 @@ STD_FLOOR = 1e-4
 """Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
 
 Values = TypeVar("Values", NDArray[np.float32], Tensor)
+Columns = NDArray[np.int64] | slice
+"""Columns of a layout: by number, or a field's slice."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +92,14 @@ class FeatureStats:
         default_factory=dict, repr=False, compare=False
     )
 
-    def normalize(self, values: Values, columns: NDArray[np.int64] | None = None) -> Values:
+    def normalize(self, values: Values, columns: Columns | None = None) -> Values:
         """(values - mean) / std over the last axis; numpy or torch. `columns`: which ones `values` holds."""
         if isinstance(values, Tensor):
             mean, std = self._on(values, columns)
             return (values - mean) / std
         return (values - self._take(self.mean, columns)) / self._take(self.std, columns)
 
-    def denormalize(self, values: Values, columns: NDArray[np.int64] | None = None) -> Values:
+    def denormalize(self, values: Values, columns: Columns | None = None) -> Values:
         """values * std + mean over the last axis; numpy or torch, differentiable."""
         if isinstance(values, Tensor):
             mean, std = self._on(values, columns)
@@ -139,7 +141,7 @@ class FeatureStats:
             require_layout(layout, expect, str(path))
         return FeatureStats(mean, std, layout, frames)
 
-    def _on(self, like: Tensor, columns: NDArray[np.int64] | None) -> tuple[Tensor, Tensor]:
+    def _on(self, like: Tensor, columns: Columns | None) -> tuple[Tensor, Tensor]:
         key = (like.device, like.dtype)
         if key not in self._tensors:
             self._tensors[key] = (
@@ -149,11 +151,11 @@ class FeatureStats:
         mean, std = self._tensors[key]
         if columns is None:
             return mean, std
-        chosen = torch.as_tensor(columns, device=like.device)
+        chosen = columns if isinstance(columns, slice) else torch.as_tensor(columns, device=like.device)
         return mean[chosen], std[chosen]
 
     @staticmethod
-    def _take(values: NDArray[np.float32], columns: NDArray[np.int64] | None) -> NDArray[np.float32]:
+    def _take(values: NDArray[np.float32], columns: Columns | None) -> NDArray[np.float32]:
         return values if columns is None else values[columns]
 
     def __getstate__(self) -> dict[str, object]:

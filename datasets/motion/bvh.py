@@ -11,8 +11,6 @@ because importers of Blender, Houdini and FBX tools take bone directions and len
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,6 +21,7 @@ import roma
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.bvh_text import (
     Floats,
     find_motion,
@@ -202,18 +201,7 @@ def write_bvh(path: Path, skeleton: Skeleton, rotations: NDArray, root: NDArray,
     ]
     row = " ".join(["%.6f"] * values.shape[1])
     lines += [row % tuple(frame) for frame in values.tolist()]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
-            file.write("\n".join(lines) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _children(skeleton: Skeleton, joint: int) -> list[int]:

@@ -83,7 +83,7 @@ class MotionLayout:
 
     @staticmethod
     def named(name: str, *, fps: float | None = None, family: Family | None = None) -> MotionLayout:
-        """A known layout, at its usual frame rate and family unless told otherwise."""
+        """A known layout, at its usual frame rate and family unless given."""
         if name not in _KNOWN:
             raise UserError(f"no motion layout '{name}'; known: {', '.join(_KNOWN)}")
         skeleton, usual_fps, usual_family, fields = _KNOWN[name]
@@ -186,6 +186,16 @@ class MotionLayout:
             if self.has(field):
                 out.append(columns[self.slice(field)][per_joint * (BODY_JOINTS - first) :])
         return np.concatenate(out) if out else columns[:0]
+
+    def without_face(self) -> MotionLayout:
+        """The layout of `part("bodyhand")`, which joints can be decoded from; itself where it has no face."""
+        if not self.has("face"):
+            return self
+        fields = tuple((name, size) for name, size in self.fields if name != "face")
+        for name, (skeleton, _, _, known) in _KNOWN.items():
+            if (skeleton, known) == (self.skeleton_name, fields):
+                return MotionLayout.named(name, fps=self.fps, family=self.family)
+        raise UserError(f"layout {self.name} has no counterpart without the face")
 
     def has_part(self, part: Part) -> bool:
         """Whether the layout has columns for a part."""

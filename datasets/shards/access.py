@@ -1,4 +1,4 @@
-"""How the bytes of one clip's member are reached: in a mapped file, or by a request of their own.
+"""How the bytes of one clip's member are reached: in a mapped file, or by requests.
 
 An access is made for one split and answers `member(shard, clip, column)` with a buffer and the byte in it
 where the member starts. (`stream.StreamedShards` is the third kind.)
@@ -33,7 +33,7 @@ class Access(Protocol):
         ...
 
     def prefetch(self, places: Sequence[tuple[int, int]], members: Collection[str]) -> None:
-        """Told before a batch is made: (shard, clip) of its clips and the members that will be read."""
+        """Called before a batch is made, with the (shard, clip) of its clips and the members it will read."""
         ...
 
 

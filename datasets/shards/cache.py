@@ -8,14 +8,14 @@ whoever has it mapped keeps its content until letting go.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reading import CacheConfig
 
@@ -113,19 +113,12 @@ class FileCache:
     def _lock(self, name: str, *, wait: bool = True) -> Iterator[bool]:
         """Hold the lock that `name` shares with a few others; false when it is taken and we do not wait."""
         path = self.folder / _LOCKS / name[:2]
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise UserError(
-                f"{self.folder}: the cache folder cannot be used ({error}); name another"
-            ) from None
-        try:
+        with ExitStack() as stack:
             try:
-                fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            except BlockingIOError:
-                yield False
-                return
-            yield True
-        finally:
-            os.close(handle)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                mine = stack.enter_context(file_lock(path, wait=wait))
+            except OSError as error:
+                raise UserError(
+                    f"{self.folder}: the cache folder cannot be used ({error}); name another"
+                ) from None
+            yield mine

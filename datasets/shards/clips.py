@@ -67,7 +67,7 @@ class ClipDataset(Protocol):
         ...
 
     def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
-        """Told before a batch is made, so that a remote data set can read it in one go; changes nothing."""
+        """Announce what a batch will read, so that a server is asked for it at once; changes no result."""
         ...
 
     def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:

@@ -82,13 +82,13 @@ def index_path(tar: Path) -> Path:
 
 
 def clip_entries(
-    path: Path, told: list[tuple[str, int]], *, clips: list[TarClip] | None = None
+    path: Path, written: list[tuple[str, int]], *, clips: list[TarClip] | None = None
 ) -> list[ClipEntry]:
-    """Index rows of a tar as it lies on the disk; `told` are the clips' (source id, held), in order."""
+    """Index rows of a tar as it lies on the disk; `written` are the clips' (source id, held), in order."""
     clips = scan_tar(path) if clips is None else clips
     entries = []
     with path.open("rb") as file:
-        for clip, (source, held) in zip(clips, told, strict=True):
+        for clip, (source, held) in zip(clips, written, strict=True):
             start, size = clip.members["motion.npy"]
             file.seek(start)
             header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'")

@@ -204,7 +204,7 @@ class ShardDataset:
         return captions_from_json(raw, self._where(i, member)) if raw else []
 
     def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
-        """Told before a batch is made, so that remote clips are read in one go; changes nothing."""
+        """Announce what a batch will read, so that a server is asked for it at once; changes no result."""
         if self._ahead:
             self._access.prefetch([(self._shard_of(i), i) for i in clips], members)
 

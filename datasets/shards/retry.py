@@ -1,4 +1,4 @@
-"""Repeating requests that failed in a way that may pass, and telling plainly of those that will not.
+"""Repeating requests that failed in a way that may pass, and reporting plainly those that will not.
 
 Server errors (5xx), timeouts, broken connections and cut answers are tried again after growing random pauses;
 a refusal (401, 403), a missing file (404) or another 4xx is an error at once.
@@ -47,8 +47,8 @@ def persist(what: str, action: Callable[[], T]) -> T:
             if refusal is not None:
                 raise UserError(f"{what}: {refusal}") from None
             failure = error
-    told = " ".join(str(failure).split()) or type(failure).__name__
-    raise UserError(f"{what}: {told[:300]} (tried {ATTEMPTS} times)") from None
+    reason = " ".join(str(failure).split()) or type(failure).__name__
+    raise UserError(f"{what}: {reason[:300]} (tried {ATTEMPTS} times)") from None
 
 
 def _from_outside(error: Exception) -> bool:

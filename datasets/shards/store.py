@@ -242,7 +242,7 @@ def _connect(scheme: str, pid: int, settings: tuple[tuple[str, str], ...]) -> An
         import fsspec  # type: ignore[import-untyped]
 
         if scheme == "s3":
-            import s3fs  # type: ignore[import-untyped]  # noqa: F401 (its absence is told by name)
+            import s3fs  # type: ignore[import-untyped]  # noqa: F401 (a missing one is reported by name)
 
             system = fsspec.filesystem(
                 "s3",

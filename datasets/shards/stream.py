@@ -91,11 +91,11 @@ def read_shard(
                 _compare(where, sample, f"{number}-{len(clips):06d}", index, rows, len(clips))
                 clips.append({name: sample[name] for name in members if name in sample})
         except (tarfile.TarError, EOFError, ValueError) as error:
-            told = str(error.args[0] if error.args else error).partition(" @ <")[0][:200]
+            reason = str(error.args[0] if error.args else error).partition(" @ <")[0][:200]
             last = (
                 f"the last whole sample is '{number}-{len(clips) - 1:06d}'" if clips else "no sample is whole"
             )
-            raise UserError(f"{where}: not readable ({told}), {last}: {_ADVICE}") from None
+            raise UserError(f"{where}: not readable ({reason}), {last}: {_ADVICE}") from None
         if len(clips) != len(rows):
             raise UserError(f"{where}: {len(clips)} samples, the index says {len(rows)}: {_ADVICE}")
         if stream.hexdigest() != shard.sha256:

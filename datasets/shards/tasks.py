@@ -8,46 +8,23 @@ finished.
 from __future__ import annotations
 
 import errno
-import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, TypeVar
 
-from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of, write_json
+from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of, sha256_of_json, write_json
 from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Dropped, ShardInfo, Split, UserError
 from motionloom.datasets.shards.index import SPLITS, ShardIndex, clip_entries, index_path, shard_stem
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import DropClip, MotionType, Sample, encode_sample
 
 T = TypeVar("T")
 Convert = Callable[[T], Sample | list[Sample]]
 Result = tuple[ShardInfo | None, list[Dropped]]
 """A shard (None when every clip of it was dropped) and what was dropped."""
-
-
-@dataclass(frozen=True)
-class Part:
-    """One machine's share of a conversion: every `count`-th task from `index` (from 0) on.
-
-    `step` is `shards`, or `features` for the sources that need that step first.
-    """
-
-    index: int
-    count: int
-    step: Literal["features", "shards"] = "shards"
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.index < self.count:
-            raise UserError(
-                f"part {self.index} of {self.count}: parts are numbered from 0 to {self.count - 1}"
-            )
-
-    def has(self, position: int) -> bool:
-        """Whether the task at `position` of all tasks is this part's."""
-        return position % self.count == self.index
 
 
 @dataclass(frozen=True)
@@ -67,28 +44,28 @@ class ShardTask(Generic[T]):
 def plan_shards(
     out: Path,
     items: Sequence[tuple[Split, T]],
-    *,
-    name: str,
-    layout: MotionLayout,
-    made_from: dict[str, Any],
-    clips_per_shard: int,
-    seed: int,
-    strict: bool,
+    facts: DatasetFacts,
+    how: WriteOptions,
     describe: Callable[[T], str],
-    motion_type: MotionType,
 ) -> list[ShardTask[T]]:
     """Which items go to which shard, in which order: known before the first one is converted."""
-    tasks = []
+    tasks: list[ShardTask[T]] = []
+    made_from = facts.made_from()
     for position, split in enumerate(SPLITS):
         members = [item for item_split, item in items if item_split == split]
-        order = permutation(len(members), seed, position)
-        for number, first in enumerate(range(0, len(members), clips_per_shard)):
-            chosen = [members[i] for i in order[first : first + clips_per_shard]]
+        order = permutation(len(members), how.seed, position)
+        for number, first in enumerate(range(0, len(members), how.clips_per_shard)):
+            chosen = [members[i] for i in order[first : first + how.clips_per_shard]]
             named = tuple((describe(item), item) for item in chosen)
-            told = [made_from, name, split, number, [label for label, _ in named]]
-            fingerprint = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
-            path = out / f"{shard_stem(name, split, number)}.tar"
-            tasks.append(ShardTask(path, split, number, named, layout, motion_type, strict, fingerprint))
+            fingerprint = sha256_of_json(
+                [made_from, facts.name, split, number, [label for label, _ in named]]
+            )
+            path = out / f"{shard_stem(facts.name, split, number)}.tar"
+            tasks.append(
+                ShardTask(
+                    path, split, number, named, facts.layout, facts.motion_type, how.strict, fingerprint
+                )
+            )
     return tasks
 
 
@@ -96,7 +73,7 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
     """Write one shard and its index."""
     from webdataset.writer import TarWriter  # imports torch: two seconds that kept shards do not pay
 
-    told: list[tuple[str, int]] = []
+    written: list[tuple[str, int]] = []
     dropped: list[Dropped] = []
     with atomic_file(task.path) as file:
         hashing = HashingFile(file)
@@ -107,10 +84,10 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
                     dropped.append(samples)
                     continue
                 for source, held, members in samples:
-                    tar.write({"__key__": f"{task.number:06d}-{len(told):06d}", **members})
-                    told.append((source, held))
+                    tar.write({"__key__": f"{task.number:06d}-{len(written):06d}", **members})
+                    written.append((source, held))
     info = None
-    entries = clip_entries(task.path, told)
+    entries = clip_entries(task.path, written)
     if entries:
         info = ShardInfo(
             name=task.path.name,

@@ -15,9 +15,10 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -27,7 +28,7 @@ from motionloom.datasets.base.files import remove_temporaries, sync_folder, writ
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SCHEMA_VERSION, Dropped, Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.schema import Manifest, ShardInfo, Split, UserError
 from motionloom.datasets.shards.index import (
     MANIFEST_FILE,
     SPLITS,
@@ -36,10 +37,9 @@ from motionloom.datasets.shards.index import (
     index_path,
     save_index,
 )
-from motionloom.datasets.shards.sample import MotionType
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.tasks import (
     Convert,
-    Part,
     Result,
     ShardTask,
     finished_shard,
@@ -50,12 +50,10 @@ from motionloom.datasets.shards.tasks import (
 T = TypeVar("T")
 
 WORK_FOLDER = ".work"
-"""Inside the folder of the shards: what a first step makes; removed when the manifest stands."""
+"""Inside the folder of the shards: what a features step makes; removed when the manifest stands."""
 
 SOURCE_CHECKSUM = "source_sha256"
-"""The option that tells of the source's content: a finished dataset follows its source."""
-
-FirstStep = Callable[[Sequence[T], Workers], None]
+"""The option that stands for the source's content: a finished dataset follows its source."""
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -64,132 +62,127 @@ def write_dataset(
     out: Path,
     items: Sequence[tuple[Split, T]],
     convert: Convert[T],
+    facts: DatasetFacts,
+    how: WriteOptions | None = None,
     *,
-    name: str,
-    layout: MotionLayout,
-    licence: str,
-    converter: str,
-    converter_version: int,
-    options: dict[str, Any],
-    workers: int = 1,
-    clips_per_shard: int = 256,
-    seed: int = 0,
-    strict: bool = False,
-    progress: bool = True,
     describe: Callable[[T], str] = str,
-    motion_type: MotionType = "float32",
-    dropped: Sequence[Dropped] = (),
-    licences: dict[str, int] | None = None,
-    audio: dict[str, Any] | None = None,
-    notes: Sequence[str] = (),
-    first: FirstStep[T] | None = None,
-    part: Part | None = None,
 ) -> Manifest:
     """Convert `items`, each already assigned to a split, into shards under `out`; return the manifest.
 
-    `convert` must be picklable when `workers > 1`. It may raise `DropClip(reason)` to leave an item out; any
-    other exception drops the item with its reason too, or stops the run when `strict`. `describe` names an
-    item in the manifest's drop list and in the fingerprint that decides whether a finished shard is kept, so
-    it must not change between runs; a change of the source files' *content* is not noticed unless it shows in
-    `describe` or `options`. `dropped` (clips the plan already left out), `licences`, `audio` and `notes` go
-    into the manifest as they are. `first` is called with the items of the shards that are not finished, if
-    there are any, before these are written; it may use `out / WORK_FOLDER`.
-
-    With `part` only that part is made and no manifest is written; the one returned tells of the part. Parts
-    may run at once; the run without a part excludes all others.
+    `convert` must be picklable with several workers. It may raise `DropClip(reason)` to leave an item out;
+    any other exception drops the item with its reason too, or stops the run when `how.strict`. `describe` as
+    for `dataset_writer`.
     """
-    _check_arguments(name, workers, clips_per_shard, options)
+    with dataset_writer(out, items, facts, how, describe=describe) as writer:
+        return writer.write(convert)
+
+
+@contextmanager
+def dataset_writer(
+    out: Path,
+    items: Sequence[tuple[Split, T]],
+    facts: DatasetFacts,
+    how: WriteOptions | None = None,
+    *,
+    describe: Callable[[T], str] = str,
+) -> Iterator[DatasetWriter[T]]:
+    """Take hold of `out` and look at what is finished there, for work between that and the writing.
+
+    `describe` names an item in the manifest's drop list and in the fingerprint that decides whether a
+    finished shard is kept, so it must not change between runs; a change of the source files' *content* is not
+    noticed unless it shows in `describe` or in the facts' options.
+    """
+    how = how or WriteOptions()
+    _check_arguments(facts, how)
     out.mkdir(parents=True, exist_ok=True)
-    with folder_lock(out, shared=part is not None), Workers(workers) as pool:
-        _check_same_dataset(out, name, layout, options)
-        made_from = {
-            "schema_version": SCHEMA_VERSION,
-            "layout": [layout.name, layout.family, layout.fps, layout.skeleton_name],
-            "converter": [converter, converter_version],
-            "options": options,
-            "motion_type": motion_type,
-        }
-        tasks = plan_shards(
-            out, items, name=name, layout=layout, made_from=made_from, clips_per_shard=clips_per_shard,
-            seed=seed, strict=strict, describe=describe, motion_type=motion_type,
-        )  # fmt: skip
-        if part is None:
-            _remove_strays(out, name, keep={task.path for task in tasks})
-        results = _make(tasks, convert, first, part, pool, out, progress)
+    with folder_lock(out, shared=how.part is not None), Workers(how.workers) as pool:
+        _check_same_dataset(out, facts.name, facts.layout, facts.options)
+        yield DatasetWriter(out, plan_shards(out, items, facts, how, describe), facts, how, pool)
+
+
+class DatasetWriter(Generic[T]):
+    """The shards of one run, planned and compared with what an earlier run finished."""
+
+    def __init__(
+        self, out: Path, tasks: list[ShardTask[T]], facts: DatasetFacts, how: WriteOptions, pool: Workers
+    ) -> None:
+        self.out, self.pool = out, pool
+        self._facts, self._how = facts, how
+        if how.part is None:
+            _remove_strays(out, facts.name, keep={task.path for task in tasks})
+        # Every part of a features step looks at all shards: any of them may need its features.
+        self._tasks = [task for at, task in enumerate(tasks) if how.features_only or how.has(at)]
+        find = partial(finished_shard, verify=not how.features_only)
+        with ThreadPoolExecutor(pool.count) as threads:  # hashing runs outside the interpreter's lock
+            self._results = list(threads.map(find, self._tasks))
+        self._todo = [at for at, result in enumerate(self._results) if result is None]
+        if self._todo:
+            (out / MANIFEST_FILE).unlink(missing_ok=True)
+
+    @property
+    def work_folder(self) -> Path:
+        """For what a features step makes; removed with everything in it when the manifest stands."""
+        return self.out / WORK_FOLDER
+
+    def pending(self) -> list[T]:
+        """The items of the shards that are not finished."""
+        return [item for at in self._todo for _, item in self._tasks[at].named_items]
+
+    def write(self, convert: Convert[T]) -> Manifest:
+        """Write the shards that are not finished; then, unless this is a part, index and manifest.
+
+        A part returns a manifest that covers the part alone.
+        """
+        results = [] if self._how.features_only else self._shards(convert)
         shards = [shard for shard, _ in results if shard is not None]
         failed = [drop for _, drops in results for drop in drops]
+        facts = self._facts
         manifest = Manifest(
-            name=name,
-            layout=layout.name,
-            family=layout.family,
-            fps=layout.fps,
-            skeleton=layout.skeleton_name,
-            licence=licence,
-            converter=converter,
-            converter_version=converter_version,
-            options=options,
+            name=facts.name,
+            layout=facts.layout.name,
+            family=facts.layout.family,
+            fps=facts.layout.fps,
+            skeleton=facts.layout.skeleton_name,
+            licence=facts.licence,
+            converter=facts.converter,
+            converter_version=facts.converter_version,
+            options=facts.options,
             shards=shards,
-            dropped=[*dropped, *failed],
-            licences=licences or {},
-            audio=audio,
-            notes=list(notes),
+            dropped=[*facts.dropped, *failed],
+            licences=facts.licences,
+            audio=facts.audio,
+            notes=list(facts.notes),
         )
-        if part is None:
+        if self._how.part is None:
             if not shards:
-                told = "; ".join(f"{drop.source}: {drop.reason}" for drop in [*failed, *dropped][:3])
-                raise UserError(f"{out}: no clip survived the conversion ({told or 'there was none'})")
-            _finish_index(out, shards)
-            write_json(out / MANIFEST_FILE, manifest.dump())
-            shutil.rmtree(out / WORK_FOLDER, ignore_errors=True)
+                some = "; ".join(f"{drop.source}: {drop.reason}" for drop in [*failed, *facts.dropped][:3])
+                raise UserError(f"{self.out}: no clip survived the conversion ({some or 'there was none'})")
+            _finish_index(self.out, shards)
+            write_json(self.out / MANIFEST_FILE, manifest.dump())
+            shutil.rmtree(self.work_folder, ignore_errors=True)
         return manifest
 
-
-def _make(
-    tasks: list[ShardTask[T]],
-    convert: Convert[T],
-    first: FirstStep[T] | None,
-    part: Part | None,
-    pool: Workers,
-    out: Path,
-    progress: bool,
-) -> list[Result]:
-    """Find or write the shards of `part` (all without one); results in task order."""
-    features_only = part is not None and part.step == "features"
-    mine = [task for position, task in enumerate(tasks) if features_only or not part or part.has(position)]
-    with ThreadPoolExecutor(pool.count) as threads:  # hashing runs outside the interpreter's lock
-        found = list(threads.map(lambda task: finished_shard(task, verify=not features_only), mine))
-    todo = [position for position, result in enumerate(found) if result is None]
-    if todo:
-        (out / MANIFEST_FILE).unlink(missing_ok=True)
-        if first is not None:
-            first([item for position in todo for _, item in mine[position].named_items], pool)
-    if features_only:
-        return []
-    with Progress(disable=not progress) as bar:
-        shown = bar.add_task("writing shards", total=len(mine), completed=len(mine) - len(todo))
-        for at, result in pool.run(_Write(convert), [mine[position] for position in todo]):
-            found[todo[at]] = result
-            bar.advance(shown)
-    return [result for result in found if result is not None]
+    def _shards(self, convert: Convert[T]) -> list[Result]:
+        """Results of all tasks, in their order."""
+        with Progress(disable=not self._how.progress) as bar:
+            done = len(self._tasks) - len(self._todo)
+            shown = bar.add_task("writing shards", total=len(self._tasks), completed=done)
+            tasks = [self._tasks[at] for at in self._todo]
+            for position, result in self.pool.run(partial(write_shard, convert=convert), tasks):
+                self._results[self._todo[position]] = result
+                bar.advance(shown)
+        return [result for result in self._results if result is not None]
 
 
-@dataclass(frozen=True)
-class _Write(Generic[T]):
-    """`write_shard` with its converter, for the pool."""
-
-    convert: Convert[T]
-
-    def __call__(self, task: ShardTask[T]) -> Result:
-        return write_shard(task, self.convert)
-
-
-def _check_arguments(name: str, workers: int, clips_per_shard: int, options: dict[str, Any]) -> None:
-    if not _NAME.fullmatch(name):
-        raise UserError(f"dataset name '{name}': use letters, digits, '-' and '_' only")
-    if workers < 1 or clips_per_shard < 1:
-        raise UserError(f"workers ({workers}) and clips per shard ({clips_per_shard}) must be at least 1")
+def _check_arguments(facts: DatasetFacts, how: WriteOptions) -> None:
+    if not _NAME.fullmatch(facts.name):
+        raise UserError(f"dataset name '{facts.name}': use letters, digits, '-' and '_' only")
+    if how.workers < 1 or how.clips_per_shard < 1:
+        raise UserError(
+            f"workers ({how.workers}) and clips per shard ({how.clips_per_shard}) must be at least 1"
+        )
     try:
-        json.dumps(options, allow_nan=False)
+        json.dumps(facts.options, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise UserError(f"converter options must be plain JSON values: {error}") from None
 

@@ -28,6 +28,7 @@ from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features import encode
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import Caption, Config, Manifest, Split
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth import arms, legs, locomotion
@@ -332,15 +333,14 @@ def synthesize(config: SynthConfig, out: Path, workers: int = 1, progress: bool 
         out,
         [(split_of(index, config), index) for index in range(config.clips)],
         partial(make_sample, config=config),
-        name="synth",
-        layout=config.motion_layout,
-        licence=LICENCE,
-        converter="synth",
-        converter_version=CONVERTER_VERSION,
-        options=options,
-        workers=workers,
-        seed=config.seed,
-        strict=True,
-        audio=audio,
-        progress=progress,
+        DatasetFacts(
+            name="synth",
+            layout=config.motion_layout,
+            licence=LICENCE,
+            converter="synth",
+            converter_version=CONVERTER_VERSION,
+            options=options,
+            audio=audio,
+        ),
+        WriteOptions(workers=workers, seed=config.seed, strict=True, progress=progress),
     )

@@ -17,14 +17,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.datasets.text.encoder import TextEncoder
 
 SIMILARITY = "similarity"
 
@@ -74,15 +73,6 @@ class TextCache:
         if not (folder / "cache.json").exists():
             raise UserError(f"{folder}: no finished text cache here; run the text stage")
         return TextCache(folder)
-
-    @staticmethod
-    def build(
-        folder: Path | str, captions: Iterable[str], encoder: TextEncoder, progress: bool = True
-    ) -> TextCache:
-        """`build_text_cache` in this process, with an encoder that is loaded already."""
-        from motionloom.datasets.text.build import build_with_encoder  # which needs this module
-
-        return build_with_encoder(Path(folder), captions, encoder, progress)
 
     def __len__(self) -> int:
         return len(self._keys)

@@ -1,10 +1,13 @@
-"""Noise schedules and samplers: all of them diffusers' own, built from one config."""
+"""Noise schedules and samplers: all of them diffusers' own, built from one config.
+
+diffusers takes seconds to import, so each is imported where it is built: a command that lists or plans stages
+starts without it.
+"""
 
 from __future__ import annotations
 
 from typing import Any, Literal
 
-from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from pydantic import Field
 
 from motionloom.datasets.schema import Config, UserError
@@ -33,6 +36,8 @@ class ScheduleConfig(Config):
 
     def noiser(self) -> Any:
         """For training: `add_noise`. Motion is not bounded, so nothing is clipped."""
+        from diffusers import DDPMScheduler
+
         return DDPMScheduler(clip_sample=False, **self.arguments())  # type: ignore[no-untyped-call]
 
     def sampler(self, kind: Sampler, steps: int) -> Any:
@@ -45,10 +50,14 @@ class ScheduleConfig(Config):
         if kind == "ddpm":
             made = self.noiser()
         elif kind == "ddim":
+            from diffusers import DDIMScheduler
+
             made = DDIMScheduler(  # type: ignore[no-untyped-call]
                 clip_sample=False, set_alpha_to_one=True, **self.arguments()
             )
         else:
+            from diffusers import DPMSolverMultistepScheduler
+
             made = DPMSolverMultistepScheduler(  # type: ignore[no-untyped-call]
                 algorithm_type="dpmsolver++", **self.arguments()
             )

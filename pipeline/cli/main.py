@@ -118,6 +118,14 @@ def generate(
     face: Annotated[
         list[str] | None, typer.Option("--face", help="What the face does, one for each caption.")
     ] = None,
+    audio: Annotated[
+        list[Path] | None,
+        typer.Option("--audio", help="A wav, flac, mp3 or ogg file to move to; beside a caption, both."),
+    ] = None,
+    script: Annotated[
+        Path | None, typer.Option("--script", help="YAML: segments of text and music, one motion.")
+    ] = None,
+    samples: Annotated[int, typer.Option(help="Motions of each caption, sound or script.")] = 1,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("motions"),
     formats: Annotated[
         str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html.")
@@ -145,9 +153,11 @@ def generate(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Motions from captions, as npz, BVH, MP4 and one page to watch.
+    """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch.
 
     Example: `motionloom generate runs/humantomato-tiny "a person waves" --face "a happy face" -o out`
+
+    Example: `motionloom generate runs/ude-tiny --audio song.ogg --samples 3 -o dances`
     """
     from motionloom.pipeline.runs.api import generate_motions
 
@@ -156,6 +166,9 @@ def generate(
         run_folder,
         captions or [],
         face_captions=face,
+        audio=audio or [],
+        script=script,
+        samples=samples,
         out=out,
         formats=formats,
         seconds=seconds,

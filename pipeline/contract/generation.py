@@ -18,6 +18,7 @@ from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.store.text import TextSource
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -97,6 +98,11 @@ class MotionGenerator(Protocol):
     @property
     def modalities(self) -> frozenset[str]:
         """The modalities it can be conditioned on."""
+        ...
+
+    @property
+    def text(self) -> TextSource | None:
+        """What encodes its words; None where it takes none."""
         ...
 
     @property

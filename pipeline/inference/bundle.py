@@ -17,11 +17,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.sampling import sample_seeds
-from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator, Prompt
+from motionloom.pipeline.contract.generation import (
+    DrivenGenerator,
+    GenerationRequest,
+    MotionGenerator,
+    Prompt,
+    Stretch,
+)
 from motionloom.pipeline.contract.lookup import finished_stages, generators_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CPU, Finished, Shelf
@@ -36,6 +43,8 @@ from motionloom.pipeline.inference.requests import (
     require_words,
     sampling_of,
 )
+from motionloom.pipeline.inference.script import DrivenSegment, sound_of
+from motionloom.pipeline.render.score import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 
 if TYPE_CHECKING:
@@ -57,6 +66,8 @@ class GeneratedMotion:
     face: NDArray[np.float32] | None
     """Expression [T, 50], or None where the model makes no face."""
     layout: MotionLayout
+    segments: tuple[Segment, ...] = ()
+    """What drove which seconds, of a motion made from a script."""
 
     @property
     def caption(self) -> str:
@@ -110,8 +121,7 @@ class Bundle:
 
     def _encoder(self, stage: Finished) -> PromptEncoder:
         if stage.name not in self._encoders:
-            given = self.shelf.given(stage.inputs)
-            self._encoders[stage.name] = PromptEncoder(given.get("text"), self.shelf.device)
+            self._encoders[stage.name] = PromptEncoder(self.of(stage).text, self.shelf.device)
         return self._encoders[stage.name]
 
     @cached_property
@@ -201,6 +211,94 @@ class Bundle:
             out.update(zip(rows, made, strict=True))
         return [out[row] for row in range(len(prompts))]
 
+    def perform(
+        self,
+        segments: Sequence[DrivenSegment],
+        *,
+        samples: int = 1,
+        seed: int = 0,
+        sampling: SamplingConfig | Mapping[str, Any] | None = None,
+    ) -> list[GeneratedMotion]:
+        """One motion driven by segments of text and music in turn, and other samples of it (`script.py`)."""
+        sampling, generator, fps = sampling_of(sampling), self.generator, self.layout.fps
+        require_seed(seed)
+        if not isinstance(generator, DrivenGenerator):
+            raise UserError(
+                f"this model ({generator.method}) makes a motion of one prompt; scripts need a UDE model"
+            )
+        require_driven(generator, [segment.prompt for segment in segments])
+        frames = []
+        for number, segment in enumerate(segments):
+            units = round(segment.seconds * fps / generator.unit_frames)
+            if units < 1:
+                raise UserError(
+                    f"segments.{number} ('{segment.label}') lasts {segment.seconds:g} s; the shortest this "
+                    f"model makes is {generator.unit_frames / fps:.2g} s"
+                )
+            frames.append(units * generator.unit_frames)
+        seeds = sample_seeds(seed, 2 * samples)
+        stretches = [
+            Stretch(
+                self._repeated(self.main, segment.prompt, segment.prompt.text, samples), [count] * samples
+            )
+            for segment, count in zip(segments, frames, strict=True)
+        ]
+        body = generator.drive(stretches, seeds[:samples], sampling)
+        faces = self._faces(segments, frames, seeds[samples:], sampling)
+        starts = np.concatenate([[0], np.cumsum(frames)]) / fps
+        bands = tuple(
+            Segment(float(a), float(b), s.label, "text" if s.prompt.sound is None else "music")
+            for s, a, b in zip(segments, starts, starts[1:], strict=False)
+        )
+        sound = sound_of(list(zip(segments, frames, strict=True)), fps)
+        words = "; ".join(segment.label for segment in segments)
+        return [
+            self._motion(Prompt(text=words, sound=sound), motion, face, bands)
+            for motion, face in zip(body, faces, strict=True)
+        ]
+
+    def _repeated(self, stage: Finished, prompt: Prompt, words: str, count: int) -> Conditions:
+        """The conditions of one prompt, encoded once, for `count` rows."""
+        once = self._encoder(stage).encode([prompt], [words], self.of(stage).modalities, self.layout.fps)
+        return {
+            name: Condition(
+                features.expand(count, -1, -1),
+                mask.expand(count, -1),
+                None if pooled is None else pooled.expand(count, -1),
+            )
+            for name, (features, mask, pooled) in once.items()
+        }
+
+    def _faces(
+        self,
+        segments: Sequence[DrivenSegment],
+        frames: Sequence[int],
+        seeds: Sequence[int],
+        sampling: SamplingConfig,
+    ) -> list[NDArray[np.float32] | None]:
+        """The expressions of a script, segment after segment; None where the model has no face generator."""
+        stage = self.choose_face(sampling.face_model)
+        if stage is None:
+            return [None] * len(seeds)
+        made = []
+        for segment, count in zip(segments, frames, strict=True):
+            conditions = self._repeated(stage, segment.prompt, segment.prompt.words, len(seeds))
+            request = GenerationRequest(conditions, [count] * len(seeds), seeds, sampling)
+            made.append(self.of(stage).generate(request))
+        return [np.concatenate(pieces) for pieces in zip(*made, strict=True)]
+
+    def _motion(
+        self,
+        prompt: Prompt,
+        motion: NDArray[np.float32],
+        face: NDArray[np.float32] | None,
+        segments: tuple[Segment, ...] = (),
+    ) -> GeneratedMotion:
+        features, with_it = _split(motion, self.generator, self.layout)
+        joints = decode(features, joint_layout(self.layout))
+        expression = with_it if face is None else face
+        return GeneratedMotion(prompt, features, joints, expression, self.layout, segments)
+
     def _batch(
         self,
         prompts: list[Prompt],
@@ -223,12 +321,7 @@ class Bundle:
             )
             # The face takes the body's length, so that both share one time line.
             face = maker.generate(GenerationRequest(words, [len(m) for m in body], seeds[1], sampling))
-        out = []
-        for prompt, motion, own in zip(prompts, body, face, strict=True):
-            features, with_it = _split(motion, generator, layout)
-            joints = decode(features, joint_layout(layout))
-            out.append(GeneratedMotion(prompt, features, joints, with_it if own is None else own, layout))
-        return out
+        return [self._motion(*row) for row in zip(prompts, body, face, strict=True)]
 
     def _frames(self, seconds: float | Sequence[float] | None, prompts: Sequence[Prompt]) -> list[int | None]:
         """Length of each motion in frames; None where the model decides."""

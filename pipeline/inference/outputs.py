@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.kinematics import joints_to_rotations
 from motionloom.datasets.schema import UserError
@@ -18,7 +19,7 @@ from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
-from motionloom.pipeline.store.files import atomic, require_folder
+from motionloom.pipeline.store.files import require_folder
 
 Format = Literal["npz", "bvh", "mp4", "html"]
 FORMATS: tuple[Format, ...] = ("npz", "bvh", "mp4", "html")
@@ -104,7 +105,7 @@ def write_npz(path: Path, motion: GeneratedMotion, seed: int) -> Path:
     arrays: dict[str, Any] = {"joints": motion.joints.astype(np.float32), "features": motion.features}
     if motion.face is not None:
         arrays["face"] = motion.face
-    with atomic(path) as temporary, temporary.open("wb") as file:
+    with atomic_file(path) as file:
         np.savez_compressed(file, metadata=np.array(json.dumps(facts)), **arrays)
     return path
 

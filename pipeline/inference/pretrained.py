@@ -23,6 +23,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.inference.exported import BUNDLE_FILE, write_exported
+from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.weights import LayoutFacts
@@ -84,6 +85,24 @@ class MotionModel(
             captions, face_captions=face_captions, sounds=sounds, seconds=seconds, seed=seed,
             sampling=sampling, strict=True,
         )  # fmt: skip
+
+    def perform(
+        self,
+        script: Path | str | Script,
+        *,
+        samples: int = 1,
+        seed: int = 0,
+        sampling: SamplingConfig | Mapping[str, Any] | None = None,
+    ) -> list[GeneratedMotion]:
+        """One motion driven by a script of text and music in turn, and `samples` - 1 others of it.
+
+        `script` is a file, or a `Script` whose sound files are seen from the current folder.
+        """
+        if isinstance(script, Script):
+            segments = script.open(Path())
+        else:
+            segments = Script.read(Path(script)).open(Path(script).parent)
+        return self.bundle.perform(segments, samples=samples, seed=seed, sampling=sampling)
 
     def _save_pretrained(self, save_directory: Path) -> None:
         """Copy all that `generate` needs into the folder."""

@@ -24,7 +24,7 @@ from motionloom.datasets.base.files import write_json
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.schema import Config, Manifest, UserError
-from motionloom.datasets.shards.tasks import Part
+from motionloom.datasets.shards.options import Part
 
 Step = Literal["features", "shards", "manifest"]
 

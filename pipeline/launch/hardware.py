@@ -24,6 +24,10 @@ class Hardware(Config):
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: int = Field(0, ge=0)
     """Processes on this node; 0 means every visible GPU, or one process on a CPU."""
+    cpu_devices: int = Field(1, ge=1)
+    """Processes on this node where `devices` is 0 and it trains on a CPU, at most one for each core that this
+    process may use. Small networks train nearly twice as fast in two processes of one thread as in one
+    process of two: the threads wait for each other at every operation, the processes once a step."""
     nodes: int = Field(1, ge=1)
     workers: int = Field(0, ge=0)
     """Loader worker processes per rank."""
@@ -58,7 +62,7 @@ class Hardware(Config):
         if "RANK" in os.environ and "LOCAL_WORLD_SIZE" in os.environ:  # torchrun has decided
             return int(os.environ["LOCAL_WORLD_SIZE"])
         if self.resolved_accelerator() == "cpu":
-            return 1
+            return min(self.cpu_devices, usable_cores())
         if torch.cuda.device_count() == 0:
             raise UserError(
                 "hardware.accelerator is gpu and no GPU is here; set hardware.devices to plan for another "
@@ -90,6 +94,13 @@ class Hardware(Config):
                 f"CPU{why}, {count} process{'es' if count > 1 else ''} x {torch.get_num_threads()} threads"
             )
         return where + (f", {nodes} nodes" if nodes > 1 else "")
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def choose_device(choice: str | torch.device) -> torch.device:

@@ -199,8 +199,8 @@ def _steps(conversion: Conversion[Any], tasks: int, clips_per_shard: int) -> lis
     if not shards:
         raise UserError(f"{conversion.plan.name}: no clip to convert; see the reasons with --plan")
     steps: list[tuple[Step, int]] = [("shards", min(tasks, shards)), ("manifest", 1)]
-    if conversion.first is not None:
-        steps.insert(0, ("features", min(tasks, len(conversion.first.batches))))
+    if conversion.features is not None:
+        steps.insert(0, ("features", min(tasks, len(conversion.features.batches))))
     return steps
 
 

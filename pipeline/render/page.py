@@ -13,9 +13,9 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.charts import Line, bar_chart, histogram, line_chart, ranking
-from motionloom.pipeline.render.files import write_text
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
     fill,

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from motionloom.datasets.base.files import write_bytes
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of
 from motionloom.pipeline.render.figure import Figure, figure_for
-from motionloom.pipeline.render.files import write_bytes
 from motionloom.pipeline.render.lettering import font, wrap
 from motionloom.pipeline.render.raster import Pose, draw_pose, halve
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of, smooth_path
 from motionloom.pipeline.render.figure import figure_for
-from motionloom.pipeline.render.files import part_path
 from motionloom.pipeline.render.lettering import font, wrap
 from motionloom.pipeline.render.raster import SKY, Pose, draw_ground, draw_pose, halve
 from motionloom.pipeline.render.sound import RATE, Soundtrack, film_sound
@@ -45,34 +46,34 @@ def write_mp4(
 
     width, height = (side + side % 2 for side in size)
     frames = render_frames(joints, skeleton, fps, caption, size=(width, height), view=view, follow=follow)
-    part, wav = part_path(path), part_path(path.with_suffix(".wav"))
-    writer = imageio_ffmpeg.write_frames(
-        str(part),
-        (width, height),
-        fps=fps,
-        codec="libx264",
-        pix_fmt_out="yuv420p",
-        macro_block_size=2,
-        output_params=["-preset", "veryfast", "-crf", "20", "-movflags", "+faststart"]
-        + ([] if sound is None else ["-ar", str(RATE), "-b:a", "128k"]),
-        audio_path=None if sound is None else str(wav),
-        audio_codec=None if sound is None else "aac",
-        ffmpeg_log_level="error",
-    )
-    try:
-        if sound is not None:
-            wav.write_bytes(film_sound(sound, len(joints) / fps))
-        writer.send(None)  # starts ffmpeg, which opens the WAV
-        for done, frame in enumerate(frames, start=1):
-            writer.send(frame.tobytes())
-            if progress is not None:
-                progress(done, len(joints))
-        writer.close()
-        part.replace(path)
-    finally:
-        writer.close()
-        part.unlink(missing_ok=True)
-        wav.unlink(missing_ok=True)
+    # Named, because the temporary file's ending does not say it.
+    form = ["-f", "mp4", "-movflags", "+faststart"]
+    with atomic_path(path) as temporary:
+        wav = temporary.with_suffix(".wav")
+        writer = imageio_ffmpeg.write_frames(
+            str(temporary),
+            (width, height),
+            fps=fps,
+            codec="libx264",
+            pix_fmt_out="yuv420p",
+            macro_block_size=2,
+            output_params=["-preset", "veryfast", "-crf", "20", *form]
+            + ([] if sound is None else ["-ar", str(RATE), "-b:a", "128k"]),
+            audio_path=None if sound is None else str(wav),
+            audio_codec=None if sound is None else "aac",
+            ffmpeg_log_level="error",
+        )
+        try:
+            if sound is not None:
+                wav.write_bytes(film_sound(sound, len(joints) / fps))
+            with closing(writer):
+                writer.send(None)  # starts ffmpeg, which opens the WAV
+                for done, frame in enumerate(frames, start=1):
+                    writer.send(frame.tobytes())
+                    if progress is not None:
+                        progress(done, len(joints))
+        finally:
+            wav.unlink(missing_ok=True)
 
 
 def render_frames(

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.figure import Figure, figure_for
-from motionloom.pipeline.render.files import write_text
 from motionloom.pipeline.render.score import Segments, score_data
 from motionloom.pipeline.render.sound import Playing, Soundtrack, embed_sounds
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-import yaml
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
@@ -18,6 +17,7 @@ from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.outputs import Format, write_motions
 from motionloom.pipeline.inference.pretrained import write_bundle
 from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
+from motionloom.pipeline.inference.script import Script, read_music
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.runs.graph import (
     Selection,
@@ -33,6 +33,7 @@ from motionloom.pipeline.runs.recipe import Recipe, load_recipe, nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
+from motionloom.pipeline.store.yaml import read_yaml
 
 
 def run_recipe(
@@ -92,8 +93,8 @@ def _require_same_recipe(run: Path, name: str) -> None:
     """Never replace the stages of another recipe's run unasked."""
     path = run / "recipe.yaml"
     try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
-    except (yaml.YAMLError, UnicodeDecodeError):
+        found = read_yaml(path) if path.is_file() else None
+    except UserError:
         return  # it is about to be written anew
     if isinstance(found, dict) and found.get("name", name) != name:
         raise UserError(
@@ -122,9 +123,12 @@ def _say_estimate(recipe: Recipe, console: Console) -> None:
 
 def generate_motions(
     folder: Path,
-    captions: Sequence[str],
+    captions: Sequence[str] = (),
     *,
     face_captions: Sequence[str] | None = None,
+    audio: Sequence[Path] = (),
+    script: Path | None = None,
+    samples: int = 1,
     out: Path,
     formats: str = "npz,bvh,mp4,html",
     seconds: float | None = None,
@@ -133,9 +137,17 @@ def generate_motions(
     device: str = "auto",
     console: Console,
 ) -> list[Path]:
-    """Generate and write; returns the paths. `device`: auto, cpu, cuda or cuda:N."""
-    if not captions:
+    """Generate and write; returns the paths. `device`: auto, cpu, cuda or cuda:N.
+
+    From captions, sound files, or both side by side (the first caption with the first file, and so on), or
+    from one script. `samples` motions of each.
+    """
+    if not captions and not audio and script is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
+    if script is not None and (captions or audio or seconds is not None or face_captions):
+        raise UserError("--script says everything: leave captions, --face, --audio and --seconds out")
+    if samples < 1:
+        raise UserError(f"--samples {samples}: take 1 or more")
     wanted = [f.strip() for f in formats.split(",") if f.strip()]
     for name in wanted:
         if name not in get_args(Format):
@@ -147,10 +159,21 @@ def generate_motions(
     require_seed(seed)
     require_folder(out)
     drawing = SamplingConfig.parse(sampling or {}, "sampling")
+    segments = None if script is None else Script.read(script).open(script.parent)
+    sounds = [read_music(path) for path in audio]
     bundle = Bundle.open(folder, choose_device(device))
-    motions = bundle.generate(
-        captions, face_captions=face_captions, seconds=seconds, seed=seed, sampling=drawing, strict=True
-    )
+    if segments is not None:
+        motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
+    else:
+        motions = bundle.generate(
+            [text for text in captions for _ in range(samples)] or None,
+            face_captions=face_captions and [text for text in face_captions for _ in range(samples)],
+            sounds=[sound for sound in sounds for _ in range(samples)] or None,
+            seconds=seconds,
+            seed=seed,
+            sampling=drawing,
+            strict=True,
+        )
     paths = write_motions(out, motions, wanted, title=folder.name, seed=seed)  # type: ignore[arg-type]
     for path in paths:
         console.print(str(path), soft_wrap=True)

@@ -13,7 +13,7 @@ from typing import Any
 
 from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.stages.training import TrainedStageConfig
-from motionloom.pipeline.store.files import digest
+from motionloom.pipeline.store.files import fingerprint_of
 
 
 def extendable(stage: Stage, facts: dict[str, Any]) -> dict[str, Any] | None:
@@ -22,7 +22,7 @@ def extendable(stage: Stage, facts: dict[str, Any]) -> dict[str, Any] | None:
         return None
     fields = dict(facts["config"])
     fields["train"] = {name: value for name, value in fields["train"].items() if name != "steps"}
-    return {"steps": stage.config.train.steps, "others": digest({**facts, "config": fields})}
+    return {"steps": stage.config.train.steps, "others": fingerprint_of({**facts, "config": fields})}
 
 
 def extension(stage: Stage, wanted: dict[str, Any] | None, folder: Path) -> tuple[bool, str] | None:

@@ -8,7 +8,6 @@ fingerprint and runs too.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import time
@@ -21,6 +20,8 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
 from motionloom.pipeline.contract.stage import Finished, Shelf, Stage, StageContext, fingerprint_fields
@@ -30,7 +31,7 @@ from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.extend import extendable, extension
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
-from motionloom.pipeline.store.files import digest, remove_tree, write_json, write_text
+from motionloom.pipeline.store.files import fingerprint_of, remove_tree, write_json
 from motionloom.pipeline.store.run_folder import stage_folder
 
 Action = Literal["skip", "run", "resume", "leave"]
@@ -75,7 +76,7 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
     rows: dict[str, PlannedStage] = {}
     for stage in recipe.stages:
         facts = _facts(recipe, stage, rows)
-        fingerprint, others = digest(facts), extendable(stage, facts)
+        fingerprint, others = fingerprint_of(facts), extendable(stage, facts)
         action, reason = _decide(stage, fingerprint, run, rows, forced, select)
         if action == "run" and stage.name not in forced:
             longer = extension(stage, others, stage_folder(run, stage.name))
@@ -337,13 +338,10 @@ def _lock(run: Path, needed: bool) -> Iterator[None]:
         yield
         return
     run.mkdir(parents=True, exist_ok=True)
-    with (run / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+    with file_lock(run / ".lock", wait=False) as mine:
+        if not mine:
             raise UserError(
                 f"{run}: another motionloom process is working on this run; wait for it or stop it"
-            ) from None
-        file.write(str(os.getpid()))
-        file.flush()
+            )
+        (run / ".lock").write_text(str(os.getpid()))
         yield

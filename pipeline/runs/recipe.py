@@ -18,17 +18,17 @@ import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.registry import stage_kinds
 from motionloom.pipeline.contract.stage import Every, Stage
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.runs.shipped import shipped_recipes
+from motionloom.pipeline.store.yaml import dump_yaml, load_yaml, read_yaml
 
 
 class RecipeFile(Config):
@@ -83,7 +83,7 @@ class Recipe:
             "hardware": self.hardware.dump(),
             "stages": stages,
         }
-        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+        return dump_yaml(data)
 
 
 def _written_inputs(stage: Stage) -> dict[str, Any]:
@@ -101,12 +101,6 @@ def nearest(name: str, valid: Sequence[str]) -> str:
     """A hint to append: did you mean 'x'?, or the list of valid names."""
     near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
     return f"; did you mean '{near[0]}'?" if near else f"; valid names: {', '.join(valid)}"
-
-
-def shipped_recipes() -> dict[str, Path]:
-    """Recipes that come with the package, by name."""
-    folder = Path(str(resources.files("motionloom.configs")))
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def find_recipe(name_or_path: str) -> Path:
@@ -136,12 +130,7 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Reci
 
 
 def _read(path: Path, depth: int) -> dict[str, Any]:
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not valid YAML: {error}") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+    data = read_yaml(path)
     if not isinstance(data, dict):
         raise UserError(f"{path}: a recipe is a mapping with 'name' and 'stages'")
     base = data.pop("extends", None)
@@ -176,26 +165,13 @@ def _apply(data: dict[str, Any], override: str) -> None:
         if parts[0] not in stages:
             raise UserError(f"--set {override}: no stage '{parts[0]}'{nearest(parts[0], list(stages))}")
         parts = ["stages", *parts]
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise UserError(f"--set {override}: {error}") from None
+    value = load_yaml(text, f"--set {override}")
     node = data
     for part in parts[:-1]:
         child = node.get(part)
         node[part] = dict(child) if isinstance(child, dict) else {}
         node = node[part]
-    # YAML 1.1 reads 1e-4 (no dot) as text; a number is what the user meant.
-    node[parts[-1]] = _number(value)
-
-
-def _number(value: Any) -> Any:
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            return value
-    return value
+    node[parts[-1]] = value
 
 
 def _stages(file: RecipeFile, where: str) -> tuple[Stage, ...]:
@@ -208,7 +184,7 @@ def _stages(file: RecipeFile, where: str) -> tuple[Stage, ...]:
             hint = nearest(str(kind_name), list(kinds))
             raise UserError(f"{where}: stages.{name}.kind = '{kind_name}' is no stage kind{hint}")
         kind = kinds[kind_name]
-        config = kind.config.parse(_numbers(fields), f"{where}: stages.{name}")
+        config = kind.config.parse(fields, f"{where}: stages.{name}")
         parsed.append((Stage(name, kind, config, {}), renamed))
     all_stages = [stage for stage, _ in parsed]
     out = [
@@ -239,15 +215,6 @@ def _in_order(stages: list[Stage], where: str) -> tuple[Stage, ...]:
         waiting.remove(ready)
         out.append(ready)
     return tuple(out)
-
-
-def _numbers(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _numbers(v) for k, v in value.items()}
-    # Only texts that look like 1e-4: other texts (a folder called "7") stay texts.
-    if isinstance(value, str) and value[:1].isdigit() and "e" in value:
-        return _number(value)
-    return value
 
 
 def _resolve(stage: Stage, renamed: Any, all_stages: list[Stage], where: str) -> dict[str, str]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.convert.aistpp.convert import AistppConfig
 from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.bvh.convert import BvhConfig
-from motionloom.datasets.convert.common.conversion import ConvertConfig, run_conversion
+from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.humanml3d.convert import HumanMl3dConfig
 from motionloom.datasets.convert.motionx.convert import MotionXConfig
 from motionloom.datasets.convert.table import converter_named
@@ -16,7 +18,6 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import StageConfig, StageContext
 from motionloom.pipeline.stages.data import DataStage, say_shards
 from motionloom.pipeline.store.data import SHARDS
-from motionloom.pipeline.store.files import sha256_file
 
 
 class HumanMl3dStageConfig(HumanMl3dConfig, StageConfig):
@@ -78,5 +79,5 @@ def source_facts(config: ConvertConfig) -> dict[str, Any]:
     for name in type(config).model_fields:
         path = getattr(config, name)
         if name != "source" and isinstance(path, Path) and path.expanduser().is_file():
-            steering[name] = sha256_file(path.expanduser())
+            steering[name] = sha256_of(path.expanduser())
     return {"files": files, "steering": steering}

@@ -74,6 +74,10 @@ class ShardsStage(DataStage):
 class SynthStageConfig(SynthConfig, StageConfig):
     """Synthetic whole-body shards."""
 
+    # The recipe's seed may stand for it, so a stage has one case more than the synthesizer.
+    seed: int | None = Field(None, ge=0)  # type: ignore[assignment]
+    """Of the clips; None = the recipe's seed."""
+
 
 class ShardsStageConfig(Reading, StageConfig):
     """Shards that exist already, in a folder or on a server, or a mix of several such data sets."""
@@ -114,8 +118,8 @@ class ShardsStageConfig(Reading, StageConfig):
 
 def run_synth(context: StageContext) -> None:
     """Write synthetic shards."""
-    config = context.config
-    if config.seed == 0:
+    config: SynthStageConfig = context.config
+    if config.seed is None:
         config = config.model_copy(update={"seed": context.seed})
     manifest = synthesize(config, context.folder / SHARDS, workers=context.hardware.convert_workers)
     say_shards(context, manifest)

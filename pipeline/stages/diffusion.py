@@ -25,6 +25,7 @@ from motionloom.pipeline.stages.tma import caption_batches, part_columns
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.networks import device_of
+from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
 
@@ -117,6 +118,12 @@ class DiffusionFace:
     unit_frames = 1
     max_frames = None
     part: Part = "face"
+
+    @property
+    def text(self) -> TextSource:
+        """What encodes its words."""
+        text: TextSource = self.given["text"]
+        return text
 
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
         """From noise, in as many steps as the request says."""

@@ -27,6 +27,7 @@ from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer, device_of
+from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import TokenBatches
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
@@ -247,6 +248,12 @@ class GptGenerator:
     def layout(self) -> MotionLayout:
         """Layout of whole frames."""
         return self.tokenizer.layout
+
+    @property
+    def text(self) -> TextSource:
+        """What encodes its words."""
+        text: TextSource = self.given["text"]
+        return text
 
     @property
     def part(self) -> Part:

@@ -26,6 +26,7 @@ from motionloom.pipeline.stages.examples import caption_example
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.networks import LoadedTma
+from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
 
@@ -160,6 +161,12 @@ class VaeFace:
     def layout(self) -> MotionLayout:
         """Layout of whole frames."""
         return self.tma.layout
+
+    @property
+    def text(self) -> TextSource:
+        """What encodes its words."""
+        text: TextSource = self.tma.given["text"]
+        return text
 
     @torch.no_grad()
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:

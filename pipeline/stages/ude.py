@@ -39,6 +39,7 @@ from motionloom.pipeline.stages.dmd import LoadedDmd
 from motionloom.pipeline.stages.utt import LoadedUtt
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.networks import TrainedTokenizer
+from motionloom.pipeline.store.text import TextSource
 
 
 class UdeConfig(StageConfig):
@@ -126,6 +127,11 @@ class UdeGenerator:
     def part(self) -> Part:
         """The columns that the tokenizer models."""
         return self.tokenizer.net.part
+
+    @property
+    def text(self) -> TextSource | None:
+        """What encodes its words."""
+        return self.utt.given.get("text")
 
     @property
     def modalities(self) -> frozenset[str]:

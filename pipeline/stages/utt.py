@@ -141,7 +141,7 @@ class UttStage(TrainedStage):
         audio = given["audio"] if "audio" in config.modalities else None
         columns = given["tokenizer"].columns
         dataset = data.split("train")
-        frames = {"max_frames": config.max_frames, "min_frames": config.min_frames}
+        frames: dict[str, Any] = {"max_frames": config.max_frames, "min_frames": config.min_frames}
 
         def train(batch: int, rank: int, world: int) -> Dataset[Any]:
             return ConditionBatches(

@@ -13,8 +13,9 @@ from typing import Any
 
 from pydantic import Field
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.store.files import sha256_file, write_json
+from motionloom.pipeline.store.files import write_json
 
 FILE_NAME = "artifact.json"
 
@@ -68,7 +69,7 @@ class Artifact(Config):
         for path in sorted(p for p in folder.rglob("*") if p.is_file()):
             name = path.relative_to(folder).as_posix()
             if name.split("/")[0] not in _PRIVATE and not path.name.startswith("."):
-                outputs[name] = OutputFile(bytes=path.stat().st_size, sha256=sha256_file(path))
+                outputs[name] = OutputFile(bytes=path.stat().st_size, sha256=sha256_of(path))
         done = self.model_copy(update={"outputs": outputs})
         write_json(folder / FILE_NAME, done.dump())
         return done

@@ -1,31 +1,16 @@
-"""Small file helpers: nothing is ever half-written under its final name."""
+"""Files and folders of a run: where they may be made, in which form, and how a folder is taken away."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.base import files
 from motionloom.datasets.schema import UserError
-
-
-@contextmanager
-def atomic(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; rename it into place only if the block ends well."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def require_folder(folder: Path) -> None:
@@ -42,25 +27,16 @@ def require_file_place(path: Path) -> None:
     require_folder(path.parent)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically."""
-    with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
 def write_json(path: Path, data: Any) -> None:
-    """Write JSON atomically, keys sorted, so that equal data gives equal bytes."""
-    write_text(path, json.dumps(data, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
+    """Write a record of a run atomically, keys sorted; a figure that is not finite is written as `NaN`."""
+    files.write_json(path, data, sort_keys=True, allow_nan=True)
 
 
-def sha256_file(path: Path) -> str:
-    """Checksum of one file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def fingerprint_of(data: Any) -> str:
+    """What tells one set of settings and inputs from another: sha256 of plain JSON data, hex.
 
-
-def digest(data: Any) -> str:
-    """Checksum of plain JSON data."""
+    Kept apart from `sha256_of_json`: it goes by the characters, not their escapes, and finished runs hold it.
+    """
     text = json.dumps(data, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 

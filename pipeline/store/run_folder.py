@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.store.yaml import read_yaml
 
 
 def stage_folder(run: Path, name: str) -> Path:
@@ -19,10 +18,7 @@ def stages_of(run: Path) -> dict[str, dict[str, Any]]:
     """The stages of a run's resolved recipe, as they are written there."""
     require_run(run)
     path = run / "recipe.yaml"
-    try:
-        recipe = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
+    recipe = read_yaml(path)
     stages = recipe.get("stages") if isinstance(recipe, dict) else None
     if not isinstance(stages, dict) or not all(isinstance(e, dict) and "kind" in e for e in stages.values()):
         raise UserError(f"{path}: holds no stages; run the recipe again into this folder")

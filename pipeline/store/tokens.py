@@ -23,11 +23,11 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.order import Source
 from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences, stream_names
-from motionloom.pipeline.store.files import atomic
 
 Codes = dict[str, Tensor]
 
@@ -75,7 +75,7 @@ class TokenStore:
         tensors = {f"codes.{name}": flat.to(torch.int32) for name, flat in self.codes.items()}
         tensors["starts"] = torch.from_numpy(self.starts)
         tensors["whole"] = torch.from_numpy(self.whole)
-        with atomic(path) as temporary:
+        with atomic_path(path) as temporary:
             temporary.write_bytes(save(tensors))
 
     @staticmethod

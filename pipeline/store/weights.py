@@ -10,9 +10,10 @@ from pydantic import Field, PrivateAttr
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
+from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.store.files import atomic, write_json
+from motionloom.pipeline.store.files import write_json
 
 Fact = TypeVar("Fact")
 
@@ -63,7 +64,7 @@ class ModelFacts(Config):
 def save_model(folder: Path, net: torch.nn.Module, facts: ModelFacts) -> None:
     """Write weights and facts; the facts last."""
     state = {k: v.detach().contiguous().cpu() for k, v in net.state_dict().items()}
-    with atomic(folder / "model.safetensors") as temporary:
+    with atomic_path(folder / "model.safetensors") as temporary:
         temporary.write_bytes(save(state))
     write_json(folder / "model.json", facts.dump())
 

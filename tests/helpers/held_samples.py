@@ -9,6 +9,7 @@ import numpy as np
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import FACE, HANDS, Caption, Split
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 
@@ -42,7 +43,10 @@ class Convert:
 def write(out: Path, garbage: float = 0.0, held: tuple[int, ...] = (3, 1, 2, 0, 3)) -> Path:
     items: list[tuple[Split, int]] = [("test" if i % 4 == 3 else "train", i) for i in range(COUNT)]
     write_dataset(
-        out, items, Convert(held, garbage), name="held", layout=LAYOUT, licence="CC0", converter="test",
-        converter_version=1, options={}, clips_per_shard=5, progress=False,
-    )  # fmt: skip
+        out,
+        items,
+        Convert(held, garbage),
+        DatasetFacts("held", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
+        WriteOptions(clips_per_shard=5, progress=False),
+    )
     return out

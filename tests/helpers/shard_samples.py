@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Manifest, Split
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import DropClip, Sample
 from motionloom.datasets.shards.writer import write_dataset
 
@@ -64,15 +66,16 @@ class Convert:
         return clip(i)
 
 
-def write(out: Path, count: int = 60, convert: Convert | None = None, **changes: object) -> Manifest:
-    options = {
-        "name": "made",
-        "layout": LAYOUT,
-        "licence": "CC0",
-        "converter": "test",
-        "converter_version": 1,
-        "options": {"size": count},
-        "clips_per_shard": 8,
-        "progress": False,
-    }
-    return write_dataset(out, items(count), convert or Convert(), **{**options, **changes})
+def facts(**changes: Any) -> DatasetFacts:
+    return replace(
+        DatasetFacts("made", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
+        **changes,
+    )
+
+
+def write(out: Path, count: int = 60, convert: Convert | None = None, **changes: Any) -> Manifest:
+    """Write clips; `changes` are fields of `DatasetFacts` or of `WriteOptions`."""
+    about = {key: changes.pop(key) for key in list(changes) if key in DatasetFacts.__dataclass_fields__}
+    how = WriteOptions(**{"clips_per_shard": 8, "progress": False, **changes})
+    given = facts(**{"options": {"size": count}, **about})
+    return write_dataset(out, items(count), convert or Convert(), given, how)

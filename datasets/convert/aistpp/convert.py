@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_features
 from motionloom.datasets.audio.sound import read_sound, resample_sound
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.aistpp.plan import (
     FPS,
@@ -37,7 +38,7 @@ from motionloom.datasets.convert.aistpp.plan import (
     genre_of,
     plan_aistpp,
 )
-from motionloom.datasets.convert.common.conversion import Conversion, digest
+from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.motion.canonical import canonicalize, facing, resample, resample_quaternions
@@ -69,22 +70,21 @@ _KEPT_PIECES = 64
 
 
 def prepare_aistpp(config: AistppConfig, *, workers: int = 1, progress: bool = False) -> Conversion[AistClip]:
-    """Look at the whole source; everything is told, nothing is converted yet."""
+    """Look at the whole source and decide what becomes of every file; nothing is converted yet."""
     body, settings = body_of(config.body_model, "smpl22"), audio_settings(config)
     plan = plan_aistpp(config, progress=progress)
-    told = []
+    content = []
     for _, clip in plan.items:
         size = (config.source / clip.label()).stat().st_size
         sound = (config.sound_folder / clip.sound).stat().st_size if clip.sound else 0
-        told.append([clip.id, clip.split, clip.used, size, clip.sound, sound])
+        content.append([clip.id, clip.split, clip.used, size, clip.sound, sound])
     options = config.options("splits", "ignore_list", "music_folder")
-    options |= {"body_model": body.statement, "source_sha256": digest(told)}
+    options |= {"body_model": body.statement, "source_sha256": sha256_of_json(content)}
     options["audio_version"] = VERSION if settings else None
     return Conversion(
         config=config,
         plan=plan,
         convert=partial(convert_clip, config, body),
-        describe=AistClip.label,
         licence=config.licence or (MUSIC_LICENCE if config.stores_music else MOTION_LICENCE),
         converter=CONVERTER,
         version=CONVERTER_VERSION,

@@ -1,4 +1,4 @@
-"""The lists of AIST++: cross-modal splits and bad sequences, with the dirt they have in circulation.
+"""The lists of AIST++: cross-modal splits and bad sequences, with the defects of the copies in circulation.
 
 Blank lines, spaces at line ends, missing last newlines, and `.json` or `.pkl` after the names are fine.
 """
@@ -47,8 +47,8 @@ def read_lists(
             absent.append(paths[0].name)
             continue
         files.append(path)
-        sequences, told = read_sequences(path)
-        notes += told
+        sequences, found_notes = read_sequences(path)
+        notes += found_notes
         for sequence in sequences:
             if sequence in found:
                 raise UserError(
@@ -64,8 +64,8 @@ def read_lists(
     ignored: list[str] = []
     if ignore_list.is_file():
         files.append(ignore_list)
-        ignored, told = read_sequences(ignore_list)
-        notes += told
+        ignored, found_notes = read_sequences(ignore_list)
+        notes += found_notes
     elif ignore_required:
         raise UserError(f"{ignore_list}: no such file")
     else:

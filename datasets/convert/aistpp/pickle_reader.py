@@ -150,7 +150,7 @@ def _plain(data: Any) -> dict[str, Any]:
 
 
 class _Refused(Exception):  # noqa: N818 (a decision, not an error)
-    """What a file asks for and does not get."""
+    """What a file asks for and is refused."""
 
 
 def _check_opcodes(raw: bytes) -> None:

@@ -1,4 +1,4 @@
-"""AIST++ conversion, first step: options, and a plan of what becomes of every file of the source.
+"""AIST++ conversion, planning: options, and a plan of what becomes of every file of the source.
 
 Every annotation that is not left out anyway is read (a file is small, and only its content says how long it
 is and whether it can be used); of the music only the headers are.
@@ -19,10 +19,10 @@ from rich.progress import track
 from motionloom.datasets.audio.sound import sound_seconds
 from motionloom.datasets.convert.aistpp.lists import SequenceLists, read_lists
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.common.conversion import ConvertConfig, count_licences, drop, limited
+from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import inside
-from motionloom.datasets.convert.common.plan import ConversionPlan, Subset, frames_by_split
+from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset, drop
 from motionloom.datasets.convert.common.splits import hash_split
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Dropped, Split, UserError
@@ -159,24 +159,22 @@ def plan_aistpp(config: AistppConfig, *, progress: bool = False) -> ConversionPl
     )
     music = _find_music(config)
     names = sorted(path.name for path in folder.iterdir() if path.suffix == ".pkl" and path.name[0] != ".")
-    items: list[tuple[Split, AistClip]] = []
-    dropped: list[Dropped] = []
-    broken: list[Dropped] = list(music.broken)
+    draft: PlanDraft[AistClip] = PlanDraft(config, broken=list(music.broken))
     cut = 0
     for name in track(names, "reading the source", disable=not progress):
         label = f"{MOTIONS}/{name}"
         try:
             found = _decide(config, lists, music, name.removesuffix(".pkl"), label)
         except UserError as error:
-            broken.append(drop(label, error))
+            draft.fail(label, error)
             continue
         if isinstance(found, str):
-            dropped.append(Dropped(source=label, reason=found))
+            draft.leave_out(label, found)
             continue
         cut += found.used < found.frames
-        items.append((found.split, found))
-    notes = [*lists.notes, *_notes(config, music, items, cut)]
-    items = limited(items, AistClip.label, config.limit, notes)
+        draft.take(found)
+    draft.notes += [*lists.notes, *_notes(config, music, draft.items, cut)]
+    draft.limit(AistClip.label)
 
     present = {name.removesuffix(".pkl") for name in names}
     missing = {
@@ -184,21 +182,14 @@ def plan_aistpp(config: AistppConfig, *, progress: bool = False) -> ConversionPl
         for sequence, split in lists.splits.items()
         if sequence not in present and sequence not in lists.ignored
     }
-    return ConversionPlan(
-        name=f"{config.source.name} -> {config.name}",
-        items=items,
-        frames=frames_by_split((split, frames_after(clip.used, FPS, layout)) for split, clip in items),
+    for sequence, split in missing.items():
+        draft.miss(f"{MOTIONS}/{sequence}.pkl", f"listed in split '{split}', but not here")
+    return draft.finish(
         found=len(names),
-        missing=[
-            Dropped(source=f"{MOTIONS}/{sequence}.pkl", reason=f"listed in split '{split}', but not here")
-            for sequence, split in missing.items()
-        ],
-        dropped=dropped,
-        broken=broken,
+        frames=lambda clip: frames_after(clip.used, FPS, layout),
+        licence=lambda clip: clip.licence,
         ignored=_count_ignored(config, lists, music),
-        notes=notes,
-        subsets=_subsets(present, lists, missing, items),
-        licences=count_licences([clip.licence for _, clip in items]),
+        subsets=_subsets(present, lists, missing, draft.items),
     )
 
 
@@ -259,7 +250,7 @@ def _find_music(config: AistppConfig) -> _Music:
 
 
 def _notes(config: AistppConfig, music: _Music, items: list[tuple[Split, AistClip]], cut: int) -> list[str]:
-    """What a user should know about music, beside single files."""
+    """What a user should know about the music as a whole."""
     notes = []
     if cut:
         notes.append(f"{cut} sequences end with their music, at most {config.max_music_gap:g} s early")

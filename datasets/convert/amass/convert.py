@@ -19,9 +19,10 @@ from typing import cast
 
 import numpy as np
 
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.amass.plan import AmassClip, plan_amass
 from motionloom.datasets.convert.amass.source import LICENCE, AmassConfig
-from motionloom.datasets.convert.common.conversion import Conversion, digest
+from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.common.smpl_npz import read_motion
 from motionloom.datasets.motion.canonical import mirror
@@ -56,7 +57,7 @@ def prepare_amass(config: AmassConfig, *, workers: int = 1, progress: bool = Fal
     bodies = bodies or {"neutral": BodyModel.neutral(skeleton)}
     statements = {gender: body.statement for gender, body in bodies.items()}
     plan.notes.extend(sorted({str(statement["sentence"]) for statement in statements.values()}))
-    told = [
+    content = [
         [clip.label(), clip.file.size, clip.first, clip.last, [caption.dump() for caption in clip.texts]]
         for _, clip in plan.items
     ]
@@ -66,11 +67,10 @@ def prepare_amass(config: AmassConfig, *, workers: int = 1, progress: bool = Fal
         config=config,
         plan=plan,
         convert=ClipMaker(config, bodies),
-        describe=AmassClip.label,
         licence=config.licence or LICENCE,
         converter=CONVERTER,
         version=CONVERTER_VERSION,
-        options=options | {"source_sha256": digest(told)},
+        options=options | {"source_sha256": sha256_of_json(content)},
     )
 
 

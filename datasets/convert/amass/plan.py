@@ -1,4 +1,4 @@
-"""AMASS conversion, first step: a plan of what becomes of every file of the source.
+"""AMASS conversion, planning: a plan of what becomes of every file of the source.
 
 Files that may be used are opened, but only for their headers and a few scalars.
 """
@@ -20,10 +20,9 @@ from motionloom.datasets.convert.amass.source import (
     read_headers,
 )
 from motionloom.datasets.convert.common.captions import CaptionTable, read_captions
-from motionloom.datasets.convert.common.conversion import count_licences, limited
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
-from motionloom.datasets.convert.common.plan import ConversionPlan, Subset, frames_by_split
+from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset
 from motionloom.datasets.convert.common.smpl_npz import MotionHeader
 from motionloom.datasets.convert.common.splits import (
     hash_split,
@@ -32,7 +31,7 @@ from motionloom.datasets.convert.common.splits import (
     read_split_files,
 )
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import Caption, Dropped, Split, UserError
+from motionloom.datasets.schema import Caption, Split, UserError
 
 _NOTED_LINES = 50
 """Wrong caption lines that are noted one by one."""
@@ -64,17 +63,9 @@ class AmassClip:
 
 
 @dataclass
-class _Plan:
-    """What the plan collects."""
-
-    items: list[tuple[Split, AmassClip]] = field(default_factory=list)
-    missing: list[Dropped] = field(default_factory=list)
+class _Draft(PlanDraft[AmassClip]):
     missing_in: Counter[str] = field(default_factory=Counter)
     """Missing clips a subset."""
-    dropped: list[Dropped] = field(default_factory=list)
-    broken: list[Dropped] = field(default_factory=list)
-    uncaptioned: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
 
 
 def plan_amass(
@@ -84,15 +75,15 @@ def plan_amass(
     layout = config.motion_layout()
     files, others, broken = list_files(config.source)
     listed, notes = read_split_files(config.splits) if config.splits else ({}, [])
-    plan = _Plan(broken=broken, notes=notes)
+    draft = _Draft(config, broken=broken, notes=notes)
     if config.humanml_index is not None:
-        clips = _index_clips(config, config.humanml_index, files, listed, plan, workers, progress)
+        clips = _index_clips(config, config.humanml_index, files, listed, draft, workers, progress)
     else:
-        clips = _whole_clips(config, files, listed, plan, workers, progress)
+        clips = _whole_clips(config, files, listed, draft, workers, progress)
     captioned = config.captions is not None or config.humanml_texts is not None
     for clip, reason in clips:
         if captioned and not clip.texts:
-            plan.uncaptioned.append(clip.label())
+            draft.uncaptioned.append(clip.label())
             if config.uncaptioned == "drop":
                 reason = reason or "no captions"
         if config.splits is not None and clip.id not in listed:
@@ -104,25 +95,16 @@ def plan_amass(
             or config.length_problem(clip.seconds)
         )
         if reason:
-            plan.dropped.append(Dropped(source=clip.label(), reason=reason))
+            draft.leave_out(clip.label(), reason)
         else:
-            plan.items.append((clip.split, clip))
-    items = limited(plan.items, AmassClip.label, config.limit, plan.notes)
-    return ConversionPlan(
-        name=f"{config.source.name} -> {config.name}",
-        items=items,
-        frames=frames_by_split(
-            (split, frames_after(clip.last - clip.first, clip.fps, layout)) for split, clip in items
-        ),
+            draft.take(clip)
+    draft.limit(AmassClip.label)
+    return draft.finish(
         found=len(files),
-        missing=plan.missing,
-        uncaptioned=plan.uncaptioned,
-        dropped=plan.dropped,
-        broken=plan.broken,
+        frames=lambda clip: frames_after(clip.last - clip.first, clip.fps, layout),
+        licence=lambda clip: config.licence or LICENCE,
         ignored=others,
-        notes=plan.notes,
-        subsets=_subsets(files, items, plan.missing_in),
-        licences=count_licences([config.licence or LICENCE] * len(items)),
+        subsets=_subsets(files, draft.items, draft.missing_in),
     )
 
 
@@ -130,18 +112,18 @@ def _whole_clips(
     config: AmassConfig,
     files: list[AmassFile],
     listed: Mapping[str, Split],
-    plan: _Plan,
+    draft: _Draft,
     workers: int,
     progress: bool,
 ) -> list[tuple[AmassClip, str]]:
     """Every file as one clip, with the reason against it if there is one already."""
     headers, broken = read_headers(files, workers, progress)
-    plan.broken += broken
+    draft.broken += broken
     table = read_captions(config.captions) if config.captions else CaptionTable({}, {})
     clips: list[tuple[AmassClip, str]] = []
     seen: dict[str, str] = {}
     for file, header in headers:
-        fps = _rate(config, file, header, plan)
+        fps = _rate(config, file, header, draft)
         if not fps:
             continue
         row = table.find(file.label)
@@ -153,10 +135,10 @@ def _whole_clips(
         clips.append((AmassClip(file, clip_id, split, header, fps, 0, header.frames, texts), reason))
     wanted = {row.id: row.file or f"{row.id}{SUFFIX}" for row in table.rows.values()}
     wanted |= {clip_id: f"{clip_id}{SUFFIX}" for clip_id in listed if clip_id not in wanted}
-    here = {file.label for file in files} | {drop.source for drop in plan.broken}
+    here = {file.label for file in files} | {drop.source for drop in draft.broken}
     for clip_id, name in wanted.items():
         if clip_id not in seen and name not in here:
-            plan.missing.append(Dropped(source=name, reason=f"clip '{clip_id}' is listed, but not here"))
+            draft.miss(name, f"clip '{clip_id}' is listed, but not here")
     return clips
 
 
@@ -165,7 +147,7 @@ def _index_clips(
     index: Path,
     files: list[AmassFile],
     listed: Mapping[str, Split],
-    plan: _Plan,
+    draft: _Draft,
     workers: int,
     progress: bool,
 ) -> list[tuple[AmassClip, str]]:
@@ -173,13 +155,13 @@ def _index_clips(
     rows = read_index(index)
     if config.splits is not None:
         keep_mirrors_together(listed, original_of, config.splits)
-    by_file = _rows_by_file(rows, files, plan)
+    by_file = _rows_by_file(rows, files, draft)
     headers, broken = read_headers([file for file in files if file.label in by_file], workers, progress)
-    plan.broken += broken
+    draft.broken += broken
     clips: list[tuple[AmassClip, str]] = []
     problems: list[str] = []
     for file, header in headers:
-        fps = _rate(config, file, header, plan)
+        fps = _rate(config, file, header, draft)
         for row in by_file[file.label] if fps else ():
             first, last = row.cut(header.frames, fps)
             beyond = "" if last > first else f"the index cuts beyond the {header.frames} frames of the file"
@@ -192,33 +174,33 @@ def _index_clips(
     known = {row.id for row in rows}
     for clip_id in listed:
         if clip_id not in known and (original_of(clip_id) or clip_id) not in known:
-            plan.missing.append(Dropped(source=clip_id, reason="in a split file, but not in the index"))
-    plan.notes += problems[:_NOTED_LINES]
+            draft.miss(clip_id, "in a split file, but not in the index")
+    draft.notes += problems[:_NOTED_LINES]
     if len(problems) > _NOTED_LINES:
-        plan.notes.append(f"and {len(problems) - _NOTED_LINES} more caption lines left out")
+        draft.notes.append(f"and {len(problems) - _NOTED_LINES} more caption lines left out")
     return clips
 
 
-def _rows_by_file(rows: list[IndexRow], files: list[AmassFile], plan: _Plan) -> dict[str, list[IndexRow]]:
-    """Rows of every file (by label); rows without a file and files without a row are told."""
+def _rows_by_file(rows: list[IndexRow], files: list[AmassFile], draft: _Draft) -> dict[str, list[IndexRow]]:
+    """Rows of every file (by label); rows without a file and files without a row are reported."""
     by_key: dict[str, AmassFile] = {}
     found: dict[str, list[IndexRow]] = {}
     here = {clip_key(file.label).split("/")[0]: file.subset for file in files}
     for file in files:
         first = by_key.setdefault(clip_key(file.label), file)
         if first is not file:
-            plan.dropped.append(Dropped(source=file.label, reason=f"the same clip as {first.label}"))
+            draft.leave_out(file.label, f"the same clip as {first.label}")
     for row in rows:
         match = by_key.get(clip_key(row.source))
         if match is not None:
             found.setdefault(match.label, []).append(row)
             continue
         why = "HumanAct12 is not part of AMASS" if row.subset == "humanact12" else "its file is not here"
-        plan.missing.append(Dropped(source=row.source, reason=f"clip '{row.id}' of the index: {why}"))
-        plan.missing_in[here.get(row.subset, row.subset)] += 1
+        draft.miss(row.source, f"clip '{row.id}' of the index: {why}")
+        draft.missing_in[here.get(row.subset, row.subset)] += 1
     for file in by_key.values():
         if file.label not in found:
-            plan.dropped.append(Dropped(source=file.label, reason="in no row of the index"))
+            draft.leave_out(file.label, "in no row of the index")
     return found
 
 
@@ -245,12 +227,11 @@ def _index_texts(
     return tuple(captions), ""
 
 
-def _rate(config: AmassConfig, file: AmassFile, header: MotionHeader, plan: _Plan) -> float:
-    """Frames a second; 0, with the file among the broken, when nobody says."""
+def _rate(config: AmassConfig, file: AmassFile, header: MotionHeader, draft: _Draft) -> float:
+    """Frames a second; 0, with the file among the broken, when neither states one."""
     fps = config.source_fps or header.fps or 0.0
     if not fps:
-        reason = "no mocap_framerate and no mocap_frame_rate in it; set source_fps"
-        plan.broken.append(Dropped(source=file.label, reason=reason))
+        draft.fail(file.label, UserError("no mocap_framerate and no mocap_frame_rate in it; set source_fps"))
     return fps
 
 

@@ -10,8 +10,9 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from motionloom.datasets.convert.common.conversion import ConvertConfig, drop
+from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.files import inside, read_in_threads
+from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.convert.common.smpl_npz import MotionHeader, read_motion_header
 from motionloom.datasets.convert.common.splits import check_id
 from motionloom.datasets.motion.layout import MotionLayout

@@ -1,7 +1,7 @@
 """BVH folders and archives -> shards: any skeleton, through a joint map (`datasets/motion/joint_map.py`).
 
 Three steps, each independent of the number of workers:
-1. plan (`bvh_plan.py`): read every file once; list it with its captions, split, frame count and digest;
+1. plan (`plan.py`): read every file once; list it with its captions, split, frame count and checksum;
 2. features: one task a batch (an archive, or 64 loose files) parses, maps, resamples and encodes its clips
    into a file of the work folder, so an archive is unpacked once although its clips go to many shards;
 3. shards: the clips are copied from those files.
@@ -20,12 +20,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.bvh.plan import SUFFIX, BvhClip, BvhConfig, plan_bvh
 from motionloom.datasets.convert.common.archives import Batch
-from motionloom.datasets.convert.common.conversion import Conversion, digest, drop
+from motionloom.datasets.convert.common.conversion import Conversion
+from motionloom.datasets.convert.common.feature_step import FeatureStep
 from motionloom.datasets.convert.common.feature_store import store_batch, stored_batch, stored_features
 from motionloom.datasets.convert.common.features import features_of
-from motionloom.datasets.convert.common.first_step import FirstStep
+from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
@@ -44,12 +46,14 @@ def prepare_bvh(
     """Plan the conversion. `scan` is a file that remembers what unchanged files hold."""
     clips = BvhClips.of(config)  # a wrong map should fail before the long part
     plan = plan_bvh(config, workers=workers, progress=progress, scan=scan)
-    options = config.options() | {"source_sha256": digest([clip.found.sha256 for _, clip in plan.items])}
+    contents = [clip.found.sha256 for _, clip in plan.items]
+    options = config.options() | {"source_sha256": sha256_of_json(contents)}
+    made_from = sha256_of_json(options)
     groups: dict[int, list[BvhClip]] = {}
     for _, clip in plan.items:
         groups.setdefault(clip.number, []).append(clip)
     batches = [
-        BvhBatch(clips, group[0].batch, number, tuple(clip.label() for clip in group), digest(options))
+        BvhBatch(clips, group[0].batch, number, tuple(clip.label() for clip in group), made_from)
         for number, group in sorted(groups.items())
     ]
     positions = {batch.number: position for position, batch in enumerate(batches)}
@@ -57,18 +61,17 @@ def prepare_bvh(
         config=config,
         plan=plan,
         convert=clips,
-        describe=BvhClip.label,
         licence=config.licence,
         converter=CONVERTER,
         version=CONVERTER_VERSION,
         options=options,
-        first=FirstStep(batches, lambda clip: positions[clip.number], clips.take),
+        features=FeatureStep(batches, lambda clip: positions[clip.number], clips.take),
     )
 
 
 @dataclass(frozen=True)
 class BvhClips:
-    """Makes samples of clips: all that every clip of a conversion has in common."""
+    """Turns clips into samples; holds what all clips of a conversion share."""
 
     config: BvhConfig
     joint_map: JointMap
@@ -92,7 +95,7 @@ class BvhClips:
         raise UserError(f"{clip.label()}: no longer in the source")
 
     def take(self, clip: BvhClip, folder: Path) -> Sample:
-        """One clip from the files of the first step."""
+        """One clip from the files of the features step."""
         return self._sample(clip, stored_features(_path(folder, clip.number), clip.label()))
 
     def features(self, label: str, data: bytes) -> NDArray[np.float32]:
@@ -147,7 +150,7 @@ class BvhBatch:
         store_batch(_path(folder, self.number), self._made(), dim=dim, fingerprint=fingerprint)
 
     def trial(self, seconds: float) -> int:
-        """Convert clips without keeping them for about so long; how many."""
+        """Convert clips for about this long without keeping them; returns how many."""
         end = time.perf_counter() + seconds
         for count, _ in enumerate(self._made(), start=1):
             if time.perf_counter() > end:
@@ -155,7 +158,7 @@ class BvhBatch:
         return self.size
 
     def _fingerprint(self) -> str:
-        return digest([CONVERTER_VERSION, self.options, self.labels])
+        return sha256_of_json([CONVERTER_VERSION, self.options, self.labels])
 
     def _made(self) -> Iterator[tuple[str, NDArray[np.float32] | Dropped]]:
         waiting = set(self.labels)

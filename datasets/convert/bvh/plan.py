@@ -1,4 +1,4 @@
-"""BVH conversion, first step: options, and a plan of what becomes of every file of the source."""
+"""BVH conversion, planning: options, and a plan of what becomes of every file of the source."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from pydantic import Field
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.convert.common.archives import Batch, list_batches
 from motionloom.datasets.convert.common.captions import CaptionTable, read_captions
-from motionloom.datasets.convert.common.conversion import ConvertConfig, count_licences, drop, limited
+from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.features import frames_after
-from motionloom.datasets.convert.common.plan import ConversionPlan, frames_by_split
+from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft
 from motionloom.datasets.convert.common.scan import BatchScan, FoundFile, scan_batches
 from motionloom.datasets.convert.common.splits import check_id, hash_split, read_split_files
 from motionloom.datasets.motion.bvh_text import read_header
 from motionloom.datasets.motion.joint_map import Unit, Up
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, Dropped, Split, UserError
+from motionloom.datasets.schema import Caption, Split, UserError
 
 SUFFIX = ".bvh"
 
@@ -62,7 +62,7 @@ class BvhConfig(ConvertConfig):
         return layout
 
     def options(self, *local: str) -> dict[str, Any]:
-        """What the output depends on, for the manifest: files by name and digest instead of local paths."""
+        """What the output depends on, for the manifest: files by name and checksum instead of local paths."""
         given = super().options(*local)
         for key in ("joint_map", "captions"):
             path: Path | None = getattr(self, key)
@@ -110,13 +110,11 @@ def _decide(
 ) -> ConversionPlan[BvhClip]:
     """Which of the files found become samples, in which split."""
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
-    broken = [scan.problem for scan in scans if scan.problem is not None]
     refused = config.licence_problem(config.licence)
     table = read_captions(config.captions) if config.captions else CaptionTable({}, {})
     listed, notes = read_split_files(config.splits) if config.splits else ({}, [])
-    items: list[tuple[Split, BvhClip]] = []
-    dropped: list[Dropped] = []
-    uncaptioned: list[str] = []
+    broken = [scan.problem for scan in scans if scan.problem is not None]
+    draft: PlanDraft[BvhClip] = PlanDraft(config, broken=broken, notes=notes)
     ids: dict[str, str] = {}
     contents: dict[str, str] = {}
     unreadable: set[str] = set()
@@ -127,15 +125,15 @@ def _decide(
         try:
             clip_id = row.id if row else check_id(str(PurePosixPath(clip.path).with_suffix("")), clip.label)
         except UserError as error:
-            broken.append(drop(clip.label, error))
+            draft.fail(clip.label, error)
             continue
         if clip.problem:
             unreadable.add(clip_id)
-            broken.append(drop(clip.label, UserError(clip.problem)))
+            draft.fail(clip.label, UserError(clip.problem))
             continue
         texts = row.texts(source="captions") if row else ()
         if config.captions and not texts:
-            uncaptioned.append(clip.label)
+            draft.uncaptioned.append(clip.label)
         other_rate += bool(row and row.fps and abs(row.fps - clip.fps) > 0.01 * clip.fps)
         if clip_id in ids:
             reason = f"second file for clip id '{clip_id}'; the first is {ids[clip_id]}"
@@ -150,33 +148,24 @@ def _decide(
         ids.setdefault(clip_id, clip.label)
         contents.setdefault(clip.sha256, clip.label)
         if reason:
-            dropped.append(Dropped(source=clip.label, reason=reason))
+            draft.leave_out(clip.label, reason)
             continue
         split = listed.get(clip_id) or (row.split if row else None) or hash_split(clip_id)
-        items.append((split, BvhClip(batches[number], number, clip, clip_id, split, texts)))
+        draft.take(BvhClip(batches[number], number, clip, clip_id, split, texts))
     if other_rate:
-        notes.append(f"{other_rate} captions state another frame rate than their file; the file's counts")
-    items = limited(items, lambda clip: clip.id, config.limit, notes)
-    layout = config.motion_layout()
+        draft.notes.append(
+            f"{other_rate} captions state another frame rate than their file; the file's counts"
+        )
+    draft.limit(lambda clip: clip.id)
     wanted = {clip_id: row.file or clip_id for clip_id, row in table.rows.items()}
     wanted |= {clip_id: clip_id for clip_id in listed if clip_id not in wanted}
-    return ConversionPlan(
-        name=f"{config.source.name} -> {config.name}",
-        items=items,
-        frames=frames_by_split(
-            (split, frames_after(planned.found.frames, config.source_fps or planned.found.fps, layout))
-            for split, planned in items
-        ),
+    for clip_id, name in wanted.items():
+        if clip_id not in ids and clip_id not in unreadable:
+            draft.miss(name, f"clip '{clip_id}' is listed, but its file is not in the source")
+    layout = config.motion_layout()
+    return draft.finish(
         found=len(found),
-        missing=[
-            Dropped(source=name, reason=f"clip '{clip_id}' is listed, but its file is not in the source")
-            for clip_id, name in wanted.items()
-            if clip_id not in ids and clip_id not in unreadable
-        ],
-        uncaptioned=uncaptioned,
-        dropped=dropped,
-        broken=broken,
+        frames=lambda clip: frames_after(clip.found.frames, config.source_fps or clip.found.fps, layout),
+        licence=lambda clip: config.licence,
         ignored=ignored,
-        notes=notes,
-        licences=count_licences([config.licence] * len(items)),
     )

@@ -6,16 +6,34 @@ and why, so nothing is skipped silently (`convert ... --plan` prints it and stop
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from rich.table import Table
 
+from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.schema import Dropped, Split, UserError
 from motionloom.datasets.shards.index import SPLITS
 
+
+class PlannedClip(Protocol):
+    """A clip of a plan: what a converter hands to its function from clip to sample."""
+
+    @property
+    def split(self) -> Split:
+        """Where it goes."""
+        ...
+
+    def label(self) -> str:
+        """Name in reports. A changed file must change it: name and size will do."""
+        ...
+
+
 T = TypeVar("T")
+C = TypeVar("C", bound=PlannedClip)
 
 
 @dataclass(frozen=True)
@@ -33,11 +51,11 @@ class Subset:
 
 
 @dataclass(frozen=True)
-class ConversionPlan(Generic[T]):
-    """What a conversion would do. `items` become samples; everything else is told with its reason."""
+class ConversionPlan(Generic[C]):
+    """What a conversion would do. `items` become samples; everything else is listed with its reason."""
 
     name: str
-    items: list[tuple[Split, T]]
+    items: list[tuple[Split, C]]
     frames: dict[Split, int]
     """Expected frames a split, at the target frame rate."""
     found: int
@@ -74,8 +92,8 @@ class ConversionPlan(Generic[T]):
         for split in SPLITS:
             table.add_row(split, str(counts[split]), str(self.frames.get(split, 0)), "")
         table.add_row("without captions", str(len(self.uncaptioned)), "", _some(self.uncaptioned))
-        told = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
-        for title, drops in told:
+        kinds = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
+        for title, drops in kinds:
             table.add_row(title, str(len(drops)), "", _some([f"{d.source}: {d.reason}" for d in drops]))
         for licence, count in sorted(self.licences.items()):
             table.add_row("licence", str(count), "", licence)
@@ -108,12 +126,84 @@ class ConversionPlan(Generic[T]):
             raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")
 
 
-def frames_by_split(counts: Iterable[tuple[Split, int]]) -> dict[Split, int]:
-    """Frames a split, from (split, frames) of every clip."""
-    frames: dict[Split, int] = dict.fromkeys(SPLITS, 0)
-    for split, count in counts:
-        frames[split] += count
-    return frames
+@dataclass
+class PlanDraft(Generic[C]):
+    """What a converter collects while it decides what becomes of every file; `finish` makes the plan."""
+
+    config: ConvertConfig
+    items: list[tuple[Split, C]] = field(default_factory=list)
+    missing: list[Dropped] = field(default_factory=list)
+    uncaptioned: list[str] = field(default_factory=list)
+    dropped: list[Dropped] = field(default_factory=list)
+    broken: list[Dropped] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def take(self, clip: C) -> None:
+        """This clip becomes a sample."""
+        self.items.append((clip.split, clip))
+
+    def leave_out(self, source: str, reason: str) -> None:
+        """This one could, but does not."""
+        self.dropped.append(Dropped(source=source, reason=reason))
+
+    def miss(self, source: str, reason: str) -> None:
+        """This one is listed somewhere, but not in the source."""
+        self.missing.append(Dropped(source=source, reason=reason))
+
+    def fail(self, source: str, error: Exception) -> None:
+        """This one cannot be read."""
+        self.broken.append(drop(source, error))
+
+    def limit(self, key: Callable[[C], str]) -> None:
+        """Keep `config.limit` clips at most, chosen by a hash of their key, with a note of the choice."""
+        kept = limited(self.items, key, self.config.limit)
+        if len(kept) < len(self.items):
+            self.notes.append(f"limited to {self.config.limit} of {len(self.items)} clips")
+        self.items = kept
+
+    def finish(
+        self,
+        *,
+        found: int,
+        frames: Callable[[C], int],
+        licence: Callable[[C], str],
+        ignored: int = 0,
+        subsets: Mapping[str, Subset] | None = None,
+    ) -> ConversionPlan[C]:
+        """The plan; `frames` (at the target frame rate) and `licence` are asked about every clip of it."""
+        total: dict[Split, int] = dict.fromkeys(SPLITS, 0)
+        for split, clip in self.items:
+            total[split] += frames(clip)
+        return ConversionPlan(
+            name=f"{self.config.source.name} -> {self.config.name}",
+            items=self.items,
+            frames=total,
+            found=found,
+            missing=self.missing,
+            uncaptioned=self.uncaptioned,
+            dropped=self.dropped,
+            broken=self.broken,
+            ignored=ignored,
+            notes=self.notes,
+            subsets=dict(subsets or {}),
+            licences=dict(sorted(Counter(licence(clip) for _, clip in self.items).items())),
+        )
+
+
+def limited(
+    items: Sequence[tuple[Split, T]], key: Callable[[T], str], limit: int | None
+) -> list[tuple[Split, T]]:
+    """At most `limit` items, chosen by a hash of their key, in the old order."""
+    if limit is None or len(items) <= limit:
+        return list(items)
+    kept = set(sorted(sha256_of_json(key(item)) for _, item in items)[:limit])
+    return [item for item in items if sha256_of_json(key(item[1])) in kept]
+
+
+def drop(label: str, error: Exception) -> Dropped:
+    """The manifest's record of a clip that failed."""
+    text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+    return Dropped(source=label, reason=text.removeprefix(f"{label}: "))
 
 
 def _duration(seconds: float) -> str:

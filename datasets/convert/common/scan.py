@@ -14,10 +14,10 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from motionloom.datasets.base.files import write_json
+from motionloom.datasets.base.files import sha256_of_json, write_json
 from motionloom.datasets.convert.common.archives import Batch
-from motionloom.datasets.convert.common.conversion import digest, drop
 from motionloom.datasets.convert.common.files import read_in_threads
+from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.schema import Config, Dropped, UserError
 
 _VERSION = 1
@@ -66,7 +66,7 @@ def scan_batches(
     progress: bool = False,
 ) -> list[BatchScan]:
     """Read the header of every file with `suffix`, in batch order; `keep` is the file that remembers."""
-    keys = [digest([_VERSION, suffix, batch.state()]) for batch in batches]
+    keys = [sha256_of_json([_VERSION, suffix, batch.state()]) for batch in batches]
     known = _load(keep)
     kept = {key: known[key] for key in keys if key in known}
     todo = [batch for key, batch in zip(keys, batches, strict=True) if key not in kept]

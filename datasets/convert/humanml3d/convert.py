@@ -6,11 +6,11 @@ Choices:
   compared.
 - Layout `h3d263` at 20 fps keeps the vectors bit for bit. Made again from new_joints/ they are not the same:
   one more frame is lost, and the published code starts every clip with a forced heading that decoding has
-  already turned into motion (docs/sources.md tells how much). That way keeps each clip's own bone lengths,
+  already turned into motion (docs/sources.md says how much). That way keeps each clip's own bone lengths,
   which are HumanML3D's uniform ones.
 - `body133` (family `exact`) is made from the joints, or from the decoded vectors.
 - Segment captions stay captions with start and end; what trains on them cuts the frames or the tokens. A
-  mirrored clip `M<id>` tells whose image it is and stays in the split of its original.
+  mirrored clip `M<id>` names its original and stays in the split of its original.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.arrays import load_array
-from motionloom.datasets.convert.common.conversion import Conversion, digest
+from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.splits import original_of
@@ -52,21 +53,20 @@ AGREEMENT = 0.01
 def prepare_humanml3d(
     config: HumanMl3dConfig, *, workers: int = 1, progress: bool = False
 ) -> Conversion[HumanMl3dClip]:
-    """Look at the whole source; everything is told, nothing is converted yet."""
+    """Look at the whole source and decide what becomes of every file; nothing is converted yet."""
     plan = plan_humanml3d(config, workers=workers, progress=progress)
-    told = []
+    content = []
     for _, clip in plan.items:
         sizes = [(config.source / file).stat().st_size for file in clip.files]
-        told.append([clip.id, clip.files, sizes, [caption.dump() for caption in clip.texts]])
+        content.append([clip.id, clip.files, sizes, [caption.dump() for caption in clip.texts]])
     return Conversion(
         config=config,
         plan=plan,
         convert=partial(convert_clip, config),
-        describe=HumanMl3dClip.label,
         licence=config.licence or LICENCE,
         converter=CONVERTER,
         version=CONVERTER_VERSION,
-        options=config.options() | {"source_sha256": digest(told)},
+        options=config.options() | {"source_sha256": sha256_of_json(content)},
     )
 
 

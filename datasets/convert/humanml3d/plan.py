@@ -1,4 +1,4 @@
-"""HumanML3D conversion, first step: options, and a plan of what becomes of every file of the source.
+"""HumanML3D conversion, planning: options, and a plan of what becomes of every file of the source.
 
 Headers and captions are read, motion data is not. Everything in the folder is accounted for: clips to
 convert, left out, broken or missing, caption lines that are wrong, and a count of the files nobody needs.
@@ -17,11 +17,11 @@ from typing import Literal
 from pydantic import Field
 
 from motionloom.datasets.convert.common.arrays import check_array_header
-from motionloom.datasets.convert.common.conversion import ConvertConfig, count_licences, drop, limited
+from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import inside, read_in_threads
 from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
-from motionloom.datasets.convert.common.plan import ConversionPlan, Subset, frames_by_split
+from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset, drop
 from motionloom.datasets.convert.common.splits import (
     check_id,
     hash_splits,
@@ -129,40 +129,33 @@ def plan_humanml3d(
     scanned = dict(zip(ids, read_in_threads(scan, ids, workers=workers, progress=progress), strict=True))
 
     licence = config.licence or LICENCE
-    items: list[tuple[Split, HumanMl3dClip]] = []
-    dropped: list[Dropped] = []
+    draft: PlanDraft[HumanMl3dClip] = PlanDraft(config, broken=strange, notes=notes)
     whole = {clip_id: found for clip_id, found in scanned.items() if found.frames}
     for clip_id, found in whole.items():
         split = splits.get(clip_id)
         reason = "in no split file" if split is None else _problem(config, found, licence)
         if split is None or reason:
-            dropped.append(Dropped(source=found.files[0], reason=reason))
+            draft.leave_out(found.files[0], reason)
             continue
-        items.append((split, HumanMl3dClip(clip_id, split, found.files, found.frames, found.texts, licence)))
-    notes += _caption_notes(scanned)
+        draft.take(HumanMl3dClip(clip_id, split, found.files, found.frames, found.texts, licence))
+    draft.broken += [problem for found in scanned.values() for problem in found.broken]
+    draft.uncaptioned += [found.files[0] for found in whole.values() if not found.texts]
+    draft.notes += _caption_notes(scanned)
     strays = len(texts.ids.keys() - present.keys())
     if strays:
-        notes.append(f"{strays} caption files in {texts.folder}/ belong to no motion file here")
-    items = limited(items, HumanMl3dClip.label, config.limit, notes)
+        draft.notes.append(f"{strays} caption files in {texts.folder}/ belong to no motion file here")
+    draft.limit(HumanMl3dClip.label)
 
     missing = {clip_id: split for clip_id, split in splits.items() if clip_id not in present}
     wanted = "/ or ".join(config.folders)
-    return ConversionPlan(
-        name=f"{config.source.name} -> {config.name}",
-        items=items,
-        frames=frames_by_split((split, _frames_made(config, clip, layout)) for split, clip in items),
+    for clip_id, split in missing.items():
+        draft.miss(clip_id, f"listed in {split}.txt, but not in {wanted}/")
+    return draft.finish(
         found=len(present),
-        missing=[
-            Dropped(source=clip_id, reason=f"listed in {split}.txt, but not in {wanted}/")
-            for clip_id, split in missing.items()
-        ],
-        uncaptioned=[found.files[0] for found in whole.values() if not found.texts],
-        dropped=dropped,
-        broken=strange + [problem for found in scanned.values() for problem in found.broken],
+        frames=lambda clip: _frames_made(config, clip, layout),
+        licence=lambda clip: clip.licence,
         ignored=_count_ignored(config, texts.folder),
-        notes=notes,
-        subsets=_subsets(present, splits, missing, items),
-        licences=count_licences([clip.licence for _, clip in items]),
+        subsets=_subsets(present, splits, missing, draft.items),
     )
 
 
@@ -246,8 +239,8 @@ def _scan(
         except UserError as error:
             return replace(found, broken=(drop(label, error),))
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{label} {frames}" for label, frames in lengths.items())
-        reason = f"frames differ ({told}); choose one with --use vecs or --use joints"
+        lengths_found = ", ".join(f"{label} {frames}" for label, frames in lengths.items())
+        reason = f"frames differ ({lengths_found}); choose one with --use vecs or --use joints"
         return replace(found, broken=(Dropped(source=found.files[0], reason=reason),))
     found = replace(found, frames=lengths[found.files[0]])
     if clip_id not in texts.ids:
@@ -258,8 +251,8 @@ def _scan(
         captions, problems = read_humanml_captions(path, seconds=found.frames / FPS, name=label)
     except UserError as error:
         return replace(found, broken=(drop(label, error),))
-    told = "; ".join(problems)
-    return replace(found, texts=tuple(captions), problems=(f"{label}: {told}",) if problems else ())
+    joined = "; ".join(problems)
+    return replace(found, texts=tuple(captions), problems=(f"{label}: {joined}",) if problems else ())
 
 
 def _caption_notes(scanned: dict[str, _Scanned]) -> list[str]:

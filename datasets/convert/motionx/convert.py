@@ -22,8 +22,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.arrays import load_array
-from motionloom.datasets.convert.common.conversion import Conversion, digest
+from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.motionx.parameters import (
@@ -62,19 +63,18 @@ CONVERTER_VERSION = 1
 def prepare_motionx(
     config: MotionXConfig, *, workers: int = 1, progress: bool = False
 ) -> Conversion[MotionXClip]:
-    """Look at the whole source; everything is told, nothing is converted yet."""
+    """Look at the whole source and decide what becomes of every file; nothing is converted yet."""
     body = body_of(config.body_model, config.skeleton)  # a wrong one should fail before the long part
     plan = plan_motionx(config, workers=workers, progress=progress)
-    told = []
+    content = []
     for _, clip in plan.items:
         sizes = [(config.source / file).stat().st_size for file in clip.files]
         texts = [caption.dump() for caption in (*clip.texts, *clip.face_texts)]
-        told.append([clip.id, clip.files, sizes, clip.licence, texts])
+        content.append([clip.id, clip.files, sizes, clip.licence, texts])
     return Conversion(
         config=config,
         plan=plan,
         convert=partial(convert_clip, config, body),
-        describe=MotionXClip.label,
         licence=config.licence or (next(iter(plan.licences)) if len(plan.licences) == 1 else LICENCE),
         converter=CONVERTER,
         version=CONVERTER_VERSION,
@@ -82,7 +82,7 @@ def prepare_motionx(
         | {
             "splits": bool(config.splits),
             "body_model": body.statement,
-            "source_sha256": digest(told),
+            "source_sha256": sha256_of_json(content),
         },
     )
 

@@ -18,8 +18,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-from motionloom.datasets.convert.common.conversion import drop
 from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.convert.common.splits import check_id
 from motionloom.datasets.schema import Dropped, UserError
 
@@ -81,12 +81,12 @@ class MotionXFiles:
 
     def notes(self) -> list[str]:
         """Which folders were taken for what."""
-        told = []
+        lines = []
         for kind, folders in self.folders.items():
             named = [f"{folder or '.'}/ ({count} files)" for folder, count in sorted(folders.items())]
-            told.append(f"{kind}: {', '.join(named) if named else 'none in this source'}")
-        told += [f"{kind}: {count} files of clips that have one" for kind, count in self.second.items()]
-        return told
+            lines.append(f"{kind}: {', '.join(named) if named else 'none in this source'}")
+        lines += [f"{kind}: {count} files of clips that have one" for kind, count in self.second.items()]
+        return lines
 
 
 @dataclass(frozen=True)

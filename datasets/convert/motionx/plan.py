@@ -1,7 +1,7 @@
-"""Motion-X conversion, first step: options, and a plan of what becomes of every file of the source.
+"""Motion-X conversion, planning: options, and a plan of what becomes of every file of the source.
 
-Headers and texts are read; motion data is not, but for a few `aist/` clips whose scale is told. Nothing is
-required but the motion: splits, captions, face motion and face texts are taken where they are.
+Headers and texts are read; motion data is not, except a few `aist/` clips whose scale is examined. Only the
+motion is required: splits, captions, face motion and face texts are taken where they are.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
-from motionloom.datasets.convert.common.conversion import ConvertConfig, count_licences, digest, drop, limited
+from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import read_in_threads
-from motionloom.datasets.convert.common.plan import ConversionPlan, Subset, frames_by_split
+from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset, drop
 from motionloom.datasets.convert.common.splits import (
     hash_splits,
     keep_mirrors_together,
@@ -162,16 +163,17 @@ def plan_motionx(
     scan = partial(_scan, config.source, files)
     scanned = list(read_in_threads(scan, ids, workers=workers, progress=progress))
 
-    items: list[tuple[Split, MotionXClip]] = []
-    dropped = list(files.repeated)
-    uncaptioned: list[str] = []
+    broken = [*files.broken, *(problem for found in scanned for problem in found.broken)]
+    draft: PlanDraft[MotionXClip] = PlanDraft(
+        config, dropped=list(files.repeated), broken=broken, notes=[*files.notes(), *notes]
+    )
     for found in scanned:
         if not found.frames:
             continue  # broken
         path, split = motion[found.id], splits.get(found.id)
         licence = config.licence or LICENCES.get(subset_of(found.id), LICENCE)
         if not found.texts:
-            uncaptioned.append(path)
+            draft.uncaptioned.append(path)
         if split is None:
             reason = "in no split file"
         elif not found.texts and config.uncaptioned == "drop":
@@ -179,41 +181,33 @@ def plan_motionx(
         else:
             reason = config.length_problem(found.frames / FPS) or config.licence_problem(licence)
         if reason or split is None:
-            dropped.append(Dropped(source=path, reason=reason))
+            draft.leave_out(path, reason)
             continue
         frame_texts = _frame_texts(files, found.id) if config.frame_texts else ()
-        clip = MotionXClip(
-            found.id, path, split, found.frames, licence, found.texts, found.face_texts, found.face,
-            frame_texts,
+        draft.take(
+            MotionXClip(
+                found.id, path, split, found.frames, licence, found.texts, found.face_texts, found.face,
+                frame_texts,
+            )
         )  # fmt: skip
-        items.append((split, clip))
-    items = limited(items, MotionXClip.label, config.limit, notes)
+    draft.limit(MotionXClip.label)
     missing = [clip_id for clip_id in splits if clip_id not in motion]
     unwanted = len(motion) - len(ids)
     texts_alone = [clip_id for clip_id in files.by_kind["captions"] if clip_id not in motion]
-    return ConversionPlan(
-        name=f"{config.source.name} -> {config.name}",
-        items=items,
-        frames=frames_by_split((split, frames_after(clip.frames, FPS, layout)) for split, clip in items),
+    for clip_id in missing:
+        draft.miss(clip_id, f"listed in {splits[clip_id]}.txt, but its motion is not here")
+    draft.notes += [
+        *_subset_notes(config, files, scanned),
+        *([f"{unwanted} clips of other subsets are not asked for"] if unwanted else []),
+        *([f"{len(texts_alone)} caption files have no motion"] if texts_alone else []),
+        *_text_notes(scanned),
+    ]
+    return draft.finish(
         found=len(ids) + len(files.repeated),
-        missing=[
-            Dropped(source=clip_id, reason=f"listed in {splits[clip_id]}.txt, but its motion is not here")
-            for clip_id in missing
-        ],
-        uncaptioned=uncaptioned,
-        dropped=dropped,
-        broken=[*files.broken, *(problem for found in scanned for problem in found.broken)],
+        frames=lambda clip: frames_after(clip.frames, FPS, layout),
+        licence=lambda clip: clip.licence,
         ignored=len(files.others - split_files) + unwanted,
-        notes=[
-            *files.notes(),
-            *notes,
-            *_subset_notes(config, files, scanned),
-            *([f"{unwanted} clips of other subsets are not asked for"] if unwanted else []),
-            *([f"{len(texts_alone)} caption files have no motion"] if texts_alone else []),
-            *_text_notes(scanned),
-        ],
-        subsets=_subsets(motion, missing, items),
-        licences=count_licences([clip.licence for _, clip in items]),
+        subsets=_subsets(motion, missing, draft.items),
     )
 
 
@@ -228,11 +222,11 @@ def _read_splits(
     names = [f"{split}.txt" for split in SPLITS]
     if config.splits is not None:
         folder: Path | None = config.splits
-        told = "splits: from the folder given"
+        origin = "splits: from the folder given"
     else:
         found = [name for name in _SPLIT_FOLDERS if any((config.source / name / f).is_file() for f in names)]
         folder = config.source / found[0] if found else None
-        told = f"splits: {found[0] or '.'}/" if found else ""
+        origin = f"splits: {found[0] or '.'}/" if found else ""
     if folder is None:
         hashed, notes = hash_splits(ids)
         return hashed, set(), notes
@@ -252,7 +246,7 @@ def _read_splits(
         inner = folder.relative_to(config.source)
         used = {(inner / name).as_posix() for name in (*names, "all.txt")}
     wanted = {clip_id: split for clip_id, split in splits.items() if _wanted(config, clip_id)}
-    return wanted, used, [f"{told}; {numbers} in the release", *notes]
+    return wanted, used, [f"{origin}; {numbers} in the release", *notes]
 
 
 def _scan(source: Path, files: MotionXFiles, clip_id: str) -> _Scanned:
@@ -312,16 +306,16 @@ def _subset_notes(config: MotionXConfig, files: MotionXFiles, scanned: list[_Sca
         )
     dances = [found.id for found in scanned if subset_of(found.id) == AIST and found.frames]
     states: Counter[str] = Counter()
-    for clip_id in sorted(dances, key=digest)[:_LOOKED_AT]:
+    for clip_id in sorted(dances, key=sha256_of_json)[:_LOOKED_AT]:
         path = files.by_kind["motion"][clip_id]
         try:
             states[aist_scale(load_array(config.source / path, width=RAW.dim, name=path))] += 1
         except UserError:
-            states["broken"] += 1  # the conversion tells why
+            states["broken"] += 1  # the conversion reports why
     if states:
-        told = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
+        counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
         notes.append(
-            f"aist/: of {states.total()} clips looked at, {told}; raw ones are brought to metres once "
+            f"aist/: of {states.total()} clips looked at, {counts}; raw ones are brought to metres once "
             f"(/ 94, z negated), each judged by itself"
         )
     return notes

@@ -23,6 +23,7 @@ from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features import encode
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 
@@ -68,10 +69,13 @@ def convert(made: Made) -> Sample:
 
 def report_on(root: Path, *clips: Made) -> CheckReport:
     write_dataset(
-        root, [(clip.split, clip) for clip in clips], convert, name="made", layout=LAYOUT, licence="CC0",
-        converter="test", converter_version=1, options={}, progress=False, describe=lambda clip: clip.id,
-        strict=True,
-    )  # fmt: skip
+        root,
+        [(clip.split, clip) for clip in clips],
+        convert,
+        DatasetFacts("made", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
+        WriteOptions(progress=False, strict=True),
+        describe=lambda clip: clip.id,
+    )
     return examine(root)
 
 

@@ -25,8 +25,8 @@ from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, Split, UserError
+from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.shards.tasks import Part
 from motionloom.datasets.shards.writer import WORK_FOLDER
 
 NAMES = (

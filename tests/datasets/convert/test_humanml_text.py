@@ -18,14 +18,40 @@ def line(text: str, start: object = "0.0", end: object = "0.0", tokens: str = TO
     return f"{text}#{tokens}#{start}#{end}"
 
 
+FILES = {
+    "bad_timestamps.txt": [
+        line("a person walks", "start", "end"),
+        line("a person runs", "5.0", "2.0"),
+        line("a person sits", "-1.0", "3.0"),
+        line("a person jumps", "0.0", "9999.0"),
+    ],
+    "nan_tags.txt": [line("a person bows", "nan", "nan")],
+    "too_few_fields.txt": ["a person walks forward", "a person turns#a/DET person/NOUN turn/VERB"],
+    "extra_hash.txt": [line("a person does move #3", tokens="a/DET person/NOUN do/VERB move/NOUN")],
+    "empty_caption.txt": ["#a/DET#0.0#0.0", "", "   "],
+    "empty_file.txt": [],
+}
+
+
 @pytest.fixture
-def broken(shared: Path) -> Path:
-    return shared / "data/broken/texts"
+def broken(tmp_path: Path) -> Path:
+    """Caption files with one mistake each."""
+    for name, lines in FILES.items():
+        (tmp_path / name).write_text("".join(f"{text}\n" for text in lines))
+    (tmp_path / "non_utf8.txt").write_bytes(line("a person walks to the café").encode("latin-1") + b"\n")
+    return tmp_path
 
 
-def test_published_captions(shared: Path) -> None:
-    folder = shared / "data/layouts/humanml3d/texts"
-    captions, problems = read_humanml_captions(folder / "900002.txt", seconds=69 / 20)
+def test_captions_as_they_are_published(tmp_path: Path) -> None:
+    path = tmp_path / "900002.txt"
+    lines = [
+        line("a person walks forward and then turns to the left."),
+        line("a figure walks around a corner, bending left"),
+        line("walking straight", "0.0", "2.0", tokens="walk/VERB straight/ADV"),
+        line("the person turns left.", "1.0", "3.5"),
+    ]
+    path.write_text("".join(f"{text}\n" for text in lines))
+    captions, problems = read_humanml_captions(path, seconds=69 / 20)
     assert not problems
     assert [(c.text, c.start, c.end) for c in captions] == [
         ("a person walks forward and then turns to the left.", 0.0, None),

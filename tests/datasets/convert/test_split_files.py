@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -18,20 +17,19 @@ def test_hash_split_is_80_5_15() -> None:
     assert counts["val"] / 20_000 == pytest.approx(0.05, abs=0.005)
 
 
-def test_leaks_and_ids_that_leave_the_folder_are_refused(shared: Path, tmp_path: Path) -> None:
-    broken = shared / "data/broken/splits"
-    shutil.copy(broken / "overlap_train.txt", tmp_path / "train.txt")
-    shutil.copy(broken / "overlap_test.txt", tmp_path / "test.txt")
+def test_leaks_and_ids_that_leave_the_folder_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "train.txt").write_text("900001\n900002\n")
+    (tmp_path / "test.txt").write_text("900002\n900003\n")
     with pytest.raises(UserError, match=r"900002.*leaks"):
         read_split_files(tmp_path)
     (tmp_path / "train.txt").unlink()
-    shutil.copy(broken / "traversal_id.txt", tmp_path / "test.txt")
+    (tmp_path / "test.txt").write_text("../../../../etc/passwd\n")
     with pytest.raises(UserError, match="not a plain relative name"):
         read_split_files(tmp_path)
-    shutil.copy(broken / "duplicate_ids.txt", tmp_path / "test.txt")
+    (tmp_path / "test.txt").write_text("900001\n900002\n900001\n")
     splits, notes = read_split_files(tmp_path)
     assert splits["900001"] == "test" and len(notes) == 1
-    shutil.copy(broken / "crlf_blank.txt", tmp_path / "test.txt")
+    (tmp_path / "test.txt").write_bytes(b"900001\r\n\r\n900002\r\n")
     assert len(read_split_files(tmp_path)[0]) == 2
     (tmp_path / "test.txt").unlink()
     with pytest.raises(UserError, match=r"no train\.txt"):

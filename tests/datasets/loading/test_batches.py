@@ -17,6 +17,7 @@ from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache
 from motionloom.datasets.text.encoder import EncodedText
 
@@ -52,7 +53,7 @@ def stats(train: ShardDataset) -> FeatureStats:
 @pytest.fixture(scope="module")
 def text(train: ShardDataset, tmp_path_factory: pytest.TempPathFactory) -> TextCache:
     captions = [caption.text for i in range(len(train)) for caption in train.texts(i) + train.face_texts(i)]
-    return TextCache.build(tmp_path_factory.mktemp("text"), captions, WordLengths(), progress=False)
+    return build_with_encoder(tmp_path_factory.mktemp("text"), captions, WordLengths(), progress=False)
 
 
 def test_windows_are_pieces_of_clips(train: ShardDataset, stats: FeatureStats) -> None:

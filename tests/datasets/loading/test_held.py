@@ -21,6 +21,7 @@ from motionloom.datasets.schema import FACE, HANDS, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.reading import Reading
+from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache
 
 GARBAGE = (0.0, 30.0)
@@ -43,7 +44,9 @@ def roots(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> list[Pa
 @pytest.fixture(scope="module")
 def text(roots: list[Path], tmp_path_factory: pytest.TempPathFactory) -> TextCache:
     captions = {c.text for d in openings(roots[0], "mixed") for i in range(len(d)) for c in d.texts(i)}
-    return TextCache.build(tmp_path_factory.mktemp("text"), [*captions, "happy"], OneToken(), progress=False)
+    return build_with_encoder(
+        tmp_path_factory.mktemp("text"), [*captions, "happy"], OneToken(), progress=False
+    )
 
 
 def openings(root: Path, *kinds: str) -> list[ClipDataset]:

@@ -23,7 +23,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.order import Source, shares
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.reading import Reading
-from motionloom.datasets.text.cache import TextCache
+from motionloom.datasets.text.build import build_with_encoder
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def test_a_clip_drawn_again_gives_another_window(mix: MixedDataset) -> None:
 
 def test_caption_batches_draw_only_from_data_sets_with_captions(mix: MixedDataset, tmp_path: Path) -> None:
     captions = [c.text for i in range(len(mix)) for c in mix.texts(i)]
-    text = TextCache.build(tmp_path, captions, OneToken(), progress=False)
+    text = build_with_encoder(tmp_path, captions, OneToken(), progress=False)
     batches = CaptionBatches(mix, compute(mix), text, batch_size=8, max_frames=40, min_frames=30, seed=2)
     usable = set(np.flatnonzero(mix.frames >= 30).tolist())
     seen = Counter(int(i >= 60) for k in range(8) for i in batches[k]["index"].tolist())

@@ -80,6 +80,12 @@ def test_normalize_and_back_numpy_and_torch(train: ShardDataset) -> None:
     torch.testing.assert_close(
         stats.normalize(tensor[:, columns], columns), stats.normalize(tensor)[:, columns]
     )
+    torch.testing.assert_close(
+        stats.denormalize(stats.normalize(tensor)[:, columns], columns), tensor[:, columns]
+    )
+    field = train.layout.slice("velocities")
+    np.testing.assert_array_equal(stats.normalize(motion[:, field], field), there[:, field])
+    torch.testing.assert_close(stats.denormalize(stats.normalize(tensor)[:, field], field), tensor[:, field])
     again = pickle.loads(pickle.dumps(stats))
     np.testing.assert_array_equal(again.normalize(motion), there)
 

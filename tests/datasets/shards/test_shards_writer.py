@@ -17,8 +17,8 @@ import pytest
 
 from motionloom.datasets.base.lock import LOCK_FILE, folder_lock
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.shards.tasks import Part
 
 
 def digests(folder: Path) -> dict[str, str]:

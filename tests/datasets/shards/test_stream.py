@@ -25,6 +25,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.reading import CacheConfig, Reading
 from motionloom.datasets.shards.store import LocalStore
 from motionloom.datasets.shards.stream import read_shard
+from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache
 
 GROUP = 2
@@ -46,7 +47,7 @@ def stats(root: Path) -> FeatureStats:
 def text(root: Path, tmp_path_factory: pytest.TempPathFactory) -> TextCache:
     train = ShardDataset.open(root, "train")
     captions = [c.text for i in range(len(train)) for c in train.texts(i) + train.face_texts(i)]
-    return TextCache.build(tmp_path_factory.mktemp("text"), captions, OneToken(), progress=False)
+    return build_with_encoder(tmp_path_factory.mktemp("text"), captions, OneToken(), progress=False)
 
 
 def opened(place: Path | str, mode: str, cache: CacheConfig | None = None) -> ShardDataset:

@@ -16,7 +16,7 @@ import torch
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text import build as build_module
-from motionloom.datasets.text.build import build_text_cache
+from motionloom.datasets.text.build import build_text_cache, build_with_encoder
 from motionloom.datasets.text.cache import TextCache, key_of
 from motionloom.datasets.text.encoder import EncodedText, SentenceEncoder, load_text_encoder
 
@@ -182,7 +182,7 @@ def digests(folder: Path) -> dict[str, str]:
 def test_cache_gives_back_what_the_encoder_said(tmp_path: Path) -> None:
     captions = [f"caption {'x' * (i % 11)} {i}" for i in range(300)]
     encoder = Counting()
-    cache = TextCache.build(tmp_path, captions * 2, encoder, progress=False)
+    cache = build_with_encoder(tmp_path, captions * 2, encoder, progress=False)
     assert len(cache) == len(encoder.asked) == 300 and cache.dim == 6
     asked = [captions[i] for i in (7, 250, 7, 0)]
     want = encoder.encode(asked)
@@ -198,29 +198,29 @@ def test_cache_gives_back_what_the_encoder_said(tmp_path: Path) -> None:
 
 def test_same_captions_same_bytes_whatever_their_order(tmp_path: Path, minilm: SentenceEncoder) -> None:
     captions = [f"{caption} {i}" for i in range(25) for caption in CAPTIONS]
-    TextCache.build(tmp_path / "a", captions, minilm, progress=False)
-    TextCache.build(tmp_path / "b", [*reversed(captions), *captions], minilm, progress=False)
+    build_with_encoder(tmp_path / "a", captions, minilm, progress=False)
+    build_with_encoder(tmp_path / "b", [*reversed(captions), *captions], minilm, progress=False)
     assert digests(tmp_path / "a") == digests(tmp_path / "b")
 
 
 def test_only_new_captions_are_encoded(tmp_path: Path) -> None:
     first = [f"caption {i}" for i in range(50)]
-    TextCache.build(tmp_path / "a", first, Counting(), progress=False)
+    build_with_encoder(tmp_path / "a", first, Counting(), progress=False)
     encoder = Counting()
-    TextCache.build(tmp_path / "a", first[:10], encoder, progress=False)
+    build_with_encoder(tmp_path / "a", first[:10], encoder, progress=False)
     assert encoder.asked == []
     more = [f"caption {i}" for i in range(40, 70)]
-    cache = TextCache.build(tmp_path / "a", more, encoder, progress=False)
+    cache = build_with_encoder(tmp_path / "a", more, encoder, progress=False)
     assert sorted(encoder.asked) == sorted(more[10:]) and len(cache) == 70
-    TextCache.build(tmp_path / "b", first + more, Counting(), progress=False)
+    build_with_encoder(tmp_path / "b", first + more, Counting(), progress=False)
     assert digests(tmp_path / "a") == digests(tmp_path / "b")
     other = Counting(name="another")
-    assert len(TextCache.build(tmp_path / "a", more, other, progress=False)) == 30
+    assert len(build_with_encoder(tmp_path / "a", more, other, progress=False)) == 30
     assert sorted(other.asked) == sorted(more)
 
 
 def test_refusals_say_to_run_the_text_stage(tmp_path: Path) -> None:
-    cache = TextCache.build(tmp_path, ["jump"], Counting(), progress=False)
+    cache = build_with_encoder(tmp_path, ["jump"], Counting(), progress=False)
     with pytest.raises(
         UserError, match=r"caption 'fly' is not in the text cache .* run the text stage again"
     ):
@@ -228,13 +228,13 @@ def test_refusals_say_to_run_the_text_stage(tmp_path: Path) -> None:
     (tmp_path / "tokens.npy").write_bytes((tmp_path / "tokens.npy").read_bytes()[:-3])
     with pytest.raises(UserError, match="run the text stage again"):
         TextCache.open(tmp_path)
-    rebuilt = TextCache.build(tmp_path, ["jump"], Counting(), progress=False)
+    rebuilt = build_with_encoder(tmp_path, ["jump"], Counting(), progress=False)
     assert len(rebuilt) == 1, "a damaged cache is made again"
     (tmp_path / "cache.json").unlink()
     with pytest.raises(UserError, match="no finished text cache here; run the text stage"):
         TextCache.open(tmp_path)
     with pytest.raises(UserError, match="no captions"):
-        TextCache.build(tmp_path, [], Counting(), progress=False)
+        build_with_encoder(tmp_path, [], Counting(), progress=False)
 
 
 WORDS = ["a", "person", "walks", "jump", "someone", "left"]
@@ -257,7 +257,7 @@ def test_same_bytes_for_any_number_of_workers(
     caches = [build_text_cache(tmp_path / str(n), captions, model, workers=n, progress=False) for n in (1, 2)]
     assert digests(tmp_path / "1") == digests(tmp_path / "2")
     assert len(caches[0]) == 100 and not (tmp_path / "1" / "parts").exists()
-    TextCache.build(tmp_path / "3", captions, load_text_encoder(model), progress=False)
+    build_with_encoder(tmp_path / "3", captions, load_text_encoder(model), progress=False)
     assert digests(tmp_path / "1") == digests(tmp_path / "3")
     encoder = load_text_encoder(model)
     for caption in captions[::17]:
@@ -280,7 +280,7 @@ def test_an_interrupted_build_keeps_its_parts(tmp_path: Path, monkeypatch: pytes
 
     stopped = Stops()
     with pytest.raises(KeyboardInterrupt):
-        TextCache.build(tmp_path / "a", captions, stopped, progress=False)
+        build_with_encoder(tmp_path / "a", captions, stopped, progress=False)
     with pytest.raises(UserError, match="no finished text cache"):
         TextCache.open(tmp_path / "a")
     parts = sorted((tmp_path / "a" / "parts").iterdir())
@@ -290,16 +290,16 @@ def test_an_interrupted_build_keeps_its_parts(tmp_path: Path, monkeypatch: pytes
         lost = len(arrays["lengths"])
     damaged.write_bytes(damaged.read_bytes()[:-40])
     rest = Counting()
-    TextCache.build(tmp_path / "a", captions, rest, progress=False)
+    build_with_encoder(tmp_path / "a", captions, rest, progress=False)
     assert len(rest.asked) == 100 - kept + lost, "finished parts are kept, a damaged one is made again"
-    TextCache.build(tmp_path / "b", captions, Counting(), progress=False)
+    build_with_encoder(tmp_path / "b", captions, Counting(), progress=False)
     assert digests(tmp_path / "a") == digests(tmp_path / "b")
 
 
 def test_parts_of_other_captions_or_encoders_are_not_taken(tmp_path: Path) -> None:
     """What a killed run left for another caption set or encoder is ignored and removed."""
     folder = tmp_path / "a"
-    TextCache.build(folder, ["jump"], Counting(), progress=False)
+    build_with_encoder(folder, ["jump"], Counting(), progress=False)
     for name in ("counting", "another"):
         kept = Counting(name=name)
         (part,) = build_module._parts([key_of("fly")], {key_of("fly"): "fly"}, tmp_path, name)
@@ -307,7 +307,7 @@ def test_parts_of_other_captions_or_encoders_are_not_taken(tmp_path: Path) -> No
         (folder / "parts").mkdir()
         part.path.rename(folder / "parts" / part.path.name)
         fresh = Counting()
-        assert len(TextCache.build(folder, ["jump", "fly", name], fresh, progress=False)) >= 3
+        assert len(build_with_encoder(folder, ["jump", "fly", name], fresh, progress=False)) >= 3
         assert sorted(fresh.asked) == sorted({"fly", name} if name == "counting" else {name})
         assert not (folder / "parts").exists()
 
@@ -326,7 +326,7 @@ class Slow(t.Counting):
             print(len(self.asked), flush=True)
             time.sleep(60)
         return super().encode(captions)
-t.TextCache.build(Path({str(tmp_path / "a")!r}), t.phrases(100), Slow(), progress=False)
+t.build_with_encoder(Path({str(tmp_path / "a")!r}), t.phrases(100), Slow(), progress=False)
 """
     process = subprocess.Popen([sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -335,8 +335,8 @@ t.TextCache.build(Path({str(tmp_path / "a")!r}), t.phrases(100), Slow(), progres
     process.communicate()
     rest = Counting()
     monkeypatch.setattr(build_module, "PART", 16)
-    TextCache.build(tmp_path / "a", phrases(100), rest, progress=False)
-    TextCache.build(tmp_path / "b", phrases(100), Counting(), progress=False)
+    build_with_encoder(tmp_path / "a", phrases(100), rest, progress=False)
+    build_with_encoder(tmp_path / "b", phrases(100), Counting(), progress=False)
     assert len(rest.asked) == 100 - done
     assert digests(tmp_path / "a") == digests(tmp_path / "b")
 

@@ -44,6 +44,7 @@ def test_schedule_equals_public_tables(shared: Path, name: str, config: Schedule
         np.testing.assert_allclose(taken[0], golden[f"{name}__p_mean"][row], rtol=1e-3, atol=2e-3)
 
 
+@pytest.mark.usefixtures("float64")
 def test_padding_plays_no_part() -> None:
     torch.manual_seed(0)
     net = MotionDiffusion(SMALL, 5, 7).eval()
@@ -65,6 +66,7 @@ def test_hidden_text_has_no_influence() -> None:
         assert torch.allclose(*pair, atol=1e-6) is same
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
 def test_learns_which_motion_a_text_means(sampler: Sampler) -> None:
     """Two texts, two constant motions: each text must give its own."""

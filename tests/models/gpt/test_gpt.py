@@ -56,6 +56,7 @@ def test_only_legal_tokens_have_logits(gpt: InterleavedGPT) -> None:
             assert set(legal[row, position].nonzero()[:, 0].tolist()) == allowed, (row, position)
 
 
+@pytest.mark.usefixtures("float64")
 @torch.no_grad()
 def test_cached_equals_uncached(gpt: InterleavedGPT) -> None:
     seq, text = sequences([4, 4]), torch.randn(2, 6)
@@ -73,6 +74,7 @@ def test_cached_equals_uncached(gpt: InterleavedGPT) -> None:
         gpt.hidden(x[:, :1], cache)
 
 
+@pytest.mark.usefixtures("float64")
 @torch.no_grad()
 def test_batch_of_mixed_lengths_equals_one_at_a_time(gpt: InterleavedGPT) -> None:
     seq, text = sequences([1, 5, 3]), torch.randn(3, 6)
@@ -83,6 +85,7 @@ def test_batch_of_mixed_lengths_equals_one_at_a_time(gpt: InterleavedGPT) -> Non
         torch.testing.assert_close(alone[0], together[row, :n], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.usefixtures("float64")
 @torch.no_grad()
 def test_cached_batch_of_mixed_lengths_equals_each_alone_uncached(gpt: InterleavedGPT) -> None:
     seq, text = sequences([1, 5, 3]), torch.randn(3, 6)
@@ -96,6 +99,7 @@ def test_cached_batch_of_mixed_lengths_equals_each_alone_uncached(gpt: Interleav
         torch.testing.assert_close(cached[row, :n], alone[0], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.usefixtures("float64")
 @torch.no_grad()
 def test_causal_and_conditional(gpt: InterleavedGPT) -> None:
     seq, text = sequences([4]), torch.randn(1, 6)
@@ -113,6 +117,7 @@ def test_causal_and_conditional(gpt: InterleavedGPT) -> None:
     torch.testing.assert_close(null, null_other)
 
 
+@pytest.mark.usefixtures("float64")
 def test_cross_entropy_equals_token_by_token(gpt: InterleavedGPT) -> None:
     seq = sequences([2, 4, 1])
     logits = gpt(seq.tokens, seq.kinds, torch.randn(3, 6))

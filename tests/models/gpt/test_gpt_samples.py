@@ -49,6 +49,7 @@ def parts(module: GptModule) -> dict[str, Any]:
     return {"tokenizer": module.tokenizer.module, "tma": module.tma.module, "temperature": 0.1}
 
 
+@pytest.mark.usefixtures("float64")
 def test_rewards_are_the_motions_half_of_infonce(module: GptModule) -> None:
     """One sample at a time, by hand; a caption that says the same is no rival, the caption itself stays."""
     text = batch_of(module)["text"]
@@ -104,6 +105,7 @@ def test_equal_rewards_teach_nothing(module: GptModule) -> None:
     assert all(p.grad is None or p.grad.abs().max() == 0 for p in module.net.parameters())
 
 
+@pytest.mark.slow
 def test_a_model_learns_what_is_rewarded(module: GptModule, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a reward of the share of code 3, samples come to hold little else, without the cross-entropy."""
     monkeypatch.setattr(

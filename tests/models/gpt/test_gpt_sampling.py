@@ -164,6 +164,7 @@ def grammar(word: int, length: int) -> tuple[list[int], list[int]]:
     return body, [(body[2 * i] + body[2 * i + 1]) % 5 for i in range(length)]
 
 
+@pytest.mark.slow
 def test_learns_a_toy_grammar() -> None:
     """Text names a word and a length: sampled freely, codes and the place of End must be those of the
     grammar.

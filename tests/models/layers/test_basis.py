@@ -30,18 +30,20 @@ def basis_of(part: Part = "bodyhand", root_gain: float = 5.0, finger_gain: float
     return basis
 
 
+@pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("part", ["bodyhand", "all"])
 def test_out_is_the_inverse_of_in(part: Part) -> None:
     basis = basis_of(part)
-    x = torch.from_numpy(RNG.standard_normal((2, 7, len(LAYOUT.part(part))))).float()
-    torch.testing.assert_close(basis.leave(basis.enter(x)), x, rtol=1e-5, atol=1e-4)
-    torch.testing.assert_close(basis.enter(basis.leave(x)), x, rtol=1e-5, atol=1e-4)
+    x = torch.from_numpy(RNG.standard_normal((2, 7, len(LAYOUT.part(part)))))
+    torch.testing.assert_close(basis.leave(basis.enter(x)), x, rtol=0, atol=1e-9)
+    torch.testing.assert_close(basis.enter(basis.leave(x)), x, rtol=0, atol=1e-9)
 
 
+@pytest.mark.usefixtures("float64")
 def test_zero_is_the_mean() -> None:
     basis, x = basis_of(), torch.zeros(1, 4, 313)
-    torch.testing.assert_close(basis.enter(x), x, rtol=0, atol=1e-5)
-    torch.testing.assert_close(basis.leave(x), x, rtol=0, atol=1e-5)
+    torch.testing.assert_close(basis.enter(x), x, rtol=0, atol=1e-9)
+    torch.testing.assert_close(basis.leave(x), x, rtol=0, atol=1e-9)
 
 
 def at(joint: int, field: str = "positions") -> slice:
@@ -119,11 +121,12 @@ def test_a_tokenizer_with_gains_gives_the_papers_features(config: type[H2VQConfi
     codes = net.eval().encode(x, length)
     out = net(x, length)
     recon = net.features(out.written, length)
-    torch.testing.assert_close(net.decode(codes, length), recon, rtol=1e-4, atol=1e-4)
+    # The palms of these random hands magnify float32's rounding some hundred times.
+    torch.testing.assert_close(net.decode(codes, length), recon, rtol=1e-3, atol=1e-3)
     assert not recon[1, 8:].any(), "padding stays zero"
     again = build_tokenizer(settings, LAYOUT)
     again.load_state_dict(net.state_dict())
-    torch.testing.assert_close(again.eval().decode(codes, length), recon, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(again.eval().decode(codes, length), recon, rtol=1e-3, atol=1e-3)
 
 
 def test_the_loss_is_of_what_is_seen() -> None:

@@ -249,6 +249,7 @@ def test_agrees_with_vector_quantize_pytorch() -> None:
     close(quantizer.codebook, inner.embed[0].detach())
 
 
+@pytest.mark.slow
 def test_compiles_to_one_graph() -> None:
     quantizer = EmaQuantizer(QuantizerConfig(num_codes=8, dim=4))
     z = torch.randn(2, 20, 4)

@@ -47,6 +47,7 @@ def worker(rank: int, out: Path) -> None:
         dist.destroy_process_group()
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_two_ranks_equal_one_process(tmp_path: Path) -> None:
     command = [sys.executable, "-P", __file__]

@@ -19,6 +19,7 @@ def net() -> Tma:
     return Tma(TINY, motion_dim=6, text_dim=5).eval()
 
 
+@pytest.mark.usefixtures("float64")
 @torch.no_grad()
 def test_padding_changes_nothing(net: Tma) -> None:
     motion, tokens = torch.randn(3, 10, 6), torch.randn(3, 7, 5)
@@ -47,6 +48,7 @@ def test_order_of_frames_matters(net: Tma) -> None:
     assert (mu - back).abs().max() > 1e-3
 
 
+@pytest.mark.usefixtures("float64")
 @torch.no_grad()
 @pytest.mark.parametrize("stride", [2, 3])
 def test_frame_stride_sees_every_nth_frame_only(stride: int) -> None:
@@ -108,6 +110,7 @@ def toy_batch(seed: int, size: int = 32) -> dict[str, torch.Tensor]:
     }
 
 
+@pytest.mark.slow
 def test_learns_to_retrieve() -> None:
     """Held-out noise and phases of 32 captions: chance is 1/32."""
     torch.manual_seed(0)

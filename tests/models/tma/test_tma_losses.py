@@ -167,6 +167,7 @@ def test_masked_reconstruction_equals_frame_by_frame(lengths: list[int], seed: i
     close(reconstruction_loss(pred, target, mask), expected)
 
 
+@pytest.mark.slow
 def test_two_ranks_equal_one_process(tmp_path: Path) -> None:
     """Loss and every gradient of DDP on two gloo ranks = one process with the concatenated batch, to 1e-5."""
     generator = torch.Generator().manual_seed(3)

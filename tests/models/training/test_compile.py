@@ -22,6 +22,8 @@ from motionloom.models.tokenizer.config import FsqConfig, H2VQConfig, MqConfig, 
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
+pytestmark = pytest.mark.slow
+
 LAYOUT = MotionLayout.named("wholebody313")
 SMALL: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8}
 BOOK: dict[str, Any] = {**SMALL, "num_codes": 16}

@@ -54,6 +54,8 @@ from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
+pytestmark = pytest.mark.slow
+
 STEPS = 20
 BATCH, FRAMES, TEXT = 6, 24, 6
 LAYOUT = MotionLayout.named("wholebody313")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from bvh_clips import write_clip, write_map
 from safetensors.numpy import load_file
 
 from motionloom.pipeline.cli.main import app
@@ -152,7 +153,7 @@ WRONG_PLACES: dict[str, tuple[list[str], str]] = {
     ),
     "run of an empty recipe": (["evaluate", "empty"], "empty/recipe.yaml: a recipe is a mapping"),
     "model of an empty recipe": (["generate", "empty", "jump"], "empty/recipe.yaml: holds no stages"),
-    "model of no YAML": (["export", "broken", "-o", "new"], "broken/recipe.yaml: cannot be read"),
+    "model of no YAML": (["export", "broken", "-o", "new"], "broken/recipe.yaml: not valid YAML"),
     "model of stages without a kind": (["export", "kindless"], "kindless/recipe.yaml: holds no stages"),
 }
 
@@ -229,13 +230,11 @@ def test_stats_describes_and_writes(shards: Path, tmp_path: Path, call: Call) ->
         assert out.read_bytes() == first, "equal statistics must be equal files"
 
 
-def test_convert_plans_and_converts(shared: Path, tmp_path: Path, call: Call) -> None:
+def test_convert_plans_and_converts(tmp_path: Path, call: Call) -> None:
     source, out = tmp_path / "mocap", tmp_path / "out"
-    source.mkdir()
-    for name in ("control_ok", "frame_time_zero"):
-        path = shared / f"data/broken/bvh/{name}.bvh"
-        (source / path.name).write_bytes(path.read_bytes())
-    joint_map = shared / "data/bandai/joint_map.json"
+    text = write_clip(source / "control_ok.bvh", 0).read_text()
+    (source / "frame_time_zero.bvh").write_text(re.sub(r"Frame Time: .*", "Frame Time: 0.0", text))
+    joint_map = write_map(tmp_path / "joint_map.json")
     words = ("data", "convert", "bvh", source, out, "--joint-map", joint_map, "--licence", "CC-BY-NC-4.0")
     plan = call(*words, "--plan")
     assert plan.code == 0 and "frame_time_zero.bvh" in plan.out and not out.exists()

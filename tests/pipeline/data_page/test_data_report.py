@@ -16,6 +16,7 @@ import pytest
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Dropped, UserError
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
@@ -48,16 +49,18 @@ def nasty(tmp_path_factory: pytest.TempPathFactory) -> Path:
         root,
         [(split_of(k, CONFIG), k) for k in range(CONFIG.clips)],
         nasty_sample,
-        name="nasty",
-        layout=CONFIG.motion_layout,
-        licence="mixed",
-        converter="synth",
-        converter_version=7,
-        options={"body_model": {"sentence": f"No body model. {NASTY}"}, "deep": {"er": [1, NASTY]}},
-        progress=False,
-        dropped=[*dropped, Dropped(source="b", reason="NaN at frame 3")],
-        audio={"rate": 30720, "name": NASTY},
-        notes=[f"a note {NASTY}"],
+        DatasetFacts(
+            name="nasty",
+            layout=CONFIG.motion_layout,
+            licence="mixed",
+            converter="synth",
+            converter_version=7,
+            options={"body_model": {"sentence": f"No body model. {NASTY}"}, "deep": {"er": [1, NASTY]}},
+            dropped=[*dropped, Dropped(source="b", reason="NaN at frame 3")],
+            audio={"rate": 30720, "name": NASTY},
+            notes=[f"a note {NASTY}"],
+        ),
+        WriteOptions(progress=False),
     )
     return root
 
@@ -175,9 +178,12 @@ def raw_sample(index: int, layout: MotionLayout) -> Sample:
 def test_raw_sets_without_captions_have_a_page(name: str, tmp_path: Path) -> None:
     layout = MotionLayout.named(name)
     write_dataset(
-        tmp_path, [("train", k) for k in range(3)], partial(raw_sample, layout=layout), name="raw",
-        layout=layout, licence="x", converter="made", converter_version=1, options={}, progress=False,
-    )  # fmt: skip
+        tmp_path,
+        [("train", k) for k in range(3)],
+        partial(raw_sample, layout=layout),
+        DatasetFacts("raw", layout, licence="x", converter="made", converter_version=1, options={}),
+        WriteOptions(progress=False),
+    )
     write_data_report(tmp_path, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     assert "No clip has a caption." in text and "neutral skeleton" in text and "none stated" in text

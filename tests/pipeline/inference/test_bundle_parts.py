@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from motionloom.pipeline.inference.bundle import PARTS, part_folders
-from motionloom.pipeline.runs.recipe import load_recipe, shipped_recipes
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.shipped import shipped_recipes
 
 
 @pytest.mark.parametrize("name", sorted(shipped_recipes()))

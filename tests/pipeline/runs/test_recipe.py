@@ -11,7 +11,8 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.recipe import load_recipe, shipped_recipes
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.shipped import shipped_recipes
 
 
 def write(tmp_path: Path, text: str) -> Path:

@@ -6,8 +6,8 @@ import jsonschema
 import pytest
 import yaml
 
-from motionloom.pipeline.runs.recipe import shipped_recipes
 from motionloom.pipeline.runs.schema import recipe_schema
+from motionloom.pipeline.runs.shipped import shipped_recipes
 
 VALIDATOR = jsonschema.Draft202012Validator(recipe_schema())
 

@@ -13,6 +13,7 @@ import torch
 from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import HANDS, Caption, Split, UserError
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
@@ -56,9 +57,12 @@ class Convert:
 def dataset_of(out: Path, convert: Convert) -> ShardDataset:
     items: list[tuple[Split, int]] = [("train", i) for i in range(len(convert.texts))]
     write_dataset(
-        out, items, convert, name="made", layout=LAYOUT, licence="CC0", converter="test",
-        converter_version=1, options={}, clips_per_shard=3, progress=False,
-    )  # fmt: skip
+        out,
+        items,
+        convert,
+        DatasetFacts("made", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
+        WriteOptions(clips_per_shard=3, progress=False),
+    )
     return ShardDataset.open(out, "train")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from motionloom.datasets.schema import Caption, Split
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, make_sample
@@ -60,10 +61,12 @@ def replace_end(caption: Caption, end: float | None) -> Caption:
 
 def test_every_stage_takes_a_mixed_data_set(tmp_path: Path, call: Callable[..., Any]) -> None:
     write_dataset(
-        tmp_path / "shards", [(split_of(i), i) for i in range(COUNT)], sample, name="mixed",
-        layout=CONFIG.motion_layout, licence="CC0", converter="test", converter_version=1, options={},
-        progress=False,
-    )  # fmt: skip
+        tmp_path / "shards",
+        [(split_of(i), i) for i in range(COUNT)],
+        sample,
+        DatasetFacts("mixed", CONFIG.motion_layout, "CC0", converter="test", converter_version=1, options={}),
+        WriteOptions(progress=False),
+    )
     recipe = tmp_path / "mixed.yaml"
     recipe.write_text(RECIPE.format(path=tmp_path / "shards"))
     done = call("run", recipe, "--out", tmp_path / "run")

@@ -15,6 +15,7 @@ import yaml
 from motionloom.datasets.schema import Split
 from motionloom.datasets.shards import retry
 from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
@@ -45,9 +46,14 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return Sample(dataset.meta(i), dataset.motion(i), dataset.texts(i), dataset.face_texts(i))
 
     write_dataset(
-        out, items, copy, name="made", layout=splits["train"].layout, licence="CC0", converter="copy",
-        converter_version=1, options={}, clips_per_shard=8, progress=False,
-    )  # fmt: skip
+        out,
+        items,
+        copy,
+        DatasetFacts(
+            "made", splits["train"].layout, "CC0", converter="copy", converter_version=1, options={}
+        ),
+        WriteOptions(clips_per_shard=8, progress=False),
+    )
     return out
 
 

@@ -1,4 +1,4 @@
-"""The first of two steps, for sources that can only be read front to back.
+"""The features step, for sources that can only be read front to back.
 
 An archive is read once, in its own order, while shards are shuffled: so features are made batch by batch (an
 archive is a batch) into a folder, and the shard writer then picks clips from there in its own order.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
@@ -15,10 +16,12 @@ from rich.progress import Progress
 
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.options import WriteOptions
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.shards.tasks import Part
+from motionloom.datasets.shards.tasks import Convert
 
 T = TypeVar("T")
+Take = Callable[[T, Path], Sample | list[Sample]]
 
 
 class FeatureBatch(Protocol):
@@ -38,60 +41,47 @@ class FeatureBatch(Protocol):
         ...
 
     def trial(self, seconds: float) -> int:
-        """Convert clips without keeping them for about so long; how many."""
+        """Convert clips for about this long without keeping them; returns how many."""
         ...
 
 
 @dataclass(frozen=True)
-class FirstStep(Generic[T]):
-    """How the features of a conversion are made batch by batch."""
+class FeatureStep(Generic[T]):
+    """How the features of a conversion are made batch by batch, and how a clip is picked from them."""
 
     batches: Sequence[FeatureBatch]
     batch_of: Callable[[T], int]
     """Position in `batches` of the batch that an item is in."""
-    take: Callable[[T, Path], Sample | list[Sample]]
+    take: Take[T]
     """The sample of an item, from the files of its batch. Picklable; raises what stopped the clip."""
 
-    def run(
-        self, items: Sequence[T], folder: Path, pool: Workers, *, part: Part | None, progress: bool
-    ) -> None:
-        """Make the batches that `items` need and that are not there: all, or those of `part`.
+    def make(self, items: Sequence[T], folder: Path, pool: Workers, how: WriteOptions) -> Convert[T]:
+        """Make the batches that `items` need and that are not there: all, or those of a part.
 
-        The part of a later step makes none: `UserError` when one is missing.
+        Returns the function from item to sample. A part of the shards makes no batch: `UserError` when one is
+        missing.
         """
         needed = sorted({self.batch_of(item) for item in items})
-        if part is not None and part.step == "features":
-            needed = [position for position in needed if part.has(position)]
-        folder.mkdir(parents=True, exist_ok=True)
+        if how.features_only:
+            needed = [position for position in needed if how.has(position)]
         todo = [self.batches[position] for position in needed if not self.batches[position].is_made(folder)]
-        if todo and part is not None and part.step != "features":
+        if todo and how.part is not None and not how.features_only:
             raise UserError(
                 f"{folder}: features of {len(todo)} batches are missing; "
                 f"run the parts of step 'features' first"
             )
-        with Progress(disable=not progress) as bar:
+        if todo:
+            folder.mkdir(parents=True, exist_ok=True)
+        with Progress(disable=not how.progress or not items) as bar:
             shown = bar.add_task("converting clips", total=sum(batch.size for batch in todo))
-            for position, _ in pool.run(_Make(folder), todo):
+            for position, _ in pool.run(partial(_make, folder), todo):
                 bar.advance(shown, todo[position].size)
+        return partial(_take, self.take, folder)
 
 
-@dataclass(frozen=True)
-class Take(Generic[T]):
-    """`FirstStep.take` with its folder: the writer's function from item to sample."""
-
-    take: Callable[[T, Path], Sample | list[Sample]]
-    folder: Path
-
-    def __call__(self, item: T) -> Sample | list[Sample]:
-        """The sample of an item."""
-        return self.take(item, self.folder)
+def _make(folder: Path, batch: FeatureBatch) -> None:
+    batch.make(folder)
 
 
-@dataclass(frozen=True)
-class _Make:
-    """`FeatureBatch.make` with its folder, for the pool."""
-
-    folder: Path
-
-    def __call__(self, batch: FeatureBatch) -> None:
-        batch.make(self.folder)
+def _take(take: Take[T], folder: Path, item: T) -> Sample | list[Sample]:
+    return take(item, folder)

@@ -1,0 +1,61 @@
+"""The options that every converter has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict, Field
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Config
+from motionloom.datasets.shards.sample import MotionType
+
+
+class ConvertConfig(Config):
+    """Options that every converter has. The docstrings of the fields are the command line's help."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    source: Path
+    """Folder of the source, as its authors publish it."""
+    name: str
+    """Name of the data set; part of the shards' file names."""
+    layout: str
+    """Feature layout of the shards (docs/data.md lists them)."""
+    fps: float = Field(gt=0, le=240)
+    """Frame rate of the shards; clips are resampled by time."""
+    licence: str | None = None
+    """Overrides the licence the converter states for the source."""
+    allow_licence: tuple[str, ...] = ()
+    """Convert only clips under these licences; empty means all."""
+    min_seconds: float = Field(default=1.0, ge=0)
+    """Shorter clips are left out."""
+    max_seconds: float | None = Field(default=None, gt=0)
+    """Longer clips are left out."""
+    limit: int | None = Field(default=None, ge=1)
+    """Convert only this many clips, chosen by a hash of the id so that they stay spread over the source."""
+    motion_type: MotionType = "float32"
+    """`float16` halves the shards; positions then keep about a millimetre."""
+
+    def motion_layout(self) -> MotionLayout:
+        """The layout of the written shards."""
+        return MotionLayout.named(self.layout, fps=self.fps)
+
+    def options(self, *local: str) -> dict[str, Any]:
+        """What the output depends on, for the manifest: without `source` and other `local` paths."""
+        return {key: value for key, value in self.dump().items() if key not in ("source", *local)}
+
+    def licence_problem(self, licence: str) -> str:
+        """Why a clip under `licence` is left out; empty when it may come."""
+        if not self.allow_licence or licence in self.allow_licence:
+            return ""
+        return f"licence '{licence}' is not allowed (--allow-licence {', '.join(self.allow_licence)})"
+
+    def length_problem(self, seconds: float) -> str:
+        """Why a clip of this length is left out; empty when it may come."""
+        if seconds < self.min_seconds:
+            return f"{seconds:.2f} s, shorter than {self.min_seconds:g} s"
+        if self.max_seconds is not None and seconds > self.max_seconds:
+            return f"{seconds:.2f} s, longer than {self.max_seconds:g} s"
+        return ""

@@ -1,0 +1,76 @@
+"""YAML as recipes are written and read: plain data only, numbers as in YAML 1.2.
+
+PyYAML follows YAML 1.1, where `1e-4` is text, `010` is eight, `1:30` is ninety and `no` is false. The core
+schema of 1.2 (section 10.3.2 of its specification) has none of these surprises. Tags other than the standard
+ones are refused, as in `yaml.safe_load`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from motionloom.datasets.schema import UserError
+
+_CORE = (
+    ("bool", re.compile(r"true|True|TRUE|false|False|FALSE"), "tTfF"),
+    ("int", re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+"), "-+0123456789"),
+    (
+        "float",
+        re.compile(
+            r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
+        ),
+        "-+.0123456789",
+    ),
+    ("null", re.compile(r"~|null|Null|NULL|"), ["~", "n", "N", ""]),
+    ("merge", re.compile(r"<<"), "<"),
+)
+"""Tag, what is of that kind, and the characters it may begin with; `<<` is 1.1's, and handy in recipes."""
+
+
+class _Loader(yaml.SafeLoader):
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes every text that either version would take for something else."""
+
+
+def _int(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:
+    text = str(loader.construct_scalar(node))
+    return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+
+
+for _kind, _pattern, _first in _CORE:
+    _whole = re.compile(rf"(?:{_pattern.pattern})\Z")
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", _whole, list(_first))
+    _Dumper.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", _whole, list(_first))
+_Loader.add_constructor("tag:yaml.org,2002:int", _int)
+
+
+def load_yaml(text: str, where: str) -> Any:
+    """Plain data from YAML; a `UserError` names `where` (a file or an option)."""
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a value that its explicit tag does not allow
+        reason = " ".join(str(error).split()).replace('in "<unicode string>", ', "at ")
+        raise UserError(f"{where}: not valid YAML: {reason}") from None
+
+
+def read_yaml(path: Path) -> Any:
+    """Plain data from a YAML file."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: not valid YAML: {error}") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+    return load_yaml(text, str(path))
+
+
+def dump_yaml(data: Any) -> str:
+    """YAML of plain data, in its order; reading it again gives equal data."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)

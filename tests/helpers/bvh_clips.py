@@ -1,0 +1,33 @@
+"""BVH files of a standing, swaying figure on our own body skeleton, with the joint map that reads them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from motionloom.datasets.motion.bvh import write_bvh
+from motionloom.datasets.motion.skeleton import Skeleton
+
+SKELETON = Skeleton.named("smpl22")
+
+
+def write_clip(path: Path, seed: int, frames: int = 90, fps: float = 30.0) -> Path:
+    """Every joint swings a little about its own axis, at its own pace, while the figure walks off slowly."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(frames)[:, None, None] / fps
+    axes = rng.standard_normal((1, len(SKELETON), 3)) * 0.08
+    turns = axes * np.sin(times * rng.uniform(0.5, 3.0, (1, len(SKELETON), 1)))
+    rotations = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix().reshape(frames, -1, 3, 3)
+    root = np.array([0.0, 0.95, 0.0]) + times[:, 0] * rng.uniform(-0.3, 0.3, 3) * [1, 0, 1]
+    write_bvh(path, SKELETON, rotations, root, fps)
+    return path
+
+
+def write_map(path: Path) -> Path:
+    """The joint map of these files: every joint by its own name."""
+    rows = [[number, name, name] for number, name in enumerate(SKELETON.joints)]
+    path.write_text(json.dumps({"smpl22": rows, "unmapped": []}))
+    return path
