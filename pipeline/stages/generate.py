@@ -1,4 +1,4 @@
-"""Generation stage: motions for held-out captions, written for tools and as a page to watch."""
+"""Generation stage: motions for held-out captions or music, written for tools and as a page to watch."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import Field
 
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import GENERATOR, Every, StageConfig, StageContext, StageKind
-from motionloom.pipeline.evaluation.truth import spread, truth_of
+from motionloom.pipeline.evaluation.example_clips import example_clips, perform
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.outputs import FORMATS, Format, write_motions
 
@@ -17,7 +17,7 @@ class GenerateConfig(StageConfig):
     """Which captions, how drawn, written as what."""
 
     captions: list[str] = Field(default_factory=list)
-    """Captions to perform; empty takes `count` from the test split."""
+    """Captions to perform; empty takes the captions, or the music, of `count` clips of the test split."""
     count: int = Field(8, ge=1)
     sampling: SamplingConfig = SamplingConfig()
     formats: list[Format] = Field(default_factory=lambda: list(FORMATS))
@@ -27,7 +27,7 @@ class GenerateStage(StageKind):
     """Motions for captions, written for tools and as a page to watch."""
 
     name = "generate"
-    summary = "motions from captions"
+    summary = "motions from captions or music"
     config = GenerateConfig
     takes = ("data", Every("generators", GENERATOR))
     version = 3  # generators as the recipe has them
@@ -40,14 +40,17 @@ class GenerateStage(StageKind):
         """Generate, decode and write."""
         config: GenerateConfig = context.config
         bundle = Bundle(context.every("generators"), context.shelf)
-        captions, faces = list(config.captions), list(config.captions)
-        if not captions:
+        if config.captions:
+            motions = bundle.generate(
+                config.captions, face_captions=config.captions, seed=context.seed, sampling=config.sampling
+            )
+        else:
             dataset = context.given["data"].held_out(prefer="test")
-            truths = [truth_of(dataset, i) for i in spread(dataset, config.count)]
-            captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
-        motions = bundle.generate(captions, face_captions=faces, seed=context.seed, sampling=config.sampling)
+            chosen = example_clips(dataset, config.count, bundle.generator.modalities)
+            motions = perform(bundle, chosen, seed=context.seed, sampling=config.sampling)
         write_motions(
             context.folder / "motions", motions, config.formats, title="Generated motions", seed=context.seed
         )
         for motion in motions:
-            context.console.print(f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {motion.caption}")
+            title = motion.caption or "to music"
+            context.console.print(f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {title}")

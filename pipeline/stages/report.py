@@ -20,7 +20,8 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
     StageKind,
 )
-from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, spread, truth_of
+from motionloom.pipeline.evaluation.example_clips import ExampleClip, example_clips, perform
+from motionloom.pipeline.evaluation.truth import reconstruct_truth
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion, joint_layout
 from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.face import synthetic_face_controls
@@ -54,13 +55,8 @@ class ReportStage(StageKind):
         """Write `report.html`."""
         bundle = Bundle(context.every("generators"), context.shelf)
         dataset = context.given["data"].held_out(prefer="test")
-        truths = [truth_of(dataset, i) for i in spread(dataset, context.config.count)]
-        generated = bundle.generate(
-            [t.caption for t in truths],
-            face_captions=[t.face_caption for t in truths],
-            seed=context.seed,
-            sampling=context.config.sampling,
-        )
+        clips = example_clips(dataset, context.config.count, bundle.generator.modalities)
+        generated = perform(bundle, clips, seed=context.seed, sampling=context.config.sampling)
         # The recipe's name, not the folder's: equal runs write equal pages wherever they lie.
         page = Page(
             f"motionloom: {context.recipe}",
@@ -68,9 +64,9 @@ class ReportStage(StageKind):
         )
         page.add_heading("Watch")
         page.add_viewer(
-            _motions(context, truths, generated),
-            "Each row is one caption: the recorded clip, what the tokenizer keeps of it, and a motion that "
-            "the model made from the words alone. Drag to orbit, wheel to zoom, space to play.",
+            _motions(context, clips, generated),
+            "Each row is one clip: as it was recorded, what the tokenizer keeps of it, and a motion that "
+            "the model made from its words or its music alone. Drag to orbit, wheel to zoom, space to play.",
         )
         stages = context.every("shown")
         shown = [(stage, stage.kind.show(stage, context.shelf.given(stage.inputs))) for stage in stages]
@@ -81,15 +77,15 @@ class ReportStage(StageKind):
 
 
 def _motions(
-    context: StageContext, truths: list[Truth], generated: list[GeneratedMotion]
+    context: StageContext, clips: Sequence[ExampleClip], generated: list[GeneratedMotion]
 ) -> list[ViewerMotion]:
     tokenizer, face_tokenizer = context.given.get("tokenizer"), context.given.get("face_tokenizer")
     layout = joint_layout(context.given["data"].layout)
     parents, out = layout.skeleton.parents, []
-    for number, (truth, made) in enumerate(zip(truths, generated, strict=True), start=1):
-        group = f"{number}"
-        same = truth.face_caption == truth.caption
-        words = truth.caption if same else f"{truth.caption} (face: {truth.face_caption})"
+    for number, (clip, made) in enumerate(zip(clips, generated, strict=True), start=1):
+        group, truth, words = f"{number}", clip.truth, clip.title
+        if truth.face_caption != truth.caption:
+            words = f"{words} (face: {truth.face_caption})"
         face = None if truth.face is None else synthetic_face_controls(truth.face)
         rows = [("recorded", truth.joints, face)]
         if tokenizer is not None:
@@ -100,7 +96,9 @@ def _motions(
         controls = None if made.face is None else synthetic_face_controls(made.face)
         rows.append(("generated", made.joints, controls))
         for label, joints, controls in rows:
-            out.append(ViewerMotion(joints, layout.fps, parents, label, words, group, controls))
+            out.append(
+                ViewerMotion(joints, layout.fps, parents, label, words, group, controls, sound=clip.sound)
+            )
     return out
 
 
