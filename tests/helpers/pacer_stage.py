@@ -91,8 +91,9 @@ class PacerBatch(TypedDict):
 class PacerBatches(Dataset[PacerBatch]):
     """Item k is one rank's rows of global batch k: a pure function of (data, seed, k), so runs resume."""
 
-    def __init__(self, data: ClipDataset, given: Given, window: int, batch: int, seed: int) -> None:
-        self.data, self.window, self.seed, self.rank, self.world = data, window, seed, 0, 1
+    def __init__(self, data: ClipDataset, given: Given, window: int, batch: int, seed: int, *at: int) -> None:
+        self.data, self.window, self.seed = data, window, seed
+        self.at = at or (0, 1)  # rank, and number of ranks
         self.stats: FeatureStats = given["stats"]
         self.audio: AudioStats = given["audio"]
         self.columns = data.layout.part(PART)
@@ -105,9 +106,8 @@ class PacerBatches(Dataset[PacerBatch]):
         return self.plan.batches_per_epoch  # of validation; training asks for as many as it has steps
 
     def __getitem__(self, k: int) -> PacerBatch:
-        turns, items = self.plan.local(k, self.rank, self.world)
-        clips = self.clips[items]
-        draws = uniform(self.seed, turns, clips)
+        turns, items = self.plan.local(k, *self.at)
+        clips, draws = self.clips[items], uniform(self.seed, turns, self.clips[items])
         begins = (draws * (self.data.frames[clips] - self.window + 1)).astype(np.int64)
         motion, audio = [], []
         for clip, begin in zip(clips.tolist(), begins.tolist(), strict=True):
@@ -131,10 +131,8 @@ class PacerModule(PlayersModule):
 
     def players(self) -> Sequence[Player]:
         """In the order of their turns."""
-        return (
-            Player("pacer", (self.net,), self.config.optim),
-            Player("critic", (self.critic,), self.config.critic),
-        )
+        mine = Player("pacer", (self.net,), self.config.optim)
+        return mine, Player("critic", (self.critic,), self.config.critic)
 
     def score(self, motion: Tensor, audio: Tensor) -> Tensor:
         """Of every frame; high for what looks recorded."""
@@ -176,14 +174,13 @@ class PacerGenerator:
         music = request.conditions.get("audio")
         if music is None or not bool(music.present.all()):
             raise UserError("the pacer is conditioned on music, and not every motion was given some")
-        heard = music.mask.sum(1).tolist()
+        heard, device = music.mask.sum(1).tolist(), music.features.device
         out = []
         for row, (seed, frames) in enumerate(zip(request.seeds, request.frames or heard, strict=True)):
             # Music that ends before the motion does is held at its last frame.
             places = torch.arange(frames).clamp(max=heard[row] - 1)
             audio = self.audio.normalize(music.features[row].cpu().numpy()[places])
             noise = torch.randn(1, self.net.noise, generator=torch.Generator().manual_seed(seed))
-            device = music.features.device
             made = self.net(torch.from_numpy(audio)[None].to(device), noise.to(device))[0].cpu().numpy()
             out.append(np.asarray(self.stats.denormalize(made, self.layout.part(PART)), dtype=np.float32))
         return out
@@ -220,18 +217,15 @@ class PacerStage(TrainedStage):
         data, window = given["data"], config.window
 
         def train(batch: int, rank: int, world: int) -> PacerBatches:
-            batches = PacerBatches(data.split("train"), given, window, batch, seed)
-            batches.rank, batches.world = rank, world
-            return batches
+            return PacerBatches(data.split("train"), given, window, batch, seed, rank, world)
 
         return Batches(train, lambda: PacerBatches(data.held_out(), given, window, 8, seed))
 
     def example(self, config: PacerConfig, net: Any, given: Given, batch: int) -> Example:
         """Shapes alone: the dry run has no data."""
-        motion = torch.empty(batch, config.window, net.motion)
-        audio = torch.empty(batch, config.window, net.audio)
+        both = {name: torch.empty(batch, config.window, getattr(net, name)) for name in ("motion", "audio")}
         length = torch.full((batch,), config.window)
-        return Example({"motion": motion, "audio": audio, "length": length}, f"{config.window} frames")
+        return Example({**both, "length": length}, f"{config.window} frames")
 
     def generator(self, stage: Finished, given: Given, device: torch.device) -> MotionGenerator:
         """From a run and from an export alike."""
