@@ -31,6 +31,8 @@ class Truth:
     face_caption: str
     truth: dict | None
     held: int = HELD_ALL
+    begin: float = 0.0
+    """Second of the clip where the stretch begins."""
 
 
 def truth_of(
@@ -72,6 +74,7 @@ def _truth(
         face_caption=max(faces, key=lambda face: _overlap(face, span)).text if faces else span.text,
         truth=truth,
         held=held,
+        begin=span.first / layout.fps,
     )
 
 

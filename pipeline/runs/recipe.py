@@ -24,7 +24,7 @@ from typing import Any
 from pydantic import Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.contract.registry import stage_kinds
+from motionloom.pipeline.contract.registry import VARIABLE, stage_kinds
 from motionloom.pipeline.contract.stage import Every, Stage
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.shipped import shipped_recipes
@@ -182,7 +182,10 @@ def _stages(file: RecipeFile, where: str) -> tuple[Stage, ...]:
         renamed = fields.pop("inputs", None) or {}
         if kind_name not in kinds:
             hint = nearest(str(kind_name), list(kinds))
-            raise UserError(f"{where}: stages.{name}.kind = '{kind_name}' is no stage kind{hint}")
+            raise UserError(
+                f"{where}: stages.{name}.kind = '{kind_name}' is no stage kind{hint}; a kind of your own "
+                f"needs its module in {VARIABLE}"
+            )
         kind = kinds[kind_name]
         config = kind.config.parse(fields, f"{where}: stages.{name}")
         parsed.append((Stage(name, kind, config, {}), renamed))
