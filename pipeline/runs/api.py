@@ -29,7 +29,8 @@ from motionloom.pipeline.runs.graph import (
     selected,
     stage_inputs,
 )
-from motionloom.pipeline.runs.recipe import Recipe, load_recipe, nearest
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
