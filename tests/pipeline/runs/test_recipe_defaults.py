@@ -98,7 +98,10 @@ def test_defaults_of_a_base_may_concern_a_stage_that_was_replaced(tmp_path: Path
 @pytest.mark.parametrize(
     ("defaults", "says"),
     [
-        ("{trainde: {train: {steps: 3}}}", "defaults.trainde: no stage kind 'trainde'; did you mean 'trained'"),
+        (
+            "{trainde: {train: {steps: 3}}}",
+            "defaults.trainde: no stage kind 'trainde'; did you mean 'trained'",
+        ),
         ("{trained: {trian: {steps: 3}}}", "defaults.trained: unknown key 'trian'; did you mean 'train'"),
         ("{trained: {net: {width: 3}}}", "defaults.trained: unknown key 'net'"),
         ("{vq: {net: {widht: 3}}}", "defaults.vq: unknown key 'net.widht'; did you mean 'width'"),
