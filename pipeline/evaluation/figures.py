@@ -131,10 +131,9 @@ class NearestClip:
         """Positions of the body's joints and of the hands', each flat."""
         layout = self.train.layout
         if layout.has("positions"):
-            positions = features[:, layout.slice("positions")]
+            key = stretch(features[:, layout.slice("positions")], KEY_FRAMES)
         else:
-            positions = local_joints(features, layout)[:, 1:].reshape(len(features), -1)
-        key = stretch(positions, KEY_FRAMES)
+            key = stretch(local_joints(features, layout)[:, 1:].reshape(len(features), -1), KEY_FRAMES)
         return [part.ravel() for part in np.split(key, [3 * (BODY_JOINTS - 1)], axis=1)]
 
     def motion(
