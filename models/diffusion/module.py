@@ -23,7 +23,7 @@ class DiffusionModule(StageModule):
         self.noiser = net.config.schedule.noiser()
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Loss of {"motion" [B, T, D], "length" [B], "sentence" [B, E], "held" bool [B, D] (optional: all)}.
+        """Loss of {"motion" [B, T, D], "length" [B], "sentence" [B, E], "present" bool [B, D], optional}.
 
         Time steps and noise are drawn anew each call; evaluation tells every caption.
         """
@@ -38,4 +38,4 @@ class DiffusionModule(StageModule):
         found = self.net(noisy, step, text, mask, told)
         target = motion if schedule.predicts == "sample" else noise
         error = (found - target.float()).square()
-        return {"loss": masked_mean(error, mask, batch.get("held"))}
+        return {"loss": masked_mean(error, mask, batch.get("present"))}

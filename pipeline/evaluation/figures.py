@@ -13,7 +13,7 @@ from torch import Tensor
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
-from motionloom.datasets.schema import HANDS, HELD_ALL
+from motionloom.datasets.schema import HANDS, PRESENT_ALL
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.metrics.reconstruction import accel, mpjpe, pa_mpjpe
@@ -70,8 +70,8 @@ def reconstruction_figures(
         real = local_joints(truth.features, layout)
         found = reconstruct_truth(tokenizer, stats, truth)
         constant = np.broadcast_to(body, truth.features.shape)
-        other = nearest.features(truth.features, truth.held)
-        joints = slice(None) if truth.held & HANDS else slice(BODY_JOINTS)
+        other = nearest.features(truth.features, truth.present)
+        joints = slice(None) if truth.present & HANDS else slice(BODY_JOINTS)
         frames = len(truth.features)
         rebuilt, target = _joints(found, layout, joints), torch.from_numpy(truth.joints)[:, joints]
         values = {"pa_mpjpe": pa_mpjpe(rebuilt, target)}
@@ -128,24 +128,24 @@ class NearestClip:
         keys = [self._key(np.asarray(train.motion(i))[:, self.columns]) for i in range(len(train))]
         self.keys = [np.stack(part) for part in zip(*keys, strict=True)]
         self.norms = [np.square(part).sum(1) for part in self.keys]
-        self.with_hands = (train.held & HANDS) > 0
+        self.with_hands = (train.present & HANDS) > 0
 
     def _key(self, features: NDArray[np.float32]) -> list[NDArray[np.float64]]:
         """Positions of the body's joints and of the hands', each flat."""
         key = stretch(features[:, self.positions], KEY_FRAMES)
         return [part.ravel() for part in np.split(key, [3 * (BODY_JOINTS - 1)], axis=1)]
 
-    def features(self, features: NDArray[np.float32], held: int = HELD_ALL) -> NDArray[np.float32]:
+    def features(self, features: NDArray[np.float32], present: int = PRESENT_ALL) -> NDArray[np.float32]:
         """Features [T, D] of that clip, stretched to T frames (velocities scaled with time).
 
-        `held` says what `features` hold.
+        `present` says what `features` hold.
         """
         body, hands = (
             norms - 2 * keys @ key
             for norms, keys, key in zip(self.norms, self.keys, self._key(features), strict=True)
         )
         distance = body
-        if held & HANDS and self.with_hands.any():
+        if present & HANDS and self.with_hands.any():
             distance = np.where(self.with_hands, body + hands, np.inf)
         found = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
         out = stretch(found, len(features))
@@ -169,17 +169,19 @@ def embed_motions(
     tma: LoadedTma,
     stats: FeatureStats,
     motions: Sequence[NDArray[np.float32]],
-    held: Sequence[int] | None = None,
+    present: Sequence[int] | None = None,
     batch: int = 64,
 ) -> Tensor:
     """TMA latents [n, 256] of body-hand features; longer motions are cut at the model's length.
 
-    `held` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
+    `present` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
     """
     columns = tma.layout.part(tma.part)
     mean, std = stats.mean[columns], stats.std[columns]
     order = np.argsort([len(m) for m in motions], kind="stable")
-    masks = tma.layout.held_columns[:, columns][[HELD_ALL] * len(motions) if held is None else held]
+    masks = tma.layout.present_columns[:, columns][
+        [PRESENT_ALL] * len(motions) if present is None else present
+    ]
     out: dict[int, Tensor] = {}
     for start in range(0, len(order), batch):
         rows = order[start : start + batch].tolist()

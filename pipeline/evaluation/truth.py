@@ -12,7 +12,7 @@ from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.features import decode, face_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import FACE, HELD_ALL, UserError
+from motionloom.datasets.schema import FACE, PRESENT_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.store.networks import device_of
@@ -23,7 +23,7 @@ class Truth:
     """A clip of the data set, or the stretch its caption is about: features of the body-hand part, joints,
     expression, captions.
 
-    `face` is None where the clip holds none; `held` are the bits of `ClipMeta.held`.
+    `face` is None where the clip holds none; `present` are the bits of `ClipMeta.present`.
     """
 
     id: str
@@ -33,7 +33,7 @@ class Truth:
     caption: str
     face_caption: str
     truth: dict | None
-    held: int = HELD_ALL
+    present: int = PRESENT_ALL
 
 
 def joint_layout(layout: MotionLayout) -> MotionLayout:
@@ -59,16 +59,16 @@ def truth_of(
     frames = min(len(motion), max_frames or len(motion)) // 4 * 4
     motion = motion[: max(frames, min(4, len(motion)))]
     body = motion[:, layout.part("bodyhand")]
-    held = int(dataset.held[index])
+    present = int(dataset.present[index])
     return Truth(
         id=dataset.ids[index],
         features=body,
         joints=decode(body, joint_layout(layout)),
-        face=face_of(motion, layout) if layout.has("face") and held & FACE else None,
+        face=face_of(motion, layout) if layout.has("face") and present & FACE else None,
         caption=span.text,
         face_caption=max(faces, key=lambda face: _overlap(face, span)).text if faces else span.text,
         truth=dataset.meta(index).truth if whole else None,
-        held=held,
+        present=present,
     )
 
 
@@ -86,17 +86,17 @@ def _overlap(one: CaptionSpan, other: CaptionSpan) -> int:
 
 @torch.no_grad()
 def reconstruct(
-    tokenizer: Tokenizer, stats: FeatureStats, features: NDArray[np.float32], held: int = HELD_ALL
+    tokenizer: Tokenizer, stats: FeatureStats, features: NDArray[np.float32], present: int = PRESENT_ALL
 ) -> NDArray[np.float32]:
     """Through the tokenizer and back, in the features' own units [T, D]; T a multiple of four.
 
-    `held` says what the clip holds; of what it does not hold, nothing is read and the mean comes back.
+    `present` says what the clip holds; of what it does not hold, nothing is read and the mean comes back.
     """
     columns, device = tokenizer.columns.cpu().numpy(), device_of(tokenizer)
     mean, std = stats.mean[columns], stats.std[columns]
     motion = torch.from_numpy(((features - mean) / std).astype(np.float32))[None].to(device)
-    mask = torch.from_numpy(tokenizer.layout.held_columns[held, columns])[None].to(device)
-    rebuilt = tokenizer.decode(tokenizer.encode(motion, held=mask), held=mask)
+    mask = torch.from_numpy(tokenizer.layout.present_columns[present, columns])[None].to(device)
+    rebuilt = tokenizer.decode(tokenizer.encode(motion, present=mask), present=mask)
     out = rebuilt.masked_fill(~mask[:, None], 0.0)[0].cpu().numpy()
     return np.asarray(out * std + mean, dtype=np.float32)
 
@@ -113,7 +113,7 @@ def reconstruct_truth(tokenizer: Tokenizer, stats: FeatureStats, truth: Truth) -
     if truth.face is not None:
         given[:, layout.slice("face")] = truth.face
     columns = tokenizer.columns.cpu().numpy()
-    out[:, columns] = reconstruct(tokenizer, stats, given[:, columns], truth.held)
+    out[:, columns] = reconstruct(tokenizer, stats, given[:, columns], truth.present)
     return out[:, layout.part("bodyhand")]
 
 

@@ -107,7 +107,7 @@ def _retrieval(
     assert bundle.tma is not None
     size = min(config.size, len(truths))
     text = bundle.tma.embed_captions([t.caption for t in truths], open_text(context.input("text")))
-    real = embed_motions(bundle.tma, bundle.stats, [t.features for t in truths], [t.held for t in truths])
+    real = embed_motions(bundle.tma, bundle.stats, [t.features for t in truths], [t.present for t in truths])
     repeats = max(config.repeats, 5)
     figures = retrieval_figures(text, real, size=size, repeats=repeats, seed=context.seed)
     made: dict[str, list[float]] = {}

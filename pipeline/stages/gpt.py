@@ -112,7 +112,7 @@ def run_gpt(context: StageContext) -> None:
             training,
             clips.sources,
             latents=latents if align and config.prior != "tma" else None,
-            held=clips.held,
+            present=clips.present,
         )
 
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
