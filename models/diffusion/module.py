@@ -39,4 +39,4 @@ class DiffusionModule(StageModule):
         found = self.net(noisy, step, text, mask, told)
         target = motion if schedule.predicts == "sample" else noise
         error = (found - target.float()).square()
-        return {"loss": masked_mean(error, mask, batch.get("held"))}
+        return {"loss": masked_mean(error, mask, batch.get("present"))}

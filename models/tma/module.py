@@ -61,10 +61,10 @@ class TmaModule(StageModule):
         moved = net.encode_motion(motion, length, held)
         z_text, z_motion = self._latent(*text), self._latent(*moved)
         target, frames = net.strided(motion, length)
-        target, mask = net.read(target, held), length_mask(frames, target.shape[1])
+        target, mask = net.read(target, present), length_mask(frames, target.shape[1])
         size = motion.shape[1]
-        rec_text = reconstruction_loss(net.write(z_text, length, size), target, mask, held)
-        rec_motion = reconstruction_loss(net.write(z_motion, length, size), target, mask, held)
+        rec_text = reconstruction_loss(net.write(z_text, length, size), target, mask, present)
+        rec_motion = reconstruction_loss(net.write(z_motion, length, size), target, mask, present)
         kl = kl_four(text, moved)
         latent = latent_loss(z_text, z_motion)
         contrastive = info_nce(

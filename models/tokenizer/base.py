@@ -4,7 +4,7 @@ A tokenizer consumes exactly the layout columns it models, already normalised; `
 frames. Four frames are one group: `length` is rounded up to whole groups, so the last group of a clip may
 hold padded (zero) frames, and a padded batch gives what each clip gives alone.
 
-Columns that a clip does not hold (`held` bool [B, dim]; hands, face) are read as 0, the mean. A stream of
+Columns that a clip does not hold (`present` bool [B, dim]; hands, face) are read as 0, the mean. A stream of
 tokens that belongs to such a part alone does not learn from the clip, and its vectors are 0 in the decoder.
 """
 
@@ -39,7 +39,7 @@ class TokenizerOutput(NamedTuple):
     """What `Tokenizer.forward` returns."""
 
     read: Tensor
-    """[B, T, dim] in the coordinates of `Basis`: what the encoders read, 0 in columns that are not held."""
+    """[B, T, dim] in the coordinates of `Basis`: what the encoders read, 0 in missing columns."""
     written: Tensor
     """[B, T, dim] in the same: what the decoder wrote, to be compared with `read`; `features` makes motion
     of it."""
@@ -131,30 +131,32 @@ class Tokenizer(nn.Module, ABC):
     def _join(self, vectors: dict[str, Tensor]) -> Tensor:
         """Code vectors per stream [B, T / 4 * per_group, d] -> the decoder's input."""
 
-    def _lost(self, held: Tensor | None) -> dict[str, Tensor]:
+    def _lost(self, present: Tensor | None) -> dict[str, Tensor]:
         """Bool [B] for each stream that belongs to a part which clips may lack: true where it is lacking."""
         return {}
 
-    def lost(self, held: Tensor) -> dict[str, Tensor]:
-        """Bool [B] for each stream of a part that clips may lack: true where `held` [B, dim] lacks it. The
+    def lost(self, present: Tensor) -> dict[str, Tensor]:
+        """Bool [B] for each stream of a part that clips may lack: true where `present` [B, dim] lacks it. The
         stream's codes then say nothing.
         """
-        return self._lost(held)
+        return self._lost(present)
 
-    def forward(self, x: Tensor, length: Tensor | None = None, held: Tensor | None = None) -> TokenizerOutput:
+    def forward(
+        self, x: Tensor, length: Tensor | None = None, present: Tensor | None = None
+    ) -> TokenizerOutput:
         """Read, quantize and write x [B, T, dim]; `length` [B] = valid frames. Training updates codebooks.
 
-        `held` [B, dim]: false where a clip does not hold a column; None = all are held.
+        `present` [B, dim]: false where a clip does not hold a column; None = all are present.
         """
         valid = self._valid(x, length)
-        read = self._read(x, held)
-        latents = self._quantize(read, valid, self._lost(held), update=True)
+        read = self._read(x, present)
+        latents = self._quantize(read, valid, self._lost(present), update=True)
         written = self.decoder(latents.joined, valid)
         return TokenizerOutput(read, written, latents.penalty, latents.codes, latents.metrics)
 
     @torch.no_grad()
     def encode(
-        self, x: Tensor, length: Tensor | None = None, held: Tensor | None = None
+        self, x: Tensor, length: Tensor | None = None, present: Tensor | None = None
     ) -> dict[str, Tensor]:
         """Tokens of x [B, T, dim], per stream int64 [B, T / 4 * per_group]. Never updates a codebook.
 
@@ -162,29 +164,29 @@ class Tokenizer(nn.Module, ABC):
         valid codes, also those of a part that the clip does not hold.
         """
         valid = self._valid(x, length)
-        return self._quantize(self._read(x, held), valid, self._lost(held), update=False).codes
+        return self._quantize(self._read(x, present), valid, self._lost(present), update=False).codes
 
     def decode(
-        self, codes: dict[str, Tensor], length: Tensor | None = None, held: Tensor | None = None
+        self, codes: dict[str, Tensor], length: Tensor | None = None, present: Tensor | None = None
     ) -> Tensor:
         """Motion [B, T, dim] of tokens; `length` [B] in frames where clips of a batch differ.
 
-        With the `held` that `encode` was given, the body comes out as in training, which knows of no hands
-        there; the columns that are not held mean nothing.
+        With the `present` that `encode` was given, the body comes out as in training, which knows of no hands
+        there; the columns that are not present mean nothing.
         """
         books = self.codebooks()
         vectors = {s.name: books[s.name].vectors(codes[s.name]) for s in self.streams}
-        for name, lost in self._lost(held).items():
+        for name, lost in self._lost(present).items():
             vectors[name] = without(vectors[name], lost)
         return self._decode(vectors, length)
 
     def decode_soft(
-        self, weights: dict[str, Tensor], length: Tensor | None = None, held: Tensor | None = None
+        self, weights: dict[str, Tensor], length: Tensor | None = None, present: Tensor | None = None
     ) -> Tensor:
         """`decode` for weights over the codes [B, L, K], differentiable in them; one-hot gives `decode`."""
         books = self.codebooks()
         vectors = {s.name: weights[s.name] @ books[s.name].codebook.to(weights[s.name]) for s in self.streams}
-        for name, lost in self._lost(held).items():
+        for name, lost in self._lost(present).items():
             vectors[name] = without(vectors[name], lost)
         return self._decode(vectors, length)
 
@@ -210,10 +212,10 @@ class Tokenizer(nn.Module, ABC):
     def _decode(self, vectors: dict[str, Tensor], length: Tensor | None) -> Tensor:
         return self.features(self.decoder(self._join(vectors), _whole_groups(length)), length)
 
-    def _read(self, x: Tensor, held: Tensor | None) -> Tensor:
-        """What the encoders read: zero in the columns that are not held."""
+    def _read(self, x: Tensor, present: Tensor | None) -> Tensor:
+        """What the encoders read: zero in the columns that are not present."""
         read = self.basis.enter(x)
-        return read if held is None else read.masked_fill(~held[:, None], 0.0)
+        return read if present is None else read.masked_fill(~present[:, None], 0.0)
 
     def _valid(self, x: Tensor, length: Tensor | None) -> Tensor | None:
         if x.shape[-1] != self.dim:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from motionloom.datasets.motion.joints import joints_of, local_joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
-from motionloom.datasets.schema import HANDS, HELD_ALL
+from motionloom.datasets.schema import HANDS, PRESENT_ALL
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.metrics.reconstruction import accel, mpjpe, pa_mpjpe
@@ -125,7 +125,7 @@ class NearestClip:
         keys = [self._key(np.asarray(train.motion(i))[:, self.columns]) for i in range(len(train))]
         self.keys = [np.stack(part) for part in zip(*keys, strict=True)]
         self.norms = [np.square(part).sum(1) for part in self.keys]
-        self.with_hands = (train.held & HANDS) > 0
+        self.with_hands = (train.present & HANDS) > 0
 
     def _key(self, features: NDArray[np.float32]) -> list[NDArray[np.float64]]:
         """Positions of the body's joints and of the hands', each flat."""
@@ -149,7 +149,7 @@ class NearestClip:
             for norms, keys, key in zip(self.norms, self.keys, self._key(features), strict=True)
         )
         distance = body
-        if held & HANDS and self.with_hands.any():
+        if present & HANDS and self.with_hands.any():
             distance = np.where(self.with_hands, body + hands, np.inf)
         found = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
         layout = self.train.layout
@@ -177,17 +177,19 @@ def stretch(values: NDArray[Any], frames: int) -> NDArray[np.float64]:
 def embed_motions(
     tma: LoadedTma,
     motions: Sequence[NDArray[np.float32]],
-    held: Sequence[int] | None = None,
+    present: Sequence[int] | None = None,
     batch: int = 64,
 ) -> Tensor:
     """TMA latents [n, 256] of body-hand features; longer motions are cut at the model's length.
 
-    `held` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
+    `present` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
     """
     columns = tma.layout.part(tma.part)
     mean, std = tma.stats.mean[columns], tma.stats.std[columns]
     order = np.argsort([len(m) for m in motions], kind="stable")
-    masks = tma.layout.held_columns[:, columns][[HELD_ALL] * len(motions) if held is None else held]
+    masks = tma.layout.present_columns[:, columns][
+        [PRESENT_ALL] * len(motions) if present is None else present
+    ]
     out: dict[int, Tensor] = {}
     for start in range(0, len(order), batch):
         rows = order[start : start + batch].tolist()

@@ -20,7 +20,7 @@ class Truth:
     """A clip of the data set, or the stretch its caption is about: features of the body-hand part, joints,
     expression, captions.
 
-    `face` is None where the clip holds none; `held` are the bits of `ClipMeta.held`.
+    `face` is None where the clip holds none; `present` are the bits of `ClipMeta.present`.
     """
 
     id: str
@@ -64,7 +64,7 @@ def _truth(
     layout = dataset.layout
     faces = caption_spans(dataset.face_texts(index), layout.fps, int(dataset.frames[index]))
     body = motion[:, layout.part("bodyhand")]
-    held = int(dataset.held[index])
+    present = int(dataset.present[index])
     return Truth(
         id=dataset.ids[index],
         features=body,

@@ -126,12 +126,12 @@ class LoadedTma:
         return torch.cat(out)
 
     @torch.no_grad()
-    def embed_motion(self, motion: Tensor, length: Tensor, held: Tensor | None = None) -> Tensor:
+    def embed_motion(self, motion: Tensor, length: Tensor, present: Tensor | None = None) -> Tensor:
         """Motion latents [B, 256] of normalised features [B, T, D], the columns of `part`.
 
-        `held` bool [B, D]: those that each motion holds (None = all).
+        `present` bool [B, D]: those that each motion holds (None = all).
         """
-        near = None if held is None else held.to(self.device)
+        near = None if present is None else present.to(self.device)
         return self.net.encode_motion(motion.to(self.device), length.to(self.device), near)[0]
 
 

@@ -136,13 +136,13 @@ def test_the_loss_is_of_what_is_seen() -> None:
     net.basis.learn(MEAN[LAYOUT.part("bodyhand")], STD[LAYOUT.part("bodyhand")])
     module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms()).eval()
     x = torch.randn(2, 8, 313)
-    held = torch.from_numpy(LAYOUT.held_columns[[3, 0]])[:, LAYOUT.part("bodyhand")]
-    batch = {"motion": x, "length": torch.tensor([8, 8]), "held": held}
+    present = torch.from_numpy(LAYOUT.present_columns[[3, 0]])[:, LAYOUT.part("bodyhand")]
+    batch = {"motion": x, "length": torch.tensor([8, 8]), "present": present}
     values = module.losses(batch)
-    error = (net.basis.enter(net.features(net(x, held=held).written)) - net.basis.enter(x)).square()
-    want = error[held[:, None].expand_as(error)].mean()
+    error = (net.basis.enter(net.features(net(x, present=present).written)) - net.basis.enter(x)).square()
+    want = error[present[:, None].expand_as(error)].mean()
     torch.testing.assert_close(values["recon"], want)
-    garbage = {**batch, "motion": torch.where(held[:, None], x, 7.0)}
+    garbage = {**batch, "motion": torch.where(present[:, None], x, 7.0)}
     torch.testing.assert_close(module.losses(garbage), values, rtol=0, atol=0)
 
 
