@@ -135,7 +135,7 @@ class Tma(nn.Module):
         """Motion [B, T, D] in the coordinates that are encoded and reconstructed; 0, the mean, in the columns
         that a clip does not hold (`present` bool [B, D]; None = all are present).
         """
-        seen = x if self.basis is None else self.basis.enter(x)
+        seen = x if self.basis is None else self.basis.encode(x)
         return seen if present is None else seen.masked_fill(~present[:, None], 0.0)
 
     def strided(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,7 +171,7 @@ class Tma(nn.Module):
             return written
         stride = self.config.frame_stride
         mask = length_mask((length + stride - 1) // stride, written.shape[1])
-        return self.basis.leave(written) * mask[..., None]
+        return self.basis.decode(written) * mask[..., None]
 
     def write(self, z: Tensor, length: Tensor, frames: int) -> Tensor:
         """`decode` in the coordinates of `read`: what the reconstruction is judged in."""

@@ -121,25 +121,27 @@ class Tokenizer(nn.Module, ABC):
         """The quantizer of each stream."""
 
     @abstractmethod
-    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
+    def _quantize(
+        self, x: Tensor, valid: Tensor | None, missing: dict[str, Tensor], *, update: bool
+    ) -> Latents:
         """Encode and quantize x [B, T, dim]; `valid` [B] counts frames in whole groups.
 
-        `lost`, bool [B] per stream, is true of clips that do not hold the stream's part (`_lost`).
+        `missing`, bool [B] per stream, is true of clips that do not hold the stream's part (`_missing`).
         """
 
     @abstractmethod
     def _join(self, vectors: dict[str, Tensor]) -> Tensor:
         """Code vectors per stream [B, T / 4 * per_group, d] -> the decoder's input."""
 
-    def _lost(self, present: Tensor | None) -> dict[str, Tensor]:
+    def _missing(self, present: Tensor | None) -> dict[str, Tensor]:
         """Bool [B] for each stream that belongs to a part which clips may lack: true where it is lacking."""
         return {}
 
-    def lost(self, present: Tensor) -> dict[str, Tensor]:
+    def missing(self, present: Tensor) -> dict[str, Tensor]:
         """Bool [B] for each stream of a part that clips may lack: true where `present` [B, dim] lacks it. The
         stream's codes then say nothing.
         """
-        return self._lost(present)
+        return self._missing(present)
 
     def forward(
         self, x: Tensor, length: Tensor | None = None, present: Tensor | None = None
@@ -150,7 +152,7 @@ class Tokenizer(nn.Module, ABC):
         """
         valid = self._valid(x, length)
         read = self._read(x, present)
-        latents = self._quantize(read, valid, self._lost(present), update=True)
+        latents = self._quantize(read, valid, self._missing(present), update=True)
         written = self.decoder(latents.joined, valid)
         return TokenizerOutput(read, written, latents.penalty, latents.codes, latents.metrics)
 
@@ -164,7 +166,7 @@ class Tokenizer(nn.Module, ABC):
         valid codes, also those of a part that the clip does not hold.
         """
         valid = self._valid(x, length)
-        return self._quantize(self._read(x, present), valid, self._lost(present), update=False).codes
+        return self._quantize(self._read(x, present), valid, self._missing(present), update=False).codes
 
     def decode(
         self, codes: dict[str, Tensor], length: Tensor | None = None, present: Tensor | None = None
@@ -176,8 +178,8 @@ class Tokenizer(nn.Module, ABC):
         """
         books = self.codebooks()
         vectors = {s.name: books[s.name].vectors(codes[s.name]) for s in self.streams}
-        for name, lost in self._lost(present).items():
-            vectors[name] = without(vectors[name], lost)
+        for name, missing in self._missing(present).items():
+            vectors[name] = without(vectors[name], missing)
         return self._decode(vectors, length)
 
     def decode_soft(
@@ -186,13 +188,13 @@ class Tokenizer(nn.Module, ABC):
         """`decode` for weights over the codes [B, L, K], differentiable in them; one-hot gives `decode`."""
         books = self.codebooks()
         vectors = {s.name: weights[s.name] @ books[s.name].codebook.to(weights[s.name]) for s in self.streams}
-        for name, lost in self._lost(present).items():
-            vectors[name] = without(vectors[name], lost)
+        for name, missing in self._missing(present).items():
+            vectors[name] = without(vectors[name], missing)
         return self._decode(vectors, length)
 
     def features(self, written: Tensor, length: Tensor | None = None) -> Tensor:
         """Motion [B, T, dim] of the decoder's coordinates, exactly zero after the last valid group."""
-        motion = self.basis.leave(written)
+        motion = self.basis.decode(written)
         mask = token_mask(_whole_groups(length), motion.shape[1], 1)
         return motion if mask is None else motion.masked_fill(~mask[..., None], 0.0)
 
@@ -214,7 +216,7 @@ class Tokenizer(nn.Module, ABC):
 
     def _read(self, x: Tensor, present: Tensor | None) -> Tensor:
         """What the encoders read: zero in the columns that are not present."""
-        read = self.basis.enter(x)
+        read = self.basis.encode(x)
         return read if present is None else read.masked_fill(~present[:, None], 0.0)
 
     def _valid(self, x: Tensor, length: Tensor | None) -> Tensor | None:
@@ -235,20 +237,22 @@ def _whole_groups(length: Tensor | None) -> Tensor | None:
     return (length + GROUP_FRAMES - 1) // GROUP_FRAMES * GROUP_FRAMES
 
 
-def without(vectors: Tensor, lost: Tensor | None) -> Tensor:
-    """Vectors [B, L, d], zero for the clips that lack their part (`lost` bool [B])."""
-    return vectors if lost is None else vectors.masked_fill(lost[:, None, None], 0.0)
+def without(vectors: Tensor, missing: Tensor | None) -> Tensor:
+    """Vectors [B, L, d], zero for the clips that lack their part (`missing` bool [B])."""
+    return vectors if missing is None else vectors.masked_fill(missing[:, None, None], 0.0)
 
 
-def token_mask(valid: Tensor | None, tokens: int, stride: int, lost: Tensor | None = None) -> Tensor | None:
+def token_mask(
+    valid: Tensor | None, tokens: int, stride: int, missing: Tensor | None = None
+) -> Tensor | None:
     """True where a token is real, [B, tokens]; `valid` [B] in frames, one token per `stride` frames.
 
-    No token is real of a clip that lacks the stream's part (`lost` bool [B]).
+    No token is real of a clip that lacks the stream's part (`missing` bool [B]).
     """
     if valid is None:
-        return None if lost is None else (~lost)[:, None].expand(-1, tokens)
+        return None if missing is None else (~missing)[:, None].expand(-1, tokens)
     real = torch.arange(tokens, device=valid.device) * stride < valid[:, None]
-    return real if lost is None else real & ~lost[:, None]
+    return real if missing is None else real & ~missing[:, None]
 
 
 def stream_metrics(metrics: dict[str, Tensor], stream: str) -> dict[str, Tensor]:

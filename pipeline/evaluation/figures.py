@@ -76,9 +76,9 @@ def reconstruction_figures(
         compared = {
             "": (local_joints(found, layout), joints_of(found, layout)),
             "_mean_pose": (local_joints(constant, layout), joints_of(constant, layout)),
-            "_nearest_train_clip": nearest.motion(truth.features, truth.held),
+            "_nearest_train_clip": nearest.motion(truth.features, truth.present),
         }
-        joints = slice(None) if truth.held & HANDS else slice(BODY_JOINTS)
+        joints = slice(None) if truth.present & HANDS else slice(BODY_JOINTS)
         frames = len(truth.features)
         target = torch.from_numpy(truth.joints)[:, joints]
         rebuilt = torch.from_numpy(compared[""][1])[:, joints]
@@ -137,12 +137,12 @@ class NearestClip:
         return [part.ravel() for part in np.split(key, [3 * (BODY_JOINTS - 1)], axis=1)]
 
     def motion(
-        self, features: NDArray[np.float32], held: int = HELD_ALL
+        self, features: NDArray[np.float32], present: int = PRESENT_ALL
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(pose, joints) of that clip, [T, N, 3] each, stretched to the T frames of `features`.
 
         Features are stretched and their velocities scaled with time; where the layout has none, the joints
-        are stretched, since angles cannot be averaged. `held` says what `features` hold.
+        are stretched, since angles cannot be averaged. `present` says what `features` hold.
         """
         body, hands = (
             norms - 2 * keys @ key

@@ -108,10 +108,10 @@ class PresentTable:
 def present_table(tokenizer: Tokenizer, layout: MotionLayout) -> PresentTable:
     """The table of a tokenizer and the layout of the full frames."""
     columns = torch.from_numpy(layout.present_columns[:, tokenizer.columns.cpu().numpy()])
-    found = tokenizer.lost(columns.to(tokenizer.columns.device))
-    lost = {name: value.cpu() for name, value in found.items()}
+    found = tokenizer.missing(columns.to(tokenizer.columns.device))
+    missing = {name: value.cpu() for name, value in found.items()}
     # A tokenizer that gives a part a stream of its own keeps that part out of the other streams.
-    others = torch.ones(len(columns), dtype=torch.bool) if lost else columns.all(1)
-    known = [~lost[name] if name in lost else others for name in stream_names(tokenizer.pattern)]
+    others = torch.ones(len(columns), dtype=torch.bool) if missing else columns.all(1)
+    known = [~missing[name] if name in missing else others for name in stream_names(tokenizer.pattern)]
     streams = torch.stack(known, dim=1)
     return PresentTable(columns, streams, streams.any(1).numpy())

@@ -28,9 +28,9 @@ class Convert:
         rng = np.random.default_rng(i)
         motion = rng.standard_normal((16 + i, LAYOUT.dim)) * np.linspace(0.5, 2, LAYOUT.dim) + 0.1 * (i % 3)
         bits = self.present[i % len(self.present)]
-        lost = ~LAYOUT.present_columns[bits]
-        junk = np.random.default_rng(1000 + i).standard_normal((len(motion), int(lost.sum())))
-        motion[:, lost] = self.garbage * (1 + junk)
+        missing = ~LAYOUT.present_columns[bits]
+        junk = np.random.default_rng(1000 + i).standard_normal((len(motion), int(missing.sum())))
+        motion[:, missing] = self.garbage * (1 + junk)
         meta = LAYOUT.clip_meta(
             f"clip{i}", source="made", split="train", frames=len(motion), licence="CC0",
             has_hands=bool(bits & HANDS), has_face=bool(bits & FACE),
@@ -46,7 +46,7 @@ def write(out: Path, garbage: float = 0.0, present: tuple[int, ...] = (3, 1, 2, 
         out,
         items,
         Convert(present, garbage),
-        DatasetFacts("held", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
+        DatasetFacts("present", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
         WriteOptions(clips_per_shard=5, progress=False),
     )
     return out

@@ -50,7 +50,7 @@ def motion() -> Tensor:
 def test_it_is_the_plain_network_between_the_coordinates(stride: int) -> None:
     net, x = build(stride), motion()
     assert net.basis is not None
-    seen = net.basis.enter(x)
+    seen = net.basis.encode(x)
     assert (seen - x).abs().max() > 1
     mu, logvar = net.encode_motion(x, LENGTH)
     for found, wanted in zip((mu, logvar), plain(net).encode_motion(seen, LENGTH), strict=True):
@@ -62,7 +62,7 @@ def test_it_is_the_plain_network_between_the_coordinates(stride: int) -> None:
     rounding = torch.finfo(torch.float32).eps * features.abs().max() * net.basis.std.max()
     bound = float(rounding / net.basis.unit.min())
     assert bound < 0.01
-    torch.testing.assert_close(net.basis.enter(features), written, rtol=0, atol=bound)
+    torch.testing.assert_close(net.basis.encode(features), written, rtol=0, atol=bound)
     for row, frames in enumerate(-(-LENGTH // stride)):
         assert (features[row, frames:] == 0).all()
 
@@ -89,13 +89,13 @@ def test_the_reconstruction_is_judged_in_the_coordinates() -> None:
     batch = {
         "motion": x, "length": LENGTH,
         "conditions": {"text": Condition(words, torch.ones(2, 4, dtype=torch.bool))},
-        "similarity": torch.eye(2), "held": held,
+        "similarity": torch.eye(2), "present": present,
     }  # fmt: skip
     found = module.losses(batch)
     frames = -(-LENGTH // 3)
     mask = torch.arange(4)[None] < frames[:, None]
     assert net.basis is not None
-    target = net.basis.enter(x[:, ::3])
+    target = net.basis.encode(x[:, ::3])
     mu, _ = net.encode_motion(x, LENGTH, present)
     wanted = reconstruction_loss(plain(net).decode(mu, LENGTH, 12), target, mask, present)
     torch.testing.assert_close(found["rec_motion"], wanted)

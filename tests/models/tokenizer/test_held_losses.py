@@ -156,7 +156,7 @@ def test_a_quantizer_waits_for_its_first_vectors() -> None:
 def captioned(present: list[int], columns: Tensor) -> dict[str, Tensor]:
     size = len(present)
     torch.manual_seed(2)
-    return batch_of(columns, held) | {
+    return batch_of(columns, present) | {
         "conditions": {
             "text": Condition(
                 torch.randn(size, 3, 6), torch.ones(size, 3, dtype=torch.bool), torch.randn(size, 6)

@@ -107,10 +107,10 @@ def test_figures_do_not_depend_on_what_was_not_recorded(data: Data) -> None:
     net, figures = tokenizer(data), []
     for dataset, stats in data:
         truths = [truth_of(dataset, i) for i in range(len(dataset))]
-        assert [t.face is None for t in truths] == ((dataset.held & FACE) == 0).tolist()
+        assert [t.face is None for t in truths] == ((dataset.present & FACE) == 0).tolist()
         trained = TrainedTokenizer(net, {"stats": stats})
         figures.append(reconstruction_figures(trained, dataset, truths))
-        with_hands = [t for t in truths if t.held & HANDS]
+        with_hands = [t for t in truths if t.present & HANDS]
         alone = reconstruction_figures(trained, dataset, with_hands)
         assert alone["mpjpe_hand"] == pytest.approx(figures[-1]["mpjpe_hand"])
         assert alone["mpjpe_body"] != pytest.approx(figures[-1]["mpjpe_body"])
