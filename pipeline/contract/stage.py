@@ -57,7 +57,7 @@ class Role:
 
 @dataclass(frozen=True)
 class Every:
-    """An input filled by every stage before this one that gives something, or by those the recipe lists."""
+    """An input filled by every other stage that gives something, or by those the recipe lists, in order."""
 
     name: str
     gives: str
@@ -78,6 +78,13 @@ class Stage:
     inputs: dict[str, str]
 
 
+class MissingInputError(UserError, KeyError):
+    """A role was asked for that no finished stage fills."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 class Given(Mapping[str, Any]):
     """What the inputs of a stage give, by role; each is made when it is first asked for."""
 
@@ -86,6 +93,8 @@ class Given(Mapping[str, Any]):
         self._made: dict[str, Any] = {}
 
     def __getitem__(self, role: str) -> Any:
+        if role not in self._makers:
+            raise MissingInputError(f"no finished '{role}' stage here; run the recipe to the end first")
         if role not in self._made:
             self._made[role] = self._makers[role]()
         return self._made[role]
@@ -109,6 +118,8 @@ class Finished:
     config: Any
     folder: Path
     inputs: Mapping[str, Finished]
+    exported: bool = False
+    """In an exported folder, which may come from anywhere: nothing outside `folder` is followed."""
 
     def gives(self, what: str) -> bool:
         """Whether other stages may ask this one for `what`."""
@@ -241,6 +252,10 @@ class StageKind(ABC):
     def exported(self, config: Any) -> tuple[str, ...]:
         """Roles whose stages an export must take along for this stage to load."""
         return ()
+
+    def exported_config(self, config: Any) -> Any:
+        """The config as an export shows it to everybody."""
+        return config
 
     def export(self, stage: Finished, target: Path) -> None:
         """Copy what loading needs into `target`, an empty folder."""

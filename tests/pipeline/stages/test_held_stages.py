@@ -23,6 +23,7 @@ from motionloom.pipeline.evaluation.figures import reconstruction_figures
 from motionloom.pipeline.evaluation.truth import reconstruct_truth, truth_of
 from motionloom.pipeline.stages.gpt_data import gpt_clips
 from motionloom.pipeline.stages.tokens import encode_split
+from motionloom.pipeline.store.networks import TrainedTokenizer
 from motionloom.pipeline.store.tokens import TokenBatches, TokenStore
 
 TINY: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
@@ -107,9 +108,10 @@ def test_figures_do_not_depend_on_what_was_not_recorded(data: Data) -> None:
     for dataset, stats in data:
         truths = [truth_of(dataset, i) for i in range(len(dataset))]
         assert [t.face is None for t in truths] == ((dataset.held & FACE) == 0).tolist()
-        figures.append(reconstruction_figures(net, stats, dataset, truths))
+        trained = TrainedTokenizer(net, {"stats": stats})
+        figures.append(reconstruction_figures(trained, dataset, truths))
         with_hands = [t for t in truths if t.held & HANDS]
-        alone = reconstruction_figures(net, stats, dataset, with_hands)
+        alone = reconstruction_figures(trained, dataset, with_hands)
         assert alone["mpjpe_hand"] == pytest.approx(figures[-1]["mpjpe_hand"])
         assert alone["mpjpe_body"] != pytest.approx(figures[-1]["mpjpe_body"])
     assert figures[0] == pytest.approx(figures[1], rel=1e-6)
@@ -119,13 +121,14 @@ def test_figures_do_not_depend_on_what_was_not_recorded(data: Data) -> None:
 def test_a_clip_through_a_tokenizer_of_any_part(data: Data, part: Part) -> None:
     dataset, stats = data[0]
     net = build_tokenizer(RvqConfig(**TINY, part=part), dataset.layout).freeze()
+    trained = TrainedTokenizer(net, {"stats": stats})
     hand = np.isin(dataset.layout.part("bodyhand"), dataset.layout.part("hand"))
     mean = stats.mean[dataset.layout.part("bodyhand")]
     for truth in (truth_of(dataset, i) for i in range(4)):
-        rebuilt = reconstruct_truth(net, stats, truth)
+        rebuilt = reconstruct_truth(trained, truth)
         assert rebuilt.shape == truth.features.shape
         modelled = part != "body" and truth.held & HANDS
         assert np.allclose(rebuilt[:, hand], mean[hand]) == (not modelled)
         assert not np.allclose(rebuilt[:, ~hand], mean[~hand])
-    figures = reconstruction_figures(net, stats, dataset, [truth_of(dataset, 0)])
+    figures = reconstruction_figures(trained, dataset, [truth_of(dataset, 0)])
     assert np.isfinite(list(figures.values())).all()
