@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.contract.stage import StageKind
     from motionloom.pipeline.inference.bundle import GeneratedMotion
+    from motionloom.pipeline.inference.outputs import write_motions
     from motionloom.pipeline.inference.pretrained import MotionModel
     from motionloom.pipeline.runs.api import evaluate_run, export_run, report_run, run_recipe
     from motionloom.pipeline.runs.recipe import Recipe, load_recipe
@@ -38,6 +39,7 @@ __all__ = [
     "register",
     "report_run",
     "run_recipe",
+    "write_motions",
 ]
 
 _HOMES = {
@@ -56,6 +58,7 @@ _HOMES = {
     "register": "pipeline.contract.registry",
     "report_run": "pipeline.runs.api",
     "run_recipe": "pipeline.runs.api",
+    "write_motions": "pipeline.inference.outputs",
 }
 
 
