@@ -11,7 +11,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("configs", "datasets", "models", "pipeline")
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = CONFIG["project"]
 
 # Imported by Lightning's loggers, which are what we import.
 THROUGH_LIGHTNING = {"tensorboard", "wandb", "mlflow"}
@@ -90,3 +91,15 @@ def test_everything_declared_is_imported() -> None:
 
 def test_nothing_is_both_required_and_optional() -> None:
     assert not REQUIRED & OPTIONAL
+
+
+def test_every_recipe_comes_with_the_package() -> None:
+    configs = ROOT / "configs"
+    taken = {
+        path
+        for glob in CONFIG["tool"]["setuptools"]["package-data"]["motionloom.configs"]
+        for path in configs.glob(glob)
+    }
+    assert taken == {
+        path for path in configs.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")
+    }

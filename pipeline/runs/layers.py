@@ -89,7 +89,8 @@ def override(data: dict[str, Any], text: str) -> dict[str, Any]:
             raise UserError(f"--set {text}: no stage '{parts[0]}'{nearest(parts[0], list(stages))}")
         parts = ["stages", *parts]
     # A value replaces what is there, a mapping too.
-    return _put(data, parts, load_yaml(value, f"--set {text}"))
+    out: dict[str, Any] = _put(data, parts, load_yaml(value, f"--set {text}"))
+    return out
 
 
 def _put(data: Any, parts: list[str], value: Any) -> Any:

@@ -173,7 +173,7 @@ class GptStage(TrainedStage):
                 training,
                 clips.sources,
                 latents=latents if config.aligned and config.prior != "tma" else None,
-                held=clips.held,
+                present=clips.present,
             )
 
         def train(batch: int, rank: int, world: int) -> Dataset[Any]:

@@ -34,7 +34,7 @@ class MixStageConfig(StageConfig):
     """How often each data stage is drawn."""
 
     weights: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = Field(default_factory=dict)
-    """Share of the batches of a stage, by its name, relative to the others; 1 for those that are not named."""
+    """Share of the batches of a stage, by its name, relative to the others; 1 for a stage not named."""
 
 
 class MixStage(StageKind):
@@ -63,7 +63,8 @@ class MixStage(StageKind):
         for name in stage.config.weights:
             if name not in sources:
                 raise UserError(
-                    f"stage '{stage.name}': weights.{name} is of no stage that it mixes ({', '.join(sources)})"
+                    f"stage '{stage.name}': weights.{name} is of no stage that it mixes; "
+                    f"these are {', '.join(sources)}"
                 )
 
     def run(self, context: StageContext) -> None:
@@ -77,7 +78,7 @@ class MixStage(StageKind):
         for stage, part in zip(sources, parts, strict=True):
             clips = len(context.shelf.get(stage).split("train"))
             context.console.print(
-                f"    {part.stage}: {clips} training clips, {100 * part.weight / total:.0f} % of what is drawn"
+                f"    {part.stage}: {clips} training clips, {100 * part.weight / total:.0f} % of the draws"
             )
 
     def preview(self, config: MixStageConfig, given: Given) -> DataPreview:

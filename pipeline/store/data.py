@@ -84,8 +84,8 @@ def _opened(folder: Path, split: str, training: bool) -> list[tuple[ClipDataset,
             opened += [(dataset, mixed.weight * weight / whole) for dataset, weight in inner]
         return opened
     if _is_plain(folder):
-        held = split in _held(_manifests(folder)[0])
-        return [(ShardDataset.open(folder / SHARDS, split), 1.0)] if held else []
+        there = split in _filled(_manifests(folder)[0])
+        return [(ShardDataset.open(folder / SHARDS, split), 1.0)] if there else []
     reference = Reference.load_json(folder / REFERENCE)
     reader = Reader.load_json(folder / READER)
     reading = Reading(
@@ -97,7 +97,7 @@ def _opened(folder: Path, split: str, training: bool) -> list[tuple[ClipDataset,
     return [
         (ShardDataset.open(part.path, split, reading=reading), part.weight)
         for part, manifest in zip(reference.parts, _manifests(folder), strict=True)
-        if split in _held(manifest)
+        if split in _filled(manifest)
     ]
 
 
@@ -108,8 +108,8 @@ def _is_plain(folder: Path) -> bool:
 
 def splits_of(folder: Path) -> list[str]:
     """Splits that hold at least one clip, of any data set."""
-    held = set().union(*map(_held, _manifests(folder)))
-    return [split for split in ("train", "val", "test") if split in held]
+    filled = set().union(*map(_filled, _manifests(folder)))
+    return [split for split in ("train", "val", "test") if split in filled]
 
 
 def held_out(folder: Path, *, prefer: str = "val") -> str:
@@ -130,7 +130,7 @@ def _manifests(folder: Path) -> list[Manifest]:
     return [read_manifest(open_store(part.path, cache))[0] for part in parts]
 
 
-def _held(manifest: Manifest) -> set[str]:
+def _filled(manifest: Manifest) -> set[str]:
     return {shard.split for shard in manifest.shards if shard.samples}
 
 

@@ -177,7 +177,7 @@ class PacerGenerator:
         heard, device = music.mask.sum(1).tolist(), music.features.device
         out = []
         for row, (seed, frames) in enumerate(zip(request.seeds, request.frames or heard, strict=True)):
-            # Music that ends before the motion does is held at its last frame.
+            # Music that ends before the motion does is present at its last frame.
             places = torch.arange(frames).clamp(max=heard[row] - 1)
             audio = self.audio.normalize(music.features[row].cpu().numpy()[places])
             noise = torch.randn(1, self.net.noise, generator=torch.Generator().manual_seed(seed))
