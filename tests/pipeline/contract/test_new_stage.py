@@ -53,6 +53,7 @@ stages:
     net: {{width: 8}}
     train: {{steps: {STEPS}, batch_size: 8, checkpoint_every: 10, validate_every: 20, ema: 0.9}}
   generate: {{kind: generate, count: 1, formats: [npz]}}
+  evaluate_dances: {{kind: evaluate_dances, clips: 2, repeats: 1, shuffles: 1, pool: 4}}
   report: {{kind: report, count: 1}}
 """
 
@@ -95,7 +96,7 @@ def run(recipe: Path) -> Path:
     """An undisturbed run."""
     folder = recipe.parent / "run"
     output = program("run", recipe, "--out", folder)
-    assert "[4/6] pacer (motion paced by music)" in output and f"step {STEPS}/{STEPS}" in output
+    assert "[4/7] pacer (motion paced by music)" in output and f"step {STEPS}/{STEPS}" in output
     return folder
 
 
@@ -140,7 +141,7 @@ def test_dry_run_counts_it_without_data(recipe: Path) -> None:
 def test_killed_and_resumed_equals_undisturbed(run: Path, recipe: Path) -> None:
     folder = recipe.parent / "killed"
     shutil.copytree(run, folder)
-    for name in ("pacer", "generate", "report"):
+    for name in ("pacer", "generate", "evaluate_dances", "report"):
         shutil.rmtree(folder / "stages" / name)
     process = start("run", recipe, "--out", folder)
     stage, end = folder / "stages/pacer", time.monotonic() + 120
@@ -151,8 +152,14 @@ def test_killed_and_resumed_equals_undisturbed(run: Path, recipe: Path) -> None:
     process.communicate(timeout=60)
     assert not (stage / "model.safetensors").exists(), "it was finished already: nothing was interrupted"
     output = program("run", recipe, "--out", folder)
-    assert "3 of 6 stages to run" in output
-    for name in ("pacer/model.safetensors", "pacer/model.json", "report/report.html"):
+    assert "4 of 7 stages to run" in output
+    outputs = (
+        "pacer/model.safetensors",
+        "pacer/model.json",
+        "evaluate_dances/dances.json",
+        "report/report.html",
+    )
+    for name in outputs:
         assert (folder / "stages" / name).read_bytes() == (run / "stages" / name).read_bytes(), name
     assert read_metrics(stage) == read_metrics(run / "stages/pacer")
     (made,) = (folder / "stages/generate/motions").iterdir()
