@@ -131,7 +131,7 @@ class NearestClip:
         """Positions of the body's joints and of the hands', each flat."""
         layout = self.train.layout
         if layout.has("positions"):
-            positions = features[:, layout.slice("positions")]
+            positions: NDArray[Any] = features[:, layout.slice("positions")]
         else:
             positions = local_joints(features, layout)[:, 1:].reshape(len(features), -1)
         key = stretch(positions, KEY_FRAMES)
