@@ -53,7 +53,7 @@ def batches(
         gpt.max_groups,
         size,
         0,
-        held=clips.held,
+        present=clips.present,
     )
 
 
@@ -83,9 +83,9 @@ def measure(run: Path, stage: str, size: int, count: int) -> dict[tuple[str, flo
             "predicted after the truth": soft_codes(gpt, logits, groups, temperature=1.0, sample=True),
             "own samples": {name: F.one_hot(codes, sizes[name]).float() for name, codes in own.items()},
         }
-        frames, held = groups * tokenizer.group_frames, batch.get("held")
+        frames, present = groups * tokenizer.group_frames, batch.get("present")
         for row, codes in weights.items():
-            latent = tma.embed_motion(tokenizer.decode_soft(codes, frames, held), frames, held)
+            latent = tma.embed_motion(tokenizer.decode_soft(codes, frames, present), frames, present)
             for threshold in THRESHOLDS:
                 loss = info_nce(text, latent, batch["similarity"], threshold=threshold)
                 found[row, threshold].append(float(loss))

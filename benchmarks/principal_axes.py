@@ -32,7 +32,7 @@ GAINS = {"the paper's features": (1.0, 0.0), "fingers in the palm's frame": (5.0
 
 
 def seen(basis: Basis, features: NDArray[np.float32], mean: NDArray, std: NDArray) -> NDArray[np.float32]:
-    return np.asarray(basis.enter(torch.from_numpy((features - mean) / std)).numpy(), dtype=np.float32)
+    return np.asarray(basis.encode(torch.from_numpy((features - mean) / std)).numpy(), dtype=np.float32)
 
 
 def main() -> None:
@@ -62,7 +62,7 @@ def main() -> None:
             found: dict[str, list[float]] = defaultdict(list)
             for truth in truths:
                 few = (seen(basis, truth.features, mean, std) - center) @ axes[:count].T @ axes[:count]
-                features = basis.leave(torch.from_numpy(few + center)).numpy() * std + mean
+                features = basis.decode(torch.from_numpy(few + center)).numpy() * std + mean
                 right = agrees(truth.truth or {}, decode(features, layout), None, layout.fps)
                 found["action"].append(right["action"])
                 for name in ("left_hand", "right_hand"):

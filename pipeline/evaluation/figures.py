@@ -13,7 +13,7 @@ from torch import Tensor
 
 from motionloom.datasets.motion.joints import joints_of, local_joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
-from motionloom.datasets.schema import HANDS, HELD_ALL
+from motionloom.datasets.schema import HANDS, PRESENT_ALL
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.metrics.reconstruction import accel, mpjpe, pa_mpjpe
@@ -76,9 +76,9 @@ def reconstruction_figures(
         compared = {
             "": (local_joints(found, layout), joints_of(found, layout)),
             "_mean_pose": (local_joints(constant, layout), joints_of(constant, layout)),
-            "_nearest_train_clip": nearest.motion(truth.features, truth.held),
+            "_nearest_train_clip": nearest.motion(truth.features, truth.present),
         }
-        joints = slice(None) if truth.held & HANDS else slice(BODY_JOINTS)
+        joints = slice(None) if truth.present & HANDS else slice(BODY_JOINTS)
         frames = len(truth.features)
         target = torch.from_numpy(truth.joints)[:, joints]
         rebuilt = torch.from_numpy(compared[""][1])[:, joints]
@@ -125,32 +125,31 @@ class NearestClip:
         keys = [self._key(np.asarray(train.motion(i))[:, self.columns]) for i in range(len(train))]
         self.keys = [np.stack(part) for part in zip(*keys, strict=True)]
         self.norms = [np.square(part).sum(1) for part in self.keys]
-        self.with_hands = (train.held & HANDS) > 0
+        self.with_hands = (train.present & HANDS) > 0
 
     def _key(self, features: NDArray[np.float32]) -> list[NDArray[np.float64]]:
         """Positions of the body's joints and of the hands', each flat."""
         layout = self.train.layout
         if layout.has("positions"):
-            positions: NDArray[Any] = features[:, layout.slice("positions")]
+            key = stretch(features[:, layout.slice("positions")], KEY_FRAMES)
         else:
-            positions = local_joints(features, layout)[:, 1:].reshape(len(features), -1)
-        key = stretch(positions, KEY_FRAMES)
+            key = stretch(local_joints(features, layout)[:, 1:].reshape(len(features), -1), KEY_FRAMES)
         return [part.ravel() for part in np.split(key, [3 * (BODY_JOINTS - 1)], axis=1)]
 
     def motion(
-        self, features: NDArray[np.float32], held: int = HELD_ALL
+        self, features: NDArray[np.float32], present: int = PRESENT_ALL
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(pose, joints) of that clip, [T, N, 3] each, stretched to the T frames of `features`.
 
         Features are stretched and their velocities scaled with time; where the layout has none, the joints
-        are stretched, since angles cannot be averaged. `held` says what `features` hold.
+        are stretched, since angles cannot be averaged. `present` says what `features` hold.
         """
         body, hands = (
             norms - 2 * keys @ key
             for norms, keys, key in zip(self.norms, self.keys, self._key(features), strict=True)
         )
         distance = body
-        if held & HANDS and self.with_hands.any():
+        if present & HANDS and self.with_hands.any():
             distance = np.where(self.with_hands, body + hands, np.inf)
         found = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
         layout = self.train.layout
@@ -178,17 +177,19 @@ def stretch(values: NDArray[Any], frames: int) -> NDArray[np.float64]:
 def embed_motions(
     tma: LoadedTma,
     motions: Sequence[NDArray[np.float32]],
-    held: Sequence[int] | None = None,
+    present: Sequence[int] | None = None,
     batch: int = 64,
 ) -> Tensor:
     """TMA latents [n, 256] of body-hand features; longer motions are cut at the model's length.
 
-    `held` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
+    `present` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
     """
     columns = tma.layout.part(tma.part)
     mean, std = tma.stats.mean[columns], tma.stats.std[columns]
     order = np.argsort([len(m) for m in motions], kind="stable")
-    masks = tma.layout.held_columns[:, columns][[HELD_ALL] * len(motions) if held is None else held]
+    masks = tma.layout.present_columns[:, columns][
+        [PRESENT_ALL] * len(motions) if present is None else present
+    ]
     out: dict[int, Tensor] = {}
     for start in range(0, len(order), batch):
         rows = order[start : start + batch].tolist()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
 from motionloom.datasets.motion.features import face_of
 from motionloom.datasets.motion.joints import joints_of
-from motionloom.datasets.schema import FACE, HELD_ALL, UserError
+from motionloom.datasets.schema import FACE, PRESENT_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
@@ -20,7 +20,7 @@ class Truth:
     """A clip of the data set, or the stretch its caption is about: features of the body-hand part, joints,
     expression, captions.
 
-    `face` is None where the clip holds none; `held` are the bits of `ClipMeta.held`.
+    `face` is None where the clip holds none; `present` are the bits of `ClipMeta.present`.
     """
 
     id: str
@@ -30,7 +30,9 @@ class Truth:
     caption: str
     face_caption: str
     truth: dict | None
-    held: int = HELD_ALL
+    present: int = PRESENT_ALL
+    begin: float = 0.0
+    """Second of the clip where the stretch begins."""
 
 
 def truth_of(
@@ -62,16 +64,17 @@ def _truth(
     layout = dataset.layout
     faces = caption_spans(dataset.face_texts(index), layout.fps, int(dataset.frames[index]))
     body = motion[:, layout.part("bodyhand")]
-    held = int(dataset.held[index])
+    present = int(dataset.present[index])
     return Truth(
         id=dataset.ids[index],
         features=body,
         joints=joints_of(body, layout),
-        face=face_of(motion, layout) if layout.has("face") and held & FACE else None,
+        face=face_of(motion, layout) if layout.has("face") and present & FACE else None,
         caption=span.text,
         face_caption=max(faces, key=lambda face: _overlap(face, span)).text if faces else span.text,
         truth=truth,
-        held=held,
+        present=present,
+        begin=span.first / layout.fps,
     )
 
 
@@ -104,7 +107,7 @@ def reconstruct_all(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.flo
     if truth.face is not None:
         given[:, layout.slice("face")] = truth.face
     columns = tokenizer.columns
-    out[:, columns] = tokenizer.reconstruct(given[:, columns], truth.held)
+    out[:, columns] = tokenizer.reconstruct(given[:, columns], truth.present)
     return out
 
 

@@ -42,10 +42,11 @@ def write_motions(
 ) -> list[Path]:
     """Write every motion in every format; the page holds all of them. Returns the paths.
 
-    `scores`, one for each motion: sound for the film and the page, beats and segments for the page.
+    `scores`, one for each motion: sound for the film and the page, beats and segments for the page. Without
+    them each motion comes with what drove it.
     """
     require_folder(folder)
-    scores = [Score()] * len(motions) if scores is None else scores
+    scores = [score_of(motion) for motion in motions] if scores is None else scores
     if len(scores) != len(motions):
         raise UserError(f"{len(scores)} scores for {len(motions)} motions; give one for each")
     folder.mkdir(parents=True, exist_ok=True)
@@ -67,6 +68,11 @@ def write_motions(
         write_viewer(page, shown, title)
         out.append(page)
     return out
+
+
+def score_of(motion: GeneratedMotion) -> Score:
+    """The music and the segments that a motion was driven by."""
+    return Score(sound=motion.prompt.sound, segments=motion.segments)
 
 
 def viewer_motion(

@@ -2,8 +2,8 @@
 
 A model of tokens is trained on windows of some frames. A longer stretch, such as a song, is made window by
 window: the last groups of what is there already stand before the new ones (`context`), and the music of a
-window begins where its first group does. Where a stretch begins, music from before it is masked. Noise z is
-drawn once a motion.
+window begins and ends where its groups do, as in training. Where a stretch begins, music from before it is
+masked. Noise z is drawn once a motion.
 
 Legend: B rows, G groups of four frames, L positions.
 """
@@ -89,8 +89,9 @@ class TokenTimeline:
             seen = here.groups.clamp(max=self.context)
             new = torch.minimum(wanted[rows] - done[rows], self.window - seen)
             first = (done[rows] - seen) * GROUP_FRAMES
+            frames = (seen + new) * GROUP_FRAMES
             part = {
-                name: _cut(_rows_of(condition, rows), first, self.window * GROUP_FRAMES)
+                name: _cut(_rows_of(condition, rows), first, frames)
                 if MODALITIES[name].timed
                 else _rows_of(condition, rows)
                 for name, condition in conditions.items()
@@ -161,11 +162,12 @@ def _rows_of(condition: Condition, rows: Tensor) -> Condition:
     return Condition(features[rows], mask[rows], None if pooled is None else pooled[rows])
 
 
-def _cut(condition: Condition, first: Tensor, frames: int) -> Condition:
-    """Positions first [B] .. first + frames of a timed modality; those outside of it are masked."""
+def _cut(condition: Condition, first: Tensor, frames: Tensor) -> Condition:
+    """Positions first [B] .. first + frames [B] of a timed modality; those outside of it are masked."""
     features, mask, pooled = condition
-    at = first[:, None] + torch.arange(frames, device=first.device)
-    inside = (at >= 0) & (at < mask.shape[1])
+    order = torch.arange(int(frames.max()), device=first.device)
+    at = first[:, None] + order
+    inside = (at >= 0) & (at < mask.shape[1]) & (order < frames[:, None])
     index = at.clamp(0, mask.shape[1] - 1)
     cut_mask = mask.gather(1, index) & inside
     cut = features.gather(1, index[..., None].expand(-1, -1, features.shape[2]))

@@ -1,4 +1,7 @@
-"""The Python API behind the commands: run a recipe, generate, evaluate, report, export."""
+"""The Python API behind the commands: run a recipe, generate, evaluate, report, export.
+
+Without a console they speak on standard output.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,7 @@ from motionloom.pipeline.inference.outputs import Format, write_motions
 from motionloom.pipeline.inference.pretrained import write_bundle
 from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
 from motionloom.pipeline.inference.script import Script, read_music
+from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.runs.graph import (
     Selection,
@@ -29,7 +33,8 @@ from motionloom.pipeline.runs.graph import (
     selected,
     stage_inputs,
 )
-from motionloom.pipeline.runs.recipe import Recipe, load_recipe, nearest
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
@@ -44,12 +49,13 @@ def run_recipe(
     select: Selection | None = None,
     dry_run: bool = False,
     replace: bool = False,
-    console: Console,
+    console: Console | None = None,
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
 
     A folder of another recipe is refused without `replace`.
     """
+    console = console or make_console()
     loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
     if dry_run:
@@ -237,15 +243,19 @@ def evaluate_run(
     clips: int | None = None,
     repeats: int | None = None,
     device: str = "auto",
-    console: Console,
+    console: Console | None = None,
 ) -> Path:
     """Figures of a finished run by all its stages that make some; returns the folder RUN/evaluate."""
+    console = console or make_console()
     changes = {"clips": clips, "repeats": repeats}
     return _stages_again(folder, "figures", "evaluate", console, changes, device)
 
 
-def report_run(folder: Path, out: Path | None, *, device: str = "auto", console: Console) -> Path:
+def report_run(
+    folder: Path, out: Path | None, *, device: str = "auto", console: Console | None = None
+) -> Path:
     """The page of a finished run; returns its path."""
+    console = console or make_console()
     if out is not None:
         require_file_place(out)
     page = _stages_again(folder, "page", "report", console, {}, device) / "report.html"
@@ -257,8 +267,9 @@ def report_run(folder: Path, out: Path | None, *, device: str = "auto", console:
     return page
 
 
-def export_run(folder: Path, out: Path, *, console: Console) -> Path:
+def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Path:
     """Copy what generation needs into one folder."""
+    console = console or make_console()
     require_folder(out)
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")

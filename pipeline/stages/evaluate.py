@@ -156,7 +156,7 @@ class _Evaluation:
         config, seed = self.config, self.context.seed
         size = min(config.size, len(truths))
         text = tma.embed_captions([t.caption for t in truths], self.context.given["text"].cache)
-        real = embed_motions(tma, [t.features for t in truths], [t.held for t in truths])
+        real = embed_motions(tma, [t.features for t in truths], [t.present for t in truths])
         repeats = max(config.repeats, 5)
         # A caption that says the same as the own one is no wrong answer.
         words = [t.caption for t in truths]

@@ -173,7 +173,7 @@ class GptStage(TrainedStage):
                 training,
                 clips.sources,
                 latents=latents if config.aligned and config.prior != "tma" else None,
-                held=clips.held,
+                present=clips.present,
             )
 
         def train(batch: int, rank: int, world: int) -> Dataset[Any]:
@@ -250,9 +250,9 @@ class GptGenerator:
         return self.tokenizer.layout
 
     @property
-    def text(self) -> TextSource:
+    def text(self) -> TextSource | None:
         """What encodes its words."""
-        text: TextSource = self.given["text"]
+        text: TextSource | None = self.given.get("text")
         return text
 
     @property

@@ -163,9 +163,9 @@ class VaeFace:
         return self.tma.layout
 
     @property
-    def text(self) -> TextSource:
+    def text(self) -> TextSource | None:
         """What encodes its words."""
-        text: TextSource = self.tma.given["text"]
+        text: TextSource | None = self.tma.given.get("text")
         return text
 
     @torch.no_grad()

@@ -16,7 +16,7 @@ from motionloom.pipeline.store.files import write_json
 
 _EXPORTED = "text.json"
 _COPY = "encoder"
-_KNOWN_WIDTHS = {BUILT_IN: 384}
+_KNOWN_WIDTHS = {BUILT_IN: 384, "openai/clip-vit-base-patch32": 512}
 _USUAL_WIDTH = 768
 """Of DistilBERT and CLIP ViT-L/14, assumed for encoders that are not loaded to look."""
 

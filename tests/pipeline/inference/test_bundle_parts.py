@@ -45,7 +45,7 @@ def test_finished_generators_are_found(name: str, tmp_path: Path) -> None:
     makers = [s.name for s in recipe.stages if GENERATOR in s.kind.gives(s.config)]
     assert {stage.name for stage in found} == set(makers)
     if makers:
-        assert found[0].name == "gpt"
+        assert found[0].name == ("ude" if name.startswith("ude") else "gpt")
     for stage in found:
         assert stage.folder == tmp_path / "stages" / stage.name
         assert stage.config == recipe.stage(stage.name).config
@@ -131,6 +131,7 @@ def old(small_run: Any, tmp_path: Path) -> Path:
             for model in sorted(models)
         }
         path.write_text(json.dumps(artifact))
+        (path.parent / "started.json").unlink()
     (run / "recipe.yaml").write_text(yaml.safe_dump(recipe, sort_keys=False))
     return run
 

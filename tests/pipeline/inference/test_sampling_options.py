@@ -60,13 +60,15 @@ def bundle(
     """An untrained model; `face` is the config of its face generators' networks."""
     torch.manual_seed(0)
     layout = MotionLayout.named("wholebody363", fps=fps)
-    given = {"stats": FeatureStats(np.zeros(363, np.float32), np.ones(363, np.float32), layout)}
+    stats = FeatureStats(np.zeros(363, np.float32), np.ones(363, np.float32), layout)
+    given = {"stats": stats, "text": SimpleNamespace(encoder=Encoder())}
     small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
     tokenizer = build_tokenizer(H2VQConfig(**small), layout).freeze()
     gpt = opinionated(InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, 8))
 
     def of(levels: Any, net: InterleavedGPT, face: bool) -> GptGenerator:
-        return GptGenerator(LoadedGpt(net, "sentence"), {"tokenizer": TrainedTokenizer(levels, given)}, face)
+        trained = {"tokenizer": TrainedTokenizer(levels, given), "text": given["text"]}
+        return GptGenerator(LoadedGpt(net, "sentence"), trained, face)
 
     made: list[Any] = [of(tokenizer, gpt, False)]
     if "gpt" in faces:
@@ -77,8 +79,8 @@ def bundle(
         denoiser = MotionDiffusion(face or DENOISER, 50, 8)
         made.append(DiffusionFace(denoiser.eval().requires_grad_(False), layout, given))
     if "vae" in faces:
-        made.append(VaeFace(None))  # type: ignore[arg-type]
-    return Bundle([stage(f"stage{k}", one, text=Encoder()) for k, one in enumerate(made)], Shelf())
+        made.append(VaeFace(SimpleNamespace(given=given)))  # type: ignore[arg-type]
+    return Bundle([stage(f"stage{k}", one) for k, one in enumerate(made)], Shelf())
 
 
 def stage(name: str, made: Any, **given: Any) -> Finished:

@@ -1,0 +1,380 @@
+"""Training of MATE and UTT: sequences, the adversarial weight, both players, gradients, what is learnt."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from motionloom.datasets.conditions import Condition
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.condition.mate import MateConfig
+from motionloom.models.discriminator.losses import AdversarialConfig, generator_loss
+from motionloom.models.discriminator.patch import DiscriminatorConfig
+from motionloom.models.gpt.tokens import interleave, stream_names
+from motionloom.models.tokenizer.base import Stream, Tokenizer
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import H2VQConfig, MqConfig
+from motionloom.models.training.optim import OptimConfig
+from motionloom.models.utt.conditioned import ConditionedUtt
+from motionloom.models.utt.module import UttLossConfig, UttModule, closed_sequences
+from motionloom.models.utt.network import UttConfig
+
+# ---- sequences
+
+PATTERNS = [
+    ("code",),
+    ("body", "body", "hand"),
+    ("hand", "body", "hand"),
+    ("level0", "level1", "level2"),
+    ("a", "b", "a", "c", "b"),
+]
+
+
+def some_codes(pattern: tuple[str, ...], groups: int, batch: int) -> tuple[dict[str, Tensor], dict[str, int]]:
+    generator = torch.Generator().manual_seed(len(pattern))
+    ends = {name: 5 + 2 * k for k, name in enumerate(stream_names(pattern))}
+    codes = {
+        name: torch.randint(end, (batch, groups * pattern.count(name)), generator=generator)
+        for name, end in ends.items()
+    }
+    return codes, ends
+
+
+def by_hand(
+    codes: dict[str, Tensor],
+    groups: list[int],
+    closed: list[bool],
+    pattern: tuple[str, ...],
+    ends: dict[str, int],
+) -> list[list[tuple[int, int]]]:
+    """(token, kind) one after another, row by row."""
+    names = list(dict.fromkeys(pattern))
+    rows = []
+    for row, count in enumerate(groups):
+        left = {name: iter(codes[name][row].tolist()) for name in names}
+        made = [(next(left[name]), names.index(name)) for _ in range(count) for name in pattern]
+        rows.append(made + [(ends[name], k) for k, name in enumerate(names)] * closed[row])
+    return rows
+
+
+@pytest.mark.parametrize("pattern", PATTERNS, ids="-".join)
+def test_sequences_equal_those_by_hand(pattern: tuple[str, ...]) -> None:
+    groups, closed = [4, 4, 1, 2, 3, 1], [True, False, True, False, True, False]
+    codes, ends = some_codes(pattern, 4, 6)
+    found = closed_sequences(codes, torch.tensor(groups), torch.tensor(closed), pattern, ends)
+    expected = by_hand(codes, groups, closed, pattern, ends)
+    assert found.tokens.shape == found.kinds.shape == (6, 4 * len(pattern) + len(ends))
+    assert found.length.tolist() == [len(row) for row in expected]
+    for row, pairs in enumerate(expected):
+        size = len(pairs)
+        assert (
+            list(zip(found.tokens[row, :size].tolist(), found.kinds[row, :size].tolist(), strict=True))
+            == pairs
+        )
+        assert (found.tokens[row, size:] == -1).all() and (found.kinds[row, size:] == 0).all()
+
+
+@pytest.mark.parametrize("pattern", PATTERNS, ids="-".join)
+def test_rows_that_are_all_closed_or_all_open_are_those_of_interleave(pattern: tuple[str, ...]) -> None:
+    groups = torch.tensor([3, 1, 2])
+    codes, ends = some_codes(pattern, 3, 3)
+    closed = closed_sequences(codes, groups, torch.ones(3, dtype=torch.bool), pattern, ends)
+    for ours, theirs in zip(closed, interleave(codes, pattern, ends=ends, groups=groups), strict=True):
+        assert torch.equal(ours, theirs)
+    opened = closed_sequences(codes, groups, torch.zeros(3, dtype=torch.bool), pattern, ends)
+    tokens, kinds, length = interleave(codes, pattern, groups=groups)
+    assert torch.equal(opened.length, length)
+    assert torch.equal(opened.tokens[:, : tokens.shape[1]], tokens)
+    assert torch.equal(opened.kinds[:, : kinds.shape[1]], kinds)
+    assert (opened.tokens[:, tokens.shape[1] :] == -1).all()
+
+
+# ---- the weight
+
+
+def test_the_adversarial_weight_starts_and_rises() -> None:
+    ramp = UttLossConfig(adversarial=AdversarialConfig(weight=0.4), adversarial_start=10, adversarial_ramp=4)
+    assert [ramp.weight(step) for step in range(8, 17)] == pytest.approx(
+        [0, 0, 0.1, 0.2, 0.3, 0.4, 0.4, 0.4, 0.4]
+    )
+    at_once = UttLossConfig(adversarial=AdversarialConfig(weight=0.4), adversarial_start=3)
+    assert [at_once.weight(step) for step in range(5)] == [0, 0, 0, 0.4, 0.4]
+    assert UttLossConfig(adversarial=AdversarialConfig(weight=0)).weight(10**6) == 0
+
+
+# ---- both players
+
+SMALL = DiscriminatorConfig(dim=8, ff=8, heads=2, layers=1, dropout=0.0)
+LAYOUT = {"mq": "smpl75", "h2vq": "wholebody313"}
+
+
+def toy_tokenizer(kind: str = "mq", num_codes: int = 9) -> Tokenizer:
+    small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": num_codes}
+    made = build_tokenizer(
+        MqConfig(**small) if kind == "mq" else H2VQConfig(**small), MotionLayout.named(LAYOUT[kind])
+    )
+    for book in made.codebooks().values():
+        nn.init.normal_(book.codebook)
+    return made
+
+
+def toy_module(
+    kind: str = "mq", *, loss: dict[str, Any] | None = None, max_steps: int = 100, **net: Any
+) -> UttModule:
+    torch.manual_seed(0)
+    tokenizer = toy_tokenizer(kind)
+    given = {"layers": 1, "dim": 16, "heads": 2, "ff": 16, "block_size": 24, "dropout": 0.0,
+             "attention_dropout": 0.0, "z_dim": 2, "condition_dropout": 0.0, **net}  # fmt: skip
+    conditioned = ConditionedUtt(
+        MateConfig(dim=8, layers=1, heads=2, ff=8, dropout=0.0, attention_dropout=0.0),
+        UttConfig(**given),
+        {"text": 4, "audio": 3},
+        tokenizer.streams,
+        tokenizer.pattern,
+    )
+    config = UttLossConfig.parse({"discriminator": SMALL.dump(), **(loss or {})}, "loss")
+    module = UttModule(
+        conditioned,
+        OptimConfig(optimizer="adam"),
+        seed=0,
+        max_steps=max_steps,
+        tokenizer=tokenizer,
+        loss=config,
+    )
+    return module
+
+
+def toy_batch(module: UttModule, frames: int = 20) -> dict[str, Any]:
+    generator = torch.Generator().manual_seed(1)
+    dim = module.tokenizer.module.dim
+    audio = torch.tensor([0, 1, 1, 0], dtype=torch.bool)[:, None] & (torch.arange(frames) < 16)
+    text = torch.tensor([1, 0, 1, 0], dtype=torch.bool)[:, None].expand(-1, 3)
+    return {
+        "motion": torch.randn(4, frames, dim, generator=generator),
+        "length": torch.tensor([20, 16, 8, 13]),
+        "closed": torch.tensor([True, False, True, False]),
+        "present": torch.ones(4, dim, dtype=torch.bool),
+        "conditions": {
+            "text": Condition(torch.randn(4, 3, 4, generator=generator), text),
+            "audio": Condition(torch.randn(4, frames, 3, generator=generator), audio),
+        },
+    }
+
+
+def test_tokens_are_those_of_the_frozen_tokenizer() -> None:
+    module = toy_module("h2vq")
+    batch = toy_batch(module)
+    tokens, _, length = module.sequences(batch)
+    tokenizer = module.tokenizer.module
+    whole = len(tokenizer.pattern)
+    assert length.tolist() == [5 * whole + 2, 4 * whole, 2 * whole + 2, 3 * whole]
+    for row, groups in enumerate([5, 4, 2, 3]):
+        motion = batch["motion"][row : row + 1, : 4 * groups]
+        alone = tokenizer.encode(motion, torch.tensor([4 * groups]), batch["present"][row : row + 1])
+        expected = interleave(alone, tokenizer.pattern).tokens[0]
+        assert torch.equal(tokens[row, : groups * whole], expected)
+    assert not any("tokenizer" in name for name in module.state_dict())
+    assert not any(p.requires_grad for p in tokenizer.parameters())
+
+
+def grads(module: nn.Module) -> dict[str, float]:
+    return {
+        name: 0.0 if p.grad is None else float(p.grad.abs().sum()) for name, p in module.named_parameters()
+    }
+
+
+@pytest.mark.parametrize("kind", ["mq", "h2vq"])
+def test_the_generators_loss_moves_mate_and_utt_and_not_the_critic(kind: str) -> None:
+    module = toy_module(kind, loss={"adversarial": {"weight": 0.5, "sample": False}})
+    assert module.discriminator is not None
+    batch, shared = toy_batch(module), {}
+    module.discriminator.requires_grad_(False)  # as `PlayersModule` does in this turn
+    values = module.play("tokens", batch, shared)
+    assert values.keys() >= {"loss", "ce", "adversarial"} | {f"accuracy_{n}" for n in module.net.utt.names}
+    torch.testing.assert_close(values["loss"], values["ce"] + 0.5 * values["adversarial"])
+    assert set(shared) == {"motion", "length", "glob"}
+    torch.testing.assert_close(
+        values["adversarial"],
+        generator_loss(module.discriminator(shared["motion"], shared["glob"], shared["length"])),
+    )
+    values["adversarial"].backward()
+    reached = grads(module.net)
+    assert reached["mate.aggregate"] > 0 and reached["mate.project.text.weight"] > 0
+    assert reached["mate.project.audio.weight"] > 0 and reached["utt.condition_in.weight"] > 0
+    assert reached["utt.start"] > 0 and any(v > 0 for n, v in reached.items() if "backbone" in n)
+    assert set(grads(module.discriminator).values()) == {0.0}
+    assert set(grads(module.tokenizer.module).values()) == {0.0}
+
+
+def test_the_critics_loss_moves_the_critic_alone() -> None:
+    module = toy_module(loss={"adversarial": {"weight": 0.5, "gradient_penalty": 0.1}})
+    assert module.discriminator is not None
+    batch, shared = toy_batch(module), {}
+    module.play("tokens", batch, shared)
+    values = module.play("critic", batch, shared)  # also with what still has its gradient
+    assert set(values) == {"loss", "real", "fake", "accuracy", "penalty"}
+    torch.testing.assert_close(values["loss"], values["real"] + values["fake"] + 0.1 * values["penalty"])
+    values["loss"].backward()
+    assert set(grads(module.net).values()) == {0.0}
+    moved = grads(module.discriminator)
+    assert all(value > 0 for name, value in moved.items() if not name.endswith("bias")), moved
+    assert set(grads(module.tokenizer.module).values()) == {0.0}
+
+
+def test_the_critic_judges_real_frames_of_the_same_length() -> None:
+    """What lies behind a row's whole groups changes nothing of what it says."""
+    module = toy_module(loss={"adversarial": {"weight": 0.5, "sample": False}}).eval()
+    batch = toy_batch(module)
+    shared: dict[str, Tensor] = {}
+    module.play("tokens", batch, shared)
+    assert shared["length"].tolist() == [20, 16, 8, 12]
+    other = {**batch, "motion": batch["motion"].clone()}
+    for row, length in enumerate([20, 16, 8, 12]):
+        other["motion"][row, length:] = 99.0
+    for name, value in module.play("critic", batch, shared).items():
+        torch.testing.assert_close(module.play("critic", other, shared)[name], value)
+
+
+def test_turns_begin_with_the_adversarial_term() -> None:
+    module = toy_module(loss={"adversarial": {"weight": 0.5}, "adversarial_start": 7})
+    tokens, critic = module.players()
+    assert tokens.plays(0) and not critic.plays(6) and critic.plays(7) and critic.plays(8)
+    shared: dict[str, Tensor] = {}
+    values = module.play("tokens", toy_batch(module), shared)
+    assert "adversarial" not in values and not shared
+    torch.testing.assert_close(values["loss"], values["ce"])
+    module.eval()  # in validation the figure is there, and not in the loss
+    values = module.losses(toy_batch(module))
+    assert {"tokens_adversarial", "critic_loss", "critic_accuracy"} <= set(values)
+    torch.testing.assert_close(values["loss"], values["tokens_ce"])
+
+
+def test_without_the_term_there_is_no_critic() -> None:
+    module = toy_module(loss={"adversarial": {"weight": 0.0}})
+    assert module.discriminator is None and [p.name for p in module.players()] == ["tokens"]
+    assert not any("discriminator" in name for name in module.state_dict())
+    values = module.losses(toy_batch(module))
+    assert set(values) == {"loss", "tokens_loss", "tokens_ce", "tokens_accuracy_code"}
+
+
+def test_without_z() -> None:
+    module = toy_module(z_dim=0).eval()
+    assert module.net.utt.z_in is None
+    one, two = module.losses(toy_batch(module)), module.losses(toy_batch(module))
+    assert torch.equal(one["tokens_ce"], two["tokens_ce"]), "nothing is drawn"
+
+
+def test_dropped_conditions_are_the_unconditional_input() -> None:
+    module = toy_module(condition_dropout=0.99, z_dim=0)
+    batch = toy_batch(module)
+    torch.manual_seed(0)
+    dropped = module.play("tokens", batch, {})["ce"]
+    none = {name: Condition(c.features, torch.zeros_like(c.mask)) for name, c in batch["conditions"].items()}
+    bare = module.play("tokens", {**batch, "conditions": none}, {})["ce"]
+    torch.testing.assert_close(dropped, bare)
+
+
+def test_corrupted_inputs_keep_their_targets() -> None:
+    module = toy_module(pkeep=0.01, z_dim=0, loss={"adversarial": {"weight": 0.0}})
+    seen = {}
+    forward = module.net.utt.forward
+
+    def spy(tokens: Tensor, *args: Any, **options: Any) -> Tensor:
+        seen["tokens"], seen["inputs"] = tokens, options["inputs"]
+        return forward(tokens, *args, **options)
+
+    module.net.utt.forward = spy  # type: ignore[method-assign]
+    batch = toy_batch(module)
+    module.play("tokens", batch, {})
+    tokens = module.sequences(batch).tokens
+    assert torch.equal(seen["tokens"], tokens)
+    special = (tokens == -1) | (tokens == 9)
+    assert torch.equal(seen["inputs"][special], tokens[special])
+    assert (seen["inputs"] != tokens)[~special].float().mean() > 0.5
+    module.eval()
+    module.play("tokens", batch, {})
+    assert seen["inputs"] is None
+
+
+# ---- what is learnt
+
+
+class Letters(nn.Module):
+    """A tokenizer whose codes can be read off the motion: column 0 of each group's first frame."""
+
+    streams = (Stream("code", 6, 1),)
+    pattern = ("code",)
+    dim = 2
+    group_frames = 4
+
+    def encode(self, motion: Tensor, length: Tensor, present: Tensor | None = None) -> dict[str, Tensor]:
+        return {"code": motion[:, ::4, 0].round().long()}
+
+    def decode_soft(
+        self, weights: dict[str, Tensor], length: Tensor, present: Tensor | None = None
+    ) -> Tensor:
+        values = weights["code"] @ torch.arange(6.0)
+        return torch.stack([values, values], -1).repeat_interleave(4, dim=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adversarial", [0.0, 0.05])
+def test_conditions_bring_the_cross_entropy_below_the_entropy_of_the_codes(adversarial: float) -> None:
+    """Codes are uniform, ln 6 nats each; a text or a sound says which they are."""
+    torch.manual_seed(0)
+    tokenizer: Any = Letters()
+    net = ConditionedUtt(
+        MateConfig(dim=24, layers=1, heads=4, ff=48, dropout=0.0, attention_dropout=0.0),
+        UttConfig(
+            layers=2, dim=24, heads=4, ff=48, block_size=8, z_dim=2, dropout=0.0, attention_dropout=0.0
+        ),
+        {"text": 6, "audio": 6},
+        tokenizer.streams,
+        tokenizer.pattern,
+    )
+    loss = {"adversarial": {"weight": adversarial}, "discriminator": SMALL.dump()}
+    module = UttModule(
+        net, OptimConfig(optimizer="adam", lr=4e-3), seed=0, max_steps=220, tokenizer=tokenizer,
+        loss=UttLossConfig.parse(loss, "loss"),
+    )  # fmt: skip
+    optimizers = [torch.optim.Adam(player.params(), lr=4e-3) for player in module.players()]
+
+    def batch(seed: int, kind: str) -> dict[str, Any]:
+        codes = torch.randint(6, (16, 4), generator=torch.Generator().manual_seed(seed))
+        motion = codes.repeat_interleave(4, dim=1).float()[..., None].expand(-1, -1, 2)
+        there = (
+            torch.arange(16) % 2 == (kind == "audio")
+            if kind == "mixed"
+            else torch.full((16,), kind == "text")
+        )
+        heard = ~there if kind == "mixed" else torch.full((16,), kind == "audio")
+        return {
+            "motion": motion.contiguous(),
+            "length": torch.full((16,), 16),
+            "closed": torch.zeros(16, dtype=torch.bool),
+            "conditions": {
+                "text": Condition(torch.eye(6)[codes], there[:, None].expand(-1, 4)),
+                "audio": Condition(
+                    torch.eye(6)[codes.repeat_interleave(4, dim=1)], heard[:, None].expand(-1, 16)
+                ),
+            },
+        }
+
+    for step in range(220):
+        shared: dict[str, Tensor] = {}
+        for player, optimizer in zip(module.players(), optimizers, strict=True):
+            optimizer.zero_grad()
+            module.play(player.name, batch(step, "mixed"), shared)["loss"].backward()
+            shared = {name: value.detach() for name, value in shared.items()}
+            optimizer.step()
+    module.eval()
+    entropy = float(torch.log(torch.tensor(6.0)))
+    with torch.no_grad():
+        found = {
+            k: float(module.play("tokens", batch(10_000, k), {})["ce"]) for k in ("text", "audio", "none")
+        }
+    assert found["text"] < 0.5 * entropy and found["audio"] < 0.5 * entropy, found
+    assert found["none"] > 0.95 * entropy, "without conditions nothing says which code comes"
