@@ -27,21 +27,22 @@ from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.tokens import deinterleave
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Given, Shelf
 from motionloom.pipeline.stages.gpt_data import gpt_clips
-from motionloom.pipeline.store.data import open_split, open_text
-from motionloom.pipeline.store.networks import LoadedTma, load_gpt, load_tokenizer
-from motionloom.pipeline.store.tokens import TokenBatches, TokenStore
+from motionloom.pipeline.store.networks import LoadedTma
+from motionloom.pipeline.store.tokens import TokenBatches
 
 THRESHOLDS = (0.85, None)
 ROWS = ("truth", "predicted after the truth", "own samples")
 
 
-def batches(run: Path, tokenizer: Tokenizer, gpt: InterleavedGPT, tma: LoadedTma, size: int) -> TokenBatches:
+def batches(
+    given: Given, tokenizer: Tokenizer, gpt: InterleavedGPT, tma: LoadedTma, size: int
+) -> TokenBatches:
     """Validation clips with all their captions, endless, as the GPT stage trains on others."""
-    stages = run / "stages"
-    text, per_group = open_text(stages / "text"), {s.name: s.per_group for s in tokenizer.streams}
-    store = TokenStore.load(stages / "tokens/tokens-val.safetensors", per_group)
-    clips = gpt_clips(open_split(stages / "data", "val"), store, tokenizer, face=False, min_frames=16)
+    text, store = given["text"].cache, given["tokens"].open("val")
+    clips = gpt_clips(given["data"].split("val"), store, tokenizer, face=False, min_frames=16)
     return TokenBatches(
         clips.store,
         clips.captions,
@@ -52,19 +53,21 @@ def batches(run: Path, tokenizer: Tokenizer, gpt: InterleavedGPT, tma: LoadedTma
         gpt.max_groups,
         size,
         0,
-        held=clips.held,
+        present=clips.present,
     )
 
 
 @torch.no_grad()
 def measure(run: Path, stage: str, size: int, count: int) -> dict[tuple[str, float | None], float]:
     """(row, threshold of the filter) -> mean L_align over `count` batches."""
-    stages = run / "stages"
-    tokenizer, tma = load_tokenizer(stages / "tokenizer"), LoadedTma.load(stages / "tma")
-    gpt, prior = load_gpt(stages / stage, tokenizer)
-    if prior != "tma":
-        raise SystemExit(f"{stages / stage}: reads the prior '{prior}'; this script asks GPTs with TMA's")
-    data = batches(run, tokenizer, gpt, tma, size)
+    stages, shelf = finished_stages(run), Shelf()
+    if stage not in stages:
+        raise SystemExit(f"{run}: stage '{stage}' has not finished; run it first")
+    given, loaded = shelf.given(stages[stage].inputs), shelf.get(stages[stage])
+    if loaded.prior != "tma":
+        raise SystemExit(f"{run}: {stage} reads the prior '{loaded.prior}'; this script asks GPTs with TMA's")
+    tokenizer, tma, gpt = given["tokenizer"].net, given["tma"], loaded.net
+    data = batches(given, tokenizer, gpt, tma, size)
     found: dict[tuple[str, float | None], list[float]] = {(r, t): [] for r in ROWS for t in THRESHOLDS}
     torch.manual_seed(0)
     for k in range(count):
@@ -80,9 +83,9 @@ def measure(run: Path, stage: str, size: int, count: int) -> dict[tuple[str, flo
             "predicted after the truth": soft_codes(gpt, logits, groups, temperature=1.0, sample=True),
             "own samples": {name: F.one_hot(codes, sizes[name]).float() for name, codes in own.items()},
         }
-        frames, held = groups * tokenizer.group_frames, batch.get("held")
+        frames, present = groups * tokenizer.group_frames, batch.get("present")
         for row, codes in weights.items():
-            latent = tma.embed_motion(tokenizer.decode_soft(codes, frames, held), frames, held)
+            latent = tma.embed_motion(tokenizer.decode_soft(codes, frames, present), frames, present)
             for threshold in THRESHOLDS:
                 loss = info_nce(text, latent, batch["similarity"], threshold=threshold)
                 found[row, threshold].append(float(loss))

@@ -28,20 +28,19 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.synth.face import read
 from motionloom.datasets.synth.measure import agrees
-from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.models.gpt.sampling import sample_seeds
 from motionloom.models.metrics.retrieval import recall
+from motionloom.pipeline.contract.generation import GenerationRequest, Prompt
+from motionloom.pipeline.contract.lookup import finished_stages, generators_of
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import Finished, Shelf
 from motionloom.pipeline.evaluation.figures import embed_motions
-from motionloom.pipeline.evaluation.truth import Truth, joint_layout, reconstruct_truth, truth_of
-from motionloom.pipeline.inference.bundle import Bundle, part_folders, text_encoder_of
-from motionloom.pipeline.inference.faces import FaceRequest, expression, load_faces
-from motionloom.pipeline.inference.sampling import SamplingConfig
-from motionloom.pipeline.store.data import open_split, open_text
-from motionloom.pipeline.store.networks import LoadedTma
+from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
+from motionloom.pipeline.inference.bundle import Bundle, joint_layout
+from motionloom.pipeline.inference.conditions import PromptEncoder
 
 matplotlib.use("Agg")
 
@@ -71,7 +70,7 @@ def finished(run: Path, stage: str) -> bool:
 
 
 def test_truths(run: Path) -> list[Truth]:
-    dataset = open_split(run / "stages/data", "test")
+    dataset = Shelf().get(finished_stages(run)["data"]).split("test")
     return [truth_of(dataset, i) for i in range(len(dataset))]
 
 
@@ -90,11 +89,10 @@ def retrieval(
 ) -> dict[str, float]:
     """Mean recall over draws of 32 clips with different truths; `motions` made for their captions instead of
     their own."""
-    stages = run / "stages"
-    tma, cache = LoadedTma.load(stages / stage), open_text(stages / "text")
-    stats = FeatureStats.load(stages / "stats/stats.safetensors")
+    found_stage, shelf = finished_stages(run)[stage], Shelf()
+    tma, cache = shelf.get(found_stage), shelf.given(found_stage.inputs)["text"].cache
     text = tma.embed_captions([t.caption for t in truths], cache)
-    motion = embed_motions(tma, stats, [t.features for t in truths] if motions is None else motions)
+    motion = embed_motions(tma, [t.features for t in truths] if motions is None else motions)
     kinds: dict[str, list[int]] = defaultdict(list)
     for row, truth in enumerate(truths):
         kinds[told(truth)].append(row)
@@ -110,8 +108,8 @@ def retrieval(
 
 def similarities(run: Path, stage: str = "tma") -> list[tuple[str, str, float, float]]:
     """(caption, caption, cosine of the sentence encoder, cosine of TMA)."""
-    tma = LoadedTma.load(run / "stages" / stage)
-    encoder = load_text_encoder(text_encoder_of(run / "stages/text"))
+    found, shelf = finished_stages(run)[stage], Shelf()
+    tma, encoder = shelf.get(found), shelf.given(found.inputs)["text"].encoder
     rows = []
     for one, other in PAIRS:
         encoded = encoder.encode([one, other])
@@ -147,14 +145,13 @@ def generation(
 ) -> tuple[dict[str, Shares], dict[str, dict[str, float]]]:
     """Shares of a guess, of the tokenizer's reconstructions and of every GPT of the run; and how well TMA
     finds the motions of every GPT (R-precision, Tables 5 and 8)."""
-    parts = part_folders(run)
-    encoder = text_encoder_of(parts["text"])
+    stages, makers, shelf = finished_stages(run), generators_of(run), Shelf()
+    tokenizer, face_makers = shelf.get(stages["tokenizer"]), makers_of_faces(makers, shelf)
     captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
-    bundle = Bundle.from_parts(parts, encoder)
-    fps, joints = bundle.layout.fps, joint_layout(bundle.layout)
+    fps, joints = tokenizer.layout.fps, joint_layout(tokenizer.layout)
     order = np.random.default_rng(0).permutation(len(truths))
     guess = ((truths[k].joints, truths[k].face) for k in order)
-    rebuilt = (reconstruct_truth(bundle.tokenizer, bundle.stats, t) for t in truths)
+    rebuilt = (reconstruct_truth(tokenizer, t) for t in truths)
     out = {
         "another clip's motion": judge(truths, guess, fps, hold_out),
         "reconstruction": judge(truths, ((decode(x, joints), None) for x in rebuilt), fps, hold_out),
@@ -162,34 +159,38 @@ def generation(
     found = {}
     for name, title in GPTS.items():
         if finished(run, name):
-            bundle = Bundle.from_parts({**parts, "gpt": run / "stages" / name}, encoder)
+            bundle = Bundle([stages[name], *face_makers], shelf)
             made = bundle.generate(captions, face_captions=faces, sampling=sampling)
             out[title] = judge(truths, ((m.joints, m.face) for m in made), fps, hold_out)
             found[title] = retrieval(run, "tma", truths, draws, [m.features for m in made])
     return out, found
 
 
+def makers_of_faces(makers: Iterable[Finished], shelf: Shelf) -> list[Finished]:
+    return [stage for stage in makers if shelf.generator(stage).part == "face"]
+
+
 def facial(run: Path, truths: list[Truth]) -> dict[str, float]:
     """Share of expressions that show what the caption says, for each generator (Table 4 in miniature)."""
-    parts = part_folders(run)
-    encoder = load_text_encoder(text_encoder_of(parts["text"]))
-    stats = FeatureStats.load(parts["stats"] / "stats.safetensors")
+    shelf = Shelf()
     shown = [t for t in truths if t.face is not None and (t.truth or {}).get("face")]
-    request = FaceRequest(
-        encoder.encode([t.face_caption for t in shown]),
-        None,
-        [len(t.features) for t in shown],
-        sample_seeds(0, len(shown)),
-        SamplingConfig(),
-    )
+    prompts = [Prompt(t.face_caption) for t in shown]
+    frames, seeds = [len(t.features) for t in shown], sample_seeds(0, len(shown))
     wanted = [(t.truth or {})["face"] for t in shown]
     order = np.random.default_rng(0).permutation(len(shown))
     out = {
         "another clip's face": float(np.mean([wanted[k] == w for k, w in zip(order, wanted, strict=True)]))
     }
-    for kind, generator in load_faces(parts).items():
-        made = [expression(values, stats.layout, stats) for values in generator.make(request)]
-        out[kind] = float(np.mean([read(face) == w for face, w in zip(made, wanted, strict=True)]))
+    for stage in makers_of_faces(generators_of(run), shelf):
+        generator = shelf.generator(stage)
+        encoder = PromptEncoder(shelf.given(stage.inputs)["text"], shelf.device)
+        conditions = encoder.encode(
+            prompts, [p.words for p in prompts], generator.modalities, generator.layout.fps
+        )
+        made = generator.generate(GenerationRequest(conditions, frames, seeds))
+        out[generator.method] = float(
+            np.mean([read(face) == w for face, w in zip(made, wanted, strict=True)])
+        )
     return out
 
 

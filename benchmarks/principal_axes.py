@@ -22,15 +22,17 @@ from rich.table import Table
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.layers.basis import Basis
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.figures import local_joints, pose_errors
-from motionloom.pipeline.evaluation.truth import joint_layout, truth_of
-from motionloom.pipeline.store.data import open_split, open_stats
+from motionloom.pipeline.evaluation.truth import truth_of
+from motionloom.pipeline.inference.bundle import joint_layout
 
 GAINS = {"the paper's features": (1.0, 0.0), "fingers in the palm's frame": (5.0, 4.0)}
 
 
 def seen(basis: Basis, features: NDArray[np.float32], mean: NDArray, std: NDArray) -> NDArray[np.float32]:
-    return np.asarray(basis.enter(torch.from_numpy((features - mean) / std)).numpy(), dtype=np.float32)
+    return np.asarray(basis.encode(torch.from_numpy((features - mean) / std)).numpy(), dtype=np.float32)
 
 
 def main() -> None:
@@ -41,8 +43,9 @@ def main() -> None:
     parser.add_argument("--components", type=int, nargs="*", default=[16, 32, 48, 64, 96])
     parser.add_argument("--clips", type=int, default=100, help="test clips")
     args = parser.parse_args()
-    train, test = (open_split(args.run / "stages/data", split) for split in ("train", "test"))
-    stats, layout = open_stats(args.run / "stages/stats"), joint_layout(train.layout)
+    stages, shelf = finished_stages(args.run), Shelf()
+    train, test = (shelf.get(stages["data"]).split(split) for split in ("train", "test"))
+    stats, layout = shelf.get(stages["stats"]), joint_layout(train.layout)
     columns = train.layout.part("bodyhand")
     mean, std = stats.mean[columns], stats.std[columns]
     chosen = np.random.default_rng(0).permutation(len(train))[:1000]
@@ -59,7 +62,7 @@ def main() -> None:
             found: dict[str, list[float]] = defaultdict(list)
             for truth in truths:
                 few = (seen(basis, truth.features, mean, std) - center) @ axes[:count].T @ axes[:count]
-                features = basis.leave(torch.from_numpy(few + center)).numpy() * std + mean
+                features = basis.decode(torch.from_numpy(few + center)).numpy() * std + mean
                 right = agrees(truth.truth or {}, decode(features, layout), None, layout.fps)
                 found["action"].append(right["action"])
                 for name in ("left_hand", "right_hand"):

@@ -22,11 +22,10 @@ from rich.console import Console
 from rich.table import Table
 from sklearn.linear_model import LogisticRegression
 
-from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.truth import Truth, truth_of
-from motionloom.pipeline.store.data import open_split, open_text
-from motionloom.pipeline.store.networks import LoadedTma
 
 ATTRIBUTES = ("action", "direction", "side", "count", "speed", "left_hand", "right_hand")
 
@@ -69,20 +68,19 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--train", type=int, default=3000, help="training captions the reader learns from")
     args = parser.parse_args()
-    stages = args.run / "stages"
-    hold_out = json.loads((stages / "data/artifact.json").read_text())["config"]["hold_out"]
-    split = open_split(stages / "data", "train")
+    stages, shelf = finished_stages(args.run), Shelf()
+    hold_out = json.loads((stages["data"].folder / "artifact.json").read_text())["config"]["hold_out"]
+    split = shelf.get(stages["data"]).split("train")
     chosen = np.random.default_rng(1).permutation(len(split))[: args.train]
     truths = [truth_of(split, int(i)) for i in chosen], test_truths(args.run)
-    tma, cache = LoadedTma.load(stages / "tma"), open_text(stages / "text")
-    stats = FeatureStats.load(stages / "stats/stats.safetensors")
+    tma, cache = shelf.get(stages["tma"]), shelf.get(stages["text"]).cache
     readers: dict[str, list[NDArray[np.float32]]] = {
         "TMA, captions": [], "TMA, motions": [], "sentence encoder": []
     }  # fmt: skip
     for part in truths:
         captions = [t.caption for t in part]
         readers["TMA, captions"].append(tma.embed_captions(captions, cache).numpy())
-        readers["TMA, motions"].append(embed_motions(tma, stats, [t.features for t in part]).numpy())
+        readers["TMA, motions"].append(embed_motions(tma, [t.features for t in part]).numpy())
         readers["sentence encoder"].append(np.asarray(cache.sentence(captions)))
     table = Table("read right", *(f"{name}: {kind}" for name in readers for kind in ("held out", "other")))
     for attribute in ATTRIBUTES:

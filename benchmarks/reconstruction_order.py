@@ -23,11 +23,11 @@ from rich.table import Table
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.figures import reconstruction_figures
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.store.data import open_split, open_stats
-from motionloom.pipeline.store.networks import load_tokenizer
 
 matplotlib.use("Agg")
 
@@ -82,13 +82,12 @@ def measure(run: Path, clips: int) -> dict[str, float]:
     kept = run / "figures.json"
     if kept.is_file():
         return dict(json.loads(kept.read_text()))
-    net = load_tokenizer(run / "stages/tokenizer")
-    test = open_split(run / "stages/data", "test")
+    stages, shelf = finished_stages(run), Shelf()
+    tokenizer, data = shelf.get(stages["tokenizer"]), shelf.get(stages["data"])
+    test = data.split("test")
     truths = [truth_of(test, i) for i in range(min(clips, len(test)))]
-    figures = reconstruction_figures(
-        net, open_stats(run / "stages/stats"), open_split(run / "stages/data", "train"), truths
-    )
-    figures["bits"] = net.bits_per_second
+    figures = reconstruction_figures(tokenizer, data.split("train"), truths)
+    figures["bits"] = tokenizer.net.bits_per_second
     kept.write_text(json.dumps(figures))
     return figures
 

@@ -18,7 +18,7 @@ SCHEMA_VERSION = 2
 
 HANDS, FACE = 1, 2
 """Bits of what a clip has beside its body."""
-HELD_ALL = HANDS | FACE
+PRESENT_ALL = HANDS | FACE
 
 Split = Literal["train", "val", "test"]
 
@@ -129,7 +129,7 @@ class ClipMeta(Config):
     """What a synthetic clip really does (action, direction, side, count, hand, face)."""
 
     @property
-    def held(self) -> int:
+    def present(self) -> int:
         """`has_hands` and `has_face` as bits."""
         return HANDS * self.has_hands | FACE * self.has_face
 

@@ -1,1 +1,73 @@
-"""Command line, recipes, the stage graph, training, generation and pages."""
+"""Command line, recipes, the stage graph, training, generation and pages.
+
+The names below are the Python API (`docs/python.md`). Each is imported when it is first asked for: `import
+motionloom.pipeline` alone brings in no torch.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from motionloom.datasets.audio.sound import Sound
+    from motionloom.datasets.schema import UserError
+    from motionloom.pipeline.contract.generation import Prompt
+    from motionloom.pipeline.contract.registry import register
+    from motionloom.pipeline.contract.sampling import SamplingConfig
+    from motionloom.pipeline.contract.stage import StageKind
+    from motionloom.pipeline.inference.bundle import GeneratedMotion
+    from motionloom.pipeline.inference.outputs import write_motions
+    from motionloom.pipeline.inference.pretrained import MotionModel
+    from motionloom.pipeline.runs.api import evaluate_run, export_run, report_run, run_recipe
+    from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+    from motionloom.pipeline.stages.trained import TrainedStage
+
+__all__ = [
+    "GeneratedMotion",
+    "MotionModel",
+    "Prompt",
+    "Recipe",
+    "SamplingConfig",
+    "Sound",
+    "StageKind",
+    "TrainedStage",
+    "UserError",
+    "evaluate_run",
+    "export_run",
+    "load_recipe",
+    "register",
+    "report_run",
+    "run_recipe",
+    "write_motions",
+]
+
+_HOMES = {
+    "GeneratedMotion": "pipeline.inference.bundle",
+    "MotionModel": "pipeline.inference.pretrained",
+    "Prompt": "pipeline.contract.generation",
+    "Recipe": "pipeline.runs.recipe",
+    "SamplingConfig": "pipeline.contract.sampling",
+    "Sound": "datasets.audio.sound",
+    "StageKind": "pipeline.contract.stage",
+    "TrainedStage": "pipeline.stages.trained",
+    "UserError": "datasets.schema",
+    "evaluate_run": "pipeline.runs.api",
+    "export_run": "pipeline.runs.api",
+    "load_recipe": "pipeline.runs.recipe",
+    "register": "pipeline.contract.registry",
+    "report_run": "pipeline.runs.api",
+    "run_recipe": "pipeline.runs.api",
+    "write_motions": "pipeline.inference.outputs",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A name of the API, from where it is defined."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"motionloom.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

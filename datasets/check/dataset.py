@@ -69,11 +69,11 @@ def examine(root: Path, *, progress: bool = False) -> CheckReport:
     table = ClipTable(root, manifest.shards, layout)
     widths: dict[int, str] = {}
     for number, shard in enumerate(track(manifest.shards, "checking shards", disable=not progress)):
-        indexed = _indexed_held(root / shard.name)
+        indexed = _indexed_present(root / shard.name)
         try:
             for row, key, clip in _checked_clips(root / shard.name, shard, layout, findings):
                 where = f"{shard.name}: '{key}'"
-                if row < len(indexed) and indexed[row] != clip.meta.held:
+                if row < len(indexed) and indexed[row] != clip.meta.present:
                     findings.error("index", where, "has_hands or has_face is not what the index says")
                 table.add(number, row, clip.meta, clip.motion)
                 frames += clip.meta.frames
@@ -154,10 +154,10 @@ def _against_manifest(
             findings.error("audio", where, other)
 
 
-def _indexed_held(path: Path) -> list[int]:
+def _indexed_present(path: Path) -> list[int]:
     """What a shard's index says its clips hold; an unreadable index is reported with the indices."""
     try:
-        return [clip.held for clip in ShardIndex.load_json(index_path(path)).clips]
+        return [clip.present for clip in ShardIndex.load_json(index_path(path)).clips]
     except (UserError, OSError):
         return []
 
@@ -186,7 +186,7 @@ def _sound_indices(root: Path, shards: list[ShardInfo], findings: Findings) -> I
         path = root / shard.name
         try:
             stored = ShardIndex.load_json(index_path(path))
-            entries = clip_entries(path, [(clip.id, clip.held) for clip in stored.clips])
+            entries = clip_entries(path, [(clip.id, clip.present) for clip in stored.clips])
         except (UserError, OSError, ValueError) as error:
             findings.error("index", index_path(path).name, f"does not fit its tar: {error}")
             continue

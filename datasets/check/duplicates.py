@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.check.clip import read_meta, read_motion
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.motion.canonical import mirror
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import ClipMeta, ShardInfo
 from motionloom.datasets.shards.tar import TarClip, scan_tar
@@ -159,8 +159,7 @@ class ClipTable:
         first, second = self._motion(a), self._motion(b)
         if first.shape != second.shape:
             return ""
-        layout, columns = self.layout.without_face(), self.layout.part("bodyhand")
-        here, there = (decode(motion[:, columns], layout) for motion in (first, second))
+        here, there = (joints_of(motion, self.layout) for motion in (first, second))
         if _distance(mirror(here, self.layout.skeleton), there) < SAME_METRES:
             return "the mirror image of"
         return "the same recording as" if _distance(here, there) < SAME_METRES else ""

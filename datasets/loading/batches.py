@@ -34,11 +34,11 @@ _WINDOW, _CAPTION, _CROP = 1, 2, 3
 
 
 class MotionBatch(TypedDict):
-    """`motion` float32 [B, T, C], normalised, zero behind `length` int64 [B] and where `held` is false."""
+    """`motion` float32 [B, T, C], normalised, zero behind `length` int64 [B] and where `present` is false."""
 
     motion: Tensor
     length: Tensor
-    held: Tensor
+    present: Tensor
     """bool [B, C]: columns of parts (hands, face) that the clip holds. The others must not be learnt from."""
 
 
@@ -86,7 +86,7 @@ class WindowBatches(Dataset[MotionBatch]):
         self.windows_per_clip = windows_per_clip
         self.seed, self.rank, self.world = seed, rank, world
         self.clips = self.crops.clips
-        if len(self.clips) == 0 or not self.crops.held[np.unique(dataset.held)].any(axis=0).all():
+        if len(self.clips) == 0 or not self.crops.present[np.unique(dataset.present)].any(axis=0).all():
             raise UserError(
                 f"{dataset.where}: no clip of split '{dataset.split}' holds hands or a face that the chosen "
                 f"part has columns for; choose another `part` or another data set"
@@ -107,17 +107,17 @@ class WindowBatches(Dataset[MotionBatch]):
         starts = (draws * (np.maximum(frames - self.window, 0) + 1)[:, None]).astype(np.int64)
         length = np.minimum(frames, self.window)
         motion = np.empty((len(clips) * per_clip, self.window, self.crops.width), dtype=np.float32)
-        held = self.dataset.held[clips]
+        present = self.dataset.present[clips]
         self.dataset.prefetch(clips.tolist(), ("motion.npy",))
         for row, clip in enumerate(clips.tolist()):
             source = self.dataset.motion(clip)
             for j in range(per_clip):
                 place = motion[row * per_clip + j]
-                self.crops.fill(place, source, int(starts[row, j]), int(length[row]), int(held[row]))
+                self.crops.fill(place, source, int(starts[row, j]), int(length[row]), int(present[row]))
         return {
             "motion": torch.from_numpy(motion),
             "length": torch.from_numpy(np.repeat(length, per_clip)),
-            "held": torch.from_numpy(self.crops.held[np.repeat(held, per_clip)]),
+            "present": torch.from_numpy(self.crops.present[np.repeat(present, per_clip)]),
         }
 
 
@@ -176,15 +176,15 @@ class _CaptionedClips:
         length = np.minimum(whole, self.max_frames)
         begin += (crop * (whole - length + 1)).astype(np.int64)
         motion = np.empty((len(clips), padded_length(length), self.crops.width), dtype=np.float32)
-        held = self.dataset.held[clips]
+        present = self.dataset.present[clips]
         for row, clip in enumerate(clips.tolist()):
             source = self.dataset.motion(clip)
-            self.crops.fill(motion[row], source, int(begin[row]), int(length[row]), int(held[row]))
+            self.crops.fill(motion[row], source, int(begin[row]), int(length[row]), int(present[row]))
         captions = [span.text for span in spans]
         batch = {
             "motion": torch.from_numpy(motion),
             "length": torch.from_numpy(length),
-            "held": torch.from_numpy(self.crops.held[held]),
+            "present": torch.from_numpy(self.crops.present[present]),
             "index": torch.from_numpy(clips.copy()),
             "valid": torch.ones(len(clips), dtype=torch.bool),
             "caption": captions,

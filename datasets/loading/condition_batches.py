@@ -115,10 +115,10 @@ class ConditionedClips:
         closed = torch.from_numpy(length == whole)
         begin += (crop * (whole - length + 1)).astype(np.int64)
         motion = np.empty((len(clips), padded_length(length), self.crops.width), dtype=np.float32)
-        held = self.dataset.held[clips]
+        present = self.dataset.present[clips]
         for row, clip in enumerate(clips.tolist()):
             source = self.dataset.motion(clip)
-            self.crops.fill(motion[row], source, int(begin[row]), int(length[row]), int(held[row]))
+            self.crops.fill(motion[row], source, int(begin[row]), int(length[row]), int(present[row]))
         captions = [span.text for span in spans]
         conditions: dict[str, Condition] = {}
         if self.text is not None:
@@ -130,7 +130,7 @@ class ConditionedClips:
         return {
             "motion": torch.from_numpy(motion),
             "length": torch.from_numpy(length),
-            "held": torch.from_numpy(self.crops.held[held]),
+            "present": torch.from_numpy(self.crops.present[present]),
             "index": torch.from_numpy(clips.copy()),
             "closed": closed,
             "valid": torch.ones(len(clips), dtype=torch.bool),

@@ -33,23 +33,23 @@ class Crops:
             raise UserError(f"columns outside layout {dataset.layout.name} (or none of them)")
         self.dataset = dataset
         self.width = len(chosen)
-        self.held = dataset.layout.held_columns[:, chosen]
+        self.present = dataset.layout.present_columns[:, chosen]
         """Row b: which of the columns clips hold that hold the bits b, [4, C]."""
-        some = np.asarray(self.held.any(axis=1))
-        self.clips = np.flatnonzero(some[dataset.held])
+        some = np.asarray(self.present.any(axis=1))
+        self.clips = np.flatnonzero(some[dataset.present])
         """Clips that hold any of the columns: the others have nothing to give, [n]."""
-        self._lost = [[place for place, _ in _runs(np.flatnonzero(~row))] for row in self.held]
+        self._missing = [[place for place, _ in _runs(np.flatnonzero(~row))] for row in self.present]
         self._mean = stats.mean[chosen]
         self._scale = 1.0 / stats.std[chosen]
         self._mean_row, self._scale_row = self._mean, self._scale
         self._runs = _runs(chosen)
 
     def fill(
-        self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int, held: int
+        self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int, present: int
     ) -> None:
         """Normalised frames `start .. start + length` of `clip` into `out` [T >= length, C], then zeros.
 
-        `held` are the bits of what the clip holds.
+        `present` are the bits of what the clip holds.
         """
         target = out[:length]
         if self.width == clip.shape[1]:
@@ -61,7 +61,7 @@ class Crops:
             for source, place in self._runs:
                 np.subtract(clip[start : start + length, source], self._mean[place], out=target[:, place])
             np.multiply(target, self._scale, out=target)
-        for place in self._lost[held]:
+        for place in self._missing[present]:
             target[:, place] = 0.0
         if length < len(out):
             out[length:] = 0.0

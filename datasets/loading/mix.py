@@ -56,9 +56,9 @@ class MixedDataset:
         return np.concatenate([dataset.frames for dataset in self._datasets])
 
     @cached_property
-    def held(self) -> NDArray[np.uint8]:
-        """What every clip holds beside its body, bits of `ClipMeta.held`, [n]."""
-        return np.concatenate([dataset.held for dataset in self._datasets])
+    def present(self) -> NDArray[np.uint8]:
+        """What every clip holds beside its body, bits of `ClipMeta.present`, [n]."""
+        return np.concatenate([dataset.present for dataset in self._datasets])
 
     @cached_property
     def ids(self) -> list[str]:

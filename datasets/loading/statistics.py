@@ -51,14 +51,14 @@ class Moments:
         return Moments(np.zeros(width), np.zeros(width), np.zeros(width))
 
     @staticmethod
-    def of(rows: NDArray[np.floating], held: NDArray[np.bool_] | None = None) -> Moments:
-        """Of one array [T, D]; `held` [D] says which columns count (all when None)."""
+    def of(rows: NDArray[np.floating], present: NDArray[np.bool_] | None = None) -> Moments:
+        """Of one array [T, D]; `present` [D] says which columns count (all when None)."""
         mean = rows.mean(axis=0, dtype=np.float64)
         m2 = np.square(rows - mean).sum(axis=0)
         count = np.full(len(mean), float(len(rows)))
-        if held is None or held.all():
+        if present is None or present.all():
             return Moments(count, mean, m2)
-        return Moments(*(np.where(held, values, 0.0) for values in (count, mean, m2)))
+        return Moments(*(np.where(present, values, 0.0) for values in (count, mean, m2)))
 
     def merge(self, other: Moments) -> Moments:
         """Of both together."""
@@ -184,7 +184,7 @@ def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -
         own = Moments.none(layout.dim)
         clips = in_order(part, "motion.npy")
         for i in track(clips, "feature statistics", total=len(part), disable=not progress):
-            own = own.merge(Moments.of(part.motion(i), layout.held_columns[part.held[i]]))
+            own = own.merge(Moments.of(part.motion(i), layout.present_columns[part.present[i]]))
         times = weight / total * len(dataset) / len(part)
         moments = moments.merge(own.counted(times) if len(parts) > 1 else own)
     return from_moments(moments, layout, group=group)

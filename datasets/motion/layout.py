@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import FACE, HANDS, HELD_ALL, ClipMeta, Split, UserError
+from motionloom.datasets.schema import FACE, HANDS, PRESENT_ALL, ClipMeta, Split, UserError
 
 Family = Literal["exact", "h3d", "raw"]
 Part = Literal["all", "bodyhand", "body", "hand", "face"]
@@ -166,8 +166,8 @@ class MotionLayout:
         return hand if part == "hand" else np.setdiff1d(columns, np.concatenate([hand, face]))
 
     @cached_property
-    def held_columns(self) -> NDArray[np.bool_]:
-        """Row b: which columns mean something in a clip that holds the bits b (`ClipMeta.held`), [4, D].
+    def present_columns(self) -> NDArray[np.bool_]:
+        """Row b: which columns mean something in a clip that holds the bits b (`ClipMeta.present`), [4, D].
 
         The body's always do. The others are masked in training: what a file stores there plays no part.
         """
@@ -175,9 +175,9 @@ class MotionLayout:
         needs[self._hand_columns()] = HANDS
         if self.has("face"):
             needs[self.slice("face")] = FACE
-        bits = np.arange(HELD_ALL + 1, dtype=np.uint8)[:, None]
-        held: NDArray[np.bool_] = (bits & needs) == needs
-        return held
+        bits = np.arange(PRESENT_ALL + 1, dtype=np.uint8)[:, None]
+        present: NDArray[np.bool_] = (bits & needs) == needs
+        return present
 
     def _hand_columns(self) -> NDArray[np.int64]:
         columns = np.arange(self.dim)

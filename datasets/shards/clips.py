@@ -29,8 +29,8 @@ class ClipDataset(Protocol):
         ...
 
     @property
-    def held(self) -> NDArray[np.uint8]:
-        """What every clip holds beside its body, bits of `ClipMeta.held`, [n]."""
+    def present(self) -> NDArray[np.uint8]:
+        """What every clip holds beside its body, bits of `ClipMeta.present`, [n]."""
         ...
 
     @property

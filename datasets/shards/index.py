@@ -27,9 +27,10 @@ from typing import BinaryIO, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
 
 from motionloom.datasets.base.files import write_with
-from motionloom.datasets.schema import HELD_ALL, Config, Dropped, ShardInfo, Split, UserError
+from motionloom.datasets.schema import PRESENT_ALL, Config, Dropped, ShardInfo, Split, UserError
 from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.tar import TarClip, read_npy_header, scan_tar
 
@@ -41,21 +42,25 @@ _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "frames": (np.int32, 1),
     "data": (np.int64, 1),
     "itemsize": (np.uint8, 1),
-    "held": (np.uint8, 1),
+    "present": (np.uint8, 1),
     "offsets": (np.int64, 2),
     "sizes": (np.uint32, 2),
     "id_ends": (np.int64, 1),
     "id_bytes": (np.uint8, 1),
 }
+_STORED_AS = {"present": "held"}
+"""Names that files have kept since the first data sets."""
 
 
 class ClipEntry(Config):
     """One clip of a shard: member name -> (offset, size), and where its motion values start."""
 
+    model_config = ConfigDict(validate_by_name=True, validate_by_alias=True, serialize_by_alias=True)
+
     key: str
     id: str
-    held: int
-    """Bits of `ClipMeta.held`."""
+    present: int = Field(alias="held")
+    """Bits of `ClipMeta.present`."""
     frames: int
     motion_data: int
     motion_itemsize: int
@@ -84,11 +89,11 @@ def index_path(tar: Path) -> Path:
 def clip_entries(
     path: Path, written: list[tuple[str, int]], *, clips: list[TarClip] | None = None
 ) -> list[ClipEntry]:
-    """Index rows of a tar as it lies on the disk; `written` are the clips' (source id, held), in order."""
+    """Index rows of a tar as it lies on the disk; `written` are the clips' (source id, present), in order."""
     clips = scan_tar(path) if clips is None else clips
     entries = []
     with path.open("rb") as file:
-        for clip, (source, held) in zip(clips, written, strict=True):
+        for clip, (source, present) in zip(clips, written, strict=True):
             start, size = clip.members["motion.npy"]
             file.seek(start)
             header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'")
@@ -100,7 +105,7 @@ def clip_entries(
                 ClipEntry(
                     key=clip.key,
                     id=source,
-                    held=held,
+                    present=present,
                     frames=header.shape[0],
                     motion_data=start + header.data,
                     motion_itemsize=header.dtype.itemsize,
@@ -117,7 +122,7 @@ class SplitIndex:
     frames: NDArray[np.int32]
     data: NDArray[np.int64]
     itemsize: NDArray[np.uint8]
-    held: NDArray[np.uint8]
+    present: NDArray[np.uint8]
     offsets: NDArray[np.int64]
     sizes: NDArray[np.uint32]
     id_ends: NDArray[np.int64]
@@ -148,7 +153,7 @@ class SplitIndex:
                 "frames": [entry.frames for entry in shard.clips],
                 "data": [entry.motion_data for entry in shard.clips],
                 "itemsize": [entry.motion_itemsize for entry in shard.clips],
-                "held": [entry.held for entry in shard.clips],
+                "present": [entry.present for entry in shard.clips],
                 "offsets": places[..., 0],
                 "sizes": places[..., 1],
                 "id_ends": ends,
@@ -167,8 +172,15 @@ class SplitIndex:
 
 def save_index(root: Path, splits: dict[Split, SplitIndex]) -> None:
     """Write `index.npz` atomically; zip entries carry a fixed date, so equal content is equal bytes."""
-    arrays = {f"{split}.{name}": getattr(index, name) for split, index in splits.items() for name in _ARRAYS}
+    arrays = {
+        _stored_name(split, name): getattr(index, name) for split, index in splits.items() for name in _ARRAYS
+    }
     write_with(root / INDEX_FILE, lambda file: np.savez(file, allow_pickle=False, **arrays))
+
+
+def _stored_name(split: Split, name: str) -> str:
+    """Name of an array in `index.npz`."""
+    return f"{split}.{_STORED_AS.get(name, name)}"
 
 
 def load_index(root: Path, split: Split, shards: list[ShardInfo]) -> SplitIndex:
@@ -189,7 +201,7 @@ def read_index(file: BinaryIO, where: str, split: Split, shards: list[ShardInfo]
     """
     try:
         with np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[f"{split}.{name}"] for name in _ARRAYS}
+            arrays = {name: stored[_stored_name(split, name)] for name in _ARRAYS}
     except (KeyError, ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise UserError(f"{where}: not a readable index ({error}); convert the dataset again") from None
     index = SplitIndex(**arrays)
@@ -206,9 +218,10 @@ def _index_problem(index: SplitIndex, shards: list[ShardInfo]) -> str | None:
     for name, (kind, rank) in _ARRAYS.items():
         values = getattr(index, name)
         if values.dtype != kind or values.ndim != rank or (name != "id_bytes" and len(values) != count):
-            return f"array '{name}' is {values.dtype} {list(values.shape)}, the manifest has {count} clips"
-    if (index.held > HELD_ALL).any():
-        return f"array 'held' has values above {HELD_ALL}"
+            found = f"array '{_STORED_AS.get(name, name)}' is {values.dtype} {list(values.shape)}"
+            return f"{found}, the manifest has {count} clips"
+    if (index.present > PRESENT_ALL).any():
+        return f"array 'held' has values above {PRESENT_ALL}"
     if index.offsets.shape[1] != len(MEMBERS) or index.sizes.shape[1] != len(MEMBERS):
         return f"offsets are not for {len(MEMBERS)} members"
     if count == 0:

@@ -135,9 +135,9 @@ class ShardDataset:
         return self._index.frames.astype(np.int64)
 
     @property
-    def held(self) -> NDArray[np.uint8]:
-        """What every clip holds beside its body, bits of `ClipMeta.held`, [n]."""
-        return self._index.held
+    def present(self) -> NDArray[np.uint8]:
+        """What every clip holds beside its body, bits of `ClipMeta.present`, [n]."""
+        return self._index.present
 
     @cached_property
     def ids(self) -> list[str]:

@@ -83,9 +83,9 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
                 if isinstance(samples, Dropped):
                     dropped.append(samples)
                     continue
-                for source, held, members in samples:
+                for source, present, members in samples:
                     tar.write({"__key__": f"{task.number:06d}-{len(written):06d}", **members})
-                    written.append((source, held))
+                    written.append((source, present))
     info = None
     entries = clip_entries(task.path, written)
     if entries:
@@ -107,14 +107,14 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
 def _convert_item(
     task: ShardTask[T], convert: Convert[T], label: str, item: T
 ) -> list[tuple[str, int, dict[str, bytes]]] | Dropped:
-    """(clip id, held, encoded members) of each sample of one item, or why there are none."""
+    """(clip id, present, encoded members) of each sample of one item, or why there are none."""
     try:
         made = convert(item)
         samples = made if isinstance(made, list) else [made]
         return [
             (
                 sample.meta.id,
-                sample.meta.held,
+                sample.meta.present,
                 encode_sample(sample, split=task.split, layout=task.layout, motion_type=task.motion_type),
             )
             for sample in samples

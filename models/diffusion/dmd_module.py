@@ -30,15 +30,15 @@ class DmdModule(StageModule):
         self.tokenizer.to(self.device)
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Loss of one batch: "motion" [B, T, D] (the tokenizer's columns), "length" [B], "held" bool [B, D]
-        (optional: all). Time steps and noise are drawn anew each call.
+        """Loss of one batch: "motion" [B, T, D] (the tokenizer's columns), "length" [B], "present" bool
+        [B, D] (optional: all). Time steps and noise are drawn anew each call.
         """
-        motion, held = batch["motion"], batch.get("held")
+        motion, present = batch["motion"], batch.get("present")
         groups = (batch["length"] // GROUP_FRAMES).clamp(min=1)
         length = groups * GROUP_FRAMES
         with torch.no_grad():
-            codes = self.tokenizer.module.encode(motion, length, held)
+            codes = self.tokenizer.module.encode(motion, length, present)
         step = torch.randint(0, self.net.config.schedule.steps, (len(motion),), device=motion.device)
         noise = torch.randn_like(motion)
-        loss = dmd_loss(self.net, self.noiser, motion, codes, length, step, noise, present=held)
+        loss = dmd_loss(self.net, self.noiser, motion, codes, length, step, noise, present=present)
         return {"loss": loss}

@@ -23,8 +23,8 @@ class DiffusionModule(StageModule):
         self.noiser = net.config.schedule.noiser()
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "held" bool [B, D]
-        (optional: all).
+        """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
+        [B, D] (optional: all).
 
         Time steps and noise are drawn anew each call; in evaluation no caption is dropped.
         """
@@ -34,9 +34,9 @@ class DiffusionModule(StageModule):
         step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)
         noise = torch.randn_like(motion)
         hidden = self.net.config.condition_dropout if self.training else 0.0
-        told = torch.rand(len(motion), device=motion.device) >= hidden
+        conditioned = torch.rand(len(motion), device=motion.device) >= hidden
         noisy = self.noiser.add_noise(motion, noise, step)
-        found = self.net(noisy, step, text, mask, told)
+        found = self.net(noisy, step, text, mask, conditioned)
         target = motion if schedule.predicts == "sample" else noise
         error = (found - target.float()).square()
-        return {"loss": masked_mean(error, mask, batch.get("held"))}
+        return {"loss": masked_mean(error, mask, batch.get("present"))}

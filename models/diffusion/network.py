@@ -56,7 +56,7 @@ class MotionDiffusion(nn.Module):
         self.stack = Transformer(config.layers, config.dim, config.heads, config.ff, dropout=config.dropout)
         self.leave = nn.Linear(config.dim, motion_dim)
 
-    def forward(self, noisy: Tensor, step: Tensor, text: Tensor, mask: Tensor, told: Tensor) -> Tensor:
+    def forward(self, noisy: Tensor, step: Tensor, text: Tensor, mask: Tensor, conditioned: Tensor) -> Tensor:
         """The clean motion (or the noise) of `noisy`; zero where masked.
 
         Args:
@@ -64,9 +64,9 @@ class MotionDiffusion(nn.Module):
             step: int64 [B], time step of each sample.
             text: [B, E].
             mask: bool [B, T], True = real frame.
-            told: bool [B], False hides the text.
+            conditioned: bool [B], False hides the text.
         """
-        condition = self.text(text) * told[:, None] + self.time(
+        condition = self.text(text) * conditioned[:, None] + self.time(
             step_waves(step, self.config.dim).to(self.text.weight.dtype)
         )
         frames = self.enter(noisy)

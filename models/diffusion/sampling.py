@@ -61,14 +61,14 @@ def _denoise(
     scheduler = net.config.schedule.sampler(sampler, steps)
     x = x * scheduler.init_noise_sigma
     guided = guidance != 1.0
-    told = torch.ones(count * (1 + guided), dtype=torch.bool, device=device)
-    told[count:] = False
+    conditioned = torch.ones(count * (1 + guided), dtype=torch.bool, device=device)
+    conditioned[count:] = False
     text = text.repeat(1 + guided, 1)
-    mask = torch.ones(len(told), frames, dtype=torch.bool, device=device)
+    mask = torch.ones(len(conditioned), frames, dtype=torch.bool, device=device)
     extra = {} if sampler == "dpm++" else {"generator": noise}
     for step in scheduler.timesteps:
         given = scheduler.scale_model_input(x, step).repeat(1 + guided, 1, 1)
-        found = net(given, step.to(device).expand(len(told)), text, mask, told)
+        found = net(given, step.to(device).expand(len(conditioned)), text, mask, conditioned)
         if guided:
             found = found[count:] + guidance * (found[:count] - found[count:])
         stepped: Tensor = scheduler.step(found, step, x, **extra).prev_sample

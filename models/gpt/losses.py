@@ -100,17 +100,17 @@ def align_loss(
     temperature: float,
     threshold: float | None,
     sample: bool,
-    held: Tensor | None = None,
+    present: Tensor | None = None,
 ) -> Tensor:
     """L_align of one batch: logits [B, L, V], text_latent [B, Z] (TMA's text mean), sentence [B, S] for the
     filter of negatives.
 
-    `held` bool [B, dim]: columns of the tokenizer that the clip holds (None = all). What it does not hold
+    `present` bool [B, dim]: columns of the tokenizer that the clip holds (None = all). What it does not hold
     takes no part in decoding, and TMA reads the mean there, as it did in its own training.
     """
     groups = group_counts(tokens, kinds, gpt.ends, len(gpt.pattern))
     weights = soft_codes(gpt, logits, groups, temperature=gumbel_temperature, sample=sample)
     frames = groups * tokenizer.group_frames
-    motion = tokenizer.decode_soft(weights, frames, held)
-    latent, _ = tma.encode_motion(motion, frames, held)
+    motion = tokenizer.decode_soft(weights, frames, present)
+    latent, _ = tma.encode_motion(motion, frames, present)
     return info_nce(text_latent, latent, sentence, temperature=temperature, threshold=threshold)

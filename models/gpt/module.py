@@ -79,7 +79,7 @@ class GptModule(StageModule):
         "tokens" int64 [B, L] padded with -1, "kinds" int64 [B, L], "text" float32 [B, E] (the prior); for
         L_align also "similarity" [B, S] (sBERT embeddings, for the filter; optional) and "tma_text" [B, Z],
         TMA's text means, where the prior is not TMA's. Of clips that lack a part: "known" bool [B, L], false
-        at that part's codes, which are neither read nor predicted, and "held" bool [B, C], the tokenizer's
+        at that part's codes, which are neither read nor predicted, and "present" bool [B, C], the tokenizer's
         columns that they hold (both optional: all).
         """
         net, config = self.net, self.net.config
@@ -115,7 +115,7 @@ class GptModule(StageModule):
             "tma": tma,
             "temperature": config.temperature,
             "threshold": config.threshold,
-            "held": batch.get("held"),
+            "present": batch.get("present"),
         }
         if config.align_on == "samples":
             return self._align_samples(batch, latent, similarity, judge)

@@ -56,17 +56,17 @@ def rewards(
     tma: Tma,
     temperature: float,
     threshold: float | None,
-    held: Tensor | None = None,
+    present: Tensor | None = None,
 ) -> Tensor:
     """Log-probability [R] that TMA gives a sample's own caption among the captions of all ranks: the motion's
     half of InfoNCE.
 
-    text_latent [B, Z] TMA's text means, sentence [B, S] for the filter of negatives, held bool [B, dim] what
-    the captions' clips hold.
+    text_latent [B, Z] TMA's text means, sentence [B, S] for the filter of negatives, present bool [B, dim]:
+    columns that the captions' clips have.
     """
     count = len(codes.groups) // len(text_latent)
     frames = codes.groups * tokenizer.group_frames
-    columns = None if held is None else held.repeat_interleave(count, dim=0)
+    columns = None if present is None else present.repeat_interleave(count, dim=0)
     latent, _ = tma.encode_motion(tokenizer.decode(codes.codes, frames, columns), frames, columns)
     captions = F.normalize(gather_rows(text_latent.float()), dim=-1)
     logits = F.normalize(latent.float(), dim=-1) @ captions.T / temperature

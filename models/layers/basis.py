@@ -89,13 +89,13 @@ class Basis(nn.Module):
             self.mean.copy_(torch.as_tensor(mean, dtype=torch.float32))
             self.std.copy_(torch.as_tensor(std, dtype=torch.float32))
 
-    def enter(self, x: Tensor) -> Tensor:
+    def encode(self, x: Tensor) -> Tensor:
         """Features [..., D] -> coordinates [..., D]. In float32 under autocast too: it is what is learnt."""
         with torch.autocast(x.device.type, enabled=False):
             return self._enter(x)
 
-    def leave(self, seen: Tensor) -> Tensor:
-        """The inverse of `enter`; half types come out as float32, whose resolution joints need."""
+    def decode(self, seen: Tensor) -> Tensor:
+        """The inverse of `encode`; half types come out as float32, whose resolution joints need."""
         with torch.autocast(seen.device.type, enabled=False):
             return self._leave(seen.to(torch.promote_types(seen.dtype, torch.float32)))
 

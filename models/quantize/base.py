@@ -37,7 +37,7 @@ class Codebook(Protocol):
         """Code vectors, int64 [...] -> float32 [..., d]."""
 
     def freeze(self) -> None:
-        """Never update again, in training mode neither."""
+        """Stop updating for good, in training mode too."""
 
 
 def usage_metrics(counts: Tensor, *, eps: float = 1e-7) -> dict[str, Tensor]:

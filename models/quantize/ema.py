@@ -91,7 +91,7 @@ class EmaQuantizer(nn.Module):
         self._is_initialised = False
 
     def freeze(self) -> None:
-        """Never update again, in training mode neither."""
+        """Stop updating for good, in training mode too."""
         self.frozen = True
 
     def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:

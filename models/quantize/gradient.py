@@ -75,7 +75,7 @@ class GradientQuantizer(nn.Module):
         self._is_initialised = config.start == "uniform"
 
     def freeze(self) -> None:
-        """Never update again, in training mode neither."""
+        """Stop updating for good, in training mode too."""
         self.frozen = True
         self.codebook.requires_grad_(False)
 

@@ -30,7 +30,7 @@ class ResidualQuantizer(nn.Module):
         return cast(EmaQuantizer, self.levels[index])
 
     def freeze(self) -> None:
-        """Never update again, in training mode neither."""
+        """Stop updating for good, in training mode too."""
         for index in range(len(self.levels)):
             self.level(index).freeze()
 

@@ -17,17 +17,17 @@ from torch import Tensor
 from motionloom.models.training.distributed import gather_rows, gather_rows_with_grad, masked_mean
 
 
-def reconstruction_loss(pred: Tensor, target: Tensor, mask: Tensor, held: Tensor | None = None) -> Tensor:
+def reconstruction_loss(pred: Tensor, target: Tensor, mask: Tensor, present: Tensor | None = None) -> Tensor:
     """SmoothL1 over the real frames and the columns that each clip holds.
 
     Args:
         pred: [B, T, D].
         target: [B, T, D].
         mask: bool [B, T], true at real frames.
-        held: bool [B, D]; None = all.
+        present: bool [B, D]; None = all.
     """
     error = F.smooth_l1_loss(pred.float(), target.float(), reduction="none")
-    return masked_mean(error, mask, held)
+    return masked_mean(error, mask, present)
 
 
 def kl_divergence(mu_q: Tensor, logvar_q: Tensor, mu_p: Tensor, logvar_p: Tensor) -> Tensor:

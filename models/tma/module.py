@@ -46,7 +46,7 @@ class TmaModule(StageModule):
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "similarity" [B, S]
-        (sBERT embeddings, for the filter), "held" bool [B, D] (optional: all).
+        (sBERT embeddings, for the filter), "present" bool [B, D] (optional: all).
 
         Columns of a part that a clip does not hold are 0, the mean, for the encoder and not reconstructed; it
         is judged in the coordinates that the encoder reads.
@@ -57,14 +57,14 @@ class TmaModule(StageModule):
         motion, length = batch["motion"], batch["length"]
         words = batch["conditions"]["text"]
         text = net.encode_text(words.features, words.mask)
-        held = batch.get("held")
-        moved = net.encode_motion(motion, length, held)
+        present = batch.get("present")
+        moved = net.encode_motion(motion, length, present)
         z_text, z_motion = self._latent(*text), self._latent(*moved)
         target, frames = net.strided(motion, length)
-        target, mask = net.read(target, held), length_mask(frames, target.shape[1])
+        target, mask = net.read(target, present), length_mask(frames, target.shape[1])
         size = motion.shape[1]
-        rec_text = reconstruction_loss(net.write(z_text, length, size), target, mask, held)
-        rec_motion = reconstruction_loss(net.write(z_motion, length, size), target, mask, held)
+        rec_text = reconstruction_loss(net.write(z_text, length, size), target, mask, present)
+        rec_motion = reconstruction_loss(net.write(z_motion, length, size), target, mask, present)
         kl = kl_four(text, moved)
         latent = latent_loss(z_text, z_motion)
         contrastive = info_nce(

@@ -131,26 +131,28 @@ class Tma(nn.Module):
             basis = Basis(layout, columns, root_gain=config.root_gain, finger_gain=config.finger_gain)
         return cls(config, len(columns), text_dim, basis)
 
-    def read(self, x: Tensor, held: Tensor | None = None) -> Tensor:
+    def read(self, x: Tensor, present: Tensor | None = None) -> Tensor:
         """Motion [B, T, D] in the coordinates that are encoded and reconstructed; 0, the mean, in the columns
-        that a clip does not hold (`held` bool [B, D]; None = all are held).
+        that a clip does not hold (`present` bool [B, D]; None = all are present).
         """
-        seen = x if self.basis is None else self.basis.enter(x)
-        return seen if held is None else seen.masked_fill(~held[:, None], 0.0)
+        seen = x if self.basis is None else self.basis.encode(x)
+        return seen if present is None else seen.masked_fill(~present[:, None], 0.0)
 
     def strided(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
         """Every `frame_stride`-th frame of x [B, T, D], and the lengths in such frames (rounded up)."""
         stride = self.config.frame_stride
         return x[:, ::stride], (length + stride - 1) // stride
 
-    def encode_motion(self, x: Tensor, length: Tensor, held: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """x [B, T, D] normalised features, length int64 [B] frames, `held` as in `read` -> (mu, logvar),
+    def encode_motion(
+        self, x: Tensor, length: Tensor, present: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """x [B, T, D] normalised features, length int64 [B] frames, `present` as in `read` -> (mu, logvar),
         float32 [B, Z].
         """
         if x.shape[-1] != self.motion_dim:
             raise ValueError(f"TMA was built for {self.motion_dim} motion features, got {x.shape[-1]}")
         x, length = self.strided(x, length)
-        mu, logvar = self.motion_encoder(self.read(x, held), length_mask(length, x.shape[1]))
+        mu, logvar = self.motion_encoder(self.read(x, present), length_mask(length, x.shape[1]))
         return mu, logvar
 
     def encode_text(self, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -169,7 +171,7 @@ class Tma(nn.Module):
             return written
         stride = self.config.frame_stride
         mask = length_mask((length + stride - 1) // stride, written.shape[1])
-        return self.basis.leave(written) * mask[..., None]
+        return self.basis.decode(written) * mask[..., None]
 
     def write(self, z: Tensor, length: Tensor, frames: int) -> Tensor:
         """`decode` in the coordinates of `read`: what the reconstruction is judged in."""

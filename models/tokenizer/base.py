@@ -4,7 +4,7 @@ A tokenizer consumes exactly the layout columns it models, already normalised; `
 frames. Four frames are one group: `length` is rounded up to whole groups, so the last group of a clip may
 hold padded (zero) frames, and a padded batch gives what each clip gives alone.
 
-Columns that a clip does not hold (`held` bool [B, dim]; hands, face) are read as 0, the mean. A stream of
+Columns that a clip does not hold (`present` bool [B, dim]; hands, face) are read as 0, the mean. A stream of
 tokens that belongs to such a part alone does not learn from the clip, and its vectors are 0 in the decoder.
 """
 
@@ -39,7 +39,7 @@ class TokenizerOutput(NamedTuple):
     """What `Tokenizer.forward` returns."""
 
     read: Tensor
-    """[B, T, dim] in the coordinates of `Basis`: what the encoders read, 0 in columns that are not held."""
+    """[B, T, dim] in the coordinates of `Basis`: what the encoders read, 0 in missing columns."""
     written: Tensor
     """[B, T, dim] in the same: what the decoder wrote, to be compared with `read`; `features` makes motion
     of it."""
@@ -121,40 +121,44 @@ class Tokenizer(nn.Module, ABC):
         """The quantizer of each stream."""
 
     @abstractmethod
-    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
+    def _quantize(
+        self, x: Tensor, valid: Tensor | None, missing: dict[str, Tensor], *, update: bool
+    ) -> Latents:
         """Encode and quantize x [B, T, dim]; `valid` [B] counts frames in whole groups.
 
-        `lost`, bool [B] per stream, is true of clips that do not hold the stream's part (`_lost`).
+        `missing`, bool [B] per stream, is true of clips that do not hold the stream's part (`_missing`).
         """
 
     @abstractmethod
     def _join(self, vectors: dict[str, Tensor]) -> Tensor:
         """Code vectors per stream [B, T / 4 * per_group, d] -> the decoder's input."""
 
-    def _lost(self, held: Tensor | None) -> dict[str, Tensor]:
+    def _missing(self, present: Tensor | None) -> dict[str, Tensor]:
         """Bool [B] for each stream that belongs to a part which clips may lack: true where it is lacking."""
         return {}
 
-    def lost(self, held: Tensor) -> dict[str, Tensor]:
-        """Bool [B] for each stream of a part that clips may lack: true where `held` [B, dim] lacks it. The
+    def missing(self, present: Tensor) -> dict[str, Tensor]:
+        """Bool [B] for each stream of a part that clips may lack: true where `present` [B, dim] lacks it. The
         stream's codes then say nothing.
         """
-        return self._lost(held)
+        return self._missing(present)
 
-    def forward(self, x: Tensor, length: Tensor | None = None, held: Tensor | None = None) -> TokenizerOutput:
+    def forward(
+        self, x: Tensor, length: Tensor | None = None, present: Tensor | None = None
+    ) -> TokenizerOutput:
         """Read, quantize and write x [B, T, dim]; `length` [B] = valid frames. Training updates codebooks.
 
-        `held` [B, dim]: false where a clip does not hold a column; None = all are held.
+        `present` [B, dim]: false where a clip does not hold a column; None = all are present.
         """
         valid = self._valid(x, length)
-        read = self._read(x, held)
-        latents = self._quantize(read, valid, self._lost(held), update=True)
+        read = self._read(x, present)
+        latents = self._quantize(read, valid, self._missing(present), update=True)
         written = self.decoder(latents.joined, valid)
         return TokenizerOutput(read, written, latents.penalty, latents.codes, latents.metrics)
 
     @torch.no_grad()
     def encode(
-        self, x: Tensor, length: Tensor | None = None, held: Tensor | None = None
+        self, x: Tensor, length: Tensor | None = None, present: Tensor | None = None
     ) -> dict[str, Tensor]:
         """Tokens of x [B, T, dim], per stream int64 [B, T / 4 * per_group]. Never updates a codebook.
 
@@ -162,35 +166,35 @@ class Tokenizer(nn.Module, ABC):
         valid codes, also those of a part that the clip does not hold.
         """
         valid = self._valid(x, length)
-        return self._quantize(self._read(x, held), valid, self._lost(held), update=False).codes
+        return self._quantize(self._read(x, present), valid, self._missing(present), update=False).codes
 
     def decode(
-        self, codes: dict[str, Tensor], length: Tensor | None = None, held: Tensor | None = None
+        self, codes: dict[str, Tensor], length: Tensor | None = None, present: Tensor | None = None
     ) -> Tensor:
         """Motion [B, T, dim] of tokens; `length` [B] in frames where clips of a batch differ.
 
-        With the `held` that `encode` was given, the body comes out as in training, which knows of no hands
-        there; the columns that are not held mean nothing.
+        With the `present` that `encode` was given, the body comes out as in training, which knows of no hands
+        there; the columns that are not present mean nothing.
         """
         books = self.codebooks()
         vectors = {s.name: books[s.name].vectors(codes[s.name]) for s in self.streams}
-        for name, lost in self._lost(held).items():
-            vectors[name] = without(vectors[name], lost)
+        for name, missing in self._missing(present).items():
+            vectors[name] = without(vectors[name], missing)
         return self._decode(vectors, length)
 
     def decode_soft(
-        self, weights: dict[str, Tensor], length: Tensor | None = None, held: Tensor | None = None
+        self, weights: dict[str, Tensor], length: Tensor | None = None, present: Tensor | None = None
     ) -> Tensor:
         """`decode` for weights over the codes [B, L, K], differentiable in them; one-hot gives `decode`."""
         books = self.codebooks()
         vectors = {s.name: weights[s.name] @ books[s.name].codebook.to(weights[s.name]) for s in self.streams}
-        for name, lost in self._lost(held).items():
-            vectors[name] = without(vectors[name], lost)
+        for name, missing in self._missing(present).items():
+            vectors[name] = without(vectors[name], missing)
         return self._decode(vectors, length)
 
     def features(self, written: Tensor, length: Tensor | None = None) -> Tensor:
         """Motion [B, T, dim] of the decoder's coordinates, exactly zero after the last valid group."""
-        motion = self.basis.leave(written)
+        motion = self.basis.decode(written)
         mask = token_mask(_whole_groups(length), motion.shape[1], 1)
         return motion if mask is None else motion.masked_fill(~mask[..., None], 0.0)
 
@@ -210,10 +214,10 @@ class Tokenizer(nn.Module, ABC):
     def _decode(self, vectors: dict[str, Tensor], length: Tensor | None) -> Tensor:
         return self.features(self.decoder(self._join(vectors), _whole_groups(length)), length)
 
-    def _read(self, x: Tensor, held: Tensor | None) -> Tensor:
-        """What the encoders read: zero in the columns that are not held."""
-        read = self.basis.enter(x)
-        return read if held is None else read.masked_fill(~held[:, None], 0.0)
+    def _read(self, x: Tensor, present: Tensor | None) -> Tensor:
+        """What the encoders read: zero in the columns that are not present."""
+        read = self.basis.encode(x)
+        return read if present is None else read.masked_fill(~present[:, None], 0.0)
 
     def _valid(self, x: Tensor, length: Tensor | None) -> Tensor | None:
         if x.shape[-1] != self.dim:
@@ -233,20 +237,22 @@ def _whole_groups(length: Tensor | None) -> Tensor | None:
     return (length + GROUP_FRAMES - 1) // GROUP_FRAMES * GROUP_FRAMES
 
 
-def without(vectors: Tensor, lost: Tensor | None) -> Tensor:
-    """Vectors [B, L, d], zero for the clips that lack their part (`lost` bool [B])."""
-    return vectors if lost is None else vectors.masked_fill(lost[:, None, None], 0.0)
+def without(vectors: Tensor, missing: Tensor | None) -> Tensor:
+    """Vectors [B, L, d], zero for the clips that lack their part (`missing` bool [B])."""
+    return vectors if missing is None else vectors.masked_fill(missing[:, None, None], 0.0)
 
 
-def token_mask(valid: Tensor | None, tokens: int, stride: int, lost: Tensor | None = None) -> Tensor | None:
+def token_mask(
+    valid: Tensor | None, tokens: int, stride: int, missing: Tensor | None = None
+) -> Tensor | None:
     """True where a token is real, [B, tokens]; `valid` [B] in frames, one token per `stride` frames.
 
-    No token is real of a clip that lacks the stream's part (`lost` bool [B]).
+    No token is real of a clip that lacks the stream's part (`missing` bool [B]).
     """
     if valid is None:
-        return None if lost is None else (~lost)[:, None].expand(-1, tokens)
+        return None if missing is None else (~missing)[:, None].expand(-1, tokens)
     real = torch.arange(tokens, device=valid.device) * stride < valid[:, None]
-    return real if lost is None else real & ~lost[:, None]
+    return real if missing is None else real & ~missing[:, None]
 
 
 def stream_metrics(metrics: dict[str, Tensor], stream: str) -> dict[str, Tensor]:

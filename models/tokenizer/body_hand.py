@@ -34,8 +34,8 @@ class BodyHandTokenizer(Tokenizer):
         self.register_buffer("body_columns", torch.from_numpy(body))
         self.register_buffer("hand_columns", torch.from_numpy(hand))
 
-    def _lost(self, held: Tensor | None) -> dict[str, Tensor]:
-        return {} if held is None else {"hand": ~held[:, self.hand_columns].all(1)}
+    def _missing(self, present: Tensor | None) -> dict[str, Tensor]:
+        return {} if present is None else {"hand": ~present[:, self.hand_columns].all(1)}
 
     def _join(self, vectors: dict[str, Tensor]) -> Tensor:
         return torch.cat([vectors["body"], vectors["hand"].repeat_interleave(2, dim=1)], dim=-1)

@@ -32,7 +32,9 @@ class FsqTokenizer(Tokenizer):
         """The quantizer of the one stream."""
         return {"code": self.quantizer}
 
-    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
+    def _quantize(
+        self, x: Tensor, valid: Tensor | None, missing: dict[str, Tensor], *, update: bool
+    ) -> Latents:
         # Unit variance: an untrained encoder's small latents would all round to the code in the middle.
         z = functional.layer_norm(self.encoder(x, valid), (self.config.code_dim,))
         out = self.quantizer(z, token_mask(valid, z.shape[1], 4), update=update)

@@ -57,8 +57,10 @@ class H2VQ(BodyHandTokenizer):
         """The quantizer of each stream."""
         return {"body": self.body_quantizer, "hand": self.hand_quantizer}
 
-    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
-        no_hands = lost.get("hand")
+    def _quantize(
+        self, x: Tensor, valid: Tensor | None, missing: dict[str, Tensor], *, update: bool
+    ) -> Latents:
+        no_hands = missing.get("hand")
         z_hand = self.hand_encoder(x[..., self.hand_read], valid)
         hand = self.hand_quantizer(z_hand, token_mask(valid, z_hand.shape[1], 4, no_hands), update=update)
         hand_vectors = without(hand.quantized, no_hands)

@@ -14,30 +14,30 @@ from motionloom.models.training.distributed import masked_mean
 
 
 def reconstruction_loss(
-    recon: Tensor, target: Tensor, length: Tensor | None, kind: Recon, held: Tensor | None = None
+    recon: Tensor, target: Tensor, length: Tensor | None, kind: Recon, present: Tensor | None = None
 ) -> Tensor:
     """Mean error of [B, T, D] over the first `length` [B] frames of each clip and over the columns it holds.
 
-    `kind`: "l2" squared error; "smooth_l1" Huber with threshold 1. `held` bool [B, D]; None = all.
+    `kind`: "l2" squared error; "smooth_l1" Huber with threshold 1. `present` bool [B, D]; None = all.
     """
     recon, target = recon.float(), target.float()
     if kind == "l2":
         error = functional.mse_loss(recon, target, reduction="none")
     else:
         error = functional.smooth_l1_loss(recon, target, reduction="none")
-    if length is None and held is None:
+    if length is None and present is None:
         return error.mean()
     position = torch.arange(error.shape[1], device=error.device)
     end = position.new_full((len(error),), len(position)) if length is None else length
-    return masked_mean(error, position < end[:, None], held)
+    return masked_mean(error, position < end[:, None], present)
 
 
 def velocity_loss(
-    recon: Tensor, target: Tensor, length: Tensor | None, kind: Recon, held: Tensor | None = None
+    recon: Tensor, target: Tensor, length: Tensor | None, kind: Recon, present: Tensor | None = None
 ) -> Tensor:
     """`reconstruction_loss` of frame-to-frame differences; between two valid frames only."""
     shorter = None if length is None else length - 1
-    return reconstruction_loss(recon.float().diff(dim=1), target.float().diff(dim=1), shorter, kind, held)
+    return reconstruction_loss(recon.float().diff(dim=1), target.float().diff(dim=1), shorter, kind, present)
 
 
 def tokenizer_loss(
@@ -49,7 +49,7 @@ def tokenizer_loss(
     alpha: float,
     recon: Recon,
     velocity_weight: float,
-    held: Tensor | None = None,
+    present: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """`loss` = recon + velocity_weight * velocity + alpha * penalty, and its terms `recon`, `commit` (and
     `velocity`).
@@ -62,11 +62,11 @@ def tokenizer_loss(
         alpha: Weight of the penalty.
         recon: Kind of error.
         velocity_weight: Weight of the velocity term; 0 leaves it out.
-        held: bool [B, D], false in columns that a clip does not hold: they do not count. None = all.
+        present: bool [B, D], false in columns that a clip does not hold: they do not count. None = all.
     """
-    terms = {"recon": reconstruction_loss(recon_motion, target, length, recon, held), "commit": penalty}
+    terms = {"recon": reconstruction_loss(recon_motion, target, length, recon, present), "commit": penalty}
     loss = terms["recon"] + alpha * penalty
     if velocity_weight > 0:
-        terms["velocity"] = velocity_loss(recon_motion, target, length, recon, held)
+        terms["velocity"] = velocity_loss(recon_motion, target, length, recon, present)
         loss = loss + velocity_weight * terms["velocity"]
     return {"loss": loss, **terms}

@@ -34,13 +34,13 @@ class TokenizerModule(StageModule):
         self.velocity_weight = velocity_weight
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Losses of {"motion" [B, W, dim], "length" [B], "held" bool [B, dim] (optional: all)}.
+        """Losses of {"motion" [B, W, dim], "length" [B], "present" bool [B, dim] (optional: all)}.
 
         Entries: loss, recon, commit, velocity if it has a weight, and per stream `perplexity_<stream>`,
         `usage_`, `dead_`, `resets_`, `penalty_`.
         """
-        motion, length, held = batch["motion"], batch["length"], batch.get("held")
-        out: TokenizerOutput = self.net(motion, length, held)
+        motion, length, present = batch["motion"], batch["length"], batch.get("present")
+        out: TokenizerOutput = self.net(motion, length, present)
         terms = tokenizer_loss(
             out.written,
             out.read,
@@ -49,6 +49,6 @@ class TokenizerModule(StageModule):
             alpha=self.alpha,
             recon=self.recon,
             velocity_weight=self.velocity_weight,
-            held=held,
+            present=present,
         )
         return terms | out.metrics

@@ -39,7 +39,9 @@ class MotionQuantizer(Tokenizer):
         """The quantizer of the one stream."""
         return {"code": self.quantizer}
 
-    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
+    def _quantize(
+        self, x: Tensor, valid: Tensor | None, missing: dict[str, Tensor], *, update: bool
+    ) -> Latents:
         z = self.encoder(x, valid)
         out = self.quantizer(z, token_mask(valid, z.shape[1], 4), update=update)
         return Latents(out.quantized, out.penalty, {"code": out.codes}, stream_metrics(out.metrics, "code"))

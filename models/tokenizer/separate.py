@@ -55,16 +55,18 @@ class SeparateVQ(BodyHandTokenizer):
         assert isinstance(book, EmaQuantizer)
         return book
 
-    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
+    def _quantize(
+        self, x: Tensor, valid: Tensor | None, missing: dict[str, Tensor], *, update: bool
+    ) -> Latents:
         vectors: dict[str, Tensor] = {}
         codes: dict[str, Tensor] = {}
         metrics: dict[str, Tensor] = {}
         penalty = x.new_zeros((), dtype=torch.float32)
         for name, halvings in _HALVINGS.items():
             z = self.encoders[name](x[..., getattr(self, f"{name}_columns")], valid)
-            missing = lost.get(name)
-            out = self._book(name)(z, token_mask(valid, z.shape[1], 2**halvings, missing), update=update)
-            vectors[name], codes[name] = without(out.quantized, missing), out.codes
+            absent = missing.get(name)
+            out = self._book(name)(z, token_mask(valid, z.shape[1], 2**halvings, absent), update=update)
+            vectors[name], codes[name] = without(out.quantized, absent), out.codes
             metrics |= stream_metrics(out.metrics, name)
             penalty = penalty + out.penalty
         return Latents(self._join(vectors), penalty, codes, metrics)

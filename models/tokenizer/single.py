@@ -39,7 +39,9 @@ class SingleTokenizer(Tokenizer):
         """The quantizer of each stream."""
         return {stream.name: self.quantizer.level(i) for i, stream in enumerate(self.streams)}
 
-    def _quantize(self, x: Tensor, valid: Tensor | None, lost: dict[str, Tensor], *, update: bool) -> Latents:
+    def _quantize(
+        self, x: Tensor, valid: Tensor | None, missing: dict[str, Tensor], *, update: bool
+    ) -> Latents:
         z = self.encoder(x, valid)
         out = self.quantizer(z, token_mask(valid, z.shape[1], 4), update=update)
         metrics: dict[str, Tensor] = {}

@@ -51,7 +51,7 @@ def sum_over_ranks(x: Tensor) -> Tensor:
     return x
 
 
-def masked_mean(values: Tensor, mask: Tensor, held: Tensor | None = None) -> Tensor:
+def masked_mean(values: Tensor, mask: Tensor, present: Tensor | None = None) -> Tensor:
     """Mean of `values` where `mask` is True; over several ranks a share, whose mean over ranks is that mean.
 
     Ranks hold different numbers of real frames or tokens, so each divides by the mean number per rank, not by
@@ -60,14 +60,14 @@ def masked_mean(values: Tensor, mask: Tensor, held: Tensor | None = None) -> Ten
     Args:
         values: Any shape.
         mask: bool, the shape of `values` or of its leading dimensions.
-        held: For values [B, T, D] and mask [B, T]: bool [B, D], columns of a row that count; None = all.
+        present: For values [B, T, D] and mask [B, T]: bool [B, D], columns of a row that count; None = all.
     """
     each = math.prod(values.shape[mask.dim() :])
     number = mask.sum().float()
-    if held is not None:
+    if present is not None:
         # Two masks of fewer dimensions keep the layout of `values`, hence the order of the sum.
-        values = torch.where(held[:, None], values, 0.0)
-        number = (mask.sum(1) * held.float().mean(1)).sum()
+        values = torch.where(present[:, None], values, 0.0)
+        number = (mask.sum(1) * present.float().mean(1)).sum()
     count = sum_over_ranks(number) * each / world_size()
     full = mask[(...,) + (None,) * (values.dim() - mask.dim())]
     return torch.where(full, values, 0.0).sum() / count.clamp(min=1)

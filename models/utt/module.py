@@ -126,7 +126,7 @@ class UttModule(PlayersModule):
         """A player's loss of one batch.
 
         "motion" [B, T, D] (the tokenizer's columns), "length" [B], "closed" bool [B] (whether the clip ends
-        with the window), "conditions", "held" bool [B, D] (optional: all).
+        with the window), "conditions", "present" bool [B, D] (optional: all).
         """
         if player == "critic":
             return self._critic(batch, shared)
@@ -137,7 +137,7 @@ class UttModule(PlayersModule):
         tokenizer, net = self.tokenizer.module, self.net.utt
         groups = (batch["length"] // GROUP_FRAMES).clamp(min=1)
         with torch.no_grad():
-            codes = tokenizer.encode(batch["motion"], groups * GROUP_FRAMES, batch.get("held"))
+            codes = tokenizer.encode(batch["motion"], groups * GROUP_FRAMES, batch.get("present"))
         return closed_sequences(codes, groups, batch["closed"], net.pattern, net.num_codes)
 
     def _tokens(self, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -177,7 +177,7 @@ class UttModule(PlayersModule):
             tokenizer=self.tokenizer.module,
             gumbel_temperature=config.gumbel_temperature,
             sample=config.sample and self.training,
-            present=batch.get("held"),
+            present=batch.get("present"),
         )
 
     def _critic(self, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from motionloom.datasets.conditions import Conditions
+from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
@@ -38,7 +38,7 @@ class Prompt:
     @property
     def modalities(self) -> frozenset[str]:
         """The modalities given."""
-        given = {"text": bool(self.text), "audio": self.sound is not None}
+        given = {"text": bool(self.text.strip()), "audio": self.sound is not None}
         return frozenset(name for name, there in given.items() if there)
 
     @property
@@ -59,12 +59,19 @@ class GenerationRequest:
     """One for each motion, so that how they are batched plays no part."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
 
+    def text(self, who: str) -> Condition:
+        """The encoded texts; `who` is conditioned on them, for the message where there are none."""
+        text = self.conditions.get("text")
+        if text is None:
+            raise UserError(f"{who} is conditioned on text, and none was given")
+        return text
+
     def pooled_text(self, who: str) -> torch.Tensor:
         """The sentence embeddings [B, E]."""
-        text = self.conditions.get("text")
-        if text is None or text.pooled is None:
-            raise UserError(f"{who} is conditioned on text, and none was given")
-        return text.pooled
+        pooled = self.text(who).pooled
+        if pooled is None:
+            raise UserError(f"{who} is conditioned on sentence embeddings, and none were given")
+        return pooled
 
 
 @dataclass(frozen=True)

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import torch
+from typing import Any
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.registry import stage_kind
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage, StageKind
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.run_folder import stage_folder, stages_of
-
-if TYPE_CHECKING:
-    pass
-
-CPU = torch.device("cpu")
 
 
 def preview_of(stage: Stage, others: Mapping[str, Stage]) -> Any:
@@ -54,7 +47,7 @@ def finished_stages(run: Path) -> dict[str, Finished]:
             inputs = {role: find(source.stage) for role, source in artifact.inputs.items()}
             config = kind.config.parse(artifact.config, f"{where}: config")
             found = {role: stage for role, stage in inputs.items() if stage is not None}
-            out[name] = Finished(name, kind, config, folder, found)
+            out[name] = Finished(name, kind, config, folder, _in_order(found, names))
         return out[name]
 
     names = list(stages_of(run))
@@ -70,18 +63,32 @@ def _gives(kind: StageKind, artifact: Artifact) -> frozenset[str]:
         return frozenset()
 
 
-def generators_of(stages: Mapping[str, Finished]) -> list[Finished]:
-    """The stages of a run that generate, its default first.
+def _in_order(inputs: Mapping[str, Finished], names: Sequence[str]) -> dict[str, Finished]:
+    """Inputs as the recipe has their stages; an artifact lists them by role."""
+    place = {name: number for number, name in enumerate(names)}
+    return dict(sorted(inputs.items(), key=lambda item: place.get(item[1].name, len(place))))
 
-    Where a stage of the run reads generators, such as `generate`, those that it reads come first: a recipe
-    with several says so which it means.
+
+def generators_of(run: Path) -> list[Finished]:
+    """The finished stages of a run that generate, its default first.
+
+    Those that the recipe lists as a stage's inputs come first, in that order, then those that a finished
+    stage such as `generate` has read: a recipe with several says so which it means.
     """
-    makers = [stage for stage in stages.values() if stage.gives(GENERATOR)]
-    named = [
-        source
+    stages = finished_stages(run)
+    makers = {name: stage for name, stage in stages.items() if stage.gives(GENERATOR)}
+    read = [
+        source.name
         for stage in stages.values()
         if not stage.gives(GENERATOR)
         for source in stage.inputs.values()
-        if source.gives(GENERATOR)
     ]
-    return list({stage.name: stage for stage in (*named, *makers)}.values())
+    names = dict.fromkeys((*_listed(run), *read, *makers))
+    return [makers[name] for name in names if name in makers]
+
+
+def _listed(run: Path) -> list[str]:
+    """Stages that the recipe of a run lists as inputs (`inputs: {generators: [gpt, face_gpt]}`)."""
+    roles = [entry.get("inputs") for entry in stages_of(run).values()]
+    found = [names for given in roles if isinstance(given, dict) for names in given.values()]
+    return [str(name) for names in found if isinstance(names, list) for name in names]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from pydantic import BaseModel
+from pydantic import BaseModel, model_validator
 from pydantic.config import JsonDict
 from rich.console import Console
 
@@ -43,6 +43,18 @@ SHOWING = "showing"
 class StageConfig(Config):
     """Base of every stage's config."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _keep_defaults(cls, data: Any) -> Any:
+        """A group of settings of which some are given keeps the stage's own defaults of the others."""
+        if not isinstance(data, dict):
+            return data
+        out = dict(data)
+        for name, info in cls.model_fields.items():
+            if isinstance(info.default, BaseModel) and isinstance(out.get(name), dict):
+                out[name] = _over(info.default.model_dump(mode="json"), out[name])
+        return out
+
     def require_fit(self, hardware: Hardware) -> None:
         """Refuse, before anything runs, settings that cannot run on this hardware."""
 
@@ -57,7 +69,7 @@ class Role:
 
 @dataclass(frozen=True)
 class Every:
-    """An input filled by every stage before this one that gives something, or by those the recipe lists."""
+    """An input filled by every other stage that gives something, or by those the recipe lists, in order."""
 
     name: str
     gives: str
@@ -78,6 +90,13 @@ class Stage:
     inputs: dict[str, str]
 
 
+class MissingInputError(UserError, KeyError):
+    """A role was asked for that no finished stage fills."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 class Given(Mapping[str, Any]):
     """What the inputs of a stage give, by role; each is made when it is first asked for."""
 
@@ -86,6 +105,8 @@ class Given(Mapping[str, Any]):
         self._made: dict[str, Any] = {}
 
     def __getitem__(self, role: str) -> Any:
+        if role not in self._makers:
+            raise MissingInputError(f"no finished '{role}' stage here; run the recipe to the end first")
         if role not in self._made:
             self._made[role] = self._makers[role]()
         return self._made[role]
@@ -109,6 +130,8 @@ class Finished:
     config: Any
     folder: Path
     inputs: Mapping[str, Finished]
+    exported: bool = False
+    """In an exported folder, which may come from anywhere: nothing outside `folder` is followed."""
 
     def gives(self, what: str) -> bool:
         """Whether other stages may ask this one for `what`."""
@@ -242,6 +265,10 @@ class StageKind(ABC):
         """Roles whose stages an export must take along for this stage to load."""
         return ()
 
+    def exported_config(self, config: Any) -> Any:
+        """The config as an export shows it to everybody."""
+        return config
+
     def export(self, stage: Finished, target: Path) -> None:
         """Copy what loading needs into `target`, an empty folder."""
         raise UserError(f"{stage.folder}: a stage of kind {self.name} cannot be exported")
@@ -281,6 +308,15 @@ class FunctionStage(StageKind):
     def run(self, context: StageContext) -> None:
         """Call the function."""
         self.function(context)
+
+
+def _over(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """`given` with what it lacks of `defaults`, group by group."""
+    out = {**defaults, **given}
+    for name, value in given.items():
+        if isinstance(value, dict) and isinstance(defaults.get(name), dict):
+            out[name] = _over(defaults[name], value)
+    return out
 
 
 def fingerprint_fields(config: BaseModel) -> dict[str, Any]:

@@ -6,15 +6,12 @@ Raw layouts (SMPL parameters) are posed on the neutral skeleton: the pose is the
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from motionloom.datasets.motion.canonical import canonicalize, resample
-from motionloom.datasets.motion.features import decode, face_of
-from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
+from motionloom.datasets.motion.features import face_of
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.pipeline.data_page.facts import DataFacts
-from motionloom.pipeline.inference.bundle import joint_layout
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.viewer import ViewerMotion
 
@@ -60,6 +57,8 @@ def watch(dataset: ShardDataset, clip: int) -> ViewerMotion:
     layout = dataset.layout
     motion = dataset.motion(clip)[: int(WATCH_SECONDS * layout.fps)]
     joints = joints_of(motion, layout)
+    if layout.family == "raw":
+        joints = canonicalize(joints)  # sources have their own axes
     face = None
     if dataset.manifest.converter == "synth" and layout.has("face"):
         face = synthetic_face_controls(face_of(motion, layout))
@@ -74,21 +73,3 @@ def watch(dataset: ShardDataset, clip: int) -> ViewerMotion:
     return ViewerMotion(
         joints, fps, layout.skeleton.parents, f"{dataset.split} · {dataset.ids[clip]}", caption, "", face
     )
-
-
-def joints_of(motion: NDArray[np.float32], layout: MotionLayout) -> NDArray[np.float64]:
-    """Joints [T, N, 3] in metres of any layout's values [T, D]."""
-    if layout.family != "raw":
-        return decode(motion[:, layout.part("bodyhand")], joint_layout(layout))
-    frames = len(motion)
-
-    def turns(field: str) -> NDArray[np.float64]:
-        return np.asarray(motion[:, layout.slice(field)], np.float64).reshape(frames, -1, 3)
-
-    if layout.has("pose"):
-        rotations = turns("pose")[:, :BODY_JOINTS]
-        body = BodyModel.neutral("smpl22")
-    else:
-        rotations = np.concatenate([turns("root_orient"), turns("pose_body"), turns("pose_hand")], axis=1)
-        body = BodyModel.neutral("smplx52")
-    return canonicalize(smpl_joints(rotations, turns("trans")[:, 0], body))

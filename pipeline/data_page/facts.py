@@ -140,10 +140,10 @@ def gather(root: Path, *, progress: bool = False) -> tuple[DataFacts, dict[str, 
                 candidates.append((split, clip))
                 described.append(_describe(motion, layout))
                 if split == measured_split:
-                    held = layout.held_columns[dataset.held[clip]]
-                    moments = moments.merge(Moments.of(motion, held))
-                    low[held] = np.minimum(low, motion.min(axis=0))[held]
-                    high[held] = np.maximum(high, motion.max(axis=0))[held]
+                    present = layout.present_columns[dataset.present[clip]]
+                    moments = moments.merge(Moments.of(motion, present))
+                    low[present] = np.minimum(low, motion.min(axis=0))[present]
+                    high[present] = np.maximum(high, motion.max(axis=0))[present]
                 bar.advance(task)
         task = bar.add_task("outliers", total=len(chosen[measured_split]))
         outliers = _outliers(opened[measured_split], chosen[measured_split], moments, bar, task)
@@ -281,7 +281,7 @@ def _outliers(
     for clip in clips:
         motion = dataset.motion(clip)
         away = np.abs(motion - moments.mean) / std
-        away[:, ~dataset.layout.held_columns[dataset.held[clip]]] = 0.0
+        away[:, ~dataset.layout.present_columns[dataset.present[clip]]] = 0.0
         frame, column = np.unravel_index(int(away.argmax()), away.shape)
         most = float(away[frame, column])
         found = Outlier(most, clip, int(frame), int(column), float(motion[frame, column]))

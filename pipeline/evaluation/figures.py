@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joints import joints_of, local_joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
-from motionloom.datasets.schema import HANDS, HELD_ALL
+from motionloom.datasets.schema import HANDS, PRESENT_ALL
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.metrics.reconstruction import accel, mpjpe, pa_mpjpe
 from motionloom.models.metrics.retrieval import recall
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth
-from motionloom.pipeline.inference.bundle import joint_layout
 from motionloom.pipeline.store.networks import LoadedTma, TrainedTokenizer
 
 KEY_FRAMES = 16
@@ -44,8 +44,12 @@ class Interval:
 
 
 def local_joints(features: NDArray[np.float32], layout: MotionLayout) -> NDArray[np.float64]:
-    """Joints [T, N, 3] relative to the root, turned into its heading: the pose without its path."""
-    layout = joint_layout(layout)
+    """Joints [T, N, 3] relative to the root, turned into its heading: the pose without its path.
+
+    Layouts that hold such positions are read as they are, so that errors of the path play no part.
+    """
+    if not layout.has("positions"):
+        return local_joints_of(joints_of(features, layout), layout.fps)
     positions = features[..., layout.slice("positions")].astype(np.float64)
     positions = positions.reshape(*positions.shape[:-1], layout.num_joints - 1, 3)
     height = features[..., layout.slice("root_height")].astype(np.float64)
@@ -61,7 +65,7 @@ def reconstruction_figures(
     `mpjpe_*` compares poses (root and heading aligned), `global_*` compares positions in the world, the path
     included. Of a clip without hands the body's joints alone count, and nothing in `mpjpe_hand`.
     """
-    layout = joint_layout(tokenizer.layout)
+    layout = tokenizer.layout
     body = tokenizer.stats.mean[tokenizer.layout.part("bodyhand")].astype(np.float32)
     nearest = NearestClip(train)
     rows: dict[str, list[float]] = {}
@@ -69,16 +73,21 @@ def reconstruction_figures(
         real = local_joints(truth.features, layout)
         found = reconstruct_truth(tokenizer, truth)
         constant = np.broadcast_to(body, truth.features.shape)
-        other = nearest.features(truth.features, truth.held)
-        joints = slice(None) if truth.held & HANDS else slice(BODY_JOINTS)
+        compared = {
+            "": (local_joints(found, layout), joints_of(found, layout)),
+            "_mean_pose": (local_joints(constant, layout), joints_of(constant, layout)),
+            "_nearest_train_clip": nearest.motion(truth.features, truth.present),
+        }
+        joints = slice(None) if truth.present & HANDS else slice(BODY_JOINTS)
         frames = len(truth.features)
-        rebuilt, target = _joints(found, layout, joints), torch.from_numpy(truth.joints)[:, joints]
+        target = torch.from_numpy(truth.joints)[:, joints]
+        rebuilt = torch.from_numpy(compared[""][1])[:, joints]
         values = {"pa_mpjpe": pa_mpjpe(rebuilt, target)}
         if frames > 2:
             values["accel"] = accel(rebuilt, target)
-        for suffix, features in (("", found), ("_mean_pose", constant), ("_nearest_train_clip", other)):
-            pose, place = torch.from_numpy(local_joints(features, layout)), _joints(features, layout, joints)
-            errors = pose_errors(pose[:, joints], torch.from_numpy(real)[:, joints])
+        for suffix, motion in compared.items():
+            pose, place = (torch.from_numpy(array)[:, joints] for array in motion)
+            errors = pose_errors(pose, torch.from_numpy(real)[:, joints])
             if layout.num_joints > BODY_JOINTS:
                 errors.setdefault("mpjpe_body", errors["mpjpe"])
             values |= {f"{k}{suffix}": v for k, v in errors.items()}
@@ -86,10 +95,6 @@ def reconstruction_figures(
         for name, value in values.items():
             rows.setdefault(name, []).append(float(value.mean()))
     return {name: float(np.mean(values)) for name, values in rows.items()}
-
-
-def _joints(features: NDArray[np.float32], layout: MotionLayout, chosen: slice) -> Tensor:
-    return torch.from_numpy(decode(features, layout))[:, chosen]
 
 
 def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
@@ -117,39 +122,49 @@ class NearestClip:
     def __init__(self, train: ClipDataset) -> None:
         self.train = train
         self.columns = train.layout.part("bodyhand")
-        layout = joint_layout(train.layout)
-        self.positions = layout.slice("positions")
         keys = [self._key(np.asarray(train.motion(i))[:, self.columns]) for i in range(len(train))]
         self.keys = [np.stack(part) for part in zip(*keys, strict=True)]
         self.norms = [np.square(part).sum(1) for part in self.keys]
-        self.with_hands = (train.held & HANDS) > 0
+        self.with_hands = (train.present & HANDS) > 0
 
     def _key(self, features: NDArray[np.float32]) -> list[NDArray[np.float64]]:
         """Positions of the body's joints and of the hands', each flat."""
-        key = stretch(features[:, self.positions], KEY_FRAMES)
+        layout = self.train.layout
+        if layout.has("positions"):
+            key = stretch(features[:, layout.slice("positions")], KEY_FRAMES)
+        else:
+            key = stretch(local_joints(features, layout)[:, 1:].reshape(len(features), -1), KEY_FRAMES)
         return [part.ravel() for part in np.split(key, [3 * (BODY_JOINTS - 1)], axis=1)]
 
-    def features(self, features: NDArray[np.float32], held: int = HELD_ALL) -> NDArray[np.float32]:
-        """Features [T, D] of that clip, stretched to T frames (velocities scaled with time).
+    def motion(
+        self, features: NDArray[np.float32], present: int = PRESENT_ALL
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(pose, joints) of that clip, [T, N, 3] each, stretched to the T frames of `features`.
 
-        `held` says what `features` hold.
+        Features are stretched and their velocities scaled with time; where the layout has none, the joints
+        are stretched, since angles cannot be averaged. `present` says what `features` hold.
         """
         body, hands = (
             norms - 2 * keys @ key
             for norms, keys, key in zip(self.norms, self.keys, self._key(features), strict=True)
         )
         distance = body
-        if held & HANDS and self.with_hands.any():
+        if present & HANDS and self.with_hands.any():
             distance = np.where(self.with_hands, body + hands, np.inf)
         found = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
+        layout = self.train.layout
+        if not layout.has("positions"):
+            joints = joints_of(found, layout)
+            path = stretch(joints.reshape(len(joints), -1), len(features)).reshape(-1, *joints.shape[1:])
+            return local_joints_of(path, layout.fps), path
         out = stretch(found, len(features))
-        layout = joint_layout(self.train.layout)
         for field in ("root_yaw_velocity", "root_xz_velocity", "velocities"):
             out[:, layout.slice(field)] *= len(found) / len(features)
-        return out.astype(np.float32)
+        near = out.astype(np.float32)
+        return local_joints(near, layout), joints_of(near, layout)
 
 
-def stretch(values: NDArray[np.float32], frames: int) -> NDArray[np.float64]:
+def stretch(values: NDArray[Any], frames: int) -> NDArray[np.float64]:
     """Linear resampling of [T, D] to `frames` rows, first and last kept."""
     at = np.linspace(0, len(values) - 1, frames)
     low = np.floor(at).astype(int)
@@ -162,17 +177,19 @@ def stretch(values: NDArray[np.float32], frames: int) -> NDArray[np.float64]:
 def embed_motions(
     tma: LoadedTma,
     motions: Sequence[NDArray[np.float32]],
-    held: Sequence[int] | None = None,
+    present: Sequence[int] | None = None,
     batch: int = 64,
 ) -> Tensor:
     """TMA latents [n, 256] of body-hand features; longer motions are cut at the model's length.
 
-    `held` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
+    `present` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
     """
     columns = tma.layout.part(tma.part)
     mean, std = tma.stats.mean[columns], tma.stats.std[columns]
     order = np.argsort([len(m) for m in motions], kind="stable")
-    masks = tma.layout.held_columns[:, columns][[HELD_ALL] * len(motions) if held is None else held]
+    masks = tma.layout.present_columns[:, columns][
+        [PRESENT_ALL] * len(motions) if present is None else present
+    ]
     out: dict[int, Tensor] = {}
     for start in range(0, len(order), batch):
         rows = order[start : start + batch].tolist()

@@ -58,7 +58,7 @@ def retrieve(
         )
     captions = [t.caption for t in truths]
     text = tma.embed_captions(captions, cache)
-    motion = embed_motions(tma, [t.features for t in truths], [t.held for t in truths])
+    motion = embed_motions(tma, [t.features for t in truths], [t.present for t in truths])
     sentence = torch.as_tensor(cache.similarity(captions))
     rows = [
         _result("A", "whole split", recall(text, motion)),

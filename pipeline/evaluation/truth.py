@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
-from motionloom.datasets.motion.features import decode, face_of
-from motionloom.datasets.schema import FACE, HELD_ALL, UserError
+from motionloom.datasets.motion.features import face_of
+from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.schema import FACE, PRESENT_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.pipeline.inference.bundle import joint_layout
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 
@@ -20,7 +20,7 @@ class Truth:
     """A clip of the data set, or the stretch its caption is about: features of the body-hand part, joints,
     expression, captions.
 
-    `face` is None where the clip holds none; `held` are the bits of `ClipMeta.held`.
+    `face` is None where the clip holds none; `present` are the bits of `ClipMeta.present`.
     """
 
     id: str
@@ -30,7 +30,9 @@ class Truth:
     caption: str
     face_caption: str
     truth: dict | None
-    held: int = HELD_ALL
+    present: int = PRESENT_ALL
+    begin: float = 0.0
+    """Second of the clip where the stretch begins."""
 
 
 def truth_of(
@@ -41,24 +43,38 @@ def truth_of(
     A caption about the whole clip comes first. Without one, the clip is cut to what its first caption of
     `min_frames` or more is about.
     """
-    layout = dataset.layout
     motion = np.asarray(dataset.motion(index))
     span = _main_caption(dataset, index, len(motion), min_frames)
     whole, motion = span.frames == len(motion), motion[span.first : span.end]
-    faces = caption_spans(dataset.face_texts(index), layout.fps, int(dataset.frames[index]))
     frames = min(len(motion), max_frames or len(motion)) // 4 * 4
     motion = motion[: max(frames, min(4, len(motion)))]
+    return _truth(dataset, index, motion, span, dataset.meta(index).truth if whole else None)
+
+
+def truth_at(dataset: ClipDataset, index: int, frames: int) -> Truth:
+    """The first `frames` of a clip, whatever its captions are about."""
+    motion = np.asarray(dataset.motion(index))
+    span = _main_caption(dataset, index, len(motion))
+    return _truth(dataset, index, motion[:frames], span, dataset.meta(index).truth)
+
+
+def _truth(
+    dataset: ClipDataset, index: int, motion: NDArray[np.float32], span: CaptionSpan, truth: dict | None
+) -> Truth:
+    layout = dataset.layout
+    faces = caption_spans(dataset.face_texts(index), layout.fps, int(dataset.frames[index]))
     body = motion[:, layout.part("bodyhand")]
-    held = int(dataset.held[index])
+    present = int(dataset.present[index])
     return Truth(
         id=dataset.ids[index],
         features=body,
-        joints=decode(body, joint_layout(layout)),
-        face=face_of(motion, layout) if layout.has("face") and held & FACE else None,
+        joints=joints_of(body, layout),
+        face=face_of(motion, layout) if layout.has("face") and present & FACE else None,
         caption=span.text,
         face_caption=max(faces, key=lambda face: _overlap(face, span)).text if faces else span.text,
-        truth=dataset.meta(index).truth if whole else None,
-        held=held,
+        truth=truth,
+        present=present,
+        begin=span.first / layout.fps,
     )
 
 
@@ -79,6 +95,11 @@ def reconstruct_truth(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.f
 
     Of columns that it does not model, the mean comes back.
     """
+    return reconstruct_all(tokenizer, truth)[:, tokenizer.layout.part("bodyhand")]
+
+
+def reconstruct_all(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.float32]:
+    """All columns [T, D] of the layout, likewise."""
     layout = tokenizer.layout
     out = np.tile(tokenizer.stats.mean.astype(np.float32), (len(truth.features), 1))
     given = out.copy()
@@ -86,16 +107,27 @@ def reconstruct_truth(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.f
     if truth.face is not None:
         given[:, layout.slice("face")] = truth.face
     columns = tokenizer.columns
-    out[:, columns] = tokenizer.reconstruct(given[:, columns], truth.held)
-    return out[:, layout.part("bodyhand")]
+    out[:, columns] = tokenizer.reconstruct(given[:, columns], truth.present)
+    return out
+
+
+def has_caption(dataset: ClipDataset) -> NDArray[np.bool_]:
+    """Clips with a caption, [n]."""
+    return dataset.has("texts.json")
 
 
 def captioned(dataset: ClipDataset) -> NDArray[np.bool_]:
     """Clips with a caption, [n]; a `UserError` when there is none."""
-    found = dataset.has("texts.json")
+    found = has_caption(dataset)
     if not found.any():
         raise UserError(f"{dataset.where}: no clip of split '{dataset.split}' has a caption")
     return found
+
+
+def spread_any(dataset: ClipDataset, count: int) -> list[int]:
+    """Numbers of clips spread evenly over a split, at most `count`, captioned or not."""
+    order: list[int] = np.random.default_rng(0).permutation(len(dataset)).tolist()
+    return order[:count]
 
 
 def spread(dataset: ClipDataset, count: int) -> list[int]:

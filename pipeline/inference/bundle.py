@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.conditions import Condition, Conditions
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.sampling import sample_seeds
@@ -29,7 +29,7 @@ from motionloom.pipeline.contract.generation import (
     Prompt,
     Stretch,
 )
-from motionloom.pipeline.contract.lookup import finished_stages, generators_of
+from motionloom.pipeline.contract.lookup import generators_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CPU, Finished, Shelf
 from motionloom.pipeline.inference.conditions import PromptEncoder
@@ -81,7 +81,7 @@ class GeneratedMotion:
 
 
 class Bundle:
-    """The generators of a model, each loaded when it is first used, all on one device."""
+    """The generators of a model, loaded at once so that a broken one is found first, all on one device."""
 
     def __init__(self, stages: Sequence[Finished], shelf: Shelf) -> None:
         self.stages = tuple(stages)
@@ -89,14 +89,16 @@ class Bundle:
         self.shelf = shelf
         self._generators: dict[str, MotionGenerator] = {}
         self._encoders: dict[str, PromptEncoder] = {}
-        if not any(self.of(stage).part != "face" for stage in self.stages):
+        for stage in self.stages:
+            self._open(stage)
+        if all(self.of(stage).part == "face" for stage in self.stages):
             raise UserError("no finished stage here generates body motion; run the recipe to the end first")
 
     @staticmethod
     def open(folder: Path, device: torch.device = CPU) -> Bundle:
         """Open a run folder or an exported folder."""
         if (folder / BUNDLE_FILE).is_file():
-            return Bundle(open_exported(folder), Shelf(device))
+            return Bundle._of(folder, open_exported(folder), device)
         if not (folder / "recipe.yaml").is_file():
             raise UserError(
                 f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no {BUNDLE_FILE})"
@@ -106,12 +108,26 @@ class Bundle:
     @staticmethod
     def from_run(run: Path, device: torch.device = CPU) -> Bundle:
         """Open the finished stages of a run."""
-        makers = generators_of(finished_stages(run))
+        makers = generators_of(run)
         require_consistent(run, (stage.name for stage in makers))
+        return Bundle._of(run, makers, device)
+
+    @staticmethod
+    def _of(folder: Path, stages: Sequence[Finished], device: torch.device) -> Bundle:
         try:
-            return Bundle(makers, Shelf(device))
+            return Bundle(stages, Shelf(device))
         except UserError as error:
-            raise UserError(f"{run}: {error}") from None
+            if str(error).startswith(str(folder)):
+                raise
+            raise UserError(f"{folder}: {error}") from None
+
+    def _open(self, stage: Finished) -> None:
+        """Load a stage's inputs, and theirs, as far as generation needs them."""
+        needed, given = stage.kind.exported(stage.config), self.shelf.given(stage.inputs)
+        for role in stage.kind.roles():
+            if role.name in needed and (role.name in given or not role.optional):
+                given[role.name]
+                self._open(stage.inputs[role.name])
 
     def of(self, stage: Finished) -> MotionGenerator:
         """The generator that a stage is."""
@@ -198,8 +214,6 @@ class Bundle:
             require_words(faces or [], "face_captions")
             require_used(self, faces, sampling)
         prompts = prompts_of(texts, faces, sounds)
-        if strict:
-            require_words([p.text for p in prompts if p.sound is None])
         require_driven(self.generator, prompts)
         frames = self._frames(seconds, prompts)
         # One seed a motion, so that how they are batched plays no part.
@@ -295,7 +309,7 @@ class Bundle:
         segments: tuple[Segment, ...] = (),
     ) -> GeneratedMotion:
         features, with_it = _split(motion, self.generator, self.layout)
-        joints = decode(features, joint_layout(self.layout))
+        joints = joints_of(features, self.layout)
         expression = with_it if face is None else face
         return GeneratedMotion(prompt, features, joints, expression, self.layout, segments)
 
@@ -344,13 +358,6 @@ class Bundle:
                 raise UserError(f"{length:g} s is out of reach: this model makes {longest} {end:.1f} s")
             out.append(units * unit)
         return out
-
-
-def joint_layout(layout: MotionLayout) -> MotionLayout:
-    """The layout of the body-hand columns alone."""
-    if not layout.has("face"):
-        return layout
-    return MotionLayout.named("wholebody313", fps=layout.fps, family=layout.family)
 
 
 def _split(

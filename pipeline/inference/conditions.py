@@ -28,7 +28,7 @@ class PromptEncoder:
         `words` are the prompts' texts, about the body or the face; an empty one is no text.
         """
         out: dict[str, Condition] = {}
-        if "text" in modalities and any(words):
+        if "text" in modalities and any(text.strip() for text in words):
             out["text"] = self._texts(words)
         if "audio" in modalities and any(prompt.sound for prompt in prompts):
             out["audio"] = self._sounds(prompts, fps)
@@ -40,7 +40,7 @@ class PromptEncoder:
         encoded = self.text.encoder.encode(list(words))
         features, mask = torch.as_tensor(encoded.tokens), torch.as_tensor(encoded.mask)
         pooled = torch.as_tensor(encoded.sentence)
-        there = torch.tensor([bool(text) for text in words])
+        there = torch.tensor([bool(text.strip()) for text in words])
         if not there.all():
             mask = mask & there[:, None]
             features, pooled = features * mask[..., None], pooled * there[:, None]

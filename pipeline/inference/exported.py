@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from pydantic import Field
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.registry import stage_kind
-from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.contract.stage import GENERATOR, Finished
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.weights import LayoutFacts
 
@@ -49,14 +50,20 @@ def write_exported(stages: Iterable[Finished], layout: LayoutFacts, skeleton: Sk
     needed: dict[str, Finished] = {}
     for stage in makers:
         _collect(stage, needed)
-    entries = {}
+    entries: dict[str, ExportedStage] = {}
+    (out / BUNDLE_FILE).unlink(missing_ok=True)
     for name, stage in needed.items():
-        stage.kind.export(stage, out / name)
+        try:
+            stage.kind.export(stage, out / name)
+        except BaseException:
+            for made in (*entries, name):  # nothing that looks like a model is left
+                shutil.rmtree(out / made, ignore_errors=True)
+            raise
         roles = set(stage.kind.exported(stage.config))
         entries[name] = ExportedStage(
             kind=stage.kind.name,
             version=stage.kind.version,
-            config=stage.config.dump(),
+            config=stage.kind.exported_config(stage.config).dump(),
             inputs={role: source.name for role, source in stage.inputs.items() if role in roles},
         )
     write_json(out / "skeleton.json", _plain(skeleton))
@@ -104,10 +111,17 @@ def open_exported(folder: Path) -> list[Finished]:
                 )
             inputs = {role: build(source, (*above, name)) for role, source in entry.inputs.items()}
             config = kind.config.parse(entry.config, f"{path}: stages.{name}.config")
-            made[name] = Finished(name, kind, config, folder / name, inputs)
+            made[name] = Finished(name, kind, config, folder / name, inputs, exported=True)
         return made[name]
 
-    return [build(name, ()) for name in facts.generators]
+    makers = [build(name, ()) for name in facts.generators]
+    for stage in makers:
+        if not stage.gives(GENERATOR):
+            raise UserError(
+                f"{path}: its stage '{stage.name}' of kind {stage.kind.name} generates nothing; export the "
+                f"run again"
+            )
+    return makers
 
 
 def _format_of(path: Path) -> Any:

@@ -136,10 +136,10 @@ class MotionModel(
 
 
 def write_bundle(run: Path, out: Path) -> None:
-    """Copy what generation needs of a run's finished stages into `out`; `bundle.json` is written last."""
+    """Copy what generation needs of a run's finished stages into `out`."""
     bundle = Bundle.from_run(run)
     for stage in bundle.stages:
         bundle.of(stage)  # opens every stage, so a broken one is found before anything is copied
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "config.json", _HUB_CONFIG)
     write_exported(bundle.stages, LayoutFacts.of(bundle.layout), bundle.layout.skeleton, out)
+    write_json(out / "config.json", _HUB_CONFIG)

@@ -70,8 +70,10 @@ def prompts_of(
 
 
 def require_driven(generator: MotionGenerator, prompts: Iterable[Prompt]) -> None:
-    """Refuse prompts of modalities that a model is not conditioned on."""
+    """Refuse prompts that say nothing, or that have what a model is not conditioned on."""
     for row, prompt in enumerate(prompts):
+        if not prompt.modalities:
+            raise UserError(f"captions[{row}] is empty; say what the person does")
         for name in sorted(prompt.modalities - generator.modalities):
             known = " and ".join(sorted(generator.modalities))
             raise UserError(f"prompt {row} has {name}, and this model is conditioned on {known} only")

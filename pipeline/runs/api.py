@@ -1,4 +1,7 @@
-"""The Python API behind the commands: run a recipe, generate, evaluate, report, export."""
+"""The Python API behind the commands: run a recipe, generate, evaluate, report, export.
+
+Without a console they speak on standard output.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,13 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import preview_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Shelf, StageContext
+from motionloom.pipeline.contract.stage import Shelf, Stage, StageContext
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.outputs import Format, write_motions
 from motionloom.pipeline.inference.pretrained import write_bundle
 from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
 from motionloom.pipeline.inference.script import Script, read_music
+from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.runs.graph import (
     Selection,
@@ -29,7 +33,8 @@ from motionloom.pipeline.runs.graph import (
     selected,
     stage_inputs,
 )
-from motionloom.pipeline.runs.recipe import Recipe, load_recipe, nearest
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
@@ -44,12 +49,13 @@ def run_recipe(
     select: Selection | None = None,
     dry_run: bool = False,
     replace: bool = False,
-    console: Console,
+    console: Console | None = None,
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
 
     A folder of another recipe is refused without `replace`.
     """
+    console = console or make_console()
     loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
     if dry_run:
@@ -180,7 +186,7 @@ def generate_motions(
     return paths
 
 
-def _stage_again(
+def _stages_again(
     folder: Path,
     what: str,
     target: str,
@@ -188,15 +194,33 @@ def _stage_again(
     changes: dict[str, Any],
     device: str = "auto",
 ) -> Path:
-    """Run the stage of a finished run that gives `what` again, into the run folder itself.
+    """Run the stages of a finished run that give `what` again, into folder `target` of the run.
 
-    On `device`: auto is what the recipe's hardware says.
+    The first one writes there, of those of kind `target` if there are some; the others into folders of their
+    names within. On `device`: auto is what the recipe's hardware says.
     """
     recipe = _recipe_of(folder)
     shelf = Shelf(recipe.hardware.device() if device == "auto" else choose_device(device))
-    stage = next((s for s in recipe.stages if what in s.kind.gives(s.config)), None)
-    if stage is None:
+    stages = [s for s in recipe.stages if what in s.kind.gives(s.config)]
+    if not stages:
         raise UserError(f"{folder}: its recipe has no {target} stage; add one and run it again")
+    stages.sort(key=lambda s: s.kind.name != target)
+    for number, stage in enumerate(stages):
+        out = folder / target / stage.name if number else folder / target
+        _stage_again(folder, recipe, stage, out, target, changes, shelf, console)
+    return folder / target
+
+
+def _stage_again(
+    folder: Path,
+    recipe: Recipe,
+    stage: Stage,
+    out: Path,
+    target: str,
+    changes: dict[str, Any],
+    shelf: Shelf,
+    console: Console,
+) -> None:
     given = {name: value for name, value in changes.items() if value is not None}
     config = stage.kind.config.parse({**stage.config.dump(), **given}, target)
     inputs = stage_inputs(recipe, folder, stage)
@@ -206,13 +230,11 @@ def _stage_again(
                 f"{folder}: stage '{source.name}' (role {role}) is not finished; run the recipe first"
             )
     require_consistent(folder, (source.name for source in inputs.values()))
-    out = folder / target
     out.mkdir(exist_ok=True)
     context = StageContext(
         stage.name, recipe.name, config, out, inputs, recipe.seed, recipe.hardware, console, shelf
     )
     stage.kind.run(context)
-    return out
 
 
 def evaluate_run(
@@ -221,18 +243,22 @@ def evaluate_run(
     clips: int | None = None,
     repeats: int | None = None,
     device: str = "auto",
-    console: Console,
+    console: Console | None = None,
 ) -> Path:
-    """Figures of a finished run; writes RUN/evaluate/metrics.json."""
+    """Figures of a finished run by all its stages that make some; returns the folder RUN/evaluate."""
+    console = console or make_console()
     changes = {"clips": clips, "repeats": repeats}
-    return _stage_again(folder, "figures", "evaluate", console, changes, device) / "metrics.json"
+    return _stages_again(folder, "figures", "evaluate", console, changes, device)
 
 
-def report_run(folder: Path, out: Path | None, *, device: str = "auto", console: Console) -> Path:
+def report_run(
+    folder: Path, out: Path | None, *, device: str = "auto", console: Console | None = None
+) -> Path:
     """The page of a finished run; returns its path."""
+    console = console or make_console()
     if out is not None:
         require_file_place(out)
-    page = _stage_again(folder, "page", "report", console, {}, device) / "report.html"
+    page = _stages_again(folder, "page", "report", console, {}, device) / "report.html"
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(page, out)
@@ -241,8 +267,9 @@ def report_run(folder: Path, out: Path | None, *, device: str = "auto", console:
     return page
 
 
-def export_run(folder: Path, out: Path, *, console: Console) -> Path:
+def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Path:
     """Copy what generation needs into one folder."""
+    console = console or make_console()
     require_folder(out)
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")

@@ -30,9 +30,16 @@ def estimate_table(cards: dict[str, ModelCard]) -> Table:
     for column in ("stage", "parameters", "batch", "memory", "tokens"):
         table.add_column(column, overflow="fold")
     for name, card in cards.items():
-        parameters = f"{card.parameters / 1e6:.1f} M"
+        parameters = _count(card.parameters)
         if card.codebook:
-            parameters += f" + {card.codebook / 1e6:.1f} M codebook"
-        memory = f"{card.memory_bytes / 2**30:.1f} GiB"
-        table.add_row(name, parameters, str(card.local_batch), memory, card.note)
+            parameters += f" + {_count(card.codebook)} codebook"
+        table.add_row(name, parameters, str(card.local_batch), _size(card.memory_bytes), card.note)
     return table
+
+
+def _count(number: int) -> str:
+    return f"{number / 1e6:.1f} M" if number >= 1e5 else f"{number / 1e3:.1f} k"
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 / 10 else f"{count / 2**20:.1f} MiB"

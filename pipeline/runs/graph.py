@@ -24,7 +24,7 @@ from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
-from motionloom.pipeline.contract.stage import Finished, Shelf, Stage, StageContext, fingerprint_fields
+from motionloom.pipeline.contract.stage import Every, Finished, Shelf, Stage, StageContext, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
@@ -135,7 +135,7 @@ def replaced_trainings(run: Path, plan: Sequence[PlannedStage]) -> tuple[list[st
 
 def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> dict[str, Any]:
     """What a stage's fingerprint is the digest of."""
-    return {
+    facts = {
         "kind": stage.kind.name,
         "version": stage.kind.version,
         "seed": recipe.seed,
@@ -143,6 +143,9 @@ def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> dict[
         "external": stage.kind.external(stage.config),
         "inputs": {role: rows[name].fingerprint for role, name in stage.inputs.items()},
     }
+    if any(isinstance(role, Every) for role in stage.kind.roles()):
+        facts["order"] = list(stage.inputs)  # the first of several generators is the default
+    return facts
 
 
 def _decide(
@@ -192,7 +195,7 @@ def _difference(artifact: Artifact, stage: Stage, rows: dict[str, PlannedStage])
         old = artifact.inputs.get(role)
         if old is None or old.fingerprint != rows[name].fingerprint:
             return f"input {name} changed"
-    return "seed or source files changed"
+    return "seed, source files or the order of inputs changed"
 
 
 def _changed_fields(old: Any, new: Any, prefix: str = "") -> Iterator[str]:

@@ -9,14 +9,14 @@
 
 A stage's inputs are found by role: a stage that needs `data` takes the stage called `data` unless its
 `inputs:` names another (or `null`, for an input it can do without). `extends:` starts from another recipe
-file beside this one. `--set stage.field=value` overrides one value.
+file, one beside this one or a shipped one by name; a stage that is `null` is left out. `defaults:` holds what
+stages share (`defaults.py`). `--set stage.field=value` overrides one value.
 """
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,11 +24,13 @@ from typing import Any
 from pydantic import Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.contract.registry import stage_kinds
+from motionloom.pipeline.contract.registry import VARIABLE, stage_kinds
 from motionloom.pipeline.contract.stage import Every, Stage
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.runs.shipped import shipped_recipes
-from motionloom.pipeline.store.yaml import dump_yaml, load_yaml, read_yaml
+from motionloom.pipeline.runs.defaults import fill, require_used
+from motionloom.pipeline.runs.layers import override, read_layers, read_recipe_file
+from motionloom.pipeline.runs.shipped import find_recipe, nearest
+from motionloom.pipeline.store.yaml import dump_yaml
 
 
 class RecipeFile(Config):
@@ -38,6 +40,8 @@ class RecipeFile(Config):
     description: str = ""
     seed: int = Field(0, ge=0)
     hardware: Hardware = Hardware()
+    defaults: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """What stages of a kind, or all that train (`trained`), share; see `defaults.py`."""
     stages: dict[str, dict[str, Any]]
 
     @field_validator("stages")
@@ -97,92 +101,34 @@ def _written_inputs(stage: Stage) -> dict[str, Any]:
     return out
 
 
-def nearest(name: str, valid: Sequence[str]) -> str:
-    """A hint to append: did you mean 'x'?, or the list of valid names."""
-    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
-    return f"; did you mean '{near[0]}'?" if near else f"; valid names: {', '.join(valid)}"
-
-
-def find_recipe(name_or_path: str) -> Path:
-    """A recipe file by path, or a shipped recipe by name."""
-    path = Path(name_or_path)
-    if path.suffix in {".yaml", ".yml"}:
-        if not path.is_file():
-            raise UserError(f"{path}: no such recipe file")
-        return path
-    shipped = shipped_recipes()
-    if name_or_path not in shipped:
-        raise UserError(
-            f"no recipe '{name_or_path}'{nearest(name_or_path, list(shipped))} (or give a .yaml file)"
-        )
-    return shipped[name_or_path]
-
-
 def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     """Read, extend, override and check a recipe."""
     path = find_recipe(str(name_or_path))
-    data = _read(path, depth=0)
-    for override in overrides:
-        _apply(data, override)
+    data = read_layers(path)
+    # Defaults of a base recipe may concern stages that this one has replaced; its own may not.
+    require_used(read_recipe_file(path).get("defaults"), data.get("stages"), str(path))
+    known = set(data.get("defaults") or {})
+    for text in overrides:
+        data = override(data, text)
     where = f"{path} with --set" if overrides else str(path)
     file = RecipeFile.parse(data, where)
-    return Recipe(file.name, file.description, file.seed, file.hardware, _stages(file, where))
+    require_used(file.defaults.keys() - known, file.stages, where)
+    stages = _stages(fill(file.stages, file.defaults, where), where)
+    return Recipe(file.name, file.description, file.seed, file.hardware, stages)
 
 
-def _read(path: Path, depth: int) -> dict[str, Any]:
-    data = read_yaml(path)
-    if not isinstance(data, dict):
-        raise UserError(f"{path}: a recipe is a mapping with 'name' and 'stages'")
-    base = data.pop("extends", None)
-    if base is None:
-        return data
-    if depth > 4:
-        raise UserError(f"{path}: 'extends' goes in a circle or more than four files deep")
-    beside = path.parent / f"{base}.yaml"
-    return _merge(_read(beside if beside.is_file() else find_recipe(str(base)), depth + 1), data)
-
-
-def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    out = dict(base)
-    for key, value in change.items():
-        old = out.get(key)
-        if isinstance(old, dict) and isinstance(value, dict):
-            # A stage of another kind has other fields, so it replaces the old one whole.
-            same_kind = value.get("kind", old.get("kind")) == old.get("kind")
-            out[key] = _merge(old, value) if same_kind else value
-        else:
-            out[key] = value
-    return out
-
-
-def _apply(data: dict[str, Any], override: str) -> None:
-    key, equals, text = override.partition("=")
-    parts = key.strip().split(".")
-    if not equals or not all(parts):
-        raise UserError(f"--set {override}: write it as stage.field=value")
-    if parts[0] not in {"seed", "name", "hardware", "description", "stages"}:
-        stages = data.get("stages") or {}
-        if parts[0] not in stages:
-            raise UserError(f"--set {override}: no stage '{parts[0]}'{nearest(parts[0], list(stages))}")
-        parts = ["stages", *parts]
-    value = load_yaml(text, f"--set {override}")
-    node = data
-    for part in parts[:-1]:
-        child = node.get(part)
-        node[part] = dict(child) if isinstance(child, dict) else {}
-        node = node[part]
-    node[parts[-1]] = value
-
-
-def _stages(file: RecipeFile, where: str) -> tuple[Stage, ...]:
+def _stages(entries: Mapping[str, dict[str, Any]], where: str) -> tuple[Stage, ...]:
     kinds, parsed = stage_kinds(), []
-    for name, entry in file.stages.items():
+    for name, entry in entries.items():
         fields = dict(entry)
         kind_name = fields.pop("kind", None)
         renamed = fields.pop("inputs", None) or {}
         if kind_name not in kinds:
             hint = nearest(str(kind_name), list(kinds))
-            raise UserError(f"{where}: stages.{name}.kind = '{kind_name}' is no stage kind{hint}")
+            raise UserError(
+                f"{where}: stages.{name}.kind = '{kind_name}' is no stage kind{hint}; a kind of your own "
+                f"needs its module in {VARIABLE}"
+            )
         kind = kinds[kind_name]
         config = kind.config.parse(fields, f"{where}: stages.{name}")
         parsed.append((Stage(name, kind, config, {}), renamed))

@@ -120,9 +120,9 @@ class DiffusionFace:
     part: Part = "face"
 
     @property
-    def text(self) -> TextSource:
+    def text(self) -> TextSource | None:
         """What encodes its words."""
-        text: TextSource = self.given["text"]
+        text: TextSource | None = self.given.get("text")
         return text
 
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from pydantic import Field
-from rich.table import Table
+from torch import Tensor
 
 from motionloom.datasets.schema import UserError
+from motionloom.models.metrics.dance_choice import accuracy_among
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import FigureTable, Showing
 from motionloom.pipeline.contract.stage import (
@@ -32,8 +32,10 @@ from motionloom.pipeline.evaluation.figures import (
     retrieval_figures,
     truth_agreement,
 )
-from motionloom.pipeline.evaluation.truth import Truth, captioned, spread, truth_of
+from motionloom.pipeline.evaluation.tables import plain, print_tables
+from motionloom.pipeline.evaluation.truth import Truth, has_caption, spread, spread_any, truth_of
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
+from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.stages.progress import bar
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.networks import LoadedTma, TrainedTokenizer
@@ -50,6 +52,8 @@ class EvaluateConfig(StageConfig):
     """Repetitions of generation and of drawing retrieval batches."""
     size: int = Field(32, ge=2)
     """Candidates in retrieval (32: protocol D; 256: protocol C)."""
+    among: int = Field(61, ge=2)
+    """Candidates of the accuracy of UDE's Table 1."""
     sampling: SamplingConfig = SamplingConfig()
 
 
@@ -60,7 +64,7 @@ class EvaluateStage(StageKind):
     summary = "figures on the test split"
     config = EvaluateConfig
     takes = ("data", "text?", "tokenizer?", "tma?", Every("generators", GENERATOR))
-    version = 3  # generators as the recipe has them
+    version = 4  # clips without captions are reconstructed too; accuracy among 61
 
     def gives(self, config: Any) -> frozenset[str]:
         """Its tables."""
@@ -68,10 +72,9 @@ class EvaluateStage(StageKind):
 
     def run(self, context: StageContext) -> None:
         """Write `metrics.json` and print it as tables."""
-        figures = _plain(_Evaluation(context).figures())
+        figures = plain(_Evaluation(context).figures())
         write_json(context.folder / _FILE, figures)
-        for table in tables(figures):
-            context.console.print(table)
+        print_tables(context.console, figure_rows(figures))
 
     def show(self, stage: Finished, given: Given) -> list[Showing]:
         """The tables."""
@@ -86,33 +89,46 @@ class _Evaluation:
         self.context, self.config = context, context.config
         self.tokenizer: TrainedTokenizer | None = context.given.get("tokenizer")
         self.tma: LoadedTma | None = context.given.get("tma")
-        self.bundle = Bundle(context.every("generators"), context.shelf)
+        makers = context.every("generators")
+        self.bundle = bundle_driven_by("text", makers, context.shelf) or Bundle(makers, context.shelf)
         self.dataset = context.given["data"].held_out(prefer="test")
 
     def figures(self) -> dict[str, Any]:
         """All figures, each beside its trivial answer."""
         dataset, context = self.dataset, self.context
         unit = self.tokenizer.net.group_frames if self.tokenizer else self.bundle.generator.unit_frames
-        truths = [truth_of(dataset, i) for i in sorted(spread(dataset, self.config.clips))]
-        truths = [t for t in truths if len(t.features) >= unit]
-        if not truths:
+        said = has_caption(dataset)
+        chosen = spread(dataset, self.config.clips) if said.any() else []
+        truths = self.truths(chosen, unit)
+        figures: dict[str, Any] = {"split": dataset.split, "clips": len(truths)}
+        if self.tokenizer is not None:
+            train = context.given["data"].split("train")
+            shown = truths if said.all() else self.truths(spread_any(dataset, self.config.clips), unit)
+            figures["bits_per_second"] = self.tokenizer.net.bits_per_second
+            figures["reconstructed_clips"] = len(shown)
+            if shown:
+                figures["reconstruction_mm"] = reconstruction_figures(self.tokenizer, train, shown)
+        if not truths and "reconstruction_mm" not in figures:
             raise UserError(
                 f"{dataset.where}: no captioned clip of split '{dataset.split}' is long enough for one group "
                 f"of tokens"
             )
-        if left := int((~captioned(dataset)).sum()):
-            context.console.print(f"    {dataset.split}: {left} clips without a caption are left out")
-        figures: dict[str, Any] = {"split": dataset.split, "clips": len(truths)}
-        if self.tokenizer is not None:
-            train = context.given["data"].split("train")
-            figures["bits_per_second"] = self.tokenizer.net.bits_per_second
-            figures["reconstruction_mm"] = reconstruction_figures(self.tokenizer, train, truths)
+        if left := int((~said).sum()):
+            rest = "are left out" if self.tokenizer is None else "are left out, except of the reconstruction"
+            context.console.print(f"    {dataset.split}: {left} clips without a caption {rest}")
+        if not truths or "text" not in self.bundle.generator.modalities:
+            return figures
         generated = self.generate(truths)
         if self.tma is not None:
             figures["retrieval"] = self.retrieval(self.tma, truths, generated)
         if any(t.truth for t in truths):
             figures["agreement_with_caption"] = self.agreement(truths, generated)
         return figures
+
+    def truths(self, chosen: Sequence[int], unit: int) -> list[Truth]:
+        """The clips `chosen` that are long enough for one group of tokens."""
+        found = [truth_of(self.dataset, i) for i in sorted(chosen)]
+        return [truth for truth in found if len(truth.features) >= unit]
 
     def generate(self, truths: list[Truth]) -> list[list[GeneratedMotion]]:
         """The captions of `truths` performed, once for each repeat."""
@@ -140,8 +156,18 @@ class _Evaluation:
         config, seed = self.config, self.context.seed
         size = min(config.size, len(truths))
         text = tma.embed_captions([t.caption for t in truths], self.context.given["text"].cache)
-        real = embed_motions(tma, [t.features for t in truths], [t.held for t in truths])
+        real = embed_motions(tma, [t.features for t in truths], [t.present for t in truths])
         repeats = max(config.repeats, 5)
+        # A caption that says the same as the own one is no wrong answer.
+        words = [t.caption for t in truths]
+        same = torch.tensor([[one == other for other in words] for one in words])
+        among = min(config.among, 1 + int((~same).sum(1).min()))
+
+        def accuracy(latent: Tensor) -> dict[str, float]:
+            if among < 2:
+                return {}
+            return accuracy_among(latent, text, candidates=among, same=same, seed=seed)
+
         figures = retrieval_figures(text, real, size=size, repeats=repeats, seed=seed)
         made: dict[str, list[float]] = {}
         for repeat, motions in enumerate(generated):
@@ -149,13 +175,20 @@ class _Evaluation:
             once = retrieval_figures(text, latent, size=size, repeats=1, seed=seed + repeat)
             for name, value in once.items():
                 made.setdefault(name, []).append(value.mean)
+            for name, share in accuracy(latent).items():
+                made.setdefault(name, []).append(share)
             distance = torch.linalg.vector_norm(text - latent, dim=-1).mean()
             made.setdefault("matching_score", []).append(float(distance))
         real_distance = float(torch.linalg.vector_norm(text - real, dim=-1).mean())
         return {
             "size": size,
+            "among": among,
             "chance": {f"r{k}": chance(k, size) for k in (1, 2, 3)},
-            "real": {**figures, "matching_score": Interval(real_distance, 0.0)},
+            "real": {
+                **figures,
+                **{name: Interval(share, 0.0) for name, share in accuracy(real).items()},
+                "matching_score": Interval(real_distance, 0.0),
+            },
             "generated": {name: Interval.of(values) for name, values in made.items()},
         }
 
@@ -167,26 +200,6 @@ class _Evaluation:
             "truth": truth_agreement([(t, t.joints, t.face) for t in truths], fps),
             "generated": truth_agreement(made, fps),
         }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Interval):
-        return {k: round(v, 5) for k, v in asdict(value).items()}
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    return round(float(value), 5) if isinstance(value, float | np.floating) else value
-
-
-def tables(figures: dict[str, Any]) -> list[Table]:
-    """The figures for people."""
-    return [_table(title, columns, rows) for title, columns, rows in figure_rows(figures)]
-
-
-def _table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
-    table = Table(*columns, title=title, title_justify="left")
-    for row in rows:
-        table.add_row(*row)
-    return table
 
 
 def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
@@ -209,6 +222,14 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
             rows.append([f"{name} motion", *(_interval(found[name][key]) for key in keys)])
         columns = ["", "text to motion R@1", "R@3", "motion to text R@1", "R@3", "matching score"]
         out.append((f"TMA retrieval among {found['size']}", columns, rows))
+        if "top-1" in found["real"]:
+            tops = [
+                [f"{name} motion", *(_interval(found[name][f"top-{k}"]) for k in (1, 5))]
+                for name in ("real", "generated")
+            ]
+            guess = ["chance", *(f"{min(1.0, chance(k, found['among'])):.3f}" for k in (1, 5))]
+            columns = ["", "top-1", "top-5"]
+            out.append((f"Own caption among {found['among']}, by TMA", columns, [guess, *tops]))
     if "agreement_with_caption" in figures:
         found = figures["agreement_with_caption"]
         names = sorted({*found["truth"], *found["generated"]})
@@ -226,7 +247,7 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
 def _reconstruction_rows(figures: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
     r = figures["reconstruction_mm"]
     return (
-        f"Reconstruction on {figures['clips']} {figures['split']} clips, mm (lower is better); "
+        f"Reconstruction on {figures['reconstructed_clips']} {figures['split']} clips, mm (lower is better); "
         f"codes of {figures['bits_per_second']:.0f} bit/s",
         ["", "pose", "body", "fingers from the wrist", "in the world", "PA-MPJPE", "ACCEL"],
         [

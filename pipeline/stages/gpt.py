@@ -173,7 +173,7 @@ class GptStage(TrainedStage):
                 training,
                 clips.sources,
                 latents=latents if config.aligned and config.prior != "tma" else None,
-                held=clips.held,
+                present=clips.present,
             )
 
         def train(batch: int, rank: int, world: int) -> Dataset[Any]:
@@ -250,9 +250,9 @@ class GptGenerator:
         return self.tokenizer.layout
 
     @property
-    def text(self) -> TextSource:
+    def text(self) -> TextSource | None:
         """What encodes its words."""
-        text: TextSource = self.given["text"]
+        text: TextSource | None = self.given.get("text")
         return text
 
     @property
@@ -282,7 +282,7 @@ class GptGenerator:
             return request.pooled_text("this GPT").to(device_of(self.gpt.net))
         if "tma" not in self.given:
             raise UserError("this GPT needs the TMA text encoder, and no tma stage is here")
-        text = request.conditions["text"]
+        text = request.text("this GPT")
         latent: Tensor = self.given["tma"].embed_text(text.features, text.mask)
         return latent
 

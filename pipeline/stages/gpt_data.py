@@ -22,7 +22,7 @@ from motionloom.datasets.shards.order import Source
 from motionloom.models.gpt.tokens import stream_names
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.store.data import captions_of
-from motionloom.pipeline.store.tokens import HeldTokens, TokenCaption, TokenStore
+from motionloom.pipeline.store.tokens import PresentTokens, TokenCaption, TokenStore
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class GptClips:
     """Those of each clip, n lists."""
     texts: list[str]
     """All captions, [m]."""
-    held: HeldTokens | None
+    present: PresentTokens | None
     """Which of their tokens were recorded; None when all were."""
     sources: tuple[Source, ...]
     uncaptioned: int
@@ -50,8 +50,8 @@ def gpt_clips(
     `store` holds the tokens of all clips. Captions about fewer than `min_frames` frames give way to longer
     ones of the same clip.
     """
-    table = held_table(tokenizer, dataset.layout)
-    usable = table.usable[dataset.held]
+    table = present_table(tokenizer, dataset.layout)
+    usable = table.usable[dataset.present]
     if not usable.any():
         raise UserError(
             f"{dataset.where}: no clip of split '{dataset.split}' holds all that the tokenizer models "
@@ -74,12 +74,12 @@ def gpt_clips(
         spans = caption_spans(found, dataset.layout.fps, frames, min_frames)
         groups = int(own.groups[number])
         captions.append([_caption(span, groups, tokenizer.group_frames, rows) for span in spans])
-    bits = torch.from_numpy(dataset.held[clips].astype(np.int64))
+    bits = torch.from_numpy(dataset.present[clips].astype(np.int64))
     return GptClips(
         own,
         captions,
         list(rows),
-        None if table.streams[bits].all() else HeldTokens(bits, table.streams, table.columns),
+        None if table.streams[bits].all() else PresentTokens(bits, table.streams, table.columns),
         # Weights count; the order of shards does not, as the tokens are all in memory.
         tuple(replace(source, shards=None) for source in dataset.sources(clips)),
         int((usable & ~chosen).sum()),
@@ -94,8 +94,8 @@ def _caption(span: CaptionSpan, groups: int, unit: int, rows: dict[str, int]) ->
 
 
 @dataclass(frozen=True)
-class HeldTable:
-    """What clips that hold the bits b (row b, see `ClipMeta.held`) have of a tokenizer's input and output."""
+class PresentTable:
+    """What clips with the bits b (row b, see `ClipMeta.present`) have of a tokenizer's input and output."""
 
     columns: Tensor
     """bool [4, C]: columns of the tokenizer."""
@@ -105,13 +105,13 @@ class HeldTable:
     """[4]: whether any stream is left that a GPT can learn."""
 
 
-def held_table(tokenizer: Tokenizer, layout: MotionLayout) -> HeldTable:
+def present_table(tokenizer: Tokenizer, layout: MotionLayout) -> PresentTable:
     """The table of a tokenizer and the layout of the full frames."""
-    columns = torch.from_numpy(layout.held_columns[:, tokenizer.columns.cpu().numpy()])
-    found = tokenizer.lost(columns.to(tokenizer.columns.device))
-    lost = {name: value.cpu() for name, value in found.items()}
+    columns = torch.from_numpy(layout.present_columns[:, tokenizer.columns.cpu().numpy()])
+    found = tokenizer.missing(columns.to(tokenizer.columns.device))
+    missing = {name: value.cpu() for name, value in found.items()}
     # A tokenizer that gives a part a stream of its own keeps that part out of the other streams.
-    others = torch.ones(len(columns), dtype=torch.bool) if lost else columns.all(1)
-    known = [~lost[name] if name in lost else others for name in stream_names(tokenizer.pattern)]
+    others = torch.ones(len(columns), dtype=torch.bool) if missing else columns.all(1)
+    known = [~missing[name] if name in missing else others for name in stream_names(tokenizer.pattern)]
     streams = torch.stack(known, dim=1)
-    return HeldTable(columns, streams, streams.any(1).numpy())
+    return PresentTable(columns, streams, streams.any(1).numpy())

@@ -13,11 +13,12 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from motionloom.models.layers.transformer import SelfAttention
 from motionloom.models.quantize.ema import EmaQuantizer
+from motionloom.models.training.players import PlayersModule
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.launch.hardware import Hardware
@@ -48,6 +49,7 @@ def model_card(
                 layer.attention_dropout = 0.0
         prepare_module(module, train)
         parameters = sum(p.numel() for p in module.net.parameters())
+        trained = sum(p.numel() for p in _trained(module))
         buffers = sum(b.numel() * b.element_size() for b in module.net.buffers())
         books = [m for m in module.net.modules() if isinstance(m, EmaQuantizer)]
         kept = _saved_bytes(module, example.batch, _HALF.get(train.precision))
@@ -56,9 +58,17 @@ def model_card(
         parameters=parameters,
         codebook=sum(book.codebook.numel() for book in books),
         local_batch=batch,
-        memory_bytes=parameters * _BYTES_A_PARAMETER // holders + buffers + kept,
+        memory_bytes=trained * _BYTES_A_PARAMETER // holders + buffers + kept,
         note=example.note,
     )
+
+
+def _trained(module: StageModule) -> list[nn.Parameter]:
+    """What gets gradients and moments: the network, and those that it is trained against."""
+    nets = [module.net]
+    if isinstance(module, PlayersModule):
+        nets += [net for player in module.players() for net in player.nets]
+    return list({id(p): p for net in nets for p in net.parameters()}.values())
 
 
 def _saved_bytes(module: StageModule, inputs: dict[str, Any], half: torch.dtype | None) -> int:

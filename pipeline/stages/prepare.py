@@ -9,7 +9,7 @@ import torch
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
-from motionloom.pipeline.contract.stage import Finished, Given, StageConfig, StageContext, StageKind
+from motionloom.pipeline.contract.stage import CPU, Finished, Given, StageConfig, StageContext, StageKind
 from motionloom.pipeline.store.data import captions_of
 from motionloom.pipeline.store.encoder_files import keep_place
 from motionloom.pipeline.store.files import copy_files
@@ -98,8 +98,16 @@ class TextStage(StageKind):
 
     def load(self, stage: Finished, given: Given, device: torch.device) -> TextSource:
         """The cache, and the encoder for new words."""
-        return TextSource(stage.folder, stage.config.encoder, device)
+        return _source(stage, device)
+
+    def exported_config(self, config: TextConfig) -> TextConfig:
+        """Without the places on this machine: an export brings its encoder along."""
+        return TextConfig()
 
     def export(self, stage: Finished, target: Path) -> None:
         """The encoder."""
-        TextSource(stage.folder, stage.config.encoder, torch.device("cpu")).export(target)
+        _source(stage, CPU).export(target)
+
+
+def _source(stage: Finished, device: torch.device) -> TextSource:
+    return TextSource(stage.folder, stage.config.encoder, device, stage.exported)

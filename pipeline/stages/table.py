@@ -16,8 +16,10 @@ from motionloom.pipeline.stages.data import (
 from motionloom.pipeline.stages.diffusion import DiffusionStage
 from motionloom.pipeline.stages.dmd import DmdStage
 from motionloom.pipeline.stages.evaluate import EvaluateStage
+from motionloom.pipeline.stages.evaluate_dances import EvaluateDancesStage
 from motionloom.pipeline.stages.generate import GenerateStage
 from motionloom.pipeline.stages.gpt import GptStage
+from motionloom.pipeline.stages.mix import MixStage
 from motionloom.pipeline.stages.prepare import StatsStage, TextStage
 from motionloom.pipeline.stages.report import ReportStage
 from motionloom.pipeline.stages.tma import TmaStage
@@ -30,6 +32,7 @@ register(DataStage("synth", "synthetic shards", SynthStageConfig, run_synth))
 for name, (title, config) in CONVERTED.items():
     register(ConvertStage(name, f"shards from {title}", config, run_convert))
 register(ShardsStage("shards", "existing shards", ShardsStageConfig, run_shards))
+register(MixStage())
 register(StatsStage())
 register(TextStage())
 register(AudioStage())
@@ -44,4 +47,5 @@ register(DmdStage())
 register(UdeStage())
 register(GenerateStage())
 register(EvaluateStage())
+register(EvaluateDancesStage())
 register(ReportStage())

@@ -163,9 +163,9 @@ class VaeFace:
         return self.tma.layout
 
     @property
-    def text(self) -> TextSource:
+    def text(self) -> TextSource | None:
         """What encodes its words."""
-        text: TextSource = self.tma.given["text"]
+        text: TextSource | None = self.tma.given.get("text")
         return text
 
     @torch.no_grad()
@@ -174,7 +174,7 @@ class VaeFace:
         if request.frames is None:
             raise UserError("the face's VAE makes a length that it is given, and none was")
         frames, seeds, device, net = request.frames, request.seeds, self.tma.device, self.tma.net
-        text = request.conditions["text"]
+        text = request.text("the face's VAE")
         mu, logvar = net.encode_text(text.features.to(device), text.mask.to(device))
         noise = torch.stack(
             [torch.randn(mu.shape[1], generator=torch.Generator().manual_seed(seed)) for seed in seeds]

@@ -47,15 +47,18 @@ class TokenizerStageConfig(TrainedStageConfig):
     def require_fit(self, hardware: Hardware) -> None:
         """A codebook must get several times the vectors that it resets codes below."""
         super().require_fit(hardware)
-        if not isinstance(self.net, EmaTokenizerConfig):
+        net = self.net
+        if not isinstance(net, EmaTokenizerConfig | MqConfig):
             return
+        if isinstance(net, MqConfig) and net.quantizer != "ema":
+            return  # codes learnt by gradient are never reset
         vectors = self.train.batch_size // self.train.accumulate * self.window // GROUP_FRAMES
-        needed = 2 * self.net.num_codes * self.net.reset_below
+        needed = 2 * net.num_codes * net.reset_below
         if vectors < needed:
             raise UserError(
-                f"a codebook of {self.net.num_codes} codes gets {vectors} vectors an update and resets codes "
-                f"used less than {self.net.reset_below:g} times: it would replace codes for ever. Set "
-                f"net.reset_below to {vectors / self.net.num_codes / 4:.2g} or less, or raise "
+                f"a codebook of {net.num_codes} codes gets {vectors} vectors an update and resets codes "
+                f"used less than {net.reset_below:g} times: it would replace codes for ever. Set "
+                f"net.reset_below to {vectors / net.num_codes / 4:.2g} or less, or raise "
                 "train.batch_size"
             )
 

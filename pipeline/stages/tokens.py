@@ -121,11 +121,11 @@ def encode_split(
     groups = np.maximum(np.asarray(dataset.frames) // unit, 1)
     starts = np.concatenate([[0], np.cumsum(groups)]).astype(np.int64)
     per_group = {s.name: s.per_group for s in tokenizer.streams}
-    held = dataset.layout.held_columns[:, tokenizer.columns.cpu().numpy()]
+    present = dataset.layout.present_columns[:, tokenizer.columns.cpu().numpy()]
     flat = {name: torch.zeros(int(starts[-1]) * n, dtype=torch.int64) for name, n in per_group.items()}
     for items in _by_length(groups, batch_frames // unit):
         motion, length = padded(tokenizer, dataset, stats, items)
-        mask = torch.from_numpy(held[dataset.held[items]])
+        mask = torch.from_numpy(present[dataset.present[items]])
         found = tokenizer.encode(motion.to(device), length.to(device), mask.to(device))
         codes = {name: values.cpu() for name, values in found.items()}
         for row, item in enumerate(items.tolist()):
@@ -134,8 +134,8 @@ def encode_split(
                 flat[name][begin : begin + count] = codes[name][row, :count]
         if advance is not None:
             advance(len(items))
-    whole = np.asarray(held.all(axis=1))
-    return TokenStore(flat, starts, per_group, whole[dataset.held])
+    whole = np.asarray(present.all(axis=1))
+    return TokenStore(flat, starts, per_group, whole[dataset.present])
 
 
 def padded(

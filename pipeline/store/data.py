@@ -20,6 +20,7 @@ from motionloom.datasets.shards.store import open_store
 SHARDS = "shards"
 REFERENCE = "reference.json"
 READER = "reader.json"
+MIX = "mix.json"
 
 
 class DataPart(Config):
@@ -46,14 +47,45 @@ class Reader(Config):
     cache: CacheConfig
 
 
+class MixedStage(Config):
+    """One data stage of a mix."""
+
+    stage: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
+    """Its name, which is its folder beside that of the mix."""
+    weight: float = Field(gt=0, allow_inf_nan=False)
+
+
+class Mix(Config):
+    """`mix.json` of a stage that mixes data stages of its own run."""
+
+    parts: list[MixedStage] = Field(min_length=1)
+
+
 def open_split(folder: Path, split: str, *, training: bool = False) -> ClipDataset:
     """One split of a data stage.
 
     `training` says that batches are drawn from it by a plan: only then does the streaming reader serve, as
     the other stages visit clips in orders of their own.
     """
-    if not (folder / REFERENCE).is_file():
+    if _is_plain(folder):
         return ShardDataset.open(folder / SHARDS, split)
+    opened = _opened(folder, split, training)
+    return opened[0][0] if len(opened) == 1 else MixedDataset(opened)
+
+
+def _opened(folder: Path, split: str, training: bool) -> list[tuple[ClipDataset, float]]:
+    """The data sets of a data stage that hold clips of a split, and their weights."""
+    if (folder / MIX).is_file():
+        opened = []
+        for mixed in Mix.load_json(folder / MIX).parts:
+            inner = _opened(folder.parent / mixed.stage, split, training)
+            # Whatever weights a stage has for its own data sets, they share the stage's.
+            whole = sum(weight for _, weight in inner)
+            opened += [(dataset, mixed.weight * weight / whole) for dataset, weight in inner]
+        return opened
+    if _is_plain(folder):
+        there = split in _filled(_manifests(folder)[0])
+        return [(ShardDataset.open(folder / SHARDS, split), 1.0)] if there else []
     reference = Reference.load_json(folder / REFERENCE)
     reader = Reader.load_json(folder / READER)
     reading = Reading(
@@ -62,18 +94,22 @@ def open_split(folder: Path, split: str, *, training: bool = False) -> ClipDatas
         shards_per_group=reference.shards_per_group,
         cache=reader.cache,
     )
-    opened = [
+    return [
         (ShardDataset.open(part.path, split, reading=reading), part.weight)
         for part, manifest in zip(reference.parts, _manifests(folder), strict=True)
-        if split in _held(manifest)
+        if split in _filled(manifest)
     ]
-    return opened[0][0] if len(opened) == 1 else MixedDataset(opened)
+
+
+def _is_plain(folder: Path) -> bool:
+    """Whether a data stage has shards of its own, and only those."""
+    return not (folder / REFERENCE).is_file() and not (folder / MIX).is_file()
 
 
 def splits_of(folder: Path) -> list[str]:
     """Splits that hold at least one clip, of any data set."""
-    held = set().union(*map(_held, _manifests(folder)))
-    return [split for split in ("train", "val", "test") if split in held]
+    filled = set().union(*map(_filled, _manifests(folder)))
+    return [split for split in ("train", "val", "test") if split in filled]
 
 
 def held_out(folder: Path, *, prefer: str = "val") -> str:
@@ -84,14 +120,17 @@ def held_out(folder: Path, *, prefer: str = "val") -> str:
 
 
 def _manifests(folder: Path) -> list[Manifest]:
-    if not (folder / REFERENCE).is_file():
+    if (folder / MIX).is_file():
+        mixed = Mix.load_json(folder / MIX).parts
+        return [manifest for part in mixed for manifest in _manifests(folder.parent / part.stage)]
+    if _is_plain(folder):
         return [read_manifest(open_store(folder / SHARDS))[0]]
     parts = Reference.load_json(folder / REFERENCE).parts
     cache = Reader.load_json(folder / READER).cache
     return [read_manifest(open_store(part.path, cache))[0] for part in parts]
 
 
-def _held(manifest: Manifest) -> set[str]:
+def _filled(manifest: Manifest) -> set[str]:
     return {shard.split for shard in manifest.shards if shard.samples}
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import HELD_ALL
+from motionloom.datasets.schema import PRESENT_ALL
 from motionloom.datasets.text.cache import TextCache
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.tma.network import Tma
@@ -70,16 +70,16 @@ class TrainedTokenizer:
         return np.asarray(self.stats.denormalize(values, self.columns), dtype=np.float32)
 
     @torch.no_grad()
-    def reconstruct(self, features: NDArray[np.float32], held: int = HELD_ALL) -> NDArray[np.float32]:
+    def reconstruct(self, features: NDArray[np.float32], present: int = PRESENT_ALL) -> NDArray[np.float32]:
         """Through the tokenizer and back, [T, C] of its columns in their own units; T a multiple of four.
 
-        `held` says what the clip holds; of what it does not hold, nothing is read and the mean comes back.
+        `present` says what the clip holds; of what it does not hold, nothing is read and the mean comes back.
         """
         columns, device = self.columns, device_of(self.net)
         mean, std = self.stats.mean[columns], self.stats.std[columns]
         motion = torch.from_numpy(((features - mean) / std).astype(np.float32))[None].to(device)
-        mask = torch.from_numpy(self.layout.held_columns[held, columns])[None].to(device)
-        rebuilt = self.net.decode(self.net.encode(motion, held=mask), held=mask)
+        mask = torch.from_numpy(self.layout.present_columns[present, columns])[None].to(device)
+        rebuilt = self.net.decode(self.net.encode(motion, present=mask), present=mask)
         out = rebuilt.masked_fill(~mask[:, None], 0.0)[0].cpu().numpy()
         return np.asarray(out * std + mean, dtype=np.float32)
 
@@ -126,12 +126,12 @@ class LoadedTma:
         return torch.cat(out)
 
     @torch.no_grad()
-    def embed_motion(self, motion: Tensor, length: Tensor, held: Tensor | None = None) -> Tensor:
+    def embed_motion(self, motion: Tensor, length: Tensor, present: Tensor | None = None) -> Tensor:
         """Motion latents [B, 256] of normalised features [B, T, D], the columns of `part`.
 
-        `held` bool [B, D]: those that each motion holds (None = all).
+        `present` bool [B, D]: those that each motion holds (None = all).
         """
-        near = None if held is None else held.to(self.device)
+        near = None if present is None else present.to(self.device)
         return self.net.encode_motion(motion.to(self.device), length.to(self.device), near)[0]
 
 

@@ -16,7 +16,7 @@ from motionloom.pipeline.store.files import write_json
 
 _EXPORTED = "text.json"
 _COPY = "encoder"
-_KNOWN_WIDTHS = {BUILT_IN: 384}
+_KNOWN_WIDTHS = {BUILT_IN: 384, "openai/clip-vit-base-patch32": 512}
 _USUAL_WIDTH = 768
 """Of DistilBERT and CLIP ViT-L/14, assumed for encoders that are not loaded to look."""
 
@@ -49,27 +49,25 @@ class TextSource:
     named: str
     """The encoder as its config names it."""
     device: torch.device
+    exported: bool = False
+    """In an export, where `text.json` says which encoder, and `named` plays no part."""
 
     @cached_property
     def cache(self) -> TextCache:
         """The captions of the data, encoded; an export has none."""
         return TextCache.open(self.folder / "cache")
 
-    @property
-    def _exported(self) -> bool:
-        return (self.folder / _EXPORTED).is_file()
-
     @cached_property
     def dim(self) -> int:
         """Width of its features."""
-        if self._exported:
+        if self.exported:
             return ExportedText.load_json(self.folder / _EXPORTED).dim
         return self.cache.dim
 
     @property
     def encoder_name(self) -> str:
         """The encoder to load; in an export, nothing outside its folder is ever followed."""
-        if not self._exported:
+        if not self.exported:
             return place_of(self.folder) or self.named
         name = ExportedText.load_json(self.folder / _EXPORTED).encoder
         if name == BUILT_IN:
@@ -91,7 +89,7 @@ class TextSource:
         target.mkdir(parents=True, exist_ok=True)
         name = self.encoder_name
         if name != BUILT_IN:
-            if self._exported:
+            if self.exported:
                 raise UserError(f"{self.folder}: an export with its own encoder; copy the folder instead")
             copy_encoder(name, self.folder, target / _COPY)
             name = _COPY

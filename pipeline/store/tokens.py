@@ -103,8 +103,8 @@ class TokenCaption(NamedTuple):
 
 
 @dataclass(frozen=True)
-class HeldTokens:
-    """Which tokens and columns of n clips were recorded, by the bits of `ClipMeta.held`."""
+class PresentTokens:
+    """Which tokens and columns of n clips were recorded, by the bits of `ClipMeta.present`."""
 
     bits: Tensor
     """int64 [n]."""
@@ -147,9 +147,9 @@ class TokenBatches(Dataset[dict[str, Any]]):
     """Data sets and their weights, when several are mixed."""
     latents: Tensor | None = None
     """TMA's embeddings of the same captions [n, Z], for an alignment loss where `prior` is something else."""
-    held: HeldTokens | None = None
+    present: PresentTokens | None = None
     """Which tokens of the clips were recorded; None = all. Batches then also hold "known" bool [B, L] and
-    "held" bool [B, C]."""
+    "present" bool [B, C]."""
 
     @cached_property
     def _plan(self) -> BatchPlan:
@@ -175,10 +175,10 @@ class TokenBatches(Dataset[dict[str, Any]]):
             sequences.append(self._sequence(item, caption, rng))
         batch = pad_sequences(sequences)
         more = {} if self.latents is None else {"tma_text": self.latents[rows]}
-        if self.held is not None:
+        if self.present is not None:
             ends = torch.tensor([self.ends[name] for name in stream_names(self.pattern)])
-            more["known"] = self.held.known(items.tolist(), batch, ends)
-            more["held"] = self.held.columns[self.held.bits[items]]
+            more["known"] = self.present.known(items.tolist(), batch, ends)
+            more["present"] = self.present.columns[self.present.bits[items]]
         return {
             "tokens": batch.tokens,
             "kinds": batch.kinds,

@@ -19,18 +19,18 @@ COUNT = 24
 
 @dataclass(frozen=True)
 class Convert:
-    """Clip i holds the bits `held[i % len(held)]`; `garbage` fills the rest."""
+    """Clip i holds the bits `present[i % len(present)]`; `garbage` fills the rest."""
 
-    held: tuple[int, ...] = (3, 1, 2, 0, 3)
+    present: tuple[int, ...] = (3, 1, 2, 0, 3)
     garbage: float = 0.0
 
     def __call__(self, i: int) -> Sample:
         rng = np.random.default_rng(i)
         motion = rng.standard_normal((16 + i, LAYOUT.dim)) * np.linspace(0.5, 2, LAYOUT.dim) + 0.1 * (i % 3)
-        bits = self.held[i % len(self.held)]
-        lost = ~LAYOUT.held_columns[bits]
-        junk = np.random.default_rng(1000 + i).standard_normal((len(motion), int(lost.sum())))
-        motion[:, lost] = self.garbage * (1 + junk)
+        bits = self.present[i % len(self.present)]
+        missing = ~LAYOUT.present_columns[bits]
+        junk = np.random.default_rng(1000 + i).standard_normal((len(motion), int(missing.sum())))
+        motion[:, missing] = self.garbage * (1 + junk)
         meta = LAYOUT.clip_meta(
             f"clip{i}", source="made", split="train", frames=len(motion), licence="CC0",
             has_hands=bool(bits & HANDS), has_face=bool(bits & FACE),
@@ -40,13 +40,13 @@ class Convert:
         return Sample(meta, motion.astype(np.float32), texts=texts, face_texts=faces)
 
 
-def write(out: Path, garbage: float = 0.0, held: tuple[int, ...] = (3, 1, 2, 0, 3)) -> Path:
+def write(out: Path, garbage: float = 0.0, present: tuple[int, ...] = (3, 1, 2, 0, 3)) -> Path:
     items: list[tuple[Split, int]] = [("test" if i % 4 == 3 else "train", i) for i in range(COUNT)]
     write_dataset(
         out,
         items,
-        Convert(held, garbage),
-        DatasetFacts("held", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
+        Convert(present, garbage),
+        DatasetFacts("present", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
         WriteOptions(clips_per_shard=5, progress=False),
     )
     return out

@@ -245,7 +245,7 @@ def test_captions_alone_give_the_batches_of_caption_batches(
     new = ConditionBatches(data, stats, text, None, batch_size=8, max_frames=24, min_frames=10, seed=5)
     for k in (0, 2, 11):
         one, other = old[k], new[k]
-        for name in ("motion", "length", "held", "index"):
+        for name in ("motion", "length", "present", "index"):
             assert torch.equal(one[name], other[name])  # type: ignore[literal-required]
         assert one["caption"] == other["caption"]
         condition = other["conditions"]["text"]

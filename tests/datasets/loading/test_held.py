@@ -38,7 +38,7 @@ def made() -> ModuleType:
 @pytest.fixture(scope="module")
 def roots(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The same data set with zeros and with garbage in the columns that clips do not hold."""
-    return [made.write(tmp_path_factory.mktemp("held"), garbage) for garbage in GARBAGE]
+    return [made.write(tmp_path_factory.mktemp("present"), garbage) for garbage in GARBAGE]
 
 
 @pytest.fixture(scope="module")
@@ -63,18 +63,18 @@ def openings(root: Path, *kinds: str) -> list[ClipDataset]:
 
 def test_columns_of_each_part() -> None:
     layout = MotionLayout.named("wholebody363")
-    held = layout.held_columns
-    assert held.shape == (4, 363) and held[3].all()
-    assert np.flatnonzero(~held[FACE]).tolist() == layout.part("hand").tolist()
-    assert np.flatnonzero(~held[HANDS]).tolist() == layout.part("face").tolist()
-    assert np.flatnonzero(held[0]).tolist() == layout.part("body").tolist()
-    assert MotionLayout.named("body133").held_columns.all()
+    present = layout.present_columns
+    assert present.shape == (4, 363) and present[3].all()
+    assert np.flatnonzero(~present[FACE]).tolist() == layout.part("hand").tolist()
+    assert np.flatnonzero(~present[HANDS]).tolist() == layout.part("face").tolist()
+    assert np.flatnonzero(present[0]).tolist() == layout.part("body").tolist()
+    assert MotionLayout.named("body133").present_columns.all()
 
 
 def test_the_index_says_what_the_metadata_says(roots: list[Path], made: ModuleType) -> None:
     for dataset in openings(roots[1]):
-        assert [dataset.meta(i).held for i in range(len(dataset))] == dataset.held.tolist()
-        assert set(dataset.held.tolist()) == {0, 1, 2, 3}
+        assert [dataset.meta(i).present for i in range(len(dataset))] == dataset.present.tolist()
+        assert set(dataset.present.tolist()) == {0, 1, 2, 3}
     assert not [problem for problem in check(roots[1]) if "index" in str(problem)]
 
 
@@ -94,7 +94,7 @@ def slow_statistics(dataset: ClipDataset) -> tuple[np.ndarray, np.ndarray]:
         rows = [
             dataset.motion(i)[:, column].astype(np.float64)
             for i in range(len(dataset))
-            if dataset.layout.held_columns[dataset.meta(i).held, column]
+            if dataset.layout.present_columns[dataset.meta(i).present, column]
         ]
         if rows:
             mean[column], std[column] = np.concatenate(rows).mean(), np.concatenate(rows).std()
@@ -115,7 +115,7 @@ def test_statistics_are_of_the_clips_that_hold_a_column(roots: list[Path]) -> No
 
 
 def test_a_part_that_no_clip_holds_has_mean_zero_and_std_one(made: ModuleType, tmp_path: Path) -> None:
-    dataset = ShardDataset.open(made.write(tmp_path, 9.0, held=(HANDS, 0)), "train")
+    dataset = ShardDataset.open(made.write(tmp_path, 9.0, present=(HANDS, 0)), "train")
     face, group = dataset.layout.part("face"), compute(dataset, group=True)
     for stats in (compute(dataset), group):
         assert (stats.mean[face] == 0).all() and (stats.std[face] == 1).all()
@@ -131,12 +131,14 @@ def test_moments_with_gaps_merge_in_any_grouping() -> None:
     rng = np.random.default_rng(0)
     parts = [(rng.standard_normal((n, 3)) + 5, rng.random(3) < 0.5) for n in (4, 1, 9, 3, 7)]
     left = right = Moments.none(3)
-    for rows, held in parts:
-        left = left.merge(Moments.of(rows, held))
-    for rows, held in reversed(parts):
-        right = Moments.of(rows, held).merge(right)
+    for rows, present in parts:
+        left = left.merge(Moments.of(rows, present))
+    for rows, present in reversed(parts):
+        right = Moments.of(rows, present).merge(right)
     for column in range(3):
-        rows = np.concatenate([rows[:, column] for rows, held in parts if held[column]] or [np.zeros(0)])
+        rows = np.concatenate(
+            [rows[:, column] for rows, present in parts if present[column]] or [np.zeros(0)]
+        )
         for moments in (left, right):
             assert moments.count[column] == len(rows)
             if len(rows):
@@ -171,20 +173,20 @@ def test_garbage_changes_no_batch(roots: list[Path], text: TextCache, part: str)
             for k in range(min(len(one), 5)):
                 a, b = one[k], other[k]
                 assert a.keys() == b.keys()
-                for name in ("motion", "length", "held"):
+                for name in ("motion", "length", "present"):
                     assert torch.equal(a[name], b[name]), name
-                assert a["held"].shape == (len(a["motion"]), len(columns)) and a["held"].any(1).all()
-                assert (a["motion"].masked_select(~a["held"][:, None]) == 0).all()
-                assert part not in ("hand", "face") or a["held"].all()
+                assert a["present"].shape == (len(a["motion"]), len(columns)) and a["present"].any(1).all()
+                assert (a["motion"].masked_select(~a["present"][:, None]) == 0).all()
+                assert part not in ("hand", "face") or a["present"].all()
                 if "index" in a:
-                    want = layout.held_columns[clean.held[a["index"].numpy()]][:, columns]
-                    np.testing.assert_array_equal(a["held"].numpy(), want)
+                    want = layout.present_columns[clean.present[a["index"].numpy()]][:, columns]
+                    np.testing.assert_array_equal(a["present"].numpy(), want)
 
 
 def test_clips_without_a_face_are_never_drawn_for_it(roots: list[Path], text: TextCache) -> None:
     stats = compute(openings(roots[0], "indexed")[0])
     for dataset in openings(roots[1]):
-        with_face = np.flatnonzero(dataset.held & FACE).tolist()
+        with_face = np.flatnonzero(dataset.present & FACE).tolist()
         assert 0 < len(with_face) < len(dataset)
         face = dataset.layout.part("face")
         windows = WindowBatches(dataset, stats, window=16, batch_size=6, columns=face)

@@ -257,7 +257,7 @@ def test_a_million_clips_in_ten_thousand_shards_open_in_a_second(made: ModuleTyp
         ClipEntry(
             key=f"000000-{j:06d}",
             id=f"source-{j:019d}",
-            held=j % 4,
+            present=j % 4,
             frames=frames,
             motion_data=j * step + 1024 + 128,
             motion_itemsize=4,

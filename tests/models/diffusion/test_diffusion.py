@@ -49,10 +49,10 @@ def test_padding_plays_no_part() -> None:
     torch.manual_seed(0)
     net = MotionDiffusion(SMALL, 5, 7).eval()
     x, text = torch.randn(1, 12, 5), torch.randn(1, 7)
-    step, told = torch.tensor([30]), torch.tensor([True])
+    step, conditioned = torch.tensor([30]), torch.tensor([True])
     mask = torch.arange(12)[None] < 8
-    padded = net(x, step, text, mask, told)
-    alone = net(x[:, :8], step, text, mask[:, :8], told)
+    padded = net(x, step, text, mask, conditioned)
+    alone = net(x[:, :8], step, text, mask[:, :8], conditioned)
     torch.testing.assert_close(padded[:, :8], alone, atol=1e-5, rtol=1e-5)
     assert (padded[:, 8:] == 0).all()
 
@@ -61,8 +61,8 @@ def test_hidden_text_has_no_influence() -> None:
     torch.manual_seed(0)
     net = MotionDiffusion(SMALL, 5, 7).eval()
     x, mask, step = torch.randn(1, 12, 5), torch.ones(1, 12, dtype=torch.bool), torch.tensor([30])
-    for told, same in ((False, True), (True, False)):
-        pair = [net(x, step, torch.randn(1, 7) * 3, mask, torch.tensor([told])) for _ in range(2)]
+    for conditioned, same in ((False, True), (True, False)):
+        pair = [net(x, step, torch.randn(1, 7) * 3, mask, torch.tensor([conditioned])) for _ in range(2)]
         assert torch.allclose(*pair, atol=1e-6) is same
 
 

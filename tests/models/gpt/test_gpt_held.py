@@ -47,11 +47,11 @@ def batch_of(tokenizer: Tokenizer, *, garbage: bool = False, lacks: Tensor = LAC
         codes["hand"] = torch.where(lacks[:, None], (codes["hand"] + 4) % 9, codes["hand"])
     ends = {s.name: s.num_codes for s in tokenizer.streams}
     sequence = interleave(codes, tokenizer.pattern, ends=ends, groups=GROUPS)
-    held = torch.ones(4, 313, dtype=torch.bool)
-    held[lacks.nonzero(), HAND] = False
+    present = torch.ones(4, 313, dtype=torch.bool)
+    present[lacks.nonzero(), HAND] = False
     text = torch.randn(4, 16, generator=generator)
     known = ~(lacks[:, None] & (sequence.kinds == 1)) | (sequence.tokens == 9)
-    return {**sequence._asdict(), "text": text, "known": known, "held": held}
+    return {**sequence._asdict(), "text": text, "known": known, "present": present}
 
 
 def losses(module: GptModule, batch: dict[str, Any]) -> tuple[dict[str, Tensor], list[Tensor | None]]:
@@ -66,7 +66,7 @@ def test_hand_codes_of_clips_without_hands_change_nothing() -> None:
     one, other = (losses(module, batch_of(tokenizer, garbage=garbage)) for garbage in (False, True))
     torch.testing.assert_close(one, other, rtol=0, atol=0)
     told = batch_of(tokenizer, garbage=True)
-    del told["known"], told["held"]
+    del told["known"], told["present"]
     assert (losses(module, told)[0]["ce"] - one[0]["ce"]).abs() > 1e-4, "else they would"
 
 
@@ -74,7 +74,7 @@ def test_all_recorded_is_the_same_as_not_told() -> None:
     module, tokenizer = made()
     batch = batch_of(tokenizer, lacks=torch.zeros(4, dtype=torch.bool))
     told = losses(module, batch)
-    del batch["known"], batch["held"]
+    del batch["known"], batch["present"]
     torch.testing.assert_close(told, losses(module, batch), rtol=0, atol=0)
 
 
@@ -109,8 +109,8 @@ def test_tma_reads_such_clips_as_in_its_own_training(
     tma, read = module.tma.module, []
     reader = tma.read
 
-    def watched(x: torch.Tensor, held: torch.Tensor | None = None) -> torch.Tensor:
-        read.append(reader(x, held))
+    def watched(x: torch.Tensor, present: torch.Tensor | None = None) -> torch.Tensor:
+        read.append(reader(x, present))
         return read[-1]
 
     monkeypatch.setattr(tma, "read", watched)
@@ -120,7 +120,9 @@ def test_tma_reads_such_clips_as_in_its_own_training(
     steps = logits[:, :15].view(4, 5, 3, -1)[..., :9]
     best = steps.argmax(-1)
     codes = {"body": best[:, :, :2].flatten(1), "hand": best[:, :, 2]}
-    wanted = tokenizer.decode(codes, 4 * GROUPS, batch["held"]).masked_fill(~batch["held"][:, None], 0.0)
+    wanted = tokenizer.decode(codes, 4 * GROUPS, batch["present"]).masked_fill(
+        ~batch["present"][:, None], 0.0
+    )
     for row, groups in enumerate(GROUPS.tolist()):
         frames = 4 * groups
         torch.testing.assert_close(read[0][row, :frames], wanted[row, :frames], rtol=1e-4, atol=1e-5)

@@ -154,10 +154,10 @@ def test_loss_adds_the_weighted_alignment_and_leaves_the_mode(module: GptModule)
 def test_hands_that_a_clip_lacks_are_not_judged(module: GptModule) -> None:
     """A batch of clips without hands: the hand's head learns nothing from L_align."""
     batch = batch_of(module)
-    held = torch.ones(3, 313, dtype=torch.bool)
-    held[:, HAND] = False
+    present = torch.ones(3, 313, dtype=torch.bool)
+    present[:, HAND] = False
     known = (batch["kinds"] != 1) | (batch["tokens"] == 9)
-    values = module.losses({**batch, "held": held, "known": known})
+    values = module.losses({**batch, "present": present, "known": known})
     values["align"].backward()
     body, hand = (head.weight.grad for head in module.net.heads)
     assert body.abs().max() > 0

@@ -35,15 +35,15 @@ def basis_of(part: Part = "bodyhand", root_gain: float = 5.0, finger_gain: float
 def test_out_is_the_inverse_of_in(part: Part) -> None:
     basis = basis_of(part)
     x = torch.from_numpy(RNG.standard_normal((2, 7, len(LAYOUT.part(part)))))
-    torch.testing.assert_close(basis.leave(basis.enter(x)), x, rtol=0, atol=1e-9)
-    torch.testing.assert_close(basis.enter(basis.leave(x)), x, rtol=0, atol=1e-9)
+    torch.testing.assert_close(basis.decode(basis.encode(x)), x, rtol=0, atol=1e-9)
+    torch.testing.assert_close(basis.encode(basis.decode(x)), x, rtol=0, atol=1e-9)
 
 
 @pytest.mark.usefixtures("float64")
 def test_zero_is_the_mean() -> None:
     basis, x = basis_of(), torch.zeros(1, 4, 313)
-    torch.testing.assert_close(basis.enter(x), x, rtol=0, atol=1e-9)
-    torch.testing.assert_close(basis.leave(x), x, rtol=0, atol=1e-9)
+    torch.testing.assert_close(basis.encode(x), x, rtol=0, atol=1e-9)
+    torch.testing.assert_close(basis.decode(x), x, rtol=0, atol=1e-9)
 
 
 def at(joint: int, field: str = "positions") -> slice:
@@ -55,7 +55,7 @@ def at(joint: int, field: str = "positions") -> slice:
 def test_fingers_are_bones_and_the_rest_stays() -> None:
     columns, basis = LAYOUT.part("bodyhand"), basis_of()
     x = RNG.standard_normal((2, 5, len(columns))).astype(np.float32)
-    seen = basis.enter(torch.from_numpy(x)).numpy()
+    seen = basis.encode(torch.from_numpy(x)).numpy()
     zero = basis._bent(torch.zeros(len(columns))).reshape(30, 3).numpy()
     real = x * STD[columns] + MEAN[columns]
     joints = local_joints(real, WHOLE)
@@ -86,7 +86,7 @@ def test_turning_a_wrist_leaves_the_shape_of_its_hand() -> None:
         features[:, at(joint)] = rest[21] + turn @ (rest[joint] - rest[21])
     features[:, at(21)] = rest[21]
     x = torch.from_numpy((features - MEAN[columns]) / STD[columns]).float()
-    seen = basis.enter(x).numpy()
+    seen = basis.encode(x).numpy()
     for joint in range(37, 52):
         spread = np.abs(seen[..., at(joint)] - seen[:1, at(joint)]).max()
         assert (spread < 1e-3) if skeleton.parents[joint] != 21 else (spread > 0.1)
@@ -98,13 +98,13 @@ def test_moving_an_arm_leaves_its_fingers() -> None:
     for joint in [20, *range(22, 37)]:  # the left wrist and its fingers
         column = at(joint).start
         moved[..., column] = 0.05 / float(STD[column])
-    changed = (basis.enter(moved) - basis.enter(x)).abs() > 1e-5
+    changed = (basis.encode(moved) - basis.encode(x)).abs() > 1e-5
     assert changed[0, 0].nonzero()[:, 0].tolist() == [at(20).start]
 
 
 def test_without_gains_nothing_changes_and_nothing_is_saved() -> None:
     basis, x = basis_of(root_gain=1.0, finger_gain=0.0), torch.randn(1, 4, 313)
-    assert torch.equal(basis.enter(x), x) and torch.equal(basis.leave(x), x) and not basis.state_dict()
+    assert torch.equal(basis.encode(x), x) and torch.equal(basis.decode(x), x) and not basis.state_dict()
 
 
 SIZES = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8, "reset_below": 0.1}
@@ -136,13 +136,13 @@ def test_the_loss_is_of_what_is_seen() -> None:
     net.basis.learn(MEAN[LAYOUT.part("bodyhand")], STD[LAYOUT.part("bodyhand")])
     module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms()).eval()
     x = torch.randn(2, 8, 313)
-    held = torch.from_numpy(LAYOUT.held_columns[[3, 0]])[:, LAYOUT.part("bodyhand")]
-    batch = {"motion": x, "length": torch.tensor([8, 8]), "held": held}
+    present = torch.from_numpy(LAYOUT.present_columns[[3, 0]])[:, LAYOUT.part("bodyhand")]
+    batch = {"motion": x, "length": torch.tensor([8, 8]), "present": present}
     values = module.losses(batch)
-    error = (net.basis.enter(net.features(net(x, held=held).written)) - net.basis.enter(x)).square()
-    want = error[held[:, None].expand_as(error)].mean()
+    error = (net.basis.encode(net.features(net(x, present=present).written)) - net.basis.encode(x)).square()
+    want = error[present[:, None].expand_as(error)].mean()
     torch.testing.assert_close(values["recon"], want)
-    garbage = {**batch, "motion": torch.where(held[:, None], x, 7.0)}
+    garbage = {**batch, "motion": torch.where(present[:, None], x, 7.0)}
     torch.testing.assert_close(module.losses(garbage), values, rtol=0, atol=0)
 
 
@@ -152,7 +152,7 @@ def test_hand_codes_read_the_shape_and_body_codes_the_turn() -> None:
     net.basis.learn(np.zeros(313), np.full(313, 0.05))
     x = torch.randn(4, 16, 313)
     net(x)  # the first batch makes the codebooks
-    seen = net.eval().basis.enter(x)
+    seen = net.eval().basis.encode(x)
     turned, bent = seen.clone(), seen.clone()
     turned[..., net.basis.knuckles] = 5.0 * seen[..., net.basis.knuckles].flip(1)
     bent[..., net.basis.bent] *= -3.0
@@ -160,7 +160,7 @@ def test_hand_codes_read_the_shape_and_body_codes_the_turn() -> None:
     def moved(coordinates: torch.Tensor, stream: str) -> float:
         """Share of code vectors that change; twins of a vector among the first codes are one."""
         book = net.codebooks()[stream]
-        before, after = (book.vectors(net.encode(f)[stream]) for f in (x, net.basis.leave(coordinates)))
+        before, after = (book.vectors(net.encode(f)[stream]) for f in (x, net.basis.decode(coordinates)))
         return float(((before - after).abs().amax(-1) > 1e-3).float().mean())
 
     assert moved(seen, "body") == 0 and moved(seen, "hand") == 0
@@ -178,9 +178,9 @@ def test_fingers_alone_are_refused(part: Part) -> None:
 def test_autocast_leaves_the_coordinates_in_float32(half: torch.dtype) -> None:
     basis = basis_of()
     x = torch.randn(2, 8, 313, generator=torch.Generator().manual_seed(0))
-    seen = basis.enter(x)
-    back = basis.leave(seen)
+    seen = basis.encode(x)
+    back = basis.decode(seen)
     with torch.autocast("cpu", dtype=half):
-        assert torch.equal(basis.enter(x), seen)
-        assert torch.equal(basis.leave(seen), back)
-        assert basis.leave(seen.to(half)).dtype == torch.float32
+        assert torch.equal(basis.encode(x), seen)
+        assert torch.equal(basis.decode(seen), back)
+        assert basis.decode(seen.to(half)).dtype == torch.float32

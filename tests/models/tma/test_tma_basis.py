@@ -50,7 +50,7 @@ def motion() -> Tensor:
 def test_it_is_the_plain_network_between_the_coordinates(stride: int) -> None:
     net, x = build(stride), motion()
     assert net.basis is not None
-    seen = net.basis.enter(x)
+    seen = net.basis.encode(x)
     assert (seen - x).abs().max() > 1
     mu, logvar = net.encode_motion(x, LENGTH)
     for found, wanted in zip((mu, logvar), plain(net).encode_motion(seen, LENGTH), strict=True):
@@ -62,42 +62,42 @@ def test_it_is_the_plain_network_between_the_coordinates(stride: int) -> None:
     rounding = torch.finfo(torch.float32).eps * features.abs().max() * net.basis.std.max()
     bound = float(rounding / net.basis.unit.min())
     assert bound < 0.01
-    torch.testing.assert_close(net.basis.enter(features), written, rtol=0, atol=bound)
+    torch.testing.assert_close(net.basis.encode(features), written, rtol=0, atol=bound)
     for row, frames in enumerate(-(-LENGTH // stride)):
         assert (features[row, frames:] == 0).all()
 
 
 @torch.no_grad()
 def test_hands_that_a_clip_does_not_hold_say_nothing() -> None:
-    net, held = build(), (~HANDS).repeat(2, 1)
-    held[1] = True
+    net, present = build(), (~HANDS).repeat(2, 1)
+    present[1] = True
     one, other = motion(), motion()
     other[0][:, HANDS] = 7.0
-    assert (net.read(one, held)[0][:, HANDS] == 0).all()
+    assert (net.read(one, present)[0][:, HANDS] == 0).all()
     for a, b in zip(
-        net.encode_motion(one, LENGTH, held), net.encode_motion(other, LENGTH, held), strict=True
+        net.encode_motion(one, LENGTH, present), net.encode_motion(other, LENGTH, present), strict=True
     ):
         torch.testing.assert_close(a, b)
     assert (net.encode_motion(one, LENGTH)[0] - net.encode_motion(other, LENGTH)[0]).abs().max() > 1e-3
 
 
 def test_the_reconstruction_is_judged_in_the_coordinates() -> None:
-    net, x, held = build(stride=3), motion(), torch.ones(2, 313, dtype=torch.bool)
-    held[0] = ~HANDS
+    net, x, present = build(stride=3), motion(), torch.ones(2, 313, dtype=torch.bool)
+    present[0] = ~HANDS
     module = TmaModule(net, OptimConfig(), seed=0, max_steps=1).eval()
     words = torch.randn(2, 4, 6, generator=torch.Generator().manual_seed(2))
     batch = {
         "motion": x, "length": LENGTH,
         "conditions": {"text": Condition(words, torch.ones(2, 4, dtype=torch.bool))},
-        "similarity": torch.eye(2), "held": held,
+        "similarity": torch.eye(2), "present": present,
     }  # fmt: skip
     found = module.losses(batch)
     frames = -(-LENGTH // 3)
     mask = torch.arange(4)[None] < frames[:, None]
     assert net.basis is not None
-    target = net.basis.enter(x[:, ::3])
-    mu, _ = net.encode_motion(x, LENGTH, held)
-    wanted = reconstruction_loss(plain(net).decode(mu, LENGTH, 12), target, mask, held)
+    target = net.basis.encode(x[:, ::3])
+    mu, _ = net.encode_motion(x, LENGTH, present)
+    wanted = reconstruction_loss(plain(net).decode(mu, LENGTH, 12), target, mask, present)
     torch.testing.assert_close(found["rec_motion"], wanted)
     found["loss"].backward()
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in net.parameters())

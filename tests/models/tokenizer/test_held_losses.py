@@ -47,12 +47,12 @@ def module_of(config: AnyTokenizerConfig) -> TokenizerModule:
     return TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms())
 
 
-def batch_of(columns: Tensor, held: list[int], garbage: float = 0.0) -> dict[str, Tensor]:
+def batch_of(columns: Tensor, present: list[int], garbage: float = 0.0) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(5)
-    motion = torch.randn(len(held), 16, len(columns), generator=generator)
-    mask = torch.from_numpy(LAYOUT.held_columns[held])[:, columns]
+    motion = torch.randn(len(present), 16, len(columns), generator=generator)
+    mask = torch.from_numpy(LAYOUT.present_columns[present])[:, columns]
     motion = torch.where(mask[:, None], motion, garbage * (1 + motion))
-    return {"motion": motion, "length": LENGTH[: len(held)], "held": mask}
+    return {"motion": motion, "length": LENGTH[: len(present)], "present": mask}
 
 
 def trained(module: StageModule, batches: list[dict[str, Tensor]]) -> tuple[list[dict], list, dict]:
@@ -77,14 +77,14 @@ def test_garbage_in_missing_columns_changes_nothing(kind: str) -> None:
     for garbage in (0.0, 50.0):
         module = module_of(CONFIGS[kind])
         columns = module.net.columns
-        batches = [batch_of(columns, held, garbage) for held in (HELD, [1, 2, 0, 0], HELD[::-1])]
+        batches = [batch_of(columns, present, garbage) for present in (HELD, [1, 2, 0, 0], HELD[::-1])]
         runs.append((*trained(module, batches), module.net.encode(**encode_arguments(batches[0]))))
     same(*runs)
     assert all(grad is not None for grad in runs[0][1])
 
 
 def encode_arguments(batch: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {"x": batch["motion"], "length": batch["length"], "held": batch["held"]}
+    return {"x": batch["motion"], "length": batch["length"], "present": batch["present"]}
 
 
 @pytest.mark.parametrize("kind", list(CONFIGS))
@@ -94,7 +94,7 @@ def test_all_held_is_the_same_as_not_told(kind: str) -> None:
         module = module_of(CONFIGS[kind])
         batch = batch_of(module.net.columns, [3, 3, 3, 3])
         if not told:
-            del batch["held"]
+            del batch["present"]
         runs.append(trained(module, [batch, batch]))
     same(*runs)
 
@@ -108,7 +108,7 @@ def test_hand_codes_learn_from_clips_with_hands_alone(kind: str) -> None:
         batch = batch_of(module.net.columns, [3, 1, 2, 0])
         part = {name: value[rows] for name, value in batch.items()}
         for _ in range(3):
-            out = module.net(part["motion"], part["length"], part["held"])
+            out = module.net(part["motion"], part["length"], part["present"])
         assert out.codes["hand"].max() < 8
         books.append((module.net.codebooks()["hand"].codebook, out.metrics["penalty_hand"]))
     torch.testing.assert_close(*books)
@@ -133,10 +133,10 @@ def test_a_batch_without_hands_teaches_the_hands_nothing(kind: str) -> None:
 def test_decoding_knows_of_no_hands_as_training_does() -> None:
     net = module_of(CONFIGS["h2vq"]).net
     batch = batch_of(net.columns, HELD)
-    net(batch["motion"], batch["length"], batch["held"])
+    net(batch["motion"], batch["length"], batch["present"])
     net.eval()
-    out = net(batch["motion"], batch["length"], batch["held"])
-    decoded = net.decode(out.codes, batch["length"], batch["held"])
+    out = net(batch["motion"], batch["length"], batch["present"])
+    decoded = net.decode(out.codes, batch["length"], batch["present"])
     torch.testing.assert_close(decoded, net.features(out.written, batch["length"]), rtol=1e-4, atol=1e-5)
 
 
@@ -153,10 +153,10 @@ def test_a_quantizer_waits_for_its_first_vectors() -> None:
     assert (torch.cdist(book.codebook, rows).min(1).values < 1).all(), "random codes are replaced"
 
 
-def captioned(held: list[int], columns: Tensor) -> dict[str, Tensor]:
-    size = len(held)
+def captioned(present: list[int], columns: Tensor) -> dict[str, Tensor]:
+    size = len(present)
     torch.manual_seed(2)
-    return batch_of(columns, held) | {
+    return batch_of(columns, present) | {
         "conditions": {
             "text": Condition(
                 torch.randn(size, 3, 6), torch.ones(size, 3, dtype=torch.bool), torch.randn(size, 6)
@@ -183,6 +183,6 @@ def test_missing_columns_are_not_reconstructed(kind: str) -> None:
     assert bias.grad is not None and (bias.grad[hand] == 0).all() and bias.grad[:60].abs().min() > 0
     told = captioned([3, 3, 3, 3], columns)
     whole, _, _ = trained(module, [told])
-    del told["held"]
+    del told["present"]
     same(trained(module, [told])[0], whole)
     assert torch.isfinite(losses[0]["loss"]) and losses[0]["loss"] != whole[0]["loss"]

@@ -31,9 +31,9 @@ OPTIM = OptimConfig()
 
 
 def windows(dim: int) -> dict[str, Any]:
-    held = torch.ones(4, dim, dtype=torch.bool)
-    held[1:3, -60:] = False  # columns of the hands
-    return {"motion": torch.randn(4, 16, dim), "length": torch.tensor([16, 16, 12, 9]), "held": held}
+    present = torch.ones(4, dim, dtype=torch.bool)
+    present[1:3, -60:] = False  # columns of the hands
+    return {"motion": torch.randn(4, 16, dim), "length": torch.tensor([16, 16, 12, 9]), "present": present}
 
 
 def captioned(dim: int) -> dict[str, Any]:

@@ -82,10 +82,10 @@ def tokenizer(config: AnyTokenizerConfig, handed: tuple[bool, ...] = ()) -> tupl
         np.zeros(net.dim), np.full(net.dim, 0.02)
     )  # independent noise in every column bends fingers wildly
     module = TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms())
-    held = torch.ones(BATCH, net.dim, dtype=torch.bool)
+    present = torch.ones(BATCH, net.dim, dtype=torch.bool)
     for row in (row for row, has in enumerate(handed) if not has):
-        held[row, np.searchsorted(net.columns.numpy(), LAYOUT.part("hand"))] = False
-    return module, lambda step: motion(step, net.dim) | ({"held": held} if handed else {})
+        present[row, np.searchsorted(net.columns.numpy(), LAYOUT.part("hand"))] = False
+    return module, lambda step: motion(step, net.dim) | ({"present": present} if handed else {})
 
 
 def captions(step: int) -> dict[str, Tensor]:
@@ -133,10 +133,10 @@ def gpt() -> tuple[StageModule, Batches]:
         text = torch.randn(BATCH, 16, generator=generator, dtype=torch.float64)
         # One clip without hands on the first rank, two on the other.
         handless = torch.tensor([False, False, True, False, True, True])
-        held = torch.ones(BATCH, LAYOUT.dim, dtype=torch.bool)
-        held[handless.nonzero(), torch.from_numpy(LAYOUT.part("hand"))] = False
+        present = torch.ones(BATCH, LAYOUT.dim, dtype=torch.bool)
+        present[handless.nonzero(), torch.from_numpy(LAYOUT.part("hand"))] = False
         known = ~(handless[:, None] & (kinds == 1)) | (tokens == 9)
-        told = {"similarity": captions(step)["similarity"], "known": known, "held": held}
+        told = {"similarity": captions(step)["similarity"], "known": known, "present": present}
         return {"tokens": tokens, "kinds": kinds, "text": text, **told}
 
     return module.eval(), batch

@@ -156,7 +156,7 @@ def toy_batch(module: UttModule, frames: int = 20) -> dict[str, Any]:
         "motion": torch.randn(4, frames, dim, generator=generator),
         "length": torch.tensor([20, 16, 8, 13]),
         "closed": torch.tensor([True, False, True, False]),
-        "held": torch.ones(4, dim, dtype=torch.bool),
+        "present": torch.ones(4, dim, dtype=torch.bool),
         "conditions": {
             "text": Condition(torch.randn(4, 3, 4, generator=generator), text),
             "audio": Condition(torch.randn(4, frames, 3, generator=generator), audio),
@@ -173,7 +173,7 @@ def test_tokens_are_those_of_the_frozen_tokenizer() -> None:
     assert length.tolist() == [5 * whole + 2, 4 * whole, 2 * whole + 2, 3 * whole]
     for row, groups in enumerate([5, 4, 2, 3]):
         motion = batch["motion"][row : row + 1, : 4 * groups]
-        alone = tokenizer.encode(motion, torch.tensor([4 * groups]), batch["held"][row : row + 1])
+        alone = tokenizer.encode(motion, torch.tensor([4 * groups]), batch["present"][row : row + 1])
         expected = interleave(alone, tokenizer.pattern).tokens[0]
         assert torch.equal(tokens[row, : groups * whole], expected)
     assert not any("tokenizer" in name for name in module.state_dict())

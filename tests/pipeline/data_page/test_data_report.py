@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Dropped, UserError
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
-from motionloom.pipeline.data_page.clips import choose, joints_of, watch
+from motionloom.pipeline.data_page.clips import choose, watch
 from motionloom.pipeline.data_page.facts import gather
 from motionloom.pipeline.data_page.page import write_data_report
 

@@ -16,7 +16,9 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.pretrained import MotionModel, write_bundle
 
-PARTS = ["stats", "tokenizer", "tma", "gpt", "face_tokenizer", "face_gpt", "face_vae", "face_diffusion"]
+STAGES = [
+    "stats", "text", "tokenizer", "tma", "gpt", "face_tokenizer", "face_gpt", "face_vae", "face_diffusion",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +41,12 @@ def change(path: Path, edit: Callable[[Any], Any]) -> None:
     path.write_text(json.dumps(data))
 
 
-def test_the_folder_lists_its_parts(whole: Path) -> None:
-    assert json.loads((whole / "bundle.json").read_text())["parts"] == PARTS
-    assert {path.name for path in whole.iterdir() if path.is_dir()} == set(PARTS)
+def test_the_folder_lists_its_stages(whole: Path) -> None:
+    facts = json.loads((whole / "bundle.json").read_text())
+    assert facts["generators"] == ["gpt", "face_gpt", "face_vae", "face_diffusion"]
+    assert set(facts["stages"]) == {path.name for path in whole.iterdir() if path.is_dir()} == set(STAGES)
+    assert facts["stages"]["gpt"]["inputs"] == {"tokenizer": "tokenizer", "text": "text", "tma": "tma"}
+    assert facts["stages"]["face_gpt"]["inputs"] == {"tokenizer": "face_tokenizer", "text": "text"}
 
 
 def test_the_hubs_helper_misses_nothing(whole: Path, small_run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,52 +58,134 @@ def test_the_hubs_helper_misses_nothing(whole: Path, small_run: Any, monkeypatch
     assert not said
 
 
-@pytest.mark.parametrize("part", PARTS)
-def test_a_lost_part_is_named(part: str, model: Path) -> None:
-    shutil.rmtree(model / part)
-    with pytest.raises(UserError, match=f"bundle.json: its part '{part}' is not here"):
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_lost_stage_is_named(stage: str, model: Path) -> None:
+    shutil.rmtree(model / stage)
+    with pytest.raises(UserError, match=f"bundle.json: its stage '{stage}' is not here"):
         Bundle.open(model)
 
 
-def test_a_folder_of_before_opens(model: Path) -> None:
-    """Without the list of parts, and without config.json."""
-    change(model / "bundle.json", lambda facts: facts.pop("parts"))
+OLD = {
+    "layout": {"name": "wholebody363", "fps": 20.0, "family": "exact"},
+    "text_encoder": "minilm",
+    "parts": ["stats", "tokenizer", "gpt"],
+}
+
+
+@pytest.mark.parametrize("text", [json.dumps(OLD), '{"format": 3}', "[]", "{", "\x00"])
+def test_a_folder_of_another_version_is_refused(text: str, model: Path) -> None:
+    """One of before `format`, one of a later version, and what is no export."""
+    (model / "bundle.json").write_text(text)
+    with pytest.raises(UserError, match=r"bundle.json: .*export the run again"):
+        MotionModel.from_pretrained(model)
+
+
+def test_config_json_is_for_the_hub_alone(model: Path) -> None:
     (model / "config.json").unlink()
-    shutil.rmtree(model / "face_vae")
-    assert set(MotionModel.from_pretrained(model).bundle.faces) == {"gpt", "diffusion"}
+    assert set(MotionModel.from_pretrained(model).bundle.faces) == {"gpt", "vae", "diffusion"}
 
 
 @pytest.mark.parametrize("name", ["../secret", "/etc", "..", ".", "", "a/b", "a\\b", "lost", "some/hub-name"])
 def test_the_text_encoder_is_never_outside(name: str, model: Path) -> None:
     (model.parent / "secret").mkdir()
     (model / "a/b").mkdir(parents=True)
-    change(model / "bundle.json", lambda facts: facts.update(text_encoder=name))
+    change(model / "text/text.json", lambda facts: facts.update(encoder=name))
     with pytest.raises(UserError, match="neither 'minilm' nor a folder beside this file"):
-        Bundle.open(model)
+        Bundle.open(model).generate(["a person waves"], seconds=1.0)
 
 
-@pytest.mark.parametrize("part", ["../gpt", "gtp", "text"])
-def test_a_part_is_one_that_is_known(part: str, model: Path) -> None:
-    change(model / "bundle.json", lambda facts: facts["parts"].append(part))
-    with pytest.raises(UserError, match=f"its part '{part}' is not here"):
-        Bundle.open(model)
+def test_the_encoder_of_the_config_is_not_followed(model: Path) -> None:
+    """What a text stage was configured with is a place on another machine."""
+    change(model / "bundle.json", lambda f: f["stages"]["text"]["config"].update(encoder="/etc"))
+    assert Bundle.open(model).generate(["a person waves"], seconds=1.0)
+    (model / "text/text.json").unlink()
+    with pytest.raises(UserError, match=r"text.json: no such file"):
+        Bundle.open(model).generate(["a person waves"], seconds=1.0)
+
+
+@pytest.mark.parametrize("name", ["../gpt", "/etc", "..", ".", "", "gtp", "a/b"])
+def test_a_stage_is_one_that_is_listed_and_beside(name: str, model: Path) -> None:
+    """Also one that is listed by a name that leads out of the folder."""
+    shutil.copytree(model / "gpt", model.parent / "gpt")
+    (model / "a/b").mkdir(parents=True)
+    whole = (model / "bundle.json").read_text()
+
+    def alias(facts: Any) -> None:
+        facts["generators"].append(name)
+        facts["stages"][name] = facts["stages"]["gpt"]
+
+    def feed(facts: Any) -> None:
+        facts["stages"][name] = facts["stages"]["tokenizer"]
+        facts["stages"]["gpt"]["inputs"]["tokenizer"] = name
+
+    for edit in (alias, feed, lambda facts: facts["generators"].append(name)):
+        (model / "bundle.json").write_text(whole)
+        change(model / "bundle.json", edit)
+        with pytest.raises(UserError, match=f"its stage '{name}' is not here"):
+            Bundle.open(model)
+
+
+WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "a circle": (
+        lambda f: f["stages"]["tokenizer"]["inputs"].update(stats="gpt"), "stage 'gpt' needs itself"
+    ),
+    "itself": (lambda f: f["stages"]["stats"]["inputs"].update(data="stats"), "'stats' needs itself"),
+    "an unknown kind": (
+        lambda f: f["stages"]["gpt"].update(kind="os"), "stages.gpt: stage kind 'os' is not known here"
+    ),
+    "another version": (
+        lambda f: f["stages"]["gpt"].update(version=1), "stages.gpt was made by version 1 of kind gpt"
+    ),
+    "a wrong config": (
+        lambda f: f["stages"]["gpt"]["config"].update(priorr=1), "stages.gpt.config: unknown key 'priorr'"
+    ),
+    "no generator": (lambda f: f.update(generators=[]), "no finished stage here generates body motion"),
+    "faces alone": (lambda f: f.update(generators=["face_vae"]), "here generates body motion"),
+    "what does not generate": (
+        lambda f: f["generators"].append("stats"), "stage 'stats' .*generates nothing.*export the run again"
+    ),
+    "an input that is missing": (
+        lambda f: f["stages"]["gpt"]["inputs"].pop("tokenizer"), "no finished 'tokenizer' stage here"
+    ),
+    "an unknown key": (lambda f: f.update(code="os"), "unknown key 'code'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_cannot_be_is_refused_in_a_sentence(name: str, model: Path) -> None:
+    edit, says = WRONG[name]
+    change(model / "bundle.json", edit)
+    with pytest.raises(UserError, match=says):
+        MotionModel.from_pretrained(model)
+
+
+def test_an_export_that_fails_leaves_nothing(
+    small_run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise UserError("the encoder is gone")
+
+    monkeypatch.setattr("motionloom.pipeline.store.text.TextSource.export", fail)
+    with pytest.raises(UserError, match="the encoder is gone"):
+        write_bundle(small_run.folder, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("part", "key"),
+    ("stage", "key"),
     [
         ("gpt", "text_dim"), ("gpt", "streams"), ("gpt", "pattern"), ("gpt", "prior"), ("tma", "text_dim"),
         ("tma", "max_frames"), ("face_diffusion", "motion_dim"), ("face_diffusion", "text_dim"),
     ],
 )  # fmt: skip
-def test_a_lost_fact_is_named(part: str, key: str, model: Path) -> None:
-    path = model / part / "model.json"
+def test_a_lost_fact_is_named(stage: str, key: str, model: Path) -> None:
+    path = model / stage / "model.json"
     for edit, says in (
         (lambda facts: facts["extra"].update({key: None}), "= None is no "),
         (lambda facts: facts["extra"].pop(key), "is required"),
     ):
         change(path, edit)
-        with pytest.raises(UserError, match=f"{part}/model.json: key 'extra.{key}' {says}"):
+        with pytest.raises(UserError, match=f"{stage}/model.json: key 'extra.{key}' {says}"):
             Bundle.open(model)
 
 

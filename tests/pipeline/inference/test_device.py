@@ -12,18 +12,17 @@ import numpy as np
 import pytest
 import torch
 
-from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.build import build_text_cache
 from motionloom.datasets.text.cache import TextCache
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import CPU, Shelf
 from motionloom.pipeline.evaluation.figures import embed_motions
-from motionloom.pipeline.evaluation.truth import reconstruct, truth_of
+from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.sampling import SamplingConfig
 from motionloom.pipeline.launch.hardware import Hardware, choose_device
 from motionloom.pipeline.stages.tokens import encode_split
-from motionloom.pipeline.store.data import open_split
-from motionloom.pipeline.store.networks import CPU, LoadedTma, load_tokenizer
 
 CAPTIONS = ["a person waves with the left hand", "a person walks"]
 
@@ -56,9 +55,10 @@ def test_motions_are_made_where_the_networks_lie(face: str, second: ModuleType, 
     near = Bundle.open(small_run.folder)
     with second.second_device() as device:
         far = Bundle.open(small_run.folder, device)
-        assert far.device == far.tma.device == device  # type: ignore[union-attr]
+        given = far.shelf.given(far.main.inputs)
+        assert far.device == given["tma"].device == device
         made = far.generate(CAPTIONS, seconds=2.0, seed=3, sampling=sampling)
-    assert str(far.text_encoder._model.device) == str(device)
+    assert str(given["text"].encoder._model.device) == str(device)
     for ours, theirs in zip(
         made, near.generate(CAPTIONS, seconds=2.0, seed=3, sampling=sampling), strict=True
     ):
@@ -70,19 +70,19 @@ def test_motions_are_made_where_the_networks_lie(face: str, second: ModuleType, 
 def test_tokens_captions_and_clips_are_encoded_where_the_networks_lie(
     second: ModuleType, small_run: Any, tmp_path: Path
 ) -> None:
-    stages = small_run.folder / "stages"
-    dataset = open_split(stages / "data", "test")
-    stats = FeatureStats.load(stages / "stats/stats.safetensors")
+    stages = finished_stages(small_run.folder)
+    dataset = Shelf().get(stages["data"]).split("test")
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
 
     def everything(device: torch.device, name: str) -> list[Any]:
-        tokenizer, tma = load_tokenizer(stages / "tokenizer", device), LoadedTma.load(stages / "tma", device)
+        shelf = Shelf(device)
+        tokenizer, tma = shelf.get(stages["tokenizer"]), shelf.get(stages["tma"])
         captions = [truth.caption for truth in truths]
         cache = build_text_cache(tmp_path / name, captions, "minilm", progress=False, device=str(device))
         assert isinstance(cache, TextCache)
-        codes = encode_split(tokenizer, dataset, stats, 256).codes
-        rebuilt = reconstruct(tokenizer, stats, truths[0].features)
-        motions = embed_motions(tma, stats, [truth.features for truth in truths])
+        codes = encode_split(tokenizer.net, dataset, tokenizer.stats, 256).codes
+        rebuilt = tokenizer.reconstruct(truths[0].features)
+        motions = embed_motions(tma, [truth.features for truth in truths])
         values = [*codes.values(), motions, tma.embed_captions(captions, cache)]
         assert all(value.device == CPU for value in values)
         return [*(value.numpy() for value in values), rebuilt, cache.sentence(captions)]

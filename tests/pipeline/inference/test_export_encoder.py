@@ -16,7 +16,9 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.build import build_text_cache
-from motionloom.pipeline.inference.bundle import Bundle, text_encoder_of
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.pretrained import write_bundle
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.graph import Selection
@@ -63,6 +65,11 @@ def motions(folder: Path) -> list[np.ndarray]:
     return [motion.joints for motion in Bundle.open(folder).generate(CAPTIONS, seconds=1.0, seed=3)]
 
 
+def text_encoder_of(run: Path) -> str:
+    """The encoder that the run's text stage loads."""
+    return str(Shelf().get(finished_stages(run)["text"]).encoder_name)
+
+
 def check_alone(run: Path, exported: Path, *originals: Path) -> None:
     """The exported folder gives the run's motions when neither the run nor its encoder is left."""
     wanted = motions(run)
@@ -71,8 +78,10 @@ def check_alone(run: Path, exported: Path, *originals: Path) -> None:
         shutil.rmtree(folder)
     for made, first in zip(motions(exported), wanted, strict=True):
         np.testing.assert_array_equal(made, first)
-    files = [path for path in (exported / "text_encoder").rglob("*") if path.is_file()]
-    assert {path.suffix for path in files} <= {".safetensors", ".json", ".txt"}
+    files = [path for path in (exported / "text/encoder").rglob("*") if path.is_file()]
+    assert {path.suffix for path in files} <= {".safetensors", ".json", ".txt"} and files
+    for original in originals:
+        assert str(original) not in (exported / "bundle.json").read_text(), "a place on the maker's machine"
 
 
 @pytest.mark.slow
@@ -87,7 +96,7 @@ def test_a_folder_named_from_where_the_run_was_started(
     (encoder / "pytorch_model.bin").write_bytes(b"pickled")
     monkeypatch.chdir(start)
     run = train(tmp_path, encoder.name)
-    assert text_encoder_of(run / "stages/text") == str(encoder)
+    assert text_encoder_of(run) == str(encoder)
     monkeypatch.chdir(elsewhere)
     check_alone(run, tmp_path / "exported", encoder)
 
@@ -102,7 +111,7 @@ def test_a_model_of_the_hub(models: ModuleType, tmp_path: Path, monkeypatch: pyt
     (stored / "refs/main").write_text("f00d")
     shutil.copytree(models.tiny_clip(tmp_path), stored / "snapshots/f00d")
     run = train(tmp_path, HUB_NAME)
-    assert text_encoder_of(run / "stages/text") == HUB_NAME
+    assert text_encoder_of(run) == HUB_NAME
     kept = tmp_path / "kept"
     shutil.copytree(run, kept)
     check_alone(run, tmp_path / "exported", cache)

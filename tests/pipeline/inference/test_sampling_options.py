@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from toy_stages import MadeStage
 
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
@@ -17,11 +20,14 @@ from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import Finished, Shelf
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.faces import DiffusionFace, GptFace, VaeFace
 from motionloom.pipeline.inference.requests import require_used
-from motionloom.pipeline.inference.sampling import SamplingConfig
-from motionloom.pipeline.store.networks import freeze
+from motionloom.pipeline.stages.diffusion import DiffusionFace
+from motionloom.pipeline.stages.gpt import GptGenerator
+from motionloom.pipeline.stages.tma import VaeFace
+from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer
 
 GPT = GptConfig(layers=1, dim=16, heads=2, ff=16, block_size=32)
 DENOISER = DiffusionConfig(dim=16, ff=16, layers=1, heads=2)
@@ -41,7 +47,7 @@ class Encoder:
 
 def opinionated(gpt: InterleavedGPT) -> InterleavedGPT:
     """An untrained GPT whose next token depends on the text."""
-    freeze(gpt)
+    gpt.eval().requires_grad_(False)
     gpt.text_in.weight *= 5
     for head in gpt.heads:
         head.weight *= 50
@@ -54,22 +60,33 @@ def bundle(
     """An untrained model; `face` is the config of its face generators' networks."""
     torch.manual_seed(0)
     layout = MotionLayout.named("wholebody363", fps=fps)
+    stats = FeatureStats(np.zeros(363, np.float32), np.ones(363, np.float32), layout)
+    given = {"stats": stats, "text": SimpleNamespace(encoder=Encoder())}
     small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
     tokenizer = build_tokenizer(H2VQConfig(**small), layout).freeze()
     gpt = opinionated(InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, 8))
-    made: dict[str, Any] = {}
+
+    def of(levels: Any, net: InterleavedGPT, face: bool) -> GptGenerator:
+        trained = {"tokenizer": TrainedTokenizer(levels, given), "text": given["text"]}
+        return GptGenerator(LoadedGpt(net, "sentence"), trained, face)
+
+    made: list[Any] = [of(tokenizer, gpt, False)]
     if "gpt" in faces:
         levels = build_tokenizer(RvqConfig(part="face", **small), layout).freeze()
         net = opinionated(InterleavedGPT(face or GPT, levels.streams, levels.pattern, 8))
-        made["gpt"] = GptFace(levels, net, "sentence")
+        made.append(of(levels, net, True))
     if "diffusion" in faces:
         denoiser = MotionDiffusion(face or DENOISER, 50, 8)
-        freeze(denoiser)
-        made["diffusion"] = DiffusionFace(denoiser)
-    stats = FeatureStats(np.zeros(363, np.float32), np.ones(363, np.float32), layout)
-    out = Bundle(layout, stats, "fixed", tokenizer, gpt, "sentence", None, made)
-    out.__dict__["text_encoder"] = Encoder()
-    return out
+        made.append(DiffusionFace(denoiser.eval().requires_grad_(False), layout, given))
+    if "vae" in faces:
+        made.append(VaeFace(SimpleNamespace(given=given)))  # type: ignore[arg-type]
+    return Bundle([stage(f"stage{k}", one) for k, one in enumerate(made)], Shelf())
+
+
+def stage(name: str, made: Any, **given: Any) -> Finished:
+    """A finished stage that gives `made`, and those that feed it."""
+    above = {role: stage(role, SimpleNamespace(encoder=one)) for role, one in given.items()}
+    return Finished(name, MadeStage(made), None, Path(name), above)
 
 
 def test_a_length_for_each_caption() -> None:
@@ -156,7 +173,11 @@ WRONG_ASKS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
     "no sampling": ((), {"sampling": 3}, "sampling: "),
     "face of no face": ((), {"face_captions": CAPTIONS}, "this model makes no face"),
     "guidance of no face": ((), {"sampling": {"face_cfg_scale": 3.0}}, "this model makes no face"),
-    "steps of no face": ((), {"sampling": {"denoising_steps": 9}}, r"\(--steps\): only a diffusion model"),
+    "steps of no face": (
+        (),
+        {"sampling": {"denoising_steps": 9}},
+        r"\(--steps\): no generator that is used here takes it; leave it out",
+    ),
     "sampler of a GPT": (("gpt",), {"sampling": {"sampler": "ddim"}}, r"\(--sampler\): .*; leave it out"),
     "steps beside a diffusion model": (
         ("gpt", "diffusion"),
@@ -174,10 +195,31 @@ def test_what_has_no_sense_or_no_effect_is_refused(name: str) -> None:
 
 
 def test_a_face_by_a_vae_takes_no_guidance() -> None:
-    face: Any = {"vae": VaeFace(None)}  # type: ignore[arg-type]
-    require_used(face, CAPTIONS, SamplingConfig(cfg_scale=2.0))
-    with pytest.raises(UserError, match="VAE knows no guidance"):
-        require_used(face, CAPTIONS, SamplingConfig(face_cfg_scale=2.0))
+    model = bundle(faces=("vae",))
+    require_used(model, CAPTIONS, SamplingConfig(cfg_scale=2.0))
+    with pytest.raises(UserError, match=r"\(--face-cfg\): no generator .* takes it; leave it out"):
+        require_used(model, CAPTIONS, SamplingConfig(face_cfg_scale=2.0))
+    both = bundle(faces=("vae", "gpt"))
+    assert list(both.faces) == ["gpt", "vae"]
+    with pytest.raises(UserError, match=r"\(--face-cfg\): .*; choose --face-model gpt, or leave it out"):
+        require_used(both, CAPTIONS, SamplingConfig(face_cfg_scale=2.0, face_model="vae"))
+
+
+def test_a_face_is_chosen_by_its_method_or_its_stage() -> None:
+    model = bundle(faces=("gpt", "diffusion"))
+    assert model.choose_face(None) == model.choose_face("gpt") == model.choose_face("stage1")
+    assert model.choose_face("diffusion") == model.choose_face("stage2") == model.stages[2]
+    with pytest.raises(UserError, match="no face generator 'vae' here; there is gpt, diffusion"):
+        model.choose_face("vae")
+
+
+def test_what_is_asked_without_words_is_refused() -> None:
+    """Also where empty captions are not refused as such: there is nothing to make a motion of."""
+    for captions in ([""], ["a person walks", " "]):
+        with pytest.raises(UserError, match=rf"captions\[{len(captions) - 1}\] is empty"):
+            bundle().generate(captions, seconds=0.2)
+    with pytest.raises(UserError, match="nothing to generate from: give captions, sounds or both"):
+        bundle().generate()
 
 
 def test_sampling_may_be_a_mapping() -> None:

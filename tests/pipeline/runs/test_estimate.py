@@ -9,6 +9,7 @@ import torch
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.estimate import estimate
 from motionloom.pipeline.runs.recipe import load_recipe
@@ -27,6 +28,10 @@ stages:
 """
 
 
+def cards(path: Path, *overrides: str) -> dict[str, ModelCard]:
+    return estimate(load_recipe(path, overrides))
+
+
 @pytest.fixture
 def paper(tmp_path: Path) -> Path:
     path = tmp_path / "paper.yaml"
@@ -35,7 +40,8 @@ def paper(tmp_path: Path) -> Path:
 
 
 def test_paper_counts(paper: Path) -> None:
-    rows = {row.stage: row for row in estimate(load_recipe(paper))}
+    rows = cards(paper)
+    assert list(rows) == ["tokenizer", "vanilla", "tma", "gpt"]
     assert rows["gpt"].note == "98 body + 49 hand + 2 End = 149 for 196 frames"
     assert rows["gpt"].parameters == pytest.approx(229e6, rel=0.01)
     # 7.5 groups a second: (2 + 1) x 9 bits against 1 x 10 bits.
@@ -46,10 +52,10 @@ def test_paper_counts(paper: Path) -> None:
 
 def test_memory_follows_batch_and_checkpointing(paper: Path) -> None:
     def memory(*overrides: str) -> int:
-        return next(r.memory_bytes for r in estimate(load_recipe(paper, overrides)) if r.stage == "gpt")
+        return cards(paper, *overrides)["gpt"].memory_bytes
 
     whole = memory()
-    weights = 16 * next(r.parameters for r in estimate(load_recipe(paper)) if r.stage == "gpt")
+    weights = 16 * cards(paper)["gpt"].parameters
     half = memory("gpt.train.batch_size=32")
     assert whole - weights == pytest.approx(2 * (half - weights), rel=0.02)
     assert memory("gpt.train.checkpoint_activations=true") - weights < 0.2 * (whole - weights)
@@ -58,11 +64,7 @@ def test_memory_follows_batch_and_checkpointing(paper: Path) -> None:
 
 def test_half_precision_keeps_the_losses_whole(paper: Path) -> None:
     rows = {
-        precision: next(
-            row
-            for row in estimate(load_recipe(paper, [f"gpt.train.precision={precision}"]))
-            if row.stage == "gpt"
-        )
+        precision: cards(paper, f"gpt.train.precision={precision}")["gpt"]
         for precision in ("32-true", "bf16-mixed")
     }
     kept = {name: row.memory_bytes - 16 * row.parameters for name, row in rows.items()}
@@ -70,10 +72,9 @@ def test_half_precision_keeps_the_losses_whole(paper: Path) -> None:
 
 
 def test_codebooks_are_told(paper: Path) -> None:
-    row = next(r for r in estimate(load_recipe(paper)) if r.stage == "vanilla")
+    row = cards(paper)["vanilla"]
     assert row.codebook == 1024 * 512
-    large = estimate(load_recipe(paper, ["vanilla.net.num_codes=4096", "vanilla.net.reset_below=0.1"]))
-    other = next(r for r in large if r.stage == "vanilla")
+    other = cards(paper, "vanilla.net.num_codes=4096", "vanilla.net.reset_below=0.1")["vanilla"]
     # The codebook itself and its running sums, float32.
     assert other.memory_bytes - row.memory_bytes >= 3072 * 512 * 2 * 4
 
@@ -85,7 +86,7 @@ def test_saved_bytes_of_a_known_network() -> None:
     from motionloom.models.tokenizer.config import VqConfig
     from motionloom.models.tokenizer.module import TokenizerModule
     from motionloom.models.training.stage_module import OptimConfig
-    from motionloom.pipeline.runs.estimate import _saved_bytes
+    from motionloom.pipeline.stages.memory import _saved_bytes
 
     config = VqConfig(width=16, depth=1, code_dim=16, num_codes=32)
     sizes = []

@@ -13,14 +13,15 @@ from pathlib import Path
 import pytest
 from pydantic import Field
 from rich.console import Console
+from toy_stages import register_toys
 
+from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.stage import RUNTIME, Every, FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.runs.graph import Selection, execute, make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
-from motionloom.pipeline.stages import table
-from motionloom.pipeline.stages.stage import RUNTIME, StageConfig, StageContext, StageKind
 from motionloom.pipeline.store.artifact import Artifact
-from motionloom.pipeline.store.files import atomic, write_json
+from motionloom.pipeline.store.files import write_json
 
 
 class AddConfig(StageConfig):
@@ -29,15 +30,17 @@ class AddConfig(StageConfig):
 
 
 def run_add(context: StageContext) -> None:
-    above = [json.loads((folder / "value.json").read_text()) for folder in context.inputs.values()]
+    above = [json.loads((above.folder / "value.json").read_text()) for above in context.inputs.values()]
     write_json(context.folder / "value.json", sum(above) + context.config.add)
 
 
 @pytest.fixture(autouse=True)
 def toy_kinds(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setitem(table.STAGES, "root", StageKind("root", "a number", AddConfig, run_add))
-    monkeypatch.setitem(
-        table.STAGES, "sum", StageKind("sum", "a sum", AddConfig, run_add, ("left", "right?"))
+    register_toys(
+        monkeypatch,
+        FunctionStage("root", "a number", AddConfig, run_add, given_names=frozenset({"number"})),
+        FunctionStage("sum", "a sum", AddConfig, run_add, ("left", "right?")),
+        FunctionStage("all", "a sum", AddConfig, run_add, (Every("numbers", "number"),)),
     )
     yield
 
@@ -105,8 +108,8 @@ def test_lost_output_runs_again(tmp_path: Path) -> None:
 
 def test_new_version_of_a_kind_runs_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go(tmp_path)
-    monkeypatch.setitem(
-        table.STAGES, "sum", StageKind("sum", "a sum", AddConfig, run_add, ("left", "right?"), version=2)
+    register_toys(
+        monkeypatch, FunctionStage("sum", "a sum", AddConfig, run_add, ("left", "right?"), version=2)
     )
     assert go(tmp_path) == ["both", "one", "top"]
 
@@ -122,6 +125,63 @@ def test_selection(tmp_path: Path) -> None:
         go(tmp_path, "right.add=4", select=Selection(only="top"))
 
 
+SEVERAL = """
+name: several
+stages:
+  every: {kind: all}
+  first: {kind: root}
+  second: {kind: root, add: 2}
+  listed: {kind: all, inputs: {numbers: [second, first]}}
+  one: {kind: all, inputs: {numbers: second}}
+"""
+
+
+def several(tmp_path: Path, *overrides: str) -> Recipe:
+    path = tmp_path / "several.yaml"
+    path.write_text(SEVERAL)
+    return load_recipe(path, overrides)
+
+
+def test_a_role_is_filled_by_every_stage_that_gives_it(tmp_path: Path) -> None:
+    loaded, run = several(tmp_path), tmp_path / "run"
+    filled = {stage.name: list(stage.inputs.values()) for stage in loaded.stages}
+    assert filled["every"] == ["first", "second"]
+    assert filled["listed"] == ["second", "first"] and filled["one"] == ["second"]
+    execute(loaded, run, make_plan(loaded, run), Console(quiet=True))
+    assert [value(tmp_path, name) for name in ("every", "listed", "one")] == [4, 4, 3]
+    again = load_recipe(run / "recipe.yaml")
+    assert again == loaded, "the resolved recipe is the recipe"
+    assert [s.inputs for s in again.stages] == [s.inputs for s in loaded.stages]
+    assert {row.action for row in make_plan(again, run)} == {"skip"}
+
+
+def test_the_order_of_a_list_counts(tmp_path: Path) -> None:
+    """The first of several generators is the default, so another order makes something else."""
+    loaded, run = several(tmp_path), tmp_path / "run"
+    execute(loaded, run, make_plan(loaded, run), Console(quiet=True))
+    turned = several(tmp_path, "listed.inputs.numbers=[first, second]")
+    rows = {row.stage.name: (row.action, row.reason) for row in make_plan(turned, run)}
+    assert rows.pop("listed") == ("run", "seed, source files or the order of inputs changed")
+    assert {action for action, _ in rows.values()} == {"skip"}
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        (
+            "listed.inputs.numbers=[frst]",
+            "numbers: 'frst' is no stage that gives a number; did you mean 'first'",
+        ),
+        ("listed.inputs.numbers=[every]", "'every' is no stage that gives a number"),
+        ("listed.inputs.numbers=7", r"numbers must list stages, like \[gpt\]"),
+        ("listed.inputs.number=[first]", "unknown role 'number'; did you mean 'numbers'"),
+    ],
+)
+def test_a_list_of_what_does_not_fit_is_refused(override: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=says):
+        several(tmp_path, override)
+
+
 def test_artifact_lists_outputs_and_inputs(tmp_path: Path) -> None:
     go(tmp_path)
     artifact = Artifact.find(tmp_path / "run/stages/both")
@@ -131,7 +191,7 @@ def test_artifact_lists_outputs_and_inputs(tmp_path: Path) -> None:
 
 
 def test_atomic_leaves_nothing_on_error(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), atomic(tmp_path / "file") as temporary:
+    with pytest.raises(RuntimeError), atomic_path(tmp_path / "file") as temporary:
         temporary.write_text("half")
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []

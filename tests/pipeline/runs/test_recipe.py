@@ -11,8 +11,10 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.estimate import estimate
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.shipped import shipped_recipes
+from motionloom.pipeline.store.yaml import read_yaml
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -34,6 +36,41 @@ def test_shipped_recipes_load_and_reload(name: str, tmp_path: Path) -> None:
     recipe = load_recipe(name)
     assert recipe.description
     assert load_recipe(write(tmp_path, recipe.to_yaml())) == recipe
+
+
+def test_shipped_recipes_are_named_by_folder_and_size() -> None:
+    for name, path in shipped_recipes().items():
+        assert read_yaml(path)["name"] == name == f"{path.parent.name}-{path.stem}"
+        assert load_recipe(f"{path.parent.name}/{path.stem}").name == name
+
+
+@pytest.mark.parametrize("name", sorted(name for name in shipped_recipes() if name.startswith("ude-")))
+def test_sizes_of_ude_are_known_before_it_runs(name: str) -> None:
+    recipe = load_recipe(name)
+    cards = estimate(recipe)
+    decoded_by_tokenizer = name.endswith(("vq-decoder", "gru"))
+    assert set(cards) == {"tokenizer", "utt"} | (set() if decoded_by_tokenizer else {"dmd"})
+    assert cards["utt"].note == "40 code + 1 End for 160 frames"
+    for stage in recipe.stages:
+        stage.config.require_fit(recipe.hardware)
+
+
+def test_ablations_of_ude_change_what_they_are_named_for() -> None:
+    """Tables 3 to 5; beside what is named, the recipes of a size are equal."""
+    for size in ("tiny", "paper"):
+        base, gru = load_recipe(f"ude-{size}"), load_recipe(f"ude-{size}-gru")
+        assert base.stage("ude").config.inject_z  # type: ignore[attr-defined]
+        assert "dmd" in base.stage("ude").inputs
+        for name in ("no-z", "no-z-vq-decoder", "vq-decoder"):
+            recipe = load_recipe(f"ude-{size}-{name}")
+            config = recipe.stage("ude").config
+            assert config.inject_z == (name == "vq-decoder")  # type: ignore[attr-defined]
+            assert ("dmd" in recipe.stage("ude").inputs) == (name == "no-z")
+            trained = {stage.name: stage for stage in recipe.stages if stage.kind.trains}
+            assert all(stage == base.stage(name) for name, stage in trained.items())
+        assert gru.stage("utt").config.net == base.stage("utt").config.net.model_copy(  # type: ignore[attr-defined]
+            update={"kind": "gru"}
+        )
 
 
 def test_override_changes_one_value() -> None:
@@ -139,6 +176,16 @@ def test_a_codebook_too_large_for_its_batches_is_refused(override: str, tmp_path
                 console=Console(quiet=True),
             )
     assert not list(tmp_path.rglob("artifact.json")), "refused before anything ran"
+
+
+def test_a_codebook_of_mq_is_reset_only_if_averages_learn_it() -> None:
+    """256 vectors a batch, 256 codes: a threshold of 1 would reset codes for ever, a gradient resets none."""
+    sets = ["tokenizer.net.reset_below=1.0"]
+    with pytest.raises(UserError, match=r"256 codes gets 256 vectors .*net.reset_below to 0\.25 or less"):
+        recipe = load_recipe("ude-tiny", sets)
+        recipe.stage("tokenizer").config.require_fit(recipe.hardware)  # type: ignore[attr-defined]
+    recipe = load_recipe("ude-tiny", [*sets, "tokenizer.net.quantizer=gradient"])
+    recipe.stage("tokenizer").config.require_fit(recipe.hardware)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import jsonschema
 import pytest
-import yaml
 
 from motionloom.pipeline.runs.schema import recipe_schema
 from motionloom.pipeline.runs.shipped import shipped_recipes
+from motionloom.pipeline.store.yaml import read_yaml
 
 VALIDATOR = jsonschema.Draft202012Validator(recipe_schema())
 
@@ -18,7 +18,7 @@ def test_schema_is_a_schema() -> None:
 
 @pytest.mark.parametrize("name", sorted(shipped_recipes()))
 def test_shipped_recipes_pass(name: str) -> None:
-    VALIDATOR.validate(yaml.safe_load(shipped_recipes()[name].read_text()))
+    VALIDATOR.validate(read_yaml(shipped_recipes()[name]))
 
 
 @pytest.mark.parametrize(
@@ -33,3 +33,18 @@ def test_shipped_recipes_pass(name: str) -> None:
 )
 def test_mistakes_are_refused(stage: dict) -> None:
     assert not VALIDATOR.is_valid({"name": "x", "stages": {"s": stage}})
+
+
+@pytest.mark.parametrize(
+    ("defaults", "right"),
+    [
+        ({"trained": {"train": {"steps": 3}}, "vq": {"net": {"width": 8}}, "bvh": {"fps": 20}}, True),
+        ({"trained": {"net": {"width": 8}}}, False),
+        ({"vq": {"kind": "vq"}}, False),
+        ({"vq": {"net": {"widht": 8}}}, False),
+        ({"vqq": {}}, False),
+    ],
+)
+def test_defaults_are_checked(defaults: dict, right: bool) -> None:
+    stages = {"data": {"kind": "bvh"}, "vq": {"kind": "vq"}, "removed": None}
+    assert VALIDATOR.is_valid({"name": "x", "defaults": defaults, "stages": stages}) == right

@@ -9,16 +9,24 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from toy_stages import register_toys
 
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import (
+    ALIGNMENT,
+    GENERATOR,
+    FunctionStage,
+    StageConfig,
+    StageContext,
+)
 from motionloom.pipeline.evaluation.retrieval import retrieve
-from motionloom.pipeline.inference.bundle import Bundle, part_folders
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe
 from motionloom.pipeline.runs.graph import Selection
-from motionloom.pipeline.stages import table
-from motionloom.pipeline.stages.stage import StageConfig, StageContext, StageKind
 from motionloom.pipeline.store.artifact import require_consistent
-from motionloom.pipeline.store.files import write_json, write_text
+from motionloom.pipeline.store.files import write_json
 
 RECIPE = """
 name: NAME
@@ -38,13 +46,14 @@ INPUTS = {
     "stats": ("data",),
     "text": ("data",),
     "tokenizer": ("data",),
-    "tma": ("data",),
+    "tma": ("data", "stats", "text"),
     "tokens": ("tokenizer",),
     "gpt": ("tokens", "tma"),
     "evaluate": ("gpt",),
     "report": ("evaluate",),
 }
 TRAINED = {"tokenizer", "tma", "gpt"}
+GIVES = {"tma": ALIGNMENT, "gpt": GENERATOR, "evaluate": "figures", "report": "page"}
 
 
 class AddConfig(StageConfig):
@@ -66,8 +75,11 @@ Go = Callable[..., str]
 def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
     """`go("tma.add=2", until="tma")`: run into `tmp_path / "run"`; what was printed."""
     for name, inputs in INPUTS.items():
-        kind = StageKind(name, "a toy", AddConfig, work, inputs, trains=name in TRAINED)
-        monkeypatch.setitem(table.STAGES, name, kind)
+        given = frozenset({GIVES[name]} if name in GIVES else ())
+        kind = FunctionStage(
+            name, "a toy", AddConfig, work, inputs, trains=name in TRAINED, given_names=given
+        )
+        register_toys(monkeypatch, kind)
 
     def run(
         *overrides: str, recipe: str = "toy", dry_run: bool = False, replace: bool = False, **select: object
@@ -95,7 +107,7 @@ def test_a_folder_with_mixed_stages_is_not_used(go: Go, tmp_path: Path) -> None:
         assert f"motionloom run {run / 'recipe.yaml'} -o {run}" in str(error.value)
     run_recipe(run / "recipe.yaml", run, console=Console(quiet=True))  # the fix
     evaluate_run(run, console=Console(quiet=True))
-    require_consistent(run, part_folders(run))
+    require_consistent(run, finished_stages(run))
 
 
 def test_it_goes_up_to_the_first_stage(go: Go, tmp_path: Path) -> None:

@@ -32,9 +32,9 @@ from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig
 from motionloom.models.training.stage_module import OptimConfig
+from motionloom.pipeline.contract.stage import Shelf, StageContext, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt import GptStageConfig
-from motionloom.pipeline.stages.stage import StageContext, fingerprint_fields
 from motionloom.pipeline.stages.tma import TmaStageConfig
 from motionloom.pipeline.stages.tokenizer import H2VQStageConfig
 from motionloom.pipeline.stages.training import TrainConfig, fit, read_metrics
@@ -86,6 +86,7 @@ def train(folder: Path, **settings: Any) -> None:
     context = StageContext(
         name="gpt", recipe="test", config=None, folder=folder, inputs={}, seed=0,
         hardware=Hardware(accelerator="cpu", devices=2, threads=1), console=Console(quiet=True),
+        shelf=Shelf(),
     )  # fmt: skip
     fit(
         context,

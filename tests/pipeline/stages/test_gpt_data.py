@@ -38,17 +38,17 @@ GROUPS = {"walks": (0, 8), "sits": (8, 19), "everything": (0, 22)}
 
 @dataclass(frozen=True)
 class Convert:
-    """Clip i has the captions `texts[i]`, the face captions `faces[i]` and holds the bits `held[i]`."""
+    """Clip i has the captions `texts[i]`, the face captions `faces[i]` and holds the bits `present[i]`."""
 
     texts: Sequence[list[Caption]]
     faces: Sequence[list[Caption]] = ()
-    held: Sequence[int] = ()
+    present: Sequence[int] = ()
 
     def __call__(self, i: int) -> Sample:
         motion = np.random.default_rng(i).standard_normal((FRAMES, LAYOUT.dim)).astype(np.float32)
         meta = LAYOUT.clip_meta(
             f"clip{i}", source="made", split="train", frames=FRAMES, licence="CC0",
-            has_hands=not self.held or bool(self.held[i] & HANDS), truth={"action": "none"},
+            has_hands=not self.present or bool(self.present[i] & HANDS), truth={"action": "none"},
         )  # fmt: skip
         faces = list(self.faces[i]) if self.faces else []
         return Sample(meta, motion, texts=list(self.texts[i]), face_texts=faces)
@@ -87,7 +87,7 @@ def batches_of(clips: GptClips, net: Tokenizer, *, most: int = 40, training: boo
     eye, ends = torch.eye(len(clips.texts)), {s.name: s.num_codes for s in net.streams}
     return TokenBatches(
         clips.store, clips.captions, eye, eye, net.pattern, ends, most, 4, 0, training=training,
-        sources=clips.sources, held=clips.held,
+        sources=clips.sources, present=clips.present,
     )  # fmt: skip
 
 
@@ -185,10 +185,10 @@ def test_no_caption_at_all_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_tokenizer_without_a_hand_stream_needs_hands(tmp_path: Path) -> None:
-    dataset = dataset_of(tmp_path, Convert([[ALL]] * 3, held=(3, 2, 3)))
+    dataset = dataset_of(tmp_path, Convert([[ALL]] * 3, present=(3, 2, 3)))
     config = VqConfig(width=8, depth=1, code_dim=8, num_codes=8)
     clips, _, _ = clips_of(dataset, config=config)
-    assert len(clips.captions) == 2 and clips.held is None and clips.uncaptioned == 0
-    bare = dataset_of(tmp_path / "bare", Convert([[ALL]] * 2, held=(2, 2)))
+    assert len(clips.captions) == 2 and clips.present is None and clips.uncaptioned == 0
+    bare = dataset_of(tmp_path / "bare", Convert([[ALL]] * 2, present=(2, 2)))
     with pytest.raises(UserError, match="holds all that the tokenizer models"):
         clips_of(bare, config=VqConfig(width=8, depth=1, code_dim=8, num_codes=8, part="bodyhand"))

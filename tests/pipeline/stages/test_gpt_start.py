@@ -33,7 +33,7 @@ def run(small_run: Any, tmp_path: Path, call: Callable[..., Any]) -> Callable[..
     def go(*arguments: str, **changes: Any) -> tuple[Any, Path]:
         recipe = yaml.safe_load(small_run.recipe.read_text())
         net = recipe["stages"]["gpt"]["net"]
-        tiny = yaml.safe_load((Path(__file__).parents[3] / "configs/humantomato-tiny.yaml").read_text())
+        tiny = yaml.safe_load((Path(__file__).parents[3] / "configs/humantomato/tiny.yaml").read_text())
         more = {**MORE, "net": {**tiny["stages"]["gpt"]["net"], **net}, **changes}
         recipe["stages"]["more"] = more
         path = tmp_path / "more.yaml"

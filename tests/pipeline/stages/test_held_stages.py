@@ -23,6 +23,7 @@ from motionloom.pipeline.evaluation.figures import reconstruction_figures
 from motionloom.pipeline.evaluation.truth import reconstruct_truth, truth_of
 from motionloom.pipeline.stages.gpt_data import gpt_clips
 from motionloom.pipeline.stages.tokens import encode_split
+from motionloom.pipeline.store.networks import TrainedTokenizer
 from motionloom.pipeline.store.tokens import TokenBatches, TokenStore
 
 TINY: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
@@ -37,7 +38,7 @@ def made() -> ModuleType:
 @pytest.fixture(scope="module")
 def data(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Data:
     """The same training clips with zeros and with garbage in what they do not hold."""
-    roots = [made.write(tmp_path_factory.mktemp("held"), garbage) for garbage in (0.0, 3.0)]
+    roots = [made.write(tmp_path_factory.mktemp("present"), garbage) for garbage in (0.0, 3.0)]
     opened = [ShardDataset.open(root, "train") for root in roots]
     return [(dataset, compute(dataset)) for dataset in opened]
 
@@ -57,7 +58,7 @@ def test_tokens_of_clips_that_lack_a_part(data: Data, part: str, bit: int, tmp_p
     dataset, store = data[0][0], stores[0]
     for name, codes in store.codes.items():
         assert torch.equal(codes, stores[1].codes[name]) and codes.min() >= 0 and codes.max() < 8
-    np.testing.assert_array_equal(store.whole, (dataset.held & bit) > 0)
+    np.testing.assert_array_equal(store.whole, (dataset.present & bit) > 0)
     store.save(tmp_path / "tokens.safetensors")
     loaded = TokenStore.load(tmp_path / "tokens.safetensors", store.per_group)
     whole = loaded.whole_clips()
@@ -74,14 +75,14 @@ def test_gpt_batches_say_which_tokens_were_recorded(data: Data) -> None:
     """Clips without hands are there, with their hand tokens marked; garbage in the hands changes no batch."""
     net, (dataset, stats) = tokenizer(data), data[0]
     clips = gpt_clips(dataset, encode_split(net, dataset, stats, 256), net, face=False, min_frames=16)
-    assert clips.held is not None and len(clips.captions) == len(dataset)
+    assert clips.present is not None and len(clips.captions) == len(dataset)
     own = [clips.texts[captions[0].row] for captions in clips.captions]
     number = len(clips.texts)
     batches = TokenBatches(
         clips.store, clips.captions, torch.eye(number), torch.eye(number), net.pattern,
-        {s.name: s.num_codes for s in net.streams}, 20, 4, 0, sources=clips.sources, held=clips.held,
+        {s.name: s.num_codes for s in net.streams}, 20, 4, 0, sources=clips.sources, present=clips.present,
     )  # fmt: skip
-    hands = {text: bool(bits & HANDS) for text, bits in zip(own, dataset.held.tolist(), strict=True)}
+    hands = {text: bool(bits & HANDS) for text, bits in zip(own, dataset.present.tolist(), strict=True)}
     seen = set()
     for k in range(12):
         batch = batches[k]
@@ -96,9 +97,9 @@ def test_gpt_batches_say_which_tokens_were_recorded(data: Data) -> None:
             seen.add(text)
             codes = (kinds[row] == 1) & ~end[row]
             assert codes.any() and (known[row][codes] == hands[text]).all()
-            assert batch["held"][row].all() == hands[text]
+            assert batch["present"][row].all() == hands[text]
             hand = torch.from_numpy(np.isin(net.columns.numpy(), dataset.layout.part("hand")))
-            assert torch.equal(batch["held"][row], torch.full_like(hand, True) if hands[text] else ~hand)
+            assert torch.equal(batch["present"][row], torch.full_like(hand, True) if hands[text] else ~hand)
     assert {hands[text] for text in seen} == {True, False}
 
 
@@ -106,10 +107,11 @@ def test_figures_do_not_depend_on_what_was_not_recorded(data: Data) -> None:
     net, figures = tokenizer(data), []
     for dataset, stats in data:
         truths = [truth_of(dataset, i) for i in range(len(dataset))]
-        assert [t.face is None for t in truths] == ((dataset.held & FACE) == 0).tolist()
-        figures.append(reconstruction_figures(net, stats, dataset, truths))
-        with_hands = [t for t in truths if t.held & HANDS]
-        alone = reconstruction_figures(net, stats, dataset, with_hands)
+        assert [t.face is None for t in truths] == ((dataset.present & FACE) == 0).tolist()
+        trained = TrainedTokenizer(net, {"stats": stats})
+        figures.append(reconstruction_figures(trained, dataset, truths))
+        with_hands = [t for t in truths if t.present & HANDS]
+        alone = reconstruction_figures(trained, dataset, with_hands)
         assert alone["mpjpe_hand"] == pytest.approx(figures[-1]["mpjpe_hand"])
         assert alone["mpjpe_body"] != pytest.approx(figures[-1]["mpjpe_body"])
     assert figures[0] == pytest.approx(figures[1], rel=1e-6)
@@ -119,13 +121,14 @@ def test_figures_do_not_depend_on_what_was_not_recorded(data: Data) -> None:
 def test_a_clip_through_a_tokenizer_of_any_part(data: Data, part: Part) -> None:
     dataset, stats = data[0]
     net = build_tokenizer(RvqConfig(**TINY, part=part), dataset.layout).freeze()
+    trained = TrainedTokenizer(net, {"stats": stats})
     hand = np.isin(dataset.layout.part("bodyhand"), dataset.layout.part("hand"))
     mean = stats.mean[dataset.layout.part("bodyhand")]
     for truth in (truth_of(dataset, i) for i in range(4)):
-        rebuilt = reconstruct_truth(net, stats, truth)
+        rebuilt = reconstruct_truth(trained, truth)
         assert rebuilt.shape == truth.features.shape
-        modelled = part != "body" and truth.held & HANDS
+        modelled = part != "body" and truth.present & HANDS
         assert np.allclose(rebuilt[:, hand], mean[hand]) == (not modelled)
         assert not np.allclose(rebuilt[:, ~hand], mean[~hand])
-    figures = reconstruction_figures(net, stats, dataset, [truth_of(dataset, 0)])
+    figures = reconstruction_figures(trained, dataset, [truth_of(dataset, 0)])
     assert np.isfinite(list(figures.values())).all()

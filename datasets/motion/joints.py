@@ -1,0 +1,67 @@
+"""Columns of any layout -> joints: motion features are decoded, SMPL parameters pose the neutral skeleton.
+
+SMPL parameters without a shape have no bone lengths of their own: the pose is the motion's, the bones are
+those of one neutral adult (`smpl.py`).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.canonical import ground, heading
+from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.motion.smpl import BodyModel, SkeletonName, smpl_joints
+from motionloom.datasets.schema import UserError
+
+_neutral = cache(BodyModel.neutral)
+
+
+def joints_of(features: NDArray[Any], layout: MotionLayout) -> NDArray[np.float64]:
+    """Columns [..., T, D] of `layout`, in their own units -> joints [..., T, N, 3] in metres.
+
+    The columns are all of the layout's, or those of its body and hands (`layout.part("bodyhand")`). Features
+    begin above the origin with heading +Z; raw parameters stay in their own axes, where
+    `canonical.canonicalize` moves them if needed.
+    """
+    columns = layout.part("bodyhand")
+    if features.ndim < 2 or features.shape[-1] not in (layout.dim, len(columns)):
+        raise UserError(
+            f"layout {layout.name} has {layout.dim} columns, but these features are {list(features.shape)}"
+        )
+    if layout.family == "raw":
+        return _posed(features, layout)
+    body = features if features.shape[-1] == len(columns) else features[..., columns]
+    return decode(body, layout.without_face())
+
+
+def local_joints_of(joints: NDArray[Any], fps: float) -> NDArray[np.float64]:
+    """Joints [..., T, N, 3] from the root, turned into the smoothed heading: the pose without its path."""
+    out = np.array(joints, dtype=np.float64)
+    turned = ground(out)
+    turned = (turned - turned[..., :1]) * np.exp(-1j * heading(out, fps))[..., None]
+    out[..., 2], out[..., 0] = turned.real, turned.imag
+    out[..., 1] -= out[..., :1, 1]
+    return out
+
+
+def _posed(motion: NDArray[Any], layout: MotionLayout) -> NDArray[np.float64]:
+    """Raw SMPL or SMPL-X parameters on the neutral skeleton, in the source's own axes."""
+    # Without the face's columns the fields behind them would lie elsewhere.
+    if motion.shape[-1] != layout.dim:
+        raise UserError(f"layout {layout.name} is posed from all of its {layout.dim} columns")
+
+    def turns(field: str) -> NDArray[np.float64]:
+        columns = np.asarray(motion[..., layout.slice(field)], np.float64)
+        return columns.reshape(*columns.shape[:-1], -1, 3)
+
+    skeleton: SkeletonName = "smpl22" if layout.has("pose") else "smplx52"
+    if layout.has("pose"):
+        rotations = turns("pose")[..., :BODY_JOINTS, :]
+    else:
+        rotations = np.concatenate([turns(f) for f in ("root_orient", "pose_body", "pose_hand")], axis=-2)
+    return smpl_joints(rotations, turns("trans")[..., 0, :], _neutral(skeleton))

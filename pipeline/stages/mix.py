@@ -1,0 +1,97 @@
+"""Several data stages of a recipe as one: captioned clips beside dances, say.
+
+Nothing is copied. The stage writes down which stages of its run it mixes, so a run that is moved still works;
+data sets outside a run are mixed by `shards` (`mix:`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import torch
+from pydantic import Field
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.reader import require_layout
+from motionloom.pipeline.contract.stage import (
+    Every,
+    Finished,
+    Given,
+    Stage,
+    StageConfig,
+    StageContext,
+    StageKind,
+)
+from motionloom.pipeline.store.data import MIX, Data, DataPreview, Mix, MixedStage
+from motionloom.pipeline.store.files import write_json
+
+_INPUTS = Every("data", gives="data")
+
+
+class MixStageConfig(StageConfig):
+    """How often each data stage is drawn."""
+
+    weights: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = Field(default_factory=dict)
+    """Share of the batches of a stage, by its name, relative to the others; 1 for a stage not named."""
+
+
+class MixStage(StageKind):
+    """Data stages, drawn by weight."""
+
+    name = "mix"
+    summary = "several data stages as one"
+    config = MixStageConfig
+    takes = (_INPUTS,)
+
+    def gives(self, config: MixStageConfig) -> frozenset[str]:
+        """Clips."""
+        return frozenset({"data"})
+
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
+        """There must be something to mix, no mixes among it, and weights for nothing else."""
+        sources = [name for key, name in stage.inputs.items() if key == _INPUTS.key(name)]
+        if not sources:
+            raise UserError(f"stage '{stage.name}' mixes data stages and the recipe has no other one")
+        for name in sources:
+            if name in others and others[name].kind.name == self.name:
+                raise UserError(
+                    f"stage '{stage.name}' mixes '{name}', a mix itself; list all data stages in one mix: "
+                    f"inputs: {{data: [...]}}"
+                )
+        for name in stage.config.weights:
+            if name not in sources:
+                raise UserError(
+                    f"stage '{stage.name}': weights.{name} is of no stage that it mixes; "
+                    f"these are {', '.join(sources)}"
+                )
+
+    def run(self, context: StageContext) -> None:
+        """Write the list of stages; refuse one of another layout."""
+        sources = context.every(_INPUTS.name)
+        _one_layout({stage.name: context.shelf.get(stage).layout for stage in sources})
+        weights = context.config.weights
+        parts = [MixedStage(stage=stage.name, weight=weights.get(stage.name, 1.0)) for stage in sources]
+        write_json(context.folder / MIX, Mix(parts=parts).dump())
+        total = sum(part.weight for part in parts)
+        for stage, part in zip(sources, parts, strict=True):
+            clips = len(context.shelf.get(stage).split("train"))
+            context.console.print(
+                f"    {part.stage}: {clips} training clips, {100 * part.weight / total:.0f} % of the draws"
+            )
+
+    def preview(self, config: MixStageConfig, given: Given) -> DataPreview:
+        """The layout that all share."""
+        return DataPreview(_one_layout({key.partition(".")[2]: given[key].layout for key in given}))
+
+    def load(self, stage: Finished, given: Given, device: torch.device) -> Data:
+        """The splits of all."""
+        return Data(stage.folder)
+
+
+def _one_layout(layouts: Mapping[str, MotionLayout]) -> MotionLayout:
+    (first, layout), *others = layouts.items()
+    for name, other in others:
+        require_layout(other, layout, f"stage '{name}', mixed with '{first}'")
+    return layout

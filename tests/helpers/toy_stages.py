@@ -1,0 +1,37 @@
+"""Stage kinds for tests of what works on stages of any kind: a toy replaces or joins the registered ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from motionloom.pipeline.contract import registry
+from motionloom.pipeline.contract.stage import StageKind
+
+
+def register_toys(monkeypatch: pytest.MonkeyPatch, *kinds: StageKind) -> None:
+    """Put kinds into the table until the test ends, also in place of one of the same name."""
+    registry.stage_kinds()  # ours are there first, or they would meet the toys' names later
+    for kind in kinds:
+        monkeypatch.setitem(registry._KINDS, kind.name, kind)
+
+
+class MadeStage(StageKind):
+    """A kind of a finished stage that gives an object, without any files."""
+
+    def __init__(self, made: Any) -> None:
+        self.name, self.summary = "made", "a toy"
+        self.made = made
+
+    def run(self, context: Any) -> None:
+        """It has run."""
+        raise AssertionError("a toy that has finished is not run")
+
+    def load(self, *_: Any) -> Any:
+        """The object."""
+        return self.made
+
+    def generator(self, *_: Any) -> Any:
+        """The same object, of one that generates."""
+        return self.made

@@ -1,0 +1,325 @@
+"""Dances from figures to the page: a tiny UDE run on SMPL parameters, and motions whose figures are known."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from motionloom.datasets.audio.features import beats
+from motionloom.datasets.motion.canonical import resample
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.synth.dance_plan import DanceConditions, DanceConfig, beats_of
+from motionloom.datasets.synth.generate import SynthConfig, make_clip, synthesize
+from motionloom.pipeline.evaluation.dance_answers import mean_pose, nearest_dances, random_dances
+from motionloom.pipeline.evaluation.dance_figures import (
+    Matched,
+    alignment_of,
+    chances,
+    distribution_of,
+    features_of,
+    feet_of,
+    multimodality_of,
+    others,
+    recognition_of,
+    way,
+)
+from motionloom.pipeline.evaluation.dances import DanceClip, dance_at, dances_of
+from motionloom.pipeline.runs.api import evaluate_run, run_recipe
+
+FPS = 20.0
+Splits = tuple[ClipDataset, ClipDataset]
+CONFIG = SynthConfig(
+    clips=24,
+    seed=5,
+    layout="smpl75",
+    fps=FPS,
+    actions=["dance"],
+    min_seconds=4.0,
+    max_seconds=6.0,
+    test_fraction=0.5,
+    val_fraction=0.0,
+    dances=DanceConfig(songs=12, song_seconds=10.0, conditions=DanceConditions(audio=1, both=0)),
+)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Splits:
+    root = tmp_path_factory.mktemp("dances")
+    synthesize(CONFIG, root, progress=False)
+    return ShardDataset.open(root, "train"), ShardDataset.open(root, "test")
+
+
+@pytest.fixture(scope="module")
+def clips(data: Splits) -> list[DanceClip]:
+    return dances_of(data[1], 20, unit=4)
+
+
+def test_clips_are_cut_with_their_music(data: Splits, clips: list[DanceClip]) -> None:
+    for clip in clips:
+        made = make_clip(int(clip.id.rpartition("-")[2]), CONFIG)
+        frames = len(clip.joints)
+        assert frames == len(made.joints) // 4 * 4
+        np.testing.assert_allclose(clip.joints, made.joints[:frames], atol=1e-5)
+        assert made.wav is not None and clip.sound.rate == made.wav[1]
+        # Sound is stored with 16 bits.
+        np.testing.assert_allclose(clip.sound.samples, made.wav[0][: len(clip.sound.samples)], atol=1e-4)
+        assert clip.sound.seconds == pytest.approx(clip.seconds, abs=1 / clip.sound.rate)
+        assert clip.beats.tolist() == beats_of(made.truth, clip.seconds)
+    short = dance_at(data[1], clips[0].index, seconds=2.0)
+    assert short is not None and short.seconds == 2.0 and short.sound.seconds == pytest.approx(2.0)
+    assert (short.beats < 2.0).all() and len(short.beats) == (clips[0].beats < 2.0).sum()
+
+
+def test_different_songs_come_first(data: Splits) -> None:
+    songs = {clip.song for clip in dances_of(data[1], 100)}
+    chosen = dances_of(data[1], len(songs))
+    assert {clip.song for clip in chosen} == songs
+    assert [c.id for c in chosen] == [c.id for c in dances_of(data[1], len(songs))]
+
+
+def test_beats_without_a_truth_are_tracked(data: Splits, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = data[1]
+    meta = dataset.meta(0)
+    monkeypatch.setattr(dataset, "meta", lambda i: meta.model_copy(update={"truth": None}), raising=True)
+    clip = dance_at(dataset, 0)
+    assert clip is not None and clip.song == clip.id and clip.truth is None
+    assert clip.beats.tolist() == beats(clip.sound.samples, clip.sound.rate).tolist()
+
+
+def matched(motions: list[np.ndarray], clips: list[DanceClip]) -> list[Matched]:
+    return [Matched(joints, clip) for joints, clip in zip(motions, clips, strict=True)]
+
+
+def test_figures_tell_the_truth_from_trivial_answers(data: Splits, clips: list[DanceClip]) -> None:
+    real = [clip.joints for clip in clips]
+    apart = others(clips, 3, seed=1)
+    assert all(clips[k].song != clip.song for clip, row in zip(clips, apart, strict=True) for k in row)
+    true = alignment_of(matched(real, clips))
+    crossed = alignment_of([Matched(m, clips[k]) for m, row in zip(real, apart, strict=True) for k in row])
+    pool = dances_of(data[0], 50)
+    still = [mean_pose(pool, len(joints)) for joints in real]
+    frozen = alignment_of(matched(still, clips))
+    late = [np.concatenate([np.tile(j[:1], (4, 1, 1)), j[:-4]]) for j in real]  # a fifth of a second
+    delayed = alignment_of(matched(late, clips))
+    for name in ("bailando", "mint", "ude", "edge"):
+        assert true[name] > 0.7 > 0.5 > crossed[name] > frozen[name] == 0.0
+        assert delayed[name] < 0.4
+    assert way(true, crossed, true) == pytest.approx(dict.fromkeys(true, 1.0))
+    assert way(crossed, crossed, true) == pytest.approx(dict.fromkeys(true, 0.0))
+    assert way(frozen, crossed, {name: value + 0.005 for name, value in crossed.items()}) == {}
+
+    found, guessed = recognition_of(matched(real, clips)), recognition_of(matched(still, clips))
+    assert found["genre"] == found["style"] == found["tempo"] == 1.0 and found["tempo_error"] < 0.02
+    assert guessed["genre"] <= chances(clips)["genre"] and guessed["tempo"] < 0.5
+
+    features = features_of(real, FPS, 60.0)
+    same, gone = distribution_of(features, features), distribution_of(features, features_of(still, FPS, 60.0))
+    assert same["fid_k"] == pytest.approx(0, abs=1e-3) and same["fid_m"] == pytest.approx(0, abs=1e-3)
+    assert gone["fid_m"] > 1 and max(gone["div_k"], gone["div_m"]) < 1e-9 < 1 < same["div_k"]
+    assert feet_of(still, FPS) == {"foot_skating": 0.0, "foot_contact": 0.0}
+    slid = [joints + np.linspace(0, 10, len(joints))[:, None, None] * [1, 0, 0] for joints in real]
+    assert feet_of(slid, FPS)["foot_skating"] > 0.5 > feet_of(real, FPS)["foot_skating"]
+
+
+def test_samples_of_a_song_vary_or_do_not(clips: list[DanceClip]) -> None:
+    real = features_of([clip.joints for clip in clips], FPS, 60.0)
+    other = features_of([clip.joints[::-1] * 1.5 for clip in clips], FPS, 60.0)
+    assert multimodality_of(real, [real]) == {}
+    for name, values in multimodality_of(real, [real, real]).items():
+        assert name in ("mm_k", "mm_m") and len(values) == len(clips) and not np.any(values)
+    assert min(multimodality_of(real, [real, other])["mm_k"]) > 0
+
+
+def test_features_are_taken_at_the_published_rate(clips: list[DanceClip]) -> None:
+    """A motion stored at 60 frames a second, and the same at 20, give features of one size."""
+    fast = [resample(clip.joints, FPS, 60.0) for clip in clips]
+    for kind, rows in features_of(fast, 60.0, 60.0).items():
+        np.testing.assert_allclose(features_of([c.joints for c in clips], FPS, 60.0)[kind], rows, atol=1e-12)
+
+
+def test_trivial_answers_come_from_training_dances(data: Splits, clips: list[DanceClip]) -> None:
+    train, test = data
+    pool = dances_of(train, 50)
+    assert not {c.song for c in pool} & {c.song for c in clips}
+    for joints, clip in zip(random_dances(pool, clips, np.random.default_rng(0)), clips, strict=True):
+        assert len(joints) <= len(clip.joints)
+        near = [np.abs(other.joints[s : s + len(joints)] - joints).max() for other in pool
+                for s in range(len(other.joints) - len(joints) + 1)]  # fmt: skip
+        assert min(near) == 0
+    itself = nearest_dances(train, pool, train, pool)
+    assert itself is not None
+    assert all(np.array_equal(found, clip.joints) for found, clip in zip(itself, pool, strict=True))
+    known = nearest_dances(train, pool, test, clips)
+    assert known is not None and [len(j) for j in known] == [
+        min(len(c.joints), max(len(p.joints) for p in pool)) for c in clips
+    ]
+
+
+RECIPE = """
+extends: ude-tiny
+name: dances
+seed: 7
+hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
+stages:
+  data:
+    clips: 40
+    layout: smpl75
+    min_seconds: 2.0
+    max_seconds: 5.0
+    test_fraction: 0.34
+    dances: {songs: 9, song_seconds: 8, share: 0.5, conditions: {audio: 1.0, both: 0.0}}
+  tokenizer:
+    net: {width: 16, code_dim: 8, num_codes: 16}
+    train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}
+  utt:
+    net: {layers: 1, dim: 16, heads: 2, ff: 16, block_size: 48, z_dim: 4}
+    mate: {dim: 16, layers: 1, heads: 2, ff: 16}
+    loss: {adversarial_start: 2, adversarial_ramp: 2, discriminator: {dim: 16, ff: 16, heads: 2}}
+    train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}
+  dmd:
+    net: {dim: 16, ff: 16, encoder_layers: 1, decoder_layers: 1, heads: 2}
+    train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}
+  ude: {denoising_steps: 2}
+  generate: {count: 1, dances: 2, dance_seconds: 2, formats: [html, npz, mp4]}
+  evaluate: {clips: 4}
+  evaluate_dances: {kind: evaluate_dances, clips: 4, repeats: 2}
+  report: {count: 1, dances: 2}
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A finished run on SMPL parameters, of captioned clips and dances without captions; what it printed."""
+    root = tmp_path_factory.mktemp("ude")
+    (root / "dances.yaml").write_text(RECIPE)
+    said = io.StringIO()
+    run_recipe(root / "dances.yaml", root / "run", console=Console(file=said, width=200))
+    return root / "run", said.getvalue()
+
+
+def page_data(path: Path, name: str = "viewer-1-data") -> dict[str, Any]:
+    text = path.read_text()
+    data: dict[str, Any] = json.loads(text.split(f'id="{name}">')[1].split("</script>")[0])
+    return data
+
+
+def test_dances_of_a_run_are_evaluated(run: tuple[Path, str]) -> None:
+    folder, said = run
+    figures = json.loads((folder / "stages/evaluate_dances/dances.json").read_text())
+    rows = figures["rows"]
+    assert (figures["clips"], figures["repeats"], figures["feature_fps"]) == (4, 2, 60.0)
+    assert set(rows) == {
+        "ground_truth", "generated", "shuffled_music", "nearest_music", "random_training_dance", "mean_pose"
+    }  # fmt: skip
+    made, true = rows["generated"], rows["ground_truth"]
+    assert set(made) == {"beat_align", "recognition", "feet", "distribution", "multimodality", "way"}
+    assert true["distribution"]["fid_k"]["mean"] == 0 and true["recognition"]["genre"]["mean"] == 1
+    for name in ("bailando", "mint", "ude", "edge"):
+        worse = (rows[other]["beat_align"][name]["mean"] for other in set(rows) - {"ground_truth"})
+        assert true["beat_align"][name]["mean"] > max(worse), "nothing was learned in two steps"
+        assert made["way"][name]["mean"] < 0.7
+    assert "generated from its music" in said and "test: " in said
+    # Captioned clips and dances without captions beside each other, no TMA in the run.
+    captions = json.loads((folder / "stages/evaluate/metrics.json").read_text())
+    assert captions["clips"] == 4 == captions["reconstructed_clips"] and "retrieval" not in captions
+    errors = captions["reconstruction_mm"]
+    assert {"mpjpe", "global_mpjpe", "mpjpe_nearest_train_clip", "pa_mpjpe"} <= errors.keys()
+    assert 0 < errors["mpjpe_nearest_train_clip"] < errors["mpjpe_mean_pose"]
+
+
+def test_the_page_plays_the_music(run: tuple[Path, str]) -> None:
+    page = run[0] / "stages/report/report.html"
+    words, dances = (page_data(page, f"viewer-{number}-data") for number in (1, 2))
+    assert "sounds" not in words and [m["label"] for m in words["motions"]] == [
+        "recorded", "reconstruction", "generated"
+    ]  # fmt: skip
+    assert len(dances["sounds"]) == 2 and len(dances["motions"]) == 6
+    for motion in dances["motions"]:
+        sound, score = dances["sounds"][motion["sound"]], dances["scores"][motion["score"]]
+        assert sound["seconds"] == pytest.approx(motion["frames"] / motion["fps"], abs=0.01)
+        assert score["beats"] and score["segments"][0][3] == "music"
+    assert "media-src blob:" in page.read_text() and "Beat Align" in page.read_text()
+
+
+@pytest.mark.browser
+def test_the_music_is_heard(run: tuple[Path, str], browser: Any, until: Any) -> None:
+    page = browser.new_page()
+    page.goto((run[0] / "stages/report/report.html").as_uri())
+    assert page.evaluate("__viewers.map(v => v.sound !== undefined)") == [True, True]
+    page.get_by_role("button", name="Sound on").click()  # there is one: captions have no sound
+    until(page, "__viewers[1].sound && !__viewers[1].audio.paused && __viewers[1].audio.currentTime > 0.05")
+    page.close()
+
+
+def test_generated_files_have_their_music(run: tuple[Path, str]) -> None:
+    folder = run[0] / "stages/generate/motions"
+    assert sorted(path.suffix for path in folder.iterdir()) == [".html", *[".mp4"] * 3, *[".npz"] * 3]
+    films = sorted(folder.glob("*.mp4"))
+    assert [b"mp4a" in film.read_bytes() for film in films] == [False, True, True]
+    data = page_data(folder / "index.html", "viewer-data")
+    assert ["sound" in motion for motion in data["motions"]] == [False, True, True]
+    assert [len(np.load(path)["joints"]) for path in sorted(folder.glob("*.npz"))][1:] == [40, 40]
+
+
+def test_evaluate_runs_every_stage_of_figures(run: tuple[Path, str]) -> None:
+    out = evaluate_run(run[0], clips=2, repeats=1, console=Console(quiet=True))
+    assert json.loads((out / "metrics.json").read_text())["clips"] == 2
+    figures = json.loads((out / "evaluate_dances/dances.json").read_text())
+    assert figures["clips"] == 2 and "multimodality" not in figures["rows"]["generated"]
+
+
+MUSIC_ONLY = """
+name: music
+seed: 7
+hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
+stages:
+  data:
+    kind: synth
+    layout: wholebody363
+    clips: 18
+    fps: 20
+    actions: [dance]
+    max_seconds: 5
+    test_fraction: 0.34
+    val_fraction: 0.17
+    dances: {songs: 6, song_seconds: 6, conditions: {audio: 1, both: 0}}
+  stats: {kind: stats}
+  audio: {kind: audio}
+  tokenizer:
+    kind: mq
+    net: {part: all, width: 16, depth: 1, code_dim: 8, num_codes: 16}
+    train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}
+  utt:
+    kind: utt
+    modalities: [audio]
+    net: {layers: 1, dim: 16, heads: 2, ff: 16, block_size: 48, z_dim: 4}
+    mate: {dim: 16, layers: 1, heads: 2, ff: 16}
+    loss: {adversarial_start: 2, adversarial_ramp: 2, discriminator: {dim: 16, ff: 16, heads: 2}}
+    train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}
+  ude: {kind: ude}
+  generate: {kind: generate, dances: 1, formats: [npz]}
+  evaluate: {kind: evaluate, clips: 3, repeats: 1}
+  report: {kind: report, dances: 1}
+"""
+
+
+def test_music_alone_is_enough(tmp_path: Path) -> None:
+    """No captions anywhere; a tokenizer of all columns, the face included."""
+    (tmp_path / "music.yaml").write_text(MUSIC_ONLY)
+    run_recipe(tmp_path / "music.yaml", tmp_path / "run", console=Console(quiet=True))
+    stages = tmp_path / "run/stages"
+    figures = json.loads((stages / "evaluate/metrics.json").read_text())
+    assert figures["clips"] == 0 and figures["reconstructed_clips"] == 3
+    assert {"mpjpe_body", "mpjpe_hand"} <= figures["reconstruction_mm"].keys()
+    data = page_data(stages / "report/report.html")
+    assert len(data["sounds"]) == 1 and all(motion["face"] for motion in data["motions"])
+    faces = [motion["face"] for motion in data["motions"]]
+    assert len(set(faces)) == 3, "recorded, kept by the tokenizer, generated"
+    assert len(list((stages / "generate/motions").glob("*.npz"))) == 1

@@ -1,0 +1,162 @@
+"""Data stages of one recipe as one: drawn by weight, told apart by nothing, and moved with their run."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.contract.lookup import preview_of
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.store.data import Data, open_split, splits_of
+
+RECIPE = """
+name: mixed
+hardware: {accelerator: cpu, convert_workers: 1}
+defaults: {synth: {layout: body133, val_fraction: 0.0, test_fraction: 0.25}}
+stages:
+  texts: {kind: synth, clips: 12, seed: 3, actions: [walk, wave]}
+  dances: {kind: synth, clips: 8, seed: 4, actions: [dance], dances: {songs: 4, song_seconds: 8.0}}
+  data: {kind: mix, weights: {dances: 3}}
+  stats: {kind: stats}
+  audio: {kind: audio}
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "recipe.yaml"
+    path.write_text(text)
+    return path
+
+
+def stage(run: Path, name: str) -> Path:
+    return run / "stages" / name
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("mix")
+    return run_recipe(write(folder, RECIPE), folder / "run", console=Console(quiet=True))
+
+
+def clips(dataset: ClipDataset) -> list[np.ndarray]:
+    return [dataset.motion(i) for i in range(len(dataset))]
+
+
+def test_it_is_the_clips_of_both(run: Path) -> None:
+    data = Data(stage(run, "data"))
+    apart = [Data(stage(run, name)) for name in ("texts", "dances")]
+    assert data.splits == ["train", "test"] and data.layout == apart[0].layout
+    for split in data.splits:
+        found, wanted = clips(data.split(split)), [m for one in apart for m in clips(one.split(split))]
+        assert len(found) == len(wanted)
+        assert all(np.array_equal(a, b) for a, b in zip(found, wanted, strict=True))
+    assert data.held_out().split == "test"
+
+
+def test_training_draws_by_weight(run: Path) -> None:
+    """A quarter of what an epoch draws is text clips, whatever their number (its places divide by four)."""
+    dataset = open_split(stage(run, "data"), "train", training=True)
+    texts = len(open_split(stage(run, "texts"), "train"))
+    sources = dataset.sources()
+    assert [source.weight for source in sources] == [1.0, 3.0]
+    plan = BatchPlan(len(dataset), 4, sources=sources, seed=0)
+    drawn = np.concatenate([plan.batch(step)[1] for step in range(plan.batches_per_epoch)])
+    assert texts > len(dataset) / 2 and np.mean(drawn < texts) == 0.25
+
+
+def test_what_follows_reads_both(run: Path) -> None:
+    train = open_split(stage(run, "data"), "train")
+    assert train.has("texts.json").any() and train.has("audio.npy").any() and not train.has("audio.npy").all()
+    assert (stage(run, "stats") / "stats.safetensors").is_file()
+    assert (stage(run, "audio") / "audio.safetensors").is_file()
+
+
+def test_a_moved_run_still_works(run: Path, tmp_path: Path) -> None:
+    wanted = clips(open_split(stage(run, "data"), "train"))
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(run, moved)
+    shutil.move(run / "stages", run / "away")
+    try:
+        found = clips(open_split(stage(moved, "data"), "train"))
+    finally:
+        shutil.move(run / "away", run / "stages")
+    assert all(np.array_equal(a, b) for a, b in zip(found, wanted, strict=True))
+
+
+def test_shards_that_lie_elsewhere_share_the_weight_of_their_stage(tmp_path: Path) -> None:
+    """One of them has test clips alone, so the training weight of its stage goes to the other."""
+    for seed, split in ((1, 0.0), (2, 0.4), (3, 0.0)):
+        config = SynthConfig(
+            clips=5, seed=seed, layout="body133", actions=["wave"], val_fraction=0.0, test_fraction=split
+        )
+        synthesize(config, tmp_path / f"set{seed}", progress=False)
+    text = f"""
+name: outside
+hardware: {{accelerator: cpu}}
+stages:
+  near: {{kind: shards, path: {tmp_path}/set3}}
+  far:
+    kind: shards
+    mix: [{{path: {tmp_path}/set1, weight: 1}}, {{path: {tmp_path}/set2, weight: 3}}]
+  data: {{kind: mix, weights: {{near: 1, far: 2}}, inputs: {{data: [near, far]}}}}
+"""
+    run = run_recipe(write(tmp_path, text), tmp_path / "run", console=Console(quiet=True))
+    folder = stage(run, "data")
+    assert splits_of(folder) == ["train", "test"]
+    weights = [source.weight for source in open_split(folder, "train").sources()]
+    assert weights == pytest.approx([1.0, 0.5, 1.5])
+    assert open_split(folder, "test").where == open_split(stage(run, "far"), "test").where
+
+
+def test_its_layout_is_known_before_it_runs(tmp_path: Path) -> None:
+    def layout(*sets: str) -> str:
+        recipe = load_recipe(write(tmp_path, RECIPE), sets)
+        stages = {stage.name: stage for stage in recipe.stages}
+        name: str = preview_of(stages["data"], stages).layout.name
+        return name
+
+    assert layout() == "body133"
+    with pytest.raises(UserError, match="stage 'dances', mixed with 'texts': holds layout wholebody363"):
+        layout("dances.layout=wholebody363", "dances.fps=20")
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("data.weights={dance: 1}", "weights.dance is of no stage that it mixes; these are texts, dances"),
+        ("data.weights={dances: 0}", "weights.dances"),
+        ("data.inputs.data=[texts, more]", "'more' is no stage that gives a data"),
+        ("data.inputs.data=[]", "mixes data stages and the recipe has no other one"),
+        ("stages.again={kind: mix, inputs: {data: [data]}}", "'again' mixes 'data', a mix itself"),
+    ],
+)
+def test_wrong_mixes_are_refused(override: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=says):
+        # As with any input that several stages may fill, a second mix would be read by the first.
+        named = ["data.inputs.data=[texts, dances]"] if "again" in override else []
+        load_recipe(write(tmp_path, RECIPE), [*named, override])
+
+
+def test_layouts_that_differ_only_in_the_shards_are_refused_when_it_runs(tmp_path: Path) -> None:
+    for layout, fps in (("body133", 20.0), ("body133", 25.0)):
+        config = SynthConfig(clips=2, layout=layout, fps=fps, actions=["wave"])  # type: ignore[arg-type]
+        synthesize(config, tmp_path / f"at{fps:g}", progress=False)
+    text = f"""
+name: rates
+hardware: {{accelerator: cpu}}
+stages:
+  slow: {{kind: shards, path: {tmp_path}/at20, layout: body133}}
+  fast: {{kind: shards, path: {tmp_path}/at25, layout: body133}}
+  data: {{kind: mix}}
+"""
+    with pytest.raises(UserError, match="stage 'fast', mixed with 'slow': holds layout body133"):
+        run_recipe(write(tmp_path, text), tmp_path / "run", console=Console(quiet=True))
