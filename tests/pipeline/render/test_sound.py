@@ -20,6 +20,7 @@ import soundfile
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.outputs import write_motions
 from motionloom.pipeline.render.page import Page
@@ -241,7 +242,7 @@ def test_broken_film_with_sound_leaves_no_file(tmp_path: Path, song: Make, walk:
 def test_generated_motions_pass_their_scores_to_film_and_page(tmp_path: Path, song: Make, walk: Make) -> None:
     layout = MotionLayout.named("tomato623")
     motions = [
-        GeneratedMotion(name, name, np.zeros((8, 1), np.float32), walk(8), None, layout) for name in "ab"
+        GeneratedMotion(Prompt(name), np.zeros((8, 1), np.float32), walk(8), None, layout) for name in "ab"
     ]
     scores = [Score(song(1.0), [0.1], [(0, 0.2, "walks")]), Score()]
     write_motions(tmp_path / "out", motions, ["mp4", "html"], title="t", seed=0, scores=scores)
