@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import json
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -77,17 +77,23 @@ def explain(error: ValidationError, model: type[BaseModel], where: str) -> str:
 
 
 def field_names(model: type[BaseModel], path: list[str]) -> list[str]:
-    """Valid keys of the (nested) model at `path`; unions and lists are not followed."""
+    """Valid keys of the model at `path`, also of one in a list; unions of several are not followed."""
     current: Any = model
     for part in path:
         fields = getattr(current, "model_fields", {})
-        if part not in fields:
+        if part in fields:
+            current = _model_in(fields[part].annotation)
+        elif not part.isdecimal():  # a place in a list of what is current already
             return list(fields)
-        annotation = fields[part].annotation
-        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
-            return []
-        current = annotation
     return list(getattr(current, "model_fields", {}))
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """The one model that a field's type is or holds."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    found = {model for inner in get_args(annotation) if (model := _model_in(inner)) is not None}
+    return found.pop() if len(found) == 1 else None
 
 
 class Caption(Config):

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from pydantic import BaseModel
+from pydantic import BaseModel, model_validator
 from pydantic.config import JsonDict
 from rich.console import Console
 
@@ -42,6 +42,18 @@ SHOWING = "showing"
 
 class StageConfig(Config):
     """Base of every stage's config."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keep_defaults(cls, data: Any) -> Any:
+        """A group of settings of which some are given keeps the stage's own defaults of the others."""
+        if not isinstance(data, dict):
+            return data
+        out = dict(data)
+        for name, info in cls.model_fields.items():
+            if isinstance(info.default, BaseModel) and isinstance(out.get(name), dict):
+                out[name] = _over(info.default.model_dump(mode="json"), out[name])
+        return out
 
     def require_fit(self, hardware: Hardware) -> None:
         """Refuse, before anything runs, settings that cannot run on this hardware."""
@@ -296,6 +308,15 @@ class FunctionStage(StageKind):
     def run(self, context: StageContext) -> None:
         """Call the function."""
         self.function(context)
+
+
+def _over(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """`given` with what it lacks of `defaults`, group by group."""
+    out = {**defaults, **given}
+    for name, value in given.items():
+        if isinstance(value, dict) and isinstance(defaults.get(name), dict):
+            out[name] = _over(defaults[name], value)
+    return out
 
 
 def fingerprint_fields(config: BaseModel) -> dict[str, Any]:

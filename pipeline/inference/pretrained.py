@@ -101,7 +101,7 @@ class MotionModel(
         if isinstance(script, Script):
             segments = script.open(Path())
         else:
-            segments = Script.read(Path(script)).open(Path(script).parent)
+            segments = Script.read(Path(script)).open(Path(script).parent, str(script))
         return self.bundle.perform(segments, samples=samples, seed=seed, sampling=sampling)
 
     def _save_pretrained(self, save_directory: Path) -> None:

@@ -76,8 +76,8 @@ class Script(Config):
             raise UserError(f"{path}: a script is a mapping with a list 'segments'")
         return Script.parse(data, str(path))
 
-    def open(self, folder: Path) -> list[DrivenSegment]:
-        """The segments with their sounds; `folder` is where files are looked for."""
+    def open(self, folder: Path, name: str = "script") -> list[DrivenSegment]:
+        """The segments with their sounds; `folder` is where files are looked for, `name` stands in errors."""
         sounds: dict[str, Sound] = {}
         out = []
         for number, segment in enumerate(self.segments):
@@ -88,7 +88,7 @@ class Script(Config):
                 continue
             if segment.music not in sounds:
                 sounds[segment.music] = read_music(folder / segment.music)
-            sound = _cut(sounds[segment.music], segment, f"segments.{number}")
+            sound = _cut(sounds[segment.music], segment, f"{name}: segments.{number}")
             prompt = Prompt(segment.text, segment.face, sound)
             out.append(DrivenSegment(prompt, sound.seconds, segment.label))
         return out

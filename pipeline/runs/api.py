@@ -165,7 +165,7 @@ def generate_motions(
     require_seed(seed)
     require_folder(out)
     drawing = SamplingConfig.parse(sampling or {}, "sampling")
-    segments = None if script is None else Script.read(script).open(script.parent)
+    segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     bundle = Bundle.open(folder, choose_device(device))
     if segments is not None:

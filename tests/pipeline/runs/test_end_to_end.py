@@ -280,6 +280,10 @@ def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..
     figures = json.loads((copy / "evaluate/metrics.json").read_text())
     assert figures["clips"] == 4 and figures["split"] == "test"
     assert figures["reconstruction_mm"]["mpjpe"] > 0
+    found = figures["retrieval"]
+    assert 2 <= found["among"] <= 4, "61 wrong captions, or as many as there are"
+    for name in ("real", "generated"):
+        assert 0 <= found[name]["top-1"]["mean"] <= found[name]["top-5"]["mean"] <= 1
     for wrong in (("--repeats", 0), ("--clips", -4)):
         done = call("evaluate", copy, *wrong)
         assert done.code == 2 and f"evaluate: key '{wrong[0][2:]}' = {wrong[1]}" in done.err

@@ -248,6 +248,16 @@ def test_the_page_plays_the_music(run: tuple[Path, str]) -> None:
     assert "media-src blob:" in page.read_text() and "Beat Align" in page.read_text()
 
 
+@pytest.mark.browser
+def test_the_music_is_heard(run: tuple[Path, str], browser: Any, until: Any) -> None:
+    page = browser.new_page()
+    page.goto((run[0] / "stages/report/report.html").as_uri())
+    assert page.evaluate("__viewers.map(v => v.sound !== undefined)") == [True, True]
+    page.get_by_role("button", name="Sound on").click()  # there is one: captions have no sound
+    until(page, "__viewers[1].sound && !__viewers[1].audio.paused && __viewers[1].audio.currentTime > 0.05")
+    page.close()
+
+
 def test_generated_files_have_their_music(run: tuple[Path, str]) -> None:
     folder = run[0] / "stages/generate/motions"
     assert sorted(path.suffix for path in folder.iterdir()) == [".html", *[".mp4"] * 3, *[".npz"] * 3]

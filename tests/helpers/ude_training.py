@@ -1,0 +1,190 @@
+"""Small trainings of UDE's three networks on random motion: MQ, UTT with its critic, DMD.
+
+Nothing draws per process: without dropout and z, and the DMD's noise is that of the whole batch, of which a
+rank takes its rows. So two ranks and one process can be compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+from rich.console import Console
+from torch import Tensor, nn
+from torch.utils.data import Dataset
+
+from motionloom.datasets.conditions import Condition
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.condition.mate import MateConfig
+from motionloom.models.diffusion.dmd import Dmd, DmdConfig
+from motionloom.models.diffusion.dmd_module import DmdModule
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import MqConfig
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.distributed import rank, world_size
+from motionloom.models.training.optim import OptimConfig
+from motionloom.models.training.stage_module import StageModule
+from motionloom.models.utt.conditioned import ConditionedUtt
+from motionloom.models.utt.module import UttLossConfig, UttModule
+from motionloom.models.utt.network import UttConfig
+from motionloom.pipeline.contract.stage import CPU, Shelf, StageContext
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.training import TrainConfig, fit
+
+LAYOUT = MotionLayout.named("smpl75")
+MQ = MqConfig(width=8, depth=1, code_dim=8, num_codes=9, quantizer="gradient", start="data")
+OPTIM = OptimConfig(optimizer="adam", lr=3e-3, warmup_steps=3)
+NAMES = ("mq", "utt", "dmd")
+
+
+class Clips(Dataset[dict[str, Any]]):
+    """Item k is this rank's rows of batch k: motion, text and music; lengths differ."""
+
+    def __init__(
+        self, batch: int, rank: int = 0, world: int = 1, *, size: int = 10**6, dtype: Any, dies_at: int | None
+    ) -> None:
+        self.batch, self.size, self.dtype, self.dies_at = batch, size, dtype, dies_at
+        self.rows = slice(rank * batch // world, (rank + 1) * batch // world)
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitem__(self, k: int) -> dict[str, Any]:
+        if k >= self.size:
+            raise IndexError(k)
+        if k == self.dies_at:
+            raise ConnectionResetError("killed")
+        generator = torch.Generator().manual_seed(k)
+
+        def numbers(*shape: int) -> Tensor:
+            return torch.randn(self.batch, *shape, generator=generator, dtype=torch.float64).to(self.dtype)
+
+        order = torch.arange(self.batch)
+        length = 8 + 4 * (order % 4)
+        heard = (torch.arange(20) < length[:, None]) & (order % 3 > 0)[:, None]
+        batch = {
+            "motion": numbers(20, LAYOUT.dim).cumsum(1) * 0.3,
+            "length": length,
+            "closed": order % 2 == 0,
+            "held": torch.ones(self.batch, LAYOUT.dim, dtype=torch.bool),
+            "conditions": {
+                "text": Condition(numbers(3, 4), ((order % 3 < 2)[:, None]).expand(-1, 3)),
+                "audio": Condition(numbers(20, 3), heard),
+            },
+        }
+        conditions = {
+            name: Condition(features[self.rows], mask[self.rows])
+            for name, (features, mask, _) in batch.pop("conditions").items()  # type: ignore[attr-defined]
+        }
+        return {name: value[self.rows] for name, value in batch.items()} | {"conditions": conditions}
+
+
+class SharedNoise(DmdModule):
+    """The DMD with draws of the whole batch."""
+
+    def seed_draws(self, part: int, turn: int = 0) -> None:
+        """The same on every rank."""
+        torch.manual_seed(self.seed * 1000 + self.global_step)
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """As the base class."""
+        with _draws_of_all():
+            return super().losses(batch)
+
+
+@contextmanager
+def _draws_of_all() -> Iterator[None]:
+    randint, randn = torch.randint, torch.randn
+    number, world = (rank(), world_size()) if torch.is_grad_enabled() else (0, 1)
+
+    def whole(low: int, high: int, size: tuple[int, ...], **options: Any) -> Tensor:
+        return randint(low, high, (size[0] * world,), **options)[number * size[0] :][: size[0]]
+
+    def like(x: Tensor) -> Tensor:
+        made = randn(len(x) * world, *x.shape[1:], dtype=torch.float64)
+        return made[number * len(x) :][: len(x)].to(x)
+
+    with mock.patch.object(torch, "randint", whole), mock.patch.object(torch, "randn_like", like):
+        yield
+
+
+def tokenizer() -> Any:
+    """A frozen one with distant codes, so that rounding changes none."""
+    torch.manual_seed(1)
+    made = build_tokenizer(MQ, LAYOUT)
+    for book in made.codebooks().values():
+        nn.init.normal_(book.codebook)
+        book.initialised.fill_(True)
+        book._is_initialised = True
+    return made
+
+
+def module_of(name: str, steps: int, *, dropout: float = 0.0) -> StageModule:
+    """The module of one network; `dropout` also turns on what else is drawn."""
+    given: dict[str, Any] = {"seed": 3, "max_steps": steps}
+    torch.manual_seed(0)
+    if name == "mq":
+        return TokenizerModule(build_tokenizer(MQ, LAYOUT), OPTIM, **given, **MQ.loss_terms())
+    if name == "dmd":
+        small = DmdConfig(
+            dim=8, ff=8, encoder_layers=1, decoder_layers=1, heads=2, dropout=dropout, attention_dropout=0.0
+        )
+        frozen = tokenizer()
+        kind = DmdModule if dropout else SharedNoise
+        return kind(Dmd(small, frozen.streams, frozen.pattern, frozen.dim), OPTIM, tokenizer=frozen, **given)
+    frozen = tokenizer()
+    net = ConditionedUtt(
+        MateConfig(dim=8, layers=1, heads=2, ff=8, dropout=dropout, attention_dropout=0.0),
+        UttConfig(
+            layers=1, dim=8, heads=2, ff=8, block_size=8, dropout=dropout, attention_dropout=0.0,
+            z_dim=2 if dropout else 0, condition_dropout=dropout, pkeep=1 - dropout,
+        ),
+        {"text": 4, "audio": 3}, frozen.streams, frozen.pattern,
+    )  # fmt: skip
+    loss = {
+        "adversarial": {"weight": 0.1, "sample": bool(dropout), "gradient_penalty": 0.01},
+        "adversarial_start": 4,
+        "adversarial_ramp": 4,
+        "discriminator": {"dim": 8, "ff": 8, "heads": 2, "dropout": dropout, "spectral_norm": True},
+        "discriminator_optim": {"optimizer": "adam", "lr": 1e-3},
+    }
+    return UttModule(net, OPTIM, tokenizer=frozen, loss=UttLossConfig.parse(loss, "loss"), **given)
+
+
+def _context(name: str, folder: Path, devices: int) -> StageContext:
+    return StageContext(
+        name=name, recipe="test", config=None, folder=folder, inputs={}, seed=0,
+        hardware=Hardware(accelerator="cpu", devices=devices, threads=1, loggers=()),
+        console=Console(quiet=True), shelf=Shelf(CPU),
+    )  # fmt: skip
+
+
+def train(
+    name: str,
+    folder: Path,
+    *,
+    dtype: torch.dtype = torch.float32,
+    devices: int = 1,
+    dies_at: int | None = None,
+    dropout: float = 0.0,
+    **settings: Any,
+) -> StageModule:
+    """Train one network in `folder`, from its newest checkpoint; `dies_at` a step all ends with an error."""
+    given: dict[str, Any] = {"steps": 16, "batch_size": 8, "checkpoint_every": 4, "validate_every": 8}
+    config = TrainConfig(**{**given, **settings})
+    module = module_of(name, config.steps, dropout=dropout).to(dtype)
+    if name != "mq":
+        module.tokenizer.module.to(dtype)  # type: ignore[operator, union-attr]
+    fit(
+        _context(name, folder, devices),
+        module,
+        config,
+        lambda batch, number, world: Clips(batch, number, world, dtype=dtype, dies_at=dies_at),
+        lambda: Clips(8, size=2, dtype=dtype, dies_at=None),
+        OPTIM.grad_clip,
+    )
+    return module

@@ -1,0 +1,159 @@
+"""UDE's trainings stop and go on: after a kill bit for bit, and on two ranks as on one.
+
+MQ with its codebook learnt by gradient, MATE + UTT against a critic with spectral norm and gradient penalty,
+and the DMD. The processes of the two ranks run this file as a script.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from ude_training import NAMES, train
+
+from motionloom.pipeline.stages.training import read_metrics
+
+
+def newest(folder: Path) -> dict[str, Any]:
+    """What training goes on from, without the clock and the paths in it."""
+    path = max((folder / "checkpoints").iterdir())
+    checkpoint: dict[str, Any] = torch.load(path, weights_only=True)
+    return {name: checkpoint[name] for name in ("global_step", "epoch", "state_dict", "optimizer_states")}
+
+
+def flat(value: Any, where: str = "") -> dict[str, Any]:
+    """All levels as one."""
+    if isinstance(value, dict | list | tuple):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return {key: leaf for name, inner in items for key, leaf in flat(inner, f"{where}.{name}").items()}
+    return {where: value}
+
+
+def assert_equal(one: Any, two: Any) -> None:
+    """Bit for bit."""
+    first, second = flat(one), flat(two)
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        same = torch.equal(value, second[name]) if isinstance(value, Tensor) else value == second[name]
+        assert same, name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_killed_twice_equals_undisturbed(name: str, tmp_path: Path) -> None:
+    """With dropout, z, dropped conditions and drawn tokens; the first kill is before the critic begins."""
+    whole = train(name, tmp_path / "whole", dropout=0.2)
+    for step in (3, 9):
+        with pytest.raises(ConnectionResetError):
+            train(name, tmp_path / "killed", dies_at=step, dropout=0.2)
+    assert newest(tmp_path / "killed")["global_step"] == 8
+    again = train(name, tmp_path / "killed", dropout=0.2)
+    assert_equal(again.state_dict(), whole.state_dict())
+    assert_equal(newest(tmp_path / "killed"), newest(tmp_path / "whole"))
+    assert read_metrics(tmp_path / "killed") == read_metrics(tmp_path / "whole")
+
+
+def test_the_critic_and_its_spectral_norms_are_in_the_checkpoint(tmp_path: Path) -> None:
+    module = train("utt", tmp_path, steps=8)
+    kept = newest(tmp_path)
+    assert kept["state_dict"].keys() == module.state_dict().keys()
+    norms = [name for name in kept["state_dict"] if name.startswith("discriminator") and name.endswith("_u")]
+    assert len(norms) > 5
+    assert [len(o["state"]) > 0 for o in kept["optimizer_states"]] == [True, True]
+    assert not any(name.startswith("tokenizer") for name in kept["state_dict"])
+
+
+def test_a_seed_decides_what_is_drawn(tmp_path: Path) -> None:
+    one, two, still = (
+        train("utt", tmp_path / str(k), steps=6, dropout=rate).state_dict()
+        for k, rate in enumerate((0.2, 0.2, 0.0))
+    )
+    assert_equal(one, two)
+    shared = [name for name in one if name in still]
+    assert any(not torch.equal(one[name], still[name]) for name in shared)
+
+
+# ---- two ranks
+
+PAIRS = {"mq": torch.float64, "utt": torch.float32, "dmd": torch.float64}
+"""UTT's logits are float32 in any case, and its decoder reads what comes of them."""
+BOUND = 1e-5
+
+
+def worker(out: Path) -> None:
+    torch.set_num_threads(1)
+    for name, dtype in PAIRS.items():
+        module = train(name, out / name, dtype=dtype, devices=2)
+        torch.save(module.state_dict(), out / f"{name}-{os.environ['RANK']}.pt")
+    torch.distributed.barrier()
+    os._exit(0)  # without destructors, as the program does
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders of the trainings on two ranks."""
+    folder = tmp_path_factory.mktemp("pair")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    path = os.pathsep.join([os.environ.get("PYTHONPATH", ""), str(Path(__file__).parents[2] / "helpers")])
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-P", __file__, str(folder)],
+            env={
+                **os.environ,
+                "PYTHONPATH": path,
+                "RANK": str(number),
+                "LOCAL_RANK": str(number),
+                "WORLD_SIZE": "2",
+                "LOCAL_WORLD_SIZE": "2",
+                "MASTER_ADDR": "127.0.0.1",
+                "MASTER_PORT": str(port),
+                "OMP_NUM_THREADS": "1",
+            },
+        )
+        for number in range(2)
+    ]
+    try:
+        assert [process.wait(timeout=200) for process in ranks] == [0, 0]
+    finally:
+        for process in ranks:
+            process.kill()
+    return folder
+
+
+def meant(name: str, value: Tensor) -> Tensor:
+    """Without the keys' biases: they change no softmax, so their gradients are rounding, which Adam makes
+    whole steps of.
+    """
+    if not name.endswith("qkv.bias"):
+        return value
+    query, _, values = value.chunk(3)
+    return torch.cat([query, values])
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("name", list(PAIRS))
+def test_two_ranks_equal_one(name: str, pair: Path, tmp_path: Path) -> None:
+    one = train(name, tmp_path, dtype=PAIRS[name])
+    first, second = (torch.load(pair / f"{name}-{rank}.pt", weights_only=True) for rank in range(2))
+    assert_equal(first, second)
+    for key, value in one.state_dict().items():
+        torch.testing.assert_close(
+            *(meant(key, weight) for weight in (first[key], value)),
+            rtol=BOUND, atol=BOUND, msg=lambda m, k=key: f"{k}: {m}",
+        )  # fmt: skip
+    rows = [read_metrics(folder) for folder in (tmp_path, pair / name)]
+    assert [sorted(row) for row in rows[0]] == [sorted(row) for row in rows[1]]
+    for row, other in zip(*rows, strict=True):
+        assert other == pytest.approx(row, rel=1e-5, abs=1e-5)
+
+
+if __name__ == "__main__":
+    worker(Path(sys.argv[1]))
