@@ -63,7 +63,7 @@ class DmdStage(TrainedStage):
         tokenizer = given["tokenizer"].net
         if config.net.schedule.predicts == "epsilon" and config.net.dim < tokenizer.dim:
             raise UserError(
-                f"net.dim {config.net.dim} cannot carry the noise of {tokenizer.dim} columns, which a network "
+                f"net.dim {config.net.dim} cannot carry the noise of {tokenizer.dim} columns, and a network "
                 f"that predicts the noise has to give back: raise net.dim to {tokenizer.dim} or more, or set "
                 f"net.schedule.predicts: sample"
             )
