@@ -131,6 +131,29 @@ stages:
   report: {count: 1}
 """
 
+UDE = """
+extends: ude-tiny
+name: ude-small
+seed: 3
+hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
+stages:
+  data: {clips: 38, max_seconds: 5.0, dances: {songs: 8, song_seconds: 10.0}}
+  tokenizer:
+    net: {width: 16, code_dim: 16, num_codes: 32}
+    train: {steps: 12, batch_size: 8, checkpoint_every: 4, validate_every: 6}
+  utt:
+    net: {layers: 1, dim: 32, heads: 2, ff: 64}
+    mate: {dim: 32, layers: 1, heads: 2, ff: 32}
+    loss: {adversarial_start: 4, adversarial_ramp: 4, discriminator: {dim: 16, ff: 32, heads: 2}}
+    max_frames: 64
+    train: {steps: 12, batch_size: 8, checkpoint_every: 4, validate_every: 6}
+  dmd:
+    net: {dim: 32, ff: 32, encoder_layers: 1, decoder_layers: 1, heads: 2}
+    window: 64
+    train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}
+  ude: {denoising_steps: 4}
+"""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -228,6 +251,19 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any
     recipe.write_text(SMALL)
     folder = root / "run"
     process = start("run", recipe, "--out", folder)
+    output, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, output
+    return SmallRun(recipe, folder, output)
+
+
+@pytest.fixture(scope="session")
+def ude_run(tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any]) -> SmallRun:
+    """A small UDE, text or music to motion, up to the stage that generates."""
+    root = tmp_path_factory.mktemp("ude")
+    recipe = root / "ude-small.yaml"
+    recipe.write_text(UDE)
+    folder = root / "run"
+    process = start("run", recipe, "--out", folder, "--until", "ude")
     output, _ = process.communicate(timeout=240)
     assert process.returncode == 0, output
     return SmallRun(recipe, folder, output)

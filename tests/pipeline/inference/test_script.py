@@ -115,7 +115,7 @@ MISTAKES = {
     "segments: [{music: song.wav, start: 3, end: 2}]": r"segments\.0.*end 2 is not behind start 3",
     "segments: [{music: song.wav, start: -1}]": r"segments\.0\.start",
     "segments: [{music: song.wav, seconds: 2, end: 1}]": r"segments\.0.*give seconds or end, not both",
-    "segments: [{music: song.wav, end: 20}]": r"show\.yaml: segments\.0: song.wav is 6.0 s long and 0 s to 20 s was asked",
+    "segments: [{music: song.wav, end: 20}]": r"show\.yaml: segments\.0: song\.wav is 6.0 s long",
     "segments: [{text: a, seconds: 1}, {music: song.wav, start: 9}]":
         r"show\.yaml: segments\.1: song.wav is 6.0 s long and 9 s to its end was asked for; shorten it",
     "segments: [{music: song.wav, start: 5, seconds: 4}]": r"segments\.0: song.wav .* 5 s to 9 s",

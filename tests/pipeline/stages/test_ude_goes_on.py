@@ -138,6 +138,7 @@ def meant(name: str, value: Tensor) -> Tensor:
     return torch.cat([query, values])
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("name", list(PAIRS))
 def test_two_ranks_equal_one(name: str, pair: Path, tmp_path: Path) -> None:
