@@ -53,6 +53,9 @@ if TYPE_CHECKING:
 _AT_ONCE = 64
 """Motions sampled together."""
 
+_BEYOND = 0.5
+"""Seconds that a motion may be longer than its music."""
+
 
 @dataclass(frozen=True)
 class GeneratedMotion:
@@ -347,10 +350,15 @@ class Bundle:
         if len(wanted) != len(prompts):
             raise UserError(f"{len(prompts)} captions but {len(wanted)} lengths in seconds")
         out: list[int | None] = []
-        for length in wanted:
+        for length, prompt in zip(wanted, prompts, strict=True):
             if length is None:
                 out.append(None)
                 continue
+            if prompt.sound is not None and prompt.sound.seconds + _BEYOND < length < math.inf:
+                raise UserError(
+                    f"{length:g} s were asked for and the music lasts {prompt.sound.seconds:.1f} s; take at "
+                    f"most as many seconds"
+                )
             units = round(length * fps / unit) if math.isfinite(length) else 0
             if units < 1 or (most is not None and units * unit > most):
                 longest = "any length from" if most is None else f"{unit / fps:.2g} to"

@@ -144,6 +144,8 @@ def test_words_beside_a_song_and_words_alone(model: MotionModel, folder: Path) -
     free = model.generate(["a person walks"], seed=1)[0]
     assert 4 <= len(free.joints) <= 64 and free.prompt.sound is None
     some = model.generate(["a person walks", ""], sounds=[None, sound], seconds=2.0, seed=2)
+    cut = model.generate(sounds=[sound.slice(0.0, 2.0)], seconds=2.4, seed=2)  # a little silence is fine
+    assert len(cut[0].joints) == 48
     assert [len(motion.joints) for motion in some] == [40, 40]
 
 
@@ -229,6 +231,7 @@ def test_a_model_of_music_refuses_words(ude_run: Any, folder: Path, tmp_path: Pa
     [
         (("--audio", "nothing.wav"), "nothing.wav: no such sound file"),
         (("--audio", "slow.wav", "--samples", "0"), "--samples 0"),
+        (("--audio", "slow.wav", "--seconds", "9"), "9 s were asked for and the music lasts 5.0 s"),
         (("a", "b", "--audio", "slow.wav"), "2 captions but 1 sounds"),
         (("a", "--script", "show.yaml"), "--script says everything"),
         ((), "at least one caption"),
