@@ -136,6 +136,7 @@ def test_arrows_go_down_the_documented_floors() -> None:
         (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Rooms")[1].split("## ")[0]
     )
     order = [name.rstrip("/") for name in re.findall(r"^\| `([\w/]+)` \|", text, re.M)]
+    order = [name for name in order if name not in FOLDERS]  # the heads of the tables
     place = {name: number for number, name in enumerate(order)}
     for room, targets in room_arrows().items():
         if room not in FOLDERS:  # what lies at a folder's top: the API, schema.py, conditions.py

@@ -31,8 +31,6 @@ class Truth:
     face_caption: str
     truth: dict | None
     present: int = PRESENT_ALL
-    begin: float = 0.0
-    """Second of the clip where the stretch begins."""
 
 
 def truth_of(
@@ -74,7 +72,6 @@ def _truth(
         face_caption=max(faces, key=lambda face: _overlap(face, span)).text if faces else span.text,
         truth=truth,
         present=present,
-        begin=span.first / layout.fps,
     )
 
 

@@ -61,6 +61,12 @@ class DmdStage(TrainedStage):
     def facts(self, config: DmdStageConfig, given: Given) -> ModelFacts:
         """Config and the tokenizer's streams."""
         tokenizer = given["tokenizer"].net
+        if config.net.schedule.predicts == "epsilon" and config.net.dim < tokenizer.dim:
+            raise UserError(
+                f"net.dim {config.net.dim} cannot carry the noise of {tokenizer.dim} columns, and a network "
+                f"that predicts the noise has to give back: raise net.dim to {tokenizer.dim} or more, or set "
+                f"net.schedule.predicts: sample"
+            )
         extra = {
             "streams": {s.name: s.num_codes for s in tokenizer.streams},
             "pattern": list(tokenizer.pattern),

@@ -52,7 +52,7 @@ stages:
     kind: pacer
     net: {{width: 8}}
     train: {{steps: {STEPS}, batch_size: 8, checkpoint_every: 10, validate_every: 20, ema: 0.9}}
-  generate: {{kind: generate, count: 1, formats: [npz]}}
+  generate: {{kind: generate, dances: 1, dance_seconds: 2, formats: [npz]}}
   evaluate_dances: {{kind: evaluate_dances, clips: 2, repeats: 1, shuffles: 1, pool: 4}}
   report: {{kind: report, count: 1}}
 """
@@ -207,7 +207,7 @@ def test_export_loads_and_generates(run: Path, export: Path, known: None, tmp_pa
 
 
 def test_the_recipe_schema_has_it(known: None) -> None:
-    stages = recipe_schema()["properties"]["stages"]["additionalProperties"]
+    stages = recipe_schema()["properties"]["stages"]["additionalProperties"]["anyOf"][0]
     assert "pacer" in stages["properties"]["kind"]["enum"]
     (branch,) = (b["then"] for b in stages["allOf"] if b["if"]["properties"]["kind"]["const"] == "pacer")
     assert {"critic", "adversarial", "window"} <= set(branch["properties"])
