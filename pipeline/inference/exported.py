@@ -50,7 +50,7 @@ def write_exported(stages: Iterable[Finished], layout: LayoutFacts, skeleton: Sk
     needed: dict[str, Finished] = {}
     for stage in makers:
         _collect(stage, needed)
-    entries = {}
+    entries: dict[str, ExportedStage] = {}
     (out / BUNDLE_FILE).unlink(missing_ok=True)
     for name, stage in needed.items():
         try:
