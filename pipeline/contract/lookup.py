@@ -27,6 +27,18 @@ def previews(stage: Stage, others: Mapping[str, Stage]) -> Given:
     return Given({role: maker(name) for role, name in stage.inputs.items()})
 
 
+def stages_giving(run: Path, what: str) -> list[str]:
+    """Stages of a run's recipe, finished or not, that give `what` to others."""
+    out = []
+    for name, entry in stages_of(run).items():
+        where = f"{run / 'recipe.yaml'}: stages.{name}"
+        kind = stage_kind(str(entry["kind"]), where)
+        fields = {key: value for key, value in entry.items() if key not in ("kind", "inputs")}
+        if what in kind.gives(kind.config.parse(fields, where)):
+            out.append(name)
+    return out
+
+
 def finished_stages(run: Path) -> dict[str, Finished]:
     """The finished stages of a run by name, in the recipe's order."""
     out: dict[str, Finished] = {}

@@ -11,14 +11,13 @@ from rich.table import Table
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.retrieval import RECALLS, recall
-from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.lookup import finished_stages, stages_giving
 from motionloom.pipeline.contract.stage import ALIGNMENT, Finished, Shelf
 from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import write_json
-from motionloom.pipeline.store.run_folder import stages_of
 
 THRESHOLD = 0.9
 """Protocol B: captions with a higher sentence cosine count as the same."""
@@ -43,7 +42,7 @@ def retrieve(
 ) -> list[ProtocolResult]:
     """All four protocols for one alignment stage of a run, on a split of its data.
 
-    By default the run's first alignment stage, on its test split or else another one held out.
+    By default its stage `tma`, or else its first, on its test split or else another one held out.
     """
     found = alignment_stage(run, stage)
     shelf = Shelf(choose_device(device))
@@ -74,19 +73,16 @@ def retrieve(
 
 
 def alignment_stage(run: Path, name: str | None = None) -> Finished:
-    """A finished stage that aligns text with motion, by name or the run's first."""
-    stages = finished_stages(run)
-    aligned = [stage.name for stage in stages.values() if stage.gives(ALIGNMENT)]
-    if name is None and aligned:
-        name = aligned[0]
+    """A finished stage that aligns text with motion: by name, else `tma`, else the recipe's first."""
+    aligned = stages_giving(run, ALIGNMENT)
+    if name is None:
+        name = "tma" if "tma" in aligned or not aligned else aligned[0]
     if name not in aligned:
-        if name is None or name in stages_of(run):
-            what = f"'{name}' is not a finished stage" if name else "no finished stage is one"
-        else:
-            what = f"there is no stage '{name}'"
-        known = f"this run has {', '.join(aligned)}" if aligned else "this run has none yet"
-        raise UserError(f"{run}: {what} that aligns text with body and hands; {known}")
-    found = stages[str(name)]
+        known = f"this run has {', '.join(aligned)}" if aligned else "this run has none"
+        raise UserError(f"{run}: no stage '{name}' that aligns text with body and hands; {known}")
+    found = finished_stages(run).get(name)
+    if found is None:
+        raise UserError(f"{run}: no finished '{name}' stage; run the recipe up to it first")
     missing = [role for role in ("data", "stats", "text") if role not in found.inputs]
     if missing:
         raise UserError(f"{run}: no finished '{missing[0]}' stage; run the recipe up to it first")

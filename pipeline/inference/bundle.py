@@ -94,7 +94,8 @@ class Bundle:
         self._encoders: dict[str, PromptEncoder] = {}
         for stage in self.stages:
             self._open(stage)
-        if all(self.of(stage).part == "face" for stage in self.stages):
+        parts = [self.of(stage).part for stage in self.stages]
+        if all(part == "face" for part in parts):
             raise UserError("no finished stage here generates body motion; run the recipe to the end first")
 
     @staticmethod
