@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
-from motionloom.pipeline.contract.stage import StageContext
+from motionloom.pipeline.contract.stage import Shelf, StageContext
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.training import TrainConfig, fit
 
@@ -100,7 +100,7 @@ def context(folder: Path, **hardware: Any) -> StageContext:
     given: dict[str, Any] = {"accelerator": "cpu", "devices": 1, "threads": 1, "loggers": (), **hardware}
     return StageContext(
         name="duel", recipe="test", config=None, folder=folder, inputs={}, seed=0,
-        hardware=Hardware(**given), console=Console(quiet=True),
+        hardware=Hardware(**given), console=Console(quiet=True), shelf=Shelf(),
     )  # fmt: skip
 
 

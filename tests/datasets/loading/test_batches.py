@@ -255,8 +255,8 @@ def test_batches_hold_the_embeddings_that_say_what_is_alike(
     plain = batch_of(text)
     assert torch.equal(plain["similarity"], plain["conditions"]["text"].pooled), "one encoder for both"
     captions = list(text.captions_by_key().values())
-    TextCache.build(tmp_path / "similarity", captions, Likeness(), progress=False)
-    batch = batch_of(TextCache.build(tmp_path, captions, WordLengths(), progress=False))
+    build_with_encoder(tmp_path / "similarity", captions, Likeness(), progress=False)
+    batch = batch_of(build_with_encoder(tmp_path, captions, WordLengths(), progress=False))
     assert torch.equal(batch["conditions"]["text"].pooled, plain["conditions"]["text"].pooled)
     wanted = np.eye(3)[[len(caption) % 3 for caption in batch["caption"]]]
     np.testing.assert_array_equal(batch["similarity"].numpy(), wanted)

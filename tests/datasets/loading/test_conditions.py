@@ -24,9 +24,11 @@ from motionloom.datasets.loading.modalities import KINDS, Balance, Drop
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
+from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache
 from motionloom.datasets.text.encoder import EncodedText
 
@@ -73,14 +75,15 @@ def written(root: Path, count: int = 60, every: int = 1, rate: int = 1) -> Shard
         root,
         [("train", i) for i in range(count)],
         partial(clip, every=every, rate=rate),
-        name="made",
-        layout=LAYOUT,
-        licence="CC0",
-        converter="test",
-        converter_version=1,
-        options={"count": count, "every": every, "rate": rate},
-        clips_per_shard=16,
-        progress=False,
+        DatasetFacts(
+            name="made",
+            layout=LAYOUT,
+            licence="CC0",
+            converter="test",
+            converter_version=1,
+            options={"count": count, "every": every, "rate": rate},
+        ),
+        WriteOptions(clips_per_shard=16, progress=False),
     )
     return ShardDataset.open(root, "train")
 
@@ -103,7 +106,7 @@ def heard(data: ShardDataset) -> AudioStats:
 @pytest.fixture(scope="module")
 def text(data: ShardDataset, tmp_path_factory: pytest.TempPathFactory) -> TextCache:
     captions = [caption.text for i in range(60) for caption in clip(i, every=0).texts]
-    return TextCache.build(tmp_path_factory.mktemp("text"), captions, WordLengths(), progress=False)
+    return build_with_encoder(tmp_path_factory.mktemp("text"), captions, WordLengths(), progress=False)
 
 
 def kind_of(data: ShardDataset, i: int) -> str:

@@ -59,10 +59,12 @@ def opened(place: Path | str, mode: str, cache: CacheConfig | None = None) -> Sh
 
 
 def equal(one: Any, other: Any) -> bool:
-    return one.keys() == other.keys() and all(
-        torch.equal(value, other[key]) if isinstance(value, torch.Tensor) else value == other[key]
-        for key, value in one.items()
-    )
+    """Batches, their conditions included."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(equal(value, other[key]) for key, value in one.items())
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(equal, one, other))
+    return torch.equal(one, other) if isinstance(one, torch.Tensor) else bool(one == other)
 
 
 # --- the order -----------------------------------------------------------------------------------------

@@ -279,10 +279,11 @@ def worker(number: int, folder: Path) -> None:
 def two(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     """What each of two ranks found, per case."""
     folder = tmp_path_factory.mktemp("ranks")
+    helpers = [str(Path(__file__).parents[2] / "helpers"), *filter(None, [os.environ.get("PYTHONPATH")])]
     ranks = [
         subprocess.Popen(
             [sys.executable, "-P", __file__, str(number), str(folder)],
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(helpers)},
         )
         for number in range(2)
     ]

@@ -12,12 +12,12 @@ import tiny_players
 import torch
 from rich.console import Console
 from tiny_players import Duel, Vectors
+from toy_stages import register_toys
 
 from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.contract.stage import FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.runs.graph import execute, make_plan, replaced_trainings
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
-from motionloom.pipeline.stages import table
-from motionloom.pipeline.stages.stage import StageConfig, StageContext, StageKind
 from motionloom.pipeline.stages.training import TrainedStageConfig, fit
 from motionloom.pipeline.store.artifact import Artifact
 
@@ -56,10 +56,9 @@ class AnyConfig(StageConfig):
 
 @pytest.fixture(autouse=True)
 def kinds(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    root = StageKind("root", "nothing", AnyConfig, lambda _: None)
-    duel = StageKind("duel", "a duel", DuelConfig, run_duel, ("data",), trains=True)
-    monkeypatch.setitem(table.STAGES, "root", root)
-    monkeypatch.setitem(table.STAGES, "duel", duel)
+    root = FunctionStage("root", "nothing", AnyConfig, lambda _: None)
+    duel = FunctionStage("duel", "a duel", DuelConfig, run_duel, ("data",), trains=True)
+    register_toys(monkeypatch, root, duel)
     yield
 
 
