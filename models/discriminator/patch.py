@@ -38,6 +38,7 @@ class DiscriminatorConfig(Config):
     layers: int = Field(default=2, ge=1)
     heads: int = Field(default=8, ge=1)
     ff: int = Field(default=1024, ge=1)
+    """Width of the transformer's feed-forward layers."""
     dropout: float = Field(default=0.1, ge=0, lt=1)
     spectral_norm: bool = False
     """Divide every linear and convolution weight by its largest singular value [ours]."""

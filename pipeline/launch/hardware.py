@@ -26,8 +26,8 @@ class Hardware(Config):
     """Processes on this node; 0 means every visible GPU, or one process on a CPU."""
     cpu_devices: int = Field(1, ge=1)
     """Processes on this node where `devices` is 0 and it trains on a CPU, at most one for each core that this
-    process may use. Small networks train nearly twice as fast in two processes of one thread as in one
-    process of two: the threads wait for each other at every operation, the processes once a step."""
+    process may use. Threads of one process wait for each other at every operation, processes once a
+    step, so small networks often train faster in several processes of one thread."""
     nodes: int = Field(1, ge=1)
     workers: int = Field(0, ge=0)
     """Loader worker processes per rank."""
@@ -90,8 +90,10 @@ class Hardware(Config):
             where = f"{count} x {torch.cuda.get_device_name(0) if here else 'GPU (none is here)'}"
         else:
             why = "" if self.accelerator == "cpu" else " (no GPU found)"
+            threads = self.threads or torch.get_num_threads()
             where = (
-                f"CPU{why}, {count} process{'es' if count > 1 else ''} x {torch.get_num_threads()} threads"
+                f"CPU{why}, {count} process{'es' if count > 1 else ''}"
+                f" x {threads} thread{'s' if threads > 1 else ''}"
             )
         return where + (f", {nodes} nodes" if nodes > 1 else "")
 
