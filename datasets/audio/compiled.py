@@ -1,20 +1,24 @@
 """librosa, imported when it is first used and compiled by one process at a time.
 
-librosa compiles parts of itself with numba: half a minute or more when it is first used on a machine, then
-seconds in each process. Processes that fill one cache of numba's at once can mix their files and crash (numba
-issue 10128), which the workers of a first conversion would do. So the first process compiles everything that
-audio features use behind a lock and leaves a mark; whoever finds the mark just imports.
+librosa compiles parts of itself with numba: half a minute or more when it is first used in an environment,
+then seconds in each process. Processes that fill one cache of numba's at once can mix their files and crash
+(numba issue 10128), which the workers of a first conversion would do. So the first process compiles all
+that audio features use behind a lock and leaves a mark beside the cache; whoever finds the mark just imports.
+A cache holds for one installation and one type of processor, and so does a mark: a new environment, a cleared
+cache and another node of a cluster begin anew.
 """
 
 from __future__ import annotations
 
 import fcntl
+import importlib.util
 import os
 import tempfile
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -22,17 +26,40 @@ import numpy as np
 @lru_cache(maxsize=1)
 def load_librosa() -> Any:
     """The module, with what audio features use of it compiled."""
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or tempfile.gettempdir())
-    folder.mkdir(parents=True, exist_ok=True)
-    name = f"motionloom-{os.getuid()}-librosa-{version('librosa')}-numba-{version('numba')}"
-    mark = folder / f"{name}.compiled"
+    mark = _mark()
     if mark.exists():
         return _imported()
-    with (folder / f"{name}.lock").open("ab") as lock:
+    with mark.with_suffix(".lock").open("ab") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         module = _imported()
         mark.touch()
     return module
+
+
+def _mark() -> Path:
+    """Where it says that the cache is filled: in the cache's folder, chosen as numba chooses it."""
+    from llvmlite.binding import get_host_cpu_name
+
+    spec = importlib.util.find_spec("librosa")
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError("No module named 'librosa'", name="librosa")
+    source = Path(spec.origin)
+    about = source.stat()
+    which = crc32(f"{source.resolve()} {about.st_mtime_ns} {about.st_size} {get_host_cpu_name()}".encode())
+    name = f"motionloom-librosa-{version('librosa')}-numba-{version('numba')}-{which:08x}.compiled"
+    wanted = os.environ.get("NUMBA_CACHE_DIR")
+    for folder in (Path(wanted) if wanted else source.parent / "__pycache__", _own_temporary()):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder / name
+    raise PermissionError(f"no folder to write to; set TMPDIR to one that user {os.getuid()} may write")
+
+
+def _own_temporary() -> Path:
+    return Path(tempfile.gettempdir()) / f"motionloom-{os.getuid()}"
 
 
 def _imported() -> Any:

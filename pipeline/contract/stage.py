@@ -215,7 +215,8 @@ class StageKind(ABC):
     """A few words for people."""
     config: type[StageConfig]
     takes: tuple[str | Every, ...] = ()
-    """Inputs: roles, with a trailing "?" for one that a recipe can do without, or `Every`."""
+    """Inputs: roles, with a trailing "?" for one that a recipe can do without, or `Every`. A role is called
+    as the kind that fills it, or as what that must give (`fills`)."""
     version: int = 1
     """Raised when the same config makes something else than before."""
     trains: bool = False
@@ -223,6 +224,10 @@ class StageKind(ABC):
     def gives(self, config: Any) -> frozenset[str]:
         """Names of what other stages may ask of this one, such as "tokenizer" or `GENERATOR`."""
         return frozenset()
+
+    def fills(self, role: str, config: Any) -> bool:
+        """Whether it may stand in a role: its kind is called so, or it gives what the role is called."""
+        return role == self.name or role in self.gives(config)
 
     def roles(self) -> tuple[Role | Every, ...]:
         """`takes`, parsed."""

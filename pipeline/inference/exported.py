@@ -111,6 +111,12 @@ def open_exported(folder: Path) -> list[Finished]:
                 )
             inputs = {role: build(source, (*above, name)) for role, source in entry.inputs.items()}
             config = kind.config.parse(entry.config, f"{path}: stages.{name}.config")
+            for role, source in inputs.items():
+                if not source.kind.fills(role, source.config):
+                    raise UserError(
+                        f"{path}: stages.{name}.inputs: '{source.name}' of kind {source.kind.name} is no "
+                        f"{role}; export the run again"
+                    )
             made[name] = Finished(name, kind, config, folder / name, inputs, exported=True)
         return made[name]
 

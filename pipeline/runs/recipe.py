@@ -183,6 +183,7 @@ def _resolve(stage: Stage, renamed: Any, all_stages: list[Stage], where: str) ->
         if source is None and role.optional:
             continue
         if source in known:
+            _require_fills(stage, role.name, all_stages[known.index(source)], all_stages, where)
             inputs[role.name] = source
         elif role.name in renamed or not role.optional:
             raise UserError(
@@ -190,6 +191,18 @@ def _resolve(stage: Stage, renamed: Any, all_stages: list[Stage], where: str) ->
                 f"{nearest(str(source), [other for other in known if other != name])}"
             )
     return inputs
+
+
+def _require_fills(stage: Stage, role: str, source: Stage, all_stages: list[Stage], where: str) -> None:
+    if source.kind.fills(role, source.config):
+        return
+    others = [s.name for s in all_stages if s.name != stage.name and s.kind.fills(role, s.config)]
+    raise UserError(
+        f"{where}: stages.{stage.name}: its input '{role}' is the stage '{source.name}' of kind "
+        f"{source.kind.name}, which is no {role}; choose "
+        + (" or ".join(others) if others else f"a stage that gives a {role}")
+        + f" in stages.{stage.name}.inputs.{role}"
+    )
 
 
 def _every(stage: Stage, role: Every, listed: Any, all_stages: list[Stage], where: str) -> list[str]:

@@ -82,8 +82,8 @@ class GptStage(TrainedStage):
     version = 3  # captions about parts of clips, clips without hands, sBERT's filter, dropped texts
 
     def gives(self, config: GptStageConfig) -> frozenset[str]:
-        """Motion of text."""
-        return super().gives(config) | {GENERATOR}
+        """Motion of text, and what another GPT starts from."""
+        return super().gives(config) | {GENERATOR, "start"}
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Its TMA must read captions as it does, and a GPT that it starts from must be the same network."""

@@ -120,6 +120,13 @@ class UttStage(TrainedStage):
 
     def module(self, config: UttStageConfig, net: Any, given: Given, seed: int) -> UttModule:
         """Cross-entropy, and what the discriminator says of the decoded motion."""
+        groups = config.max_frames // GROUP_FRAMES
+        if groups > net.utt.max_groups:
+            raise UserError(
+                f"net.block_size {config.net.block_size} holds {net.utt.max_groups} groups of tokens and "
+                f"max_frames {config.max_frames} has {groups}; raise net.block_size, or set max_frames to "
+                f"{net.utt.max_groups * GROUP_FRAMES}"
+            )
         return UttModule(
             net,
             config.optim,
