@@ -147,6 +147,10 @@ WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
     "an input that is missing": (
         lambda f: f["stages"]["gpt"]["inputs"].pop("tokenizer"), "no finished 'tokenizer' stage here"
     ),
+    "an input of another kind": (
+        lambda f: f["stages"]["gpt"]["inputs"].update(tokenizer="tma"),
+        "stages.gpt.inputs: 'tma' of kind tma is no tokenizer",
+    ),
     "an unknown key": (lambda f: f.update(code="os"), "unknown key 'code'"),
 }  # fmt: skip
 

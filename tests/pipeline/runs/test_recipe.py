@@ -203,6 +203,28 @@ def test_a_dry_run_refuses_what_cannot_run(override: str, says: str, tmp_path: P
         run_recipe("humantomato-tiny", tmp_path, overrides=[override], dry_run=True, console=console)
 
 
+def test_a_stage_that_cannot_stand_in_a_role(tmp_path: Path) -> None:
+    """By kind (`stats`) or by what it gives (`tokenizer`); what would fit is named."""
+    head = "extends: humantomato-tiny\nname: x\n"
+    wrong = write(tmp_path, head + "stages: {gpt: {inputs: {tokenizer: tma}}}")
+    with pytest.raises(UserError, match=r"'tma' of kind tma, which is no tokenizer; choose .*face_tokenizer"):
+        load_recipe(wrong)
+    wrong = write(tmp_path, head + "stages: {tma: {inputs: {stats: data}}}")
+    with pytest.raises(
+        UserError, match=r"'data' of kind synth, which is no stats; choose stats in stages\.tma"
+    ):
+        load_recipe(wrong)
+    fits = write(tmp_path, head + "stages: {face_gpt: {inputs: {start: gpt}}}")
+    with pytest.raises(UserError, match="starts from 'gpt', which differs in"):
+        load_recipe(fits)
+
+
+def test_windows_longer_than_the_block_are_refused_before_training(tmp_path: Path) -> None:
+    console = Console(quiet=True)
+    with pytest.raises(UserError, match=r"block_size 48 holds 47 groups .* max_frames to 188"):
+        run_recipe("ude-tiny", tmp_path, overrides=["utt.max_frames=800"], dry_run=True, console=console)
+
+
 def test_shards_that_are_not_there_or_of_another_layout(tmp_path: Path) -> None:
     path = tmp_path / "recipe.yaml"
     path.write_text("name: x\nstages: {data: {kind: shards, path: shards}, stats: {kind: stats}}")
