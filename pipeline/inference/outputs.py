@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from motionloom.datasets.audio.features import beats
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.kinematics import joints_to_rotations
@@ -71,8 +72,15 @@ def write_motions(
 
 
 def score_of(motion: GeneratedMotion) -> Score:
-    """The music and the segments that a motion was driven by."""
-    return Score(sound=motion.prompt.sound, segments=motion.segments)
+    """The music that a motion was driven by, its beats, and the segments; beats only where music drove."""
+    sound = motion.prompt.sound
+    if sound is None:
+        return Score(segments=motion.segments)
+    found = [float(time) for time in beats(sound.samples, sound.rate)]
+    if motion.segments:
+        spans = [(one.start, one.end) for one in motion.segments if one.kind == "music"]
+        found = [time for time in found if any(start <= time < end for start, end in spans)]
+    return Score(sound=sound, beats=found, segments=motion.segments)
 
 
 def viewer_motion(

@@ -17,12 +17,13 @@ import numpy as np
 import pytest
 import soundfile
 
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.bundle import GeneratedMotion
-from motionloom.pipeline.inference.outputs import write_motions
+from motionloom.pipeline.inference.outputs import score_of, write_motions
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.score import Score, Segment, score_data
 from motionloom.pipeline.render.sound import RATE, Playing, embed_sounds, film_sound, playable
@@ -255,3 +256,24 @@ def test_generated_motions_pass_their_scores_to_film_and_page(tmp_path: Path, so
         heard_in(tmp_path / "out" / "01-b.mp4")  # has no sound
     with pytest.raises(UserError, match="1 scores for 2 motions"):
         write_motions(tmp_path / "no", motions, ["html"], title="t", seed=0, scores=scores[:1])
+
+
+def test_a_motion_made_from_music_shows_its_beats(walk: Make) -> None:
+    """Clicks twice a second; of a script, only beats of the stretches that music drove."""
+    rate = 16_000
+    clicks = np.zeros(8 * rate, np.float32)
+    decay = np.exp(-np.arange(800) / 100).astype(np.float32)
+    noise = np.random.default_rng(0).uniform(-1, 1, 800).astype(np.float32)
+    for start in range(0, len(clicks), rate // 2):
+        clicks[start : start + 800] = decay * noise
+    layout = MotionLayout.named("tomato623")
+    prompt = Prompt("a song", sound=Sound(clicks, rate))
+    motion = GeneratedMotion(prompt, np.zeros((8, 1), np.float32), walk(8), None, layout)
+    found = np.asarray(score_of(motion).beats)
+    assert len(found) >= 10
+    assert np.abs(found * 2 - np.round(found * 2)).max() / 2 < 0.06, "two frames of 30 a second"
+    bands = (Segment(0, 4, "walks"), Segment(4, 8, "a song", "music"))
+    part = np.asarray(score_of(replace(motion, segments=bands)).beats)
+    np.testing.assert_array_equal(part, found[found >= 4])
+    silent = GeneratedMotion(Prompt("walks"), motion.features, motion.joints, None, layout)
+    assert score_of(silent) == Score()
