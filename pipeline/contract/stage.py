@@ -64,7 +64,20 @@ class Role:
     """An input of a stage, filled by the stage of the same name unless the recipe names another."""
 
     name: str
-    optional: bool = False
+    optional: bool
+    gives: str
+    """What must fill it: a stage of the kind of this name, or one that gives this."""
+
+    @staticmethod
+    def parse(text: str) -> Role:
+        """As it stands in `takes`: "stats", "tma?", "face_tokenizer?: tokenizer"."""
+        left, _, gives = text.partition(":")
+        name = left.strip().removesuffix("?")
+        return Role(name, left.strip().endswith("?"), gives.strip() or name)
+
+    def fits(self, kind: StageKind, config: Any) -> bool:
+        """Whether a stage of this kind and config may fill it."""
+        return self.gives == kind.name or self.gives in kind.gives(config)
 
 
 @dataclass(frozen=True)
@@ -215,8 +228,8 @@ class StageKind(ABC):
     """A few words for people."""
     config: type[StageConfig]
     takes: tuple[str | Every, ...] = ()
-    """Inputs: roles, with a trailing "?" for one that a recipe can do without, or `Every`. A role is called
-    as the kind that fills it, or as what that must give (`fills`)."""
+    """Inputs: roles, with a trailing "?" for one that a recipe can do without, or `Every`. A role called
+    otherwise than what fills it tells that behind a colon: "face_tokenizer?: tokenizer"."""
     version: int = 1
     """Raised when the same config makes something else than before."""
     trains: bool = False
@@ -225,16 +238,9 @@ class StageKind(ABC):
         """Names of what other stages may ask of this one, such as "tokenizer" or `GENERATOR`."""
         return frozenset()
 
-    def fills(self, role: str, config: Any) -> bool:
-        """Whether it may stand in a role: its kind is called so, or it gives what the role is called."""
-        return role == self.name or role in self.gives(config)
-
     def roles(self) -> tuple[Role | Every, ...]:
         """`takes`, parsed."""
-        return tuple(
-            one if isinstance(one, Every) else Role(one.removesuffix("?"), one.endswith("?"))
-            for one in self.takes
-        )
+        return tuple(one if isinstance(one, Every) else Role.parse(one) for one in self.takes)
 
     # Before and while it runs.
 

@@ -14,7 +14,7 @@ from pydantic import Field
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.registry import stage_kind
-from motionloom.pipeline.contract.stage import GENERATOR, Finished
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Role
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.weights import LayoutFacts
 
@@ -111,8 +111,9 @@ def open_exported(folder: Path) -> list[Finished]:
                 )
             inputs = {role: build(source, (*above, name)) for role, source in entry.inputs.items()}
             config = kind.config.parse(entry.config, f"{path}: stages.{name}.config")
+            roles = {role.name: role for role in kind.roles() if isinstance(role, Role)}
             for role, source in inputs.items():
-                if not source.kind.fills(role, source.config):
+                if role not in roles or not roles[role].fits(source.kind, source.config):
                     raise UserError(
                         f"{path}: stages.{name}.inputs: '{source.name}' of kind {source.kind.name} is no "
                         f"{role}; export the run again"

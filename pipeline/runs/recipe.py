@@ -25,7 +25,7 @@ from pydantic import Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.registry import VARIABLE, stage_kinds
-from motionloom.pipeline.contract.stage import Every, Stage
+from motionloom.pipeline.contract.stage import Every, Role, Stage
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.defaults import fill, require_used
 from motionloom.pipeline.runs.layers import override, read_layers, read_recipe_file
@@ -183,7 +183,7 @@ def _resolve(stage: Stage, renamed: Any, all_stages: list[Stage], where: str) ->
         if source is None and role.optional:
             continue
         if source in known:
-            _require_fills(stage, role.name, all_stages[known.index(source)], all_stages, where)
+            _require_fit(stage, role, all_stages[known.index(source)], all_stages, where)
             inputs[role.name] = source
         elif role.name in renamed or not role.optional:
             raise UserError(
@@ -193,15 +193,15 @@ def _resolve(stage: Stage, renamed: Any, all_stages: list[Stage], where: str) ->
     return inputs
 
 
-def _require_fills(stage: Stage, role: str, source: Stage, all_stages: list[Stage], where: str) -> None:
-    if source.kind.fills(role, source.config):
+def _require_fit(stage: Stage, role: Role, source: Stage, all_stages: list[Stage], where: str) -> None:
+    if role.fits(source.kind, source.config):
         return
-    others = [s.name for s in all_stages if s.name != stage.name and s.kind.fills(role, s.config)]
+    others = [s.name for s in all_stages if s.name != stage.name and role.fits(s.kind, s.config)]
     raise UserError(
-        f"{where}: stages.{stage.name}: its input '{role}' is the stage '{source.name}' of kind "
-        f"{source.kind.name}, which is no {role}; choose "
-        + (" or ".join(others) if others else f"a stage that gives a {role}")
-        + f" in stages.{stage.name}.inputs.{role}"
+        f"{where}: stages.{stage.name}: its input '{role.name}' is the stage '{source.name}' of kind "
+        f"{source.kind.name}, which is no {role.gives}; choose "
+        + (" or ".join(others) if others else f"a stage that gives a {role.gives}")
+        + f" in stages.{stage.name}.inputs.{role.name}"
     )
 
 

@@ -78,12 +78,12 @@ class GptStage(TrainedStage):
     name = "gpt"
     summary = "GPT over motion tokens"
     config = GptStageConfig
-    takes = ("data", "text", "tokenizer", "tokens", "tma?", "start?")
+    takes = ("data", "text", "tokenizer", "tokens", "tma?", "start?: gpt")
     version = 3  # captions about parts of clips, clips without hands, sBERT's filter, dropped texts
 
     def gives(self, config: GptStageConfig) -> frozenset[str]:
-        """Motion of text, and what another GPT starts from."""
-        return super().gives(config) | {GENERATOR, "start"}
+        """Motion of text."""
+        return super().gives(config) | {GENERATOR}
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Its TMA must read captions as it does, and a GPT that it starts from must be the same network."""

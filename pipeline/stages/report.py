@@ -62,7 +62,13 @@ class ReportStage(StageKind):
     name = "report"
     summary = "the page to watch"
     config = ReportConfig
-    takes = ("data", "tokenizer?", "face_tokenizer?", Every("generators", GENERATOR), Every("shown", SHOWING))
+    takes = (
+        "data",
+        "tokenizer?",
+        "face_tokenizer?: tokenizer",
+        Every("generators", GENERATOR),
+        Every("shown", SHOWING),
+    )
     version = 4  # dances
 
     def gives(self, config: Any) -> frozenset[str]:

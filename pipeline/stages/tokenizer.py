@@ -110,7 +110,7 @@ class TokenizerStage(TrainedStage):
 
     def gives(self, config: Any) -> frozenset[str]:
         """Tokens of motion, and motion of tokens."""
-        return super().gives(config) | {"tokenizer", "face_tokenizer"}
+        return super().gives(config) | {"tokenizer"}
 
     def facts(self, config: TokenizerStageConfig, given: Given) -> ModelFacts:
         """Config and layout."""

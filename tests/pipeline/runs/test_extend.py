@@ -56,7 +56,7 @@ class AnyConfig(StageConfig):
 
 @pytest.fixture(autouse=True)
 def kinds(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    root = FunctionStage("root", "nothing", AnyConfig, lambda _: None)
+    root = FunctionStage("root", "nothing", AnyConfig, lambda _: None, given_names=frozenset({"data"}))
     duel = FunctionStage("duel", "a duel", DuelConfig, run_duel, ("data",), trains=True)
     register_toys(monkeypatch, root, duel)
     yield

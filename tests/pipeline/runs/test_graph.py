@@ -23,6 +23,8 @@ from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.files import write_json
 
+NUMBER = frozenset({"number"})
+
 
 class AddConfig(StageConfig):
     add: int = 1
@@ -38,8 +40,10 @@ def run_add(context: StageContext) -> None:
 def toy_kinds(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     register_toys(
         monkeypatch,
-        FunctionStage("root", "a number", AddConfig, run_add, given_names=frozenset({"number"})),
-        FunctionStage("sum", "a sum", AddConfig, run_add, ("left", "right?")),
+        FunctionStage("root", "a number", AddConfig, run_add, given_names=NUMBER),
+        FunctionStage(
+            "sum", "a sum", AddConfig, run_add, ("left: number", "right?: number"), given_names=NUMBER
+        ),
         FunctionStage("all", "a sum", AddConfig, run_add, (Every("numbers", "number"),)),
     )
     yield
@@ -109,7 +113,16 @@ def test_lost_output_runs_again(tmp_path: Path) -> None:
 def test_new_version_of_a_kind_runs_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go(tmp_path)
     register_toys(
-        monkeypatch, FunctionStage("sum", "a sum", AddConfig, run_add, ("left", "right?"), version=2)
+        monkeypatch,
+        FunctionStage(
+            "sum",
+            "a sum",
+            AddConfig,
+            run_add,
+            ("left: number", "right?: number"),
+            version=2,
+            given_names=NUMBER,
+        ),
     )
     assert go(tmp_path) == ["both", "one", "top"]
 
