@@ -326,13 +326,10 @@ def _check_start(stage: Stage, others: Mapping[str, Stage]) -> None:
         return
     ours: GptStageConfig = stage.config
     theirs: Any = start.config
-    if start.kind is not stage.kind:
-        wrong = [f"kind ({start.kind.name})"]
-    else:
-        wrong = [f"net.{size}" for size in _SIZES if getattr(ours.net, size) != getattr(theirs.net, size)]
-        wrong += ["prior"] if ours.prior != theirs.prior else []
-        roles = ("text", "tokenizer") + (("tma",) if ours.prior == "tma" else ())
-        wrong += [f"inputs.{role}" for role in roles if start.inputs.get(role) != stage.inputs.get(role)]
+    wrong = [f"net.{size}" for size in _SIZES if getattr(ours.net, size) != getattr(theirs.net, size)]
+    wrong += ["prior"] if ours.prior != theirs.prior else []
+    roles = ("text", "tokenizer") + (("tma",) if ours.prior == "tma" else ())
+    wrong += [f"inputs.{role}" for role in roles if start.inputs.get(role) != stage.inputs.get(role)]
     if wrong:
         raise UserError(
             f"stage '{stage.name}' starts from '{start.name}', which differs in {', '.join(wrong)}; give "

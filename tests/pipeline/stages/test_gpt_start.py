@@ -57,20 +57,23 @@ def test_a_stage_starts_from_anothers_weights(run: Callable[..., tuple[Any, Path
 
 
 @pytest.mark.parametrize(
-    ("changes", "named"),
+    ("changes", "says"),
     [
-        ({"net": {**MORE["net"], "heads": 2}}, "net.heads"),
-        ({"prior": "sentence"}, "prior"),
-        ({"inputs": {"start": "face_gpt"}}, "net.dim, net.ff, prior, inputs.tokenizer, inputs.tma"),
-        ({"inputs": {"start": "tma"}}, "kind (tma)"),
+        ({"net": {**MORE["net"], "heads": 2}}, "which differs in net.heads;"),
+        ({"prior": "sentence"}, "which differs in prior;"),
+        (
+            {"inputs": {"start": "face_gpt"}},
+            "which differs in net.dim, net.ff, prior, inputs.tokenizer, inputs.tma;",
+        ),
+        ({"inputs": {"start": "tma"}}, "which is no gpt; choose gpt or face_gpt in"),
     ],
 )
 def test_another_network_is_refused_before_anything_runs(
-    run: Callable[..., tuple[Any, Path]], changes: dict[str, Any], named: str
+    run: Callable[..., tuple[Any, Path]], changes: dict[str, Any], says: str
 ) -> None:
     outcome, _ = run("--dry-run", **changes)
     assert outcome.code == 2
-    assert f"which differs in {named};" in " ".join(outcome.err.split())
+    assert says in " ".join(outcome.err.split())
 
 
 @pytest.mark.parametrize("train", [{"compile": True}, {"strategy": "fsdp"}])
