@@ -31,7 +31,7 @@ from rich.table import Table
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.synth.face import read
 from motionloom.datasets.synth.measure import agrees
-from motionloom.models.gpt.sampling import sample_seeds
+from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.models.metrics.retrieval import recall
 from motionloom.pipeline.contract.generation import GenerationRequest, Prompt
 from motionloom.pipeline.contract.lookup import finished_stages, generators_of

@@ -18,7 +18,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.conditions import Condition, Conditions
-from motionloom.datasets.loading.crops import Crops, padded_length
+from motionloom.datasets.loading.crops import Crops
 from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
 from motionloom.datasets.loading.statistics import FeatureStats
@@ -171,20 +171,12 @@ class _CaptionedClips:
         self, clips: NDArray[np.int64], spans: list[CaptionSpan], crop: NDArray[np.float64]
     ) -> CaptionBatch:
         """The batch of `clips` [B] and their spans; `crop` in [0, 1) places the crop of too long a span."""
-        begin = np.array([span.first for span in spans], dtype=np.int64)
-        whole = np.array([span.frames for span in spans], dtype=np.int64)
-        length = np.minimum(whole, self.max_frames)
-        begin += (crop * (whole - length + 1)).astype(np.int64)
-        motion = np.empty((len(clips), padded_length(length), self.crops.width), dtype=np.float32)
-        present = self.dataset.present[clips]
-        for row, clip in enumerate(clips.tolist()):
-            source = self.dataset.motion(clip)
-            self.crops.fill(motion[row], source, int(begin[row]), int(length[row]), int(present[row]))
+        cut = self.crops.cut(clips, spans, crop, self.max_frames)
         captions = [span.text for span in spans]
         batch = {
-            "motion": torch.from_numpy(motion),
-            "length": torch.from_numpy(length),
-            "present": torch.from_numpy(self.crops.present[present]),
+            "motion": torch.from_numpy(cut.motion),
+            "length": torch.from_numpy(cut.length),
+            "present": torch.from_numpy(cut.present),
             "index": torch.from_numpy(clips.copy()),
             "valid": torch.ones(len(clips), dtype=torch.bool),
             "caption": captions,

@@ -19,7 +19,7 @@ from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.conditions import MODALITIES, Condition
 from motionloom.datasets.loading.audio_statistics import AudioStats
 from motionloom.datasets.loading.batches import ENDLESS, MotionBatch
-from motionloom.datasets.loading.crops import Crops, padded_length
+from motionloom.datasets.loading.crops import Crops
 from motionloom.datasets.loading.modalities import KINDS, Balance, Drop, Kind, KindPlan, kinds_of
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
 from motionloom.datasets.loading.statistics import FeatureStats
@@ -109,16 +109,7 @@ class ConditionedClips:
         crop: NDArray[np.float64],
     ) -> ConditionBatch:
         """The batch of `clips` [B] of `kinds` [B]; `crop` in [0, 1) places the window of too long a span."""
-        whole = np.array([span.frames for span in spans], dtype=np.int64)
-        length = np.minimum(whole, self.max_frames)
-        begin = np.array([span.first for span in spans], dtype=np.int64)
-        closed = torch.from_numpy(length == whole)
-        begin += (crop * (whole - length + 1)).astype(np.int64)
-        motion = np.empty((len(clips), padded_length(length), self.crops.width), dtype=np.float32)
-        present = self.dataset.present[clips]
-        for row, clip in enumerate(clips.tolist()):
-            source = self.dataset.motion(clip)
-            self.crops.fill(motion[row], source, int(begin[row]), int(length[row]), int(present[row]))
+        cut = self.crops.cut(clips, spans, crop, self.max_frames)
         captions = [span.text for span in spans]
         conditions: dict[str, Condition] = {}
         if self.text is not None:
@@ -126,13 +117,15 @@ class ConditionedClips:
             conditions["text"] = self._text(self.text, captions, read)
         if self.audio is not None:
             heard = np.isin(kinds, [KINDS.index("audio"), KINDS.index("both")])
-            conditions["audio"] = self._audio(self.audio, clips, heard, begin, length, motion.shape[1])
+            conditions["audio"] = self._audio(
+                self.audio, clips, heard, cut.begin, cut.length, cut.motion.shape[1]
+            )
         return {
-            "motion": torch.from_numpy(motion),
-            "length": torch.from_numpy(length),
-            "present": torch.from_numpy(self.crops.present[present]),
+            "motion": torch.from_numpy(cut.motion),
+            "length": torch.from_numpy(cut.length),
+            "present": torch.from_numpy(cut.present),
             "index": torch.from_numpy(clips.copy()),
-            "closed": closed,
+            "closed": torch.from_numpy(cut.closed),
             "valid": torch.ones(len(clips), dtype=torch.bool),
             "caption": captions,
             "conditions": conditions,

@@ -10,15 +10,32 @@ Columns of a part that a clip does not hold (hands, face) come out as 0, the mea
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.loading.spans import CaptionSpan
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.reader import require_layout
+
+
+class Cut(NamedTuple):
+    """Stretches of clips as one batch."""
+
+    motion: NDArray[np.float32]
+    """[B, T, C], zeros behind each row's `length`."""
+    begin: NDArray[np.int64]
+    """First frame in the clip, [B]."""
+    length: NDArray[np.int64]
+    closed: NDArray[np.bool_]
+    """Whether the row is the whole stretch that was asked for, [B]."""
+    present: NDArray[np.bool_]
+    """Columns that each clip holds, [B, C]."""
 
 
 class Crops:
@@ -65,6 +82,21 @@ class Crops:
             target[:, place] = 0.0
         if length < len(out):
             out[length:] = 0.0
+
+    def cut(
+        self, clips: NDArray[np.int64], spans: Sequence[CaptionSpan], at: NDArray[np.float64], most: int
+    ) -> Cut:
+        """The spans of `clips` [B]; one longer than `most` frames is cropped at `at` [B] in [0, 1)."""
+        whole = np.array([span.frames for span in spans], dtype=np.int64)
+        length = np.minimum(whole, most)
+        begin = np.array([span.first for span in spans], dtype=np.int64)
+        begin += (at * (whole - length + 1)).astype(np.int64)
+        motion = np.empty((len(clips), padded_length(length), self.width), dtype=np.float32)
+        bits = self.dataset.present[clips]
+        for row, clip in enumerate(clips.tolist()):
+            source = self.dataset.motion(clip)
+            self.fill(motion[row], source, int(begin[row]), int(length[row]), int(bits[row]))
+        return Cut(motion, begin, length, length == whole, self.present[bits])
 
     def _repeated(self, length: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Mean and scale of `length` frames as one row; kept for the longest length asked for."""

@@ -6,7 +6,7 @@ and with `hold_out_tempi` whole ranges of tempi, are new to whoever learned from
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -115,15 +115,6 @@ class DanceTruth(Truth):
     """Seconds from the start of the clip to its first beat; the others follow each 60 / bpm seconds."""
     bar_beat: int = 0
     """Which beat of the bar that is, from 0."""
-
-    def record(self, *, hands: bool, face: bool) -> dict[str, Any]:
-        """Plain JSON form for `ClipMeta.truth`."""
-        data = asdict(self)
-        if not hands:
-            del data["left_hand"], data["right_hand"]
-        if not face:
-            del data["face"]
-        return data
 
 
 @dataclass(frozen=True)

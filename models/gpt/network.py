@@ -125,16 +125,7 @@ class InterleavedGPT(TokenNetwork):
         Returns:
             float32 [B, L, V]; -inf where a token is illegal. At padded positions the values mean nothing.
         """
-        size = tokens.shape[1]
-        if size > self.config.block_size:
-            raise UserError(
-                f"a sequence of {size} tokens is longer than the GPT's block_size {self.config.block_size}; "
-                "raise block_size or shorten max_frames"
-            )
-        seen = tokens if inputs is None else inputs
-        read = self.embed(seen[:, :-1], kinds[:, :-1])
-        if known is not None:
-            read = read.masked_fill(~known[:, :-1, None], 0.0)
+        read = self.read(tokens, kinds, inputs, known, self.config.block_size)
         x = torch.cat([self.embed_text(text, drop_text), read], dim=1)
         return self.logits(self.hidden(x), kinds, self.legal(tokens, kinds))
 

@@ -1,11 +1,9 @@
 """Sampling token sequences from an `InterleavedGPT`: KV cache, batches, guidance, requested lengths, seeds.
 
 Notable choices:
-- Every sample owns a counter-based random stream (Philox) keyed by its own seed, and the draw of position i
-  is the i-th number of that stream. A sample's result depends on its text, its seed and the settings, and on
+- Draws are those of `drawing.py`: a sample's result depends on its text, its seed and the settings, and on
   nothing else in the batch. Batched matrix products round in their own way, so a draw within 1e-6 of a
   boundary of the distribution can still differ.
-- Draws invert the cumulative distribution in float64.
 - Guidance runs the conditional and the unconditional half in one forward.
 
 Legend: B batch, V vocabulary, G groups.
@@ -15,48 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.drawing import Drawing, as_codes, seeds_of, uniform_numbers
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes
-
-
-def sample_seeds(seed: int, count: int) -> list[int]:
-    """One independent seed per sample; the first n are the same whatever `count` is."""
-    return [
-        int(np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)[0]) for index in range(count)
-    ]
-
-
-def filter_logits(logits: Tensor, *, top_k: int | None = None, top_p: float = 1.0) -> Tensor:
-    """Set all but the `top_k` largest, then all outside the smallest set of mass `top_p`, to -inf; [B, V]."""
-    if top_k is not None and top_k < logits.shape[-1]:
-        smallest = logits.topk(top_k, dim=-1).values[..., -1:]
-        logits = logits.masked_fill(logits < smallest, -torch.inf)
-    if top_p < 1:
-        ordered, index = logits.sort(dim=-1, descending=True)
-        probability = ordered.softmax(-1)
-        # A token stays while the mass before it is below top_p, so the largest one always does.
-        outside = probability.cumsum(-1) - probability >= top_p
-        logits = logits.masked_fill(torch.zeros_like(outside).scatter(-1, index, outside), -torch.inf)
-    return logits
-
-
-def draw(
-    logits: Tensor, uniform: Tensor, *, temperature: float = 1.0, top_k: int | None = None, top_p: float = 1.0
-) -> Tensor:
-    """Tokens int64 [B] from logits [B, V] and uniform float64 [B]; temperature 0 takes the largest."""
-    best = logits.argmax(-1)
-    if temperature == 0:
-        return best
-    scaled = filter_logits(logits.double() / temperature, top_k=top_k, top_p=top_p)
-    mass = scaled.softmax(-1).cumsum(-1)
-    at = torch.searchsorted(mass, uniform[:, None] * mass[:, -1:], right=True)[:, 0]
-    # Rounding can push the last number onto the total; no token lies beyond it.
-    return torch.where(at < logits.shape[-1], at, best)
 
 
 @torch.no_grad()
@@ -93,47 +56,29 @@ def generate(
     """
     batch, device = len(text), text.device
     limit = _limits(gpt, batch, max_groups, groups, device)
-    _check_settings(gpt, temperature, top_k, top_p, cfg_scale)
-    seeds = sample_seeds(seed, batch) if isinstance(seed, int) else list(seed)
-    if len(seeds) != batch:
-        raise UserError(f"{len(seeds)} seeds were given for {batch} texts")
+    how = Drawing(temperature, top_k, top_p, cfg_scale)
+    if cfg_scale != 1 and gpt.config.condition_dropout == 0:
+        raise UserError(
+            "guidance needs a GPT trained with condition_dropout > 0; set cfg_scale to 1, for the face's GPT "
+            "face_cfg_scale"
+        )
     size, most = len(gpt.pattern), int(limit.max()) if batch else 0
-    numbers = [np.random.Generator(np.random.Philox(key=s)).random(most * size) for s in seeds]
-    uniform = torch.from_numpy(np.stack(numbers)).to(device) if numbers else torch.zeros(0, 0)
+    uniform = uniform_numbers(seeds_of(seed, batch, "texts"), most * size, device)
     was_training = gpt.training
     gpt.eval()
     try:
-        tokens, counts = _decode(
-            gpt,
-            text,
-            limit,
-            uniform,
-            free=groups is None,
-            cfg_scale=cfg_scale,
-            settings={"temperature": temperature, "top_k": top_k, "top_p": top_p},
-        )
+        tokens, counts = _decode(gpt, text, limit, uniform, groups is None, how)
     finally:
         gpt.train(was_training)
-    longest = int(counts.max()) if batch else 0
-    rows = tokens.view(batch, most, size)[:, :longest]
-    rows = torch.where(torch.arange(longest, device=device)[None, :, None] < counts[:, None, None], rows, 0)
-    codes = {name: rows[:, :, gpt.slots == kind].flatten(1) for kind, name in enumerate(gpt.names)}
-    return Codes(codes, counts)
+    return as_codes(gpt, tokens.view(batch, most, size), counts)
 
 
 def _decode(
-    gpt: InterleavedGPT,
-    text: Tensor,
-    limit: Tensor,
-    uniform: Tensor,
-    *,
-    free: bool,
-    cfg_scale: float,
-    settings: dict,
+    gpt: InterleavedGPT, text: Tensor, limit: Tensor, uniform: Tensor, free: bool, how: Drawing
 ) -> tuple[Tensor, Tensor]:
     """Tokens int64 [B, G * P] and group counts int64 [B]; `limit` [B] is where each sample must stop."""
     batch, size, device = len(text), len(gpt.pattern), text.device
-    guided = cfg_scale != 1
+    guided = how.cfg_scale != 1
     x = gpt.embed_text(text)
     if guided:
         x = torch.cat([x, gpt.embed_text(text, torch.ones(batch, dtype=torch.bool, device=device))])
@@ -156,9 +101,8 @@ def _decode(
         rows = legal.repeat(2, 1) if guided else legal
         logits = gpt.logits(hidden, kinds, rows[:, None])[:, 0]
         if guided:
-            with_text, without = logits.chunk(2)
-            logits = torch.where(legal, without + cfg_scale * (with_text - without), -torch.inf)
-        token = draw(logits, uniform[:, step], **settings)
+            logits = how.guided(logits, legal)
+        token = how(logits, uniform[:, step])
         if slot == 0:
             alive = alive & (token != gpt.ends[gpt.slots[0]])
             counts = counts + alive
@@ -188,19 +132,3 @@ def _limits(
             f"got {int(limit.min())} to {int(limit.max())}"
         )
     return limit
-
-
-def _check_settings(
-    gpt: InterleavedGPT, temperature: float, top_k: int | None, top_p: float, cfg_scale: float
-) -> None:
-    if temperature < 0:
-        raise UserError(f"temperature {temperature} must not be negative; 0 is greedy")
-    if top_k is not None and top_k < 1:
-        raise UserError(f"top_k {top_k} must be at least 1; leave it out to keep every token")
-    if not 0 < top_p <= 1:
-        raise UserError(f"top_p {top_p} must be above 0 and at most 1")
-    if cfg_scale != 1 and gpt.config.condition_dropout == 0:
-        raise UserError(
-            "guidance needs a GPT trained with condition_dropout > 0; set cfg_scale to 1, for the face's GPT "
-            "face_cfg_scale"
-        )

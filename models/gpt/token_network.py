@@ -70,6 +70,27 @@ class TokenNetwork(nn.Module):
         assert out is not None  # a pattern has at least one stream
         return out
 
+    def read(
+        self, tokens: Tensor, kinds: Tensor, inputs: Tensor | None, known: Tensor | None, block_size: int
+    ) -> Tensor:
+        """What training reads before each token but the first: embeddings [B, L - 1, D].
+
+        Args:
+            tokens: int64 [B, L], padded with -1.
+            kinds: int64 [B, L], stream of each token.
+            inputs: Read instead of `tokens`; None reads those.
+            known: Bool [B, L], false where zeros are read. None = all.
+            block_size: Longest sequence.
+        """
+        size = tokens.shape[1]
+        if size > block_size:
+            raise UserError(
+                f"a sequence of {size} tokens is longer than net.block_size {block_size}; raise it or "
+                "shorten max_frames"
+            )
+        out = self.embed((tokens if inputs is None else inputs)[:, :-1], kinds[:, :-1])
+        return out if known is None else out.masked_fill(~known[:, :-1, None], 0.0)
+
     def logits(self, hidden: Tensor, kinds: Tensor, legal: Tensor) -> Tensor:
         """Hidden states [B, L, D], kinds [B, L], legal bool [B, L, V] -> float32 [B, L, V], -inf where
         illegal.

@@ -137,16 +137,7 @@ class Utt(TokenNetwork):
         Returns:
             float32 [B, L, V]; -inf where a token is illegal. At padded positions the values mean nothing.
         """
-        size = tokens.shape[1]
-        if size > self.config.block_size:
-            raise UserError(
-                f"a sequence of {size} tokens is longer than the UTT's block_size {self.config.block_size}; "
-                "raise block_size or shorten max_frames"
-            )
-        seen = tokens if inputs is None else inputs
-        embedded = self.embed(seen[:, :-1], kinds[:, :-1])
-        if known is not None:
-            embedded = embedded.masked_fill(~known[:, :-1, None], 0.0)
+        embedded = self.read(tokens, kinds, inputs, known, self.config.block_size)
         prefix, mask = self.prefix(condition, z)
         hidden = self.backbone(prefix, mask, self.motion_inputs(embedded, 0))
         return self.logits(hidden, kinds, self.legal(tokens, kinds))

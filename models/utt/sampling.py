@@ -1,7 +1,7 @@
 """Sampling motion tokens from a `Utt`: cached, guided, of any length, and continuing other tokens.
 
 Notable choices:
-- Noise and draws come from counter-based streams keyed by each sample's own seed, as in `gpt/sampling.py`: a
+- Noise and draws come from counter-based streams keyed by each sample's own seed, as in `gpt/drawing.py`: a
   sample depends on its conditions, its seed and the settings, and on nothing else in the batch.
 - `start` gives tokens that stand before the first new one, e.g. those of a segment with other conditions, so
   that a motion goes on across a change from text to music (UDE section 4.4) [ours].
@@ -14,7 +14,6 @@ Legend: B batch, G groups, P slots of a group.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,20 +22,11 @@ from torch.nn.functional import pad
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.sampling import draw, sample_seeds
+from motionloom.models.gpt.drawing import Drawing, as_codes, seeds_of, uniform_numbers
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.utt.backbone import State
 from motionloom.models.utt.continuing import last_groups, window_start
 from motionloom.models.utt.network import Utt
-
-
-class _How(NamedTuple):
-    """How one token is taken from a distribution; see `generate`."""
-
-    temperature: float
-    top_k: int | None
-    top_p: float
-    cfg_scale: float
 
 
 def draw_z(seeds: Sequence[int], dim: int) -> Tensor:
@@ -88,12 +78,10 @@ def generate(
         The new codes per stream int64 [B, G * per_group], 0 behind each sample's `groups`.
     """
     batch, device = len(condition.glob), condition.glob.device
-    how = _How(temperature, top_k, top_p, cfg_scale)
+    how = Drawing(temperature, top_k, top_p, cfg_scale)
     _check(utt, how, null, max_groups, context)
     limit = _limits(utt, batch, max_groups, groups, device)
-    seeds = sample_seeds(seed, batch) if isinstance(seed, int) else list(seed)
-    if len(seeds) != batch:
-        raise UserError(f"{len(seeds)} seeds were given for {batch} conditions")
+    seeds = seeds_of(seed, batch, "conditions")
     if start is None:
         none = torch.zeros(batch, 0, dtype=torch.int64, device=device)
         start = Codes(dict.fromkeys(utt.names, none), torch.zeros_like(limit))
@@ -102,8 +90,7 @@ def generate(
     given, before = last_groups(start, utt.pattern, context)
     size = len(utt.pattern)
     most = int(limit.max()) * size if batch else 0
-    numbers = [np.random.Generator(np.random.Philox(key=s)).random(most) for s in seeds]
-    uniform = torch.from_numpy(np.stack(numbers)).to(device) if numbers else torch.zeros(0, 0)
+    uniform = uniform_numbers(seeds, most, device)
     if not (inject_z and utt.config.z_dim):
         z = None
     elif z is None:
@@ -120,9 +107,7 @@ def generate(
     longest = int(counts.max()) if batch else 0
     at = before[:, None] * size + torch.arange(longest * size, device=device)
     rows = tokens.gather(1, at.clamp(max=max(0, tokens.shape[1] - 1))).view(batch, longest, size)
-    rows = torch.where(torch.arange(longest, device=device)[None, :, None] < counts[:, None, None], rows, 0)
-    codes = {name: rows[:, :, utt.slots == kind].flatten(1) for kind, name in enumerate(utt.names)}
-    return Codes(codes, counts)
+    return as_codes(utt, rows, counts)
 
 
 def _decode(
@@ -134,7 +119,7 @@ def _decode(
     limit: Tensor,
     uniform: Tensor,
     free: bool,
-    how: _How,
+    how: Drawing,
 ) -> tuple[Tensor, Tensor]:
     """All tokens int64 [B, N * P], `given` ones included, and the numbers of new groups int64 [B].
 
@@ -171,16 +156,9 @@ def _decode(
         rows = legal.repeat(2, 1) if guided else legal
         logits = utt.logits(hidden, utt.slots[slot].expand(len(rows), 1), rows[:, None])[:, 0]
         if guided:
-            on, off = logits.chunk(2)
-            logits = torch.where(legal, off + how.cfg_scale * (on - off), -torch.inf)
+            logits = how.guided(logits, legal)
         index = (step - before * size).clamp(0, uniform.shape[1] - 1)
-        token = draw(
-            logits,
-            uniform.gather(1, index[:, None])[:, 0],
-            temperature=how.temperature,
-            top_k=how.top_k,
-            top_p=how.top_p,
-        )
+        token = how(logits, uniform.gather(1, index[:, None])[:, 0])
         if slot == 0:
             stops = alive & (token == utt.ends[utt.slots[0]])
             ended, alive = ended | stops, alive & ~stops
@@ -217,13 +195,7 @@ def _limits(
     return limit
 
 
-def _check(utt: Utt, how: _How, null: Encoded | None, max_groups: int | None, context: int | None) -> None:
-    if how.temperature < 0:
-        raise UserError(f"temperature {how.temperature} must not be negative; 0 is greedy")
-    if how.top_k is not None and how.top_k < 1:
-        raise UserError(f"top_k {how.top_k} must be at least 1; leave it out to keep every token")
-    if not 0 < how.top_p <= 1:
-        raise UserError(f"top_p {how.top_p} must be above 0 and at most 1")
+def _check(utt: Utt, how: Drawing, null: Encoded | None, max_groups: int | None, context: int | None) -> None:
     if max_groups is not None and max_groups < 1:
         raise UserError(f"max_groups {max_groups} must be at least 1")
     if context is not None and context < 0:

@@ -21,7 +21,7 @@ from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.sampling import sample_seeds
+from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.generation import (
     DrivenGenerator,
     GenerationRequest,

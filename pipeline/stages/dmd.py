@@ -9,9 +9,7 @@ from typing import Any
 import torch
 from pydantic import Field
 from torch import nn
-from torch.utils.data import Dataset
 
-from motionloom.datasets.loading.batches import EvalBatches, WindowBatches
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.dmd_module import DmdModule
@@ -19,8 +17,10 @@ from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Given
+from motionloom.pipeline.stages.streams import require_streams, stream_facts
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.stages.windows import window_batches
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
 
@@ -67,23 +67,14 @@ class DmdStage(TrainedStage):
                 f"that predicts the noise has to give back: raise net.dim to {tokenizer.dim} or more, or set "
                 f"net.schedule.predicts: sample"
             )
-        extra = {
-            "streams": {s.name: s.num_codes for s in tokenizer.streams},
-            "pattern": list(tokenizer.pattern),
-            "window": config.window,
-        }
+        extra = {**stream_facts(tokenizer), "window": config.window}
         layout = LayoutFacts.of(given["data"].layout)
         return ModelFacts(kind="dmd", config=config.net.dump(), layout=layout, extra=extra)
 
     def network(self, facts: ModelFacts, given: Given) -> Dmd:
         """The denoiser of the tokenizer's columns given its tokens."""
         tokenizer = given["tokenizer"].net
-        expected = {s.name: s.num_codes for s in tokenizer.streams}
-        if facts.fact("streams", dict) != expected:
-            raise UserError(
-                f"{facts.where}: this decoder was trained on streams {facts.extra['streams']}, the tokenizer "
-                f"has {expected}; train it again on this tokenizer"
-            )
+        require_streams(facts, tokenizer, "decoder")
         config = DmdConfig.parse(facts.config, facts.where)
         return Dmd(config, tokenizer.streams, tokenizer.pattern, tokenizer.dim)
 
@@ -95,33 +86,10 @@ class DmdStage(TrainedStage):
 
     def batches(self, config: DmdStageConfig, net: nn.Module, given: Given, seed: int, say: Say) -> Batches:
         """Windows of motion; their tokens are made as they come."""
-        data, stats, columns = given["data"], given["stats"], given["tokenizer"].columns
-        dataset = data.split("train", training=True)
-
-        def train(batch: int, rank: int, world: int) -> Dataset[Any]:
-            return WindowBatches(
-                dataset,
-                stats,
-                window=config.window,
-                batch_size=batch,
-                windows_per_clip=config.windows_per_clip,
-                seed=seed,
-                rank=rank,
-                world=world,
-                columns=columns,
-            )
-
-        def validation() -> Dataset[Any]:
-            return EvalBatches(
-                data.held_out(),
-                stats,
-                batch_size=32,
-                max_frames=config.window,
-                min_frames=GROUP_FRAMES,
-                columns=columns,
-            )
-
-        return Batches(train, validation)
+        columns, window = given["tokenizer"].columns, config.window
+        return window_batches(
+            config, given, columns, seed, batch_size=32, max_frames=window, min_frames=GROUP_FRAMES
+        )
 
     def example(self, config: DmdStageConfig, net: Any, given: Given, batch: int) -> Example:
         """The longest windows."""

@@ -24,6 +24,7 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
+from motionloom.pipeline.stages.streams import require_streams, stream_facts
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer, device_of
@@ -99,8 +100,7 @@ class GptStage(TrainedStage):
         extra = {
             "text_dim": text_dim,
             "prior": config.prior,
-            "streams": {s.name: s.num_codes for s in tokenizer.net.streams},
-            "pattern": list(tokenizer.net.pattern),
+            **stream_facts(tokenizer.net),
         }
         layout = LayoutFacts.of(given["data"].layout)
         return ModelFacts(kind="gpt", config=config.net.dump(), layout=layout, extra=extra)
@@ -108,13 +108,7 @@ class GptStage(TrainedStage):
     def network(self, facts: ModelFacts, given: Given) -> InterleavedGPT:
         """The GPT over the tokenizer's streams, which must be those it was made for."""
         tokenizer = given["tokenizer"].net
-        expected = {s.name: s.num_codes for s in tokenizer.streams}
-        streams, pattern = facts.fact("streams", dict), facts.fact("pattern", list)
-        if streams != expected or tuple(pattern) != tuple(tokenizer.pattern):
-            raise UserError(
-                f"{facts.where}: this GPT was trained on streams {streams}, "
-                f"the tokenizer has {expected}; train it again on this tokenizer"
-            )
+        require_streams(facts, tokenizer, "GPT")
         config = GptConfig.parse(facts.config, facts.where)
         return InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, facts.fact("text_dim", int))
 

@@ -7,9 +7,7 @@ from typing import Any
 import torch
 from pydantic import Field
 from torch import nn
-from torch.utils.data import Dataset
 
-from motionloom.datasets.loading.batches import EvalBatches, WindowBatches
 from motionloom.datasets.schema import UserError
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
@@ -30,6 +28,7 @@ from motionloom.pipeline.contract.stage import Given
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.stages.windows import window_batches
 from motionloom.pipeline.store.networks import TrainedTokenizer
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
@@ -137,32 +136,9 @@ class TokenizerStage(TrainedStage):
     ) -> Batches:
         """Windows; validation on longer stretches."""
         assert isinstance(net, Tokenizer)
-        data, stats, columns = given["data"], given["stats"], net.columns.numpy()
-        dataset = data.split("train", training=True)
-
-        def train(batch: int, rank: int, world: int) -> Dataset[Any]:
-            return WindowBatches(
-                dataset,
-                stats,
-                window=config.window,
-                batch_size=batch,
-                windows_per_clip=config.windows_per_clip,
-                seed=seed,
-                rank=rank,
-                world=world,
-                columns=columns,
-            )
-
-        def validation() -> Dataset[Any]:
-            return EvalBatches(
-                data.held_out(),
-                stats,
-                batch_size=64,  # enough tokens that its perplexity compares with training's
-                max_frames=4 * config.window,
-                columns=columns,
-            )
-
-        return Batches(train, validation)
+        # Validation has enough tokens in a batch that its perplexity compares with training's.
+        columns = net.columns.numpy()
+        return window_batches(config, given, columns, seed, batch_size=64, max_frames=4 * config.window)
 
     def example(self, config: TokenizerStageConfig, net: Any, given: Given, batch: int) -> Example:
         """A batch of windows."""

@@ -24,6 +24,7 @@ from motionloom.models.utt.network import UttConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Given, Stage
 from motionloom.pipeline.stages.examples import text_example
+from motionloom.pipeline.stages.streams import require_streams, stream_facts
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
@@ -96,8 +97,7 @@ class UttStage(TrainedStage):
         extra = {
             "mate": config.mate.dump(),
             "widths": {name: given[name].dim for name in config.modalities},
-            "streams": {s.name: s.num_codes for s in tokenizer.streams},
-            "pattern": list(tokenizer.pattern),
+            **stream_facts(tokenizer),
             "max_frames": config.max_frames,
         }
         layout = LayoutFacts.of(given["data"].layout)
@@ -106,13 +106,7 @@ class UttStage(TrainedStage):
     def network(self, facts: ModelFacts, given: Given) -> ConditionedUtt:
         """MATE and UTT over the tokenizer's streams, which must be those they were made for."""
         tokenizer = given["tokenizer"].net
-        expected = {s.name: s.num_codes for s in tokenizer.streams}
-        streams, pattern = facts.fact("streams", dict), facts.fact("pattern", list)
-        if streams != expected or tuple(pattern) != tuple(tokenizer.pattern):
-            raise UserError(
-                f"{facts.where}: this model was trained on streams {streams}, the tokenizer has {expected}; "
-                f"train it again on this tokenizer"
-            )
+        require_streams(facts, tokenizer, "token model")
         mate = MateConfig.parse(facts.fact("mate", dict), facts.where)
         config = UttConfig.parse(facts.config, facts.where)
         widths = facts.fact("widths", dict)

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.drawing import draw, filter_logits, sample_seeds
 from motionloom.models.gpt.module import GptLossConfig, GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.gpt.sampling import draw, filter_logits, generate, sample_seeds
+from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tokenizer.base import Stream
 from motionloom.models.training.stage_module import OptimConfig

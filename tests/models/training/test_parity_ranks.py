@@ -18,7 +18,6 @@ The processes run this file as a script.
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +30,7 @@ import torch.distributed as dist
 from batch_rows import rows_of
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
+from two_ranks import run_two_ranks
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
@@ -279,19 +279,7 @@ def worker(number: int, folder: Path) -> None:
 def two(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     """What each of two ranks found, per case."""
     folder = tmp_path_factory.mktemp("ranks")
-    helpers = [str(Path(__file__).parents[2] / "helpers"), *filter(None, [os.environ.get("PYTHONPATH")])]
-    ranks = [
-        subprocess.Popen(
-            [sys.executable, "-P", __file__, str(number), str(folder)],
-            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(helpers)},
-        )
-        for number in range(2)
-    ]
-    try:
-        assert [process.wait(timeout=200) for process in ranks] == [0, 0]
-    finally:
-        for process in ranks:
-            process.kill()
+    run_two_ranks(__file__, folder, numbered=True)
     return [torch.load(folder / f"{number}.pt", weights_only=True) for number in range(2)]
 
 

@@ -11,7 +11,6 @@ The processes run this file as a script.
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +20,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
+from two_ranks import run_two_ranks
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
@@ -160,18 +160,7 @@ def worker(number: int, folder: Path) -> None:
 
 @pytest.mark.timeout(200)
 def test_two_ranks_equal_one_process(tmp_path: Path) -> None:
-    ranks = [
-        subprocess.Popen(
-            [sys.executable, "-P", __file__, str(number), str(tmp_path)],
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
-        for number in range(2)
-    ]
-    try:
-        assert [process.wait(timeout=150) for process in ranks] == [0, 0]
-    finally:
-        for process in ranks:
-            process.kill()
+    run_two_ranks(__file__, tmp_path, numbered=True, timeout=150)
     two = [torch.load(tmp_path / f"{number}.pt", weights_only=True) for number in range(2)]
     for case in CASES:
         one = run(case)

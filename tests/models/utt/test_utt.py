@@ -172,7 +172,7 @@ def test_sizes_of_the_paper() -> None:
 
 def test_mistakes_are_named(utt: Utt) -> None:
     tokens, kinds, _ = sequences(1, [10])
-    with pytest.raises(UserError, match="32 tokens is longer than the UTT's block_size 30"):
+    with pytest.raises(UserError, match=r"32 tokens is longer than net\.block_size 30"):
         utt(tokens, kinds, conditions(1))
     with pytest.raises(UserError, match="holds no motion"):
         Utt(TINY.model_copy(update={"block_size": 4}), STREAMS, PATTERN, 6)

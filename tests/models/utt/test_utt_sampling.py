@@ -11,8 +11,8 @@ from torch import Tensor
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded, Mate, MateConfig, drop_conditions
+from motionloom.models.gpt.drawing import draw, sample_seeds
 from motionloom.models.gpt.losses import cross_entropy
-from motionloom.models.gpt.sampling import draw, sample_seeds
 from motionloom.models.gpt.tokens import Codes, interleave
 from motionloom.models.tokenizer.base import Stream
 from motionloom.models.utt.continuing import join, last_groups, window_start

@@ -7,8 +7,6 @@ and the DMD. The processes of the two ranks run this file as a script.
 from __future__ import annotations
 
 import os
-import socket
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from two_ranks import run_two_ranks
 from ude_training import NAMES, train
 
 from motionloom.pipeline.stages.training import read_metrics
@@ -99,32 +98,7 @@ def worker(out: Path) -> None:
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders of the trainings on two ranks."""
     folder = tmp_path_factory.mktemp("pair")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    path = os.pathsep.join([os.environ.get("PYTHONPATH", ""), str(Path(__file__).parents[2] / "helpers")])
-    ranks = [
-        subprocess.Popen(
-            [sys.executable, "-P", __file__, str(folder)],
-            env={
-                **os.environ,
-                "PYTHONPATH": path,
-                "RANK": str(number),
-                "LOCAL_RANK": str(number),
-                "WORLD_SIZE": "2",
-                "LOCAL_WORLD_SIZE": "2",
-                "MASTER_ADDR": "127.0.0.1",
-                "MASTER_PORT": str(port),
-                "OMP_NUM_THREADS": "1",
-            },
-        )
-        for number in range(2)
-    ]
-    try:
-        assert [process.wait(timeout=200) for process in ranks] == [0, 0]
-    finally:
-        for process in ranks:
-            process.kill()
+    run_two_ranks(__file__, folder)
     return folder
 
 

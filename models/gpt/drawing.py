@@ -1,0 +1,111 @@
+"""Drawing tokens: seeds, random numbers and filters that every sampler of token networks shares.
+
+Every sample owns a counter-based random stream (Philox) keyed by its own seed, and the draw of position i is
+the i-th number of that stream. Draws invert the cumulative distribution in float64.
+
+Legend: B batch, V vocabulary, G groups, P slots of a group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.token_network import TokenNetwork
+from motionloom.models.gpt.tokens import Codes
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """How one token is taken from a distribution; `UserError` where that is impossible."""
+
+    temperature: float = 1.0
+    """0 takes the likeliest."""
+    top_k: int | None = None
+    """Keep the k most likely tokens."""
+    top_p: float = 1.0
+    """Keep the smallest set of tokens with this mass."""
+    cfg_scale: float = 1.0
+    """Guidance; 1 is off."""
+
+    def __post_init__(self) -> None:
+        if self.temperature < 0:
+            raise UserError(f"temperature {self.temperature} must not be negative; 0 is greedy")
+        if self.top_k is not None and self.top_k < 1:
+            raise UserError(f"top_k {self.top_k} must be at least 1; leave it out to keep every token")
+        if not 0 < self.top_p <= 1:
+            raise UserError(f"top_p {self.top_p} must be above 0 and at most 1")
+
+    def __call__(self, logits: Tensor, uniform: Tensor) -> Tensor:
+        """Tokens int64 [B] from logits [B, V] and uniform float64 [B]."""
+        return draw(logits, uniform, temperature=self.temperature, top_k=self.top_k, top_p=self.top_p)
+
+    def guided(self, logits: Tensor, legal: Tensor) -> Tensor:
+        """[B, V] of the conditional and the unconditional half [2B, V]; -inf where not `legal` [B, V]."""
+        on, off = logits.chunk(2)
+        return torch.where(legal, off + self.cfg_scale * (on - off), -torch.inf)
+
+
+def sample_seeds(seed: int, count: int) -> list[int]:
+    """One independent seed per sample; the first n are the same whatever `count` is."""
+    return [
+        int(np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)[0]) for index in range(count)
+    ]
+
+
+def filter_logits(logits: Tensor, *, top_k: int | None = None, top_p: float = 1.0) -> Tensor:
+    """Set all but the `top_k` largest, then all outside the smallest set of mass `top_p`, to -inf; [B, V]."""
+    if top_k is not None and top_k < logits.shape[-1]:
+        smallest = logits.topk(top_k, dim=-1).values[..., -1:]
+        logits = logits.masked_fill(logits < smallest, -torch.inf)
+    if top_p < 1:
+        ordered, index = logits.sort(dim=-1, descending=True)
+        probability = ordered.softmax(-1)
+        # A token stays while the mass before it is below top_p, so the largest one always does.
+        outside = probability.cumsum(-1) - probability >= top_p
+        logits = logits.masked_fill(torch.zeros_like(outside).scatter(-1, index, outside), -torch.inf)
+    return logits
+
+
+def seeds_of(seed: int | Sequence[int], count: int, what: str) -> list[int]:
+    """One seed for each of `count` samples of `what`: made of a single one, or as given."""
+    seeds = sample_seeds(seed, count) if isinstance(seed, int) else list(seed)
+    if len(seeds) != count:
+        raise UserError(f"{len(seeds)} seeds were given for {count} {what}")
+    return seeds
+
+
+def uniform_numbers(seeds: Sequence[int], count: int, device: torch.device) -> Tensor:
+    """float64 [B, count] in [0, 1), each row by its own seed."""
+    if not seeds:
+        return torch.zeros(0, 0)
+    rows = [np.random.Generator(np.random.Philox(key=seed)).random(count) for seed in seeds]
+    return torch.from_numpy(np.stack(rows)).to(device)
+
+
+def as_codes(network: TokenNetwork, tokens: Tensor, groups: Tensor) -> Codes:
+    """Tokens int64 [B, N, P] of `groups` [B] groups a row as streams; 0 behind a shorter row."""
+    longest = int(groups.max()) if len(groups) else 0
+    inside = torch.arange(longest, device=tokens.device)[None, :, None] < groups[:, None, None]
+    rows = torch.where(inside, tokens[:, :longest], 0)
+    codes = {name: rows[:, :, network.slots == kind].flatten(1) for kind, name in enumerate(network.names)}
+    return Codes(codes, groups)
+
+
+def draw(
+    logits: Tensor, uniform: Tensor, *, temperature: float = 1.0, top_k: int | None = None, top_p: float = 1.0
+) -> Tensor:
+    """Tokens int64 [B] from logits [B, V] and uniform float64 [B]; temperature 0 takes the largest."""
+    best = logits.argmax(-1)
+    if temperature == 0:
+        return best
+    scaled = filter_logits(logits.double() / temperature, top_k=top_k, top_p=top_p)
+    mass = scaled.softmax(-1).cumsum(-1)
+    at = torch.searchsorted(mass, uniform[:, None] * mass[:, -1:], right=True)[:, 0]
+    # Rounding can push the last number onto the total; no token lies beyond it.
+    return torch.where(at < logits.shape[-1], at, best)
