@@ -40,6 +40,10 @@ class Sound:
     """[S], finite, -1..1."""
     rate: int
     """Samples a second."""
+    piece: Sound | None = None
+    """The longer sound that this is a slice of; features of music are made of whole pieces."""
+    begin: float = 0.0
+    """Second of the piece at which it begins."""
 
     def __post_init__(self) -> None:
         samples = np.asarray(self.samples, dtype=np.float32)
@@ -71,7 +75,8 @@ class Sound:
                 f"nothing between second {start:g} and {'the end' if end is None else f'{end:g}'} of sound "
                 f"of {self.seconds:.3f} s"
             )
-        return Sound(self.samples[first:last], self.rate)
+        begin = self.begin + first / self.rate
+        return Sound(self.samples[first:last], self.rate, self.piece or self, begin)
 
     def resampled(self, rate: int) -> Sound:
         """The same sound at another sample rate."""

@@ -20,13 +20,14 @@ Legend: B batch, L positions of one modality, S positions of all, F its features
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, Self
+from itertools import accumulate
+from typing import Literal, NamedTuple, Self
 
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from motionloom.datasets.conditions import Condition, Conditions
+from motionloom.datasets.conditions import MODALITIES, Condition, Conditions
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.layers.transformer import Transformer, sinusoid
 
@@ -40,6 +41,8 @@ class MateConfig(Config):
     ff: int = Field(default=1024, ge=1)
     dropout: float = Field(default=0.1, ge=0, lt=1)
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
+    stride: Literal[1, 2, 4] = 1
+    """Frames of music that one position reads; 1 is the paper's, more make its sequence shorter [ours]."""
 
     @model_validator(mode="after")
     def _heads_divide(self) -> Self:
@@ -57,10 +60,14 @@ class Encoded(NamedTuple):
     """[B, S, E], sequential embedding; zero where `mask` is false."""
     mask: Tensor
     """bool [B, S]."""
+    timed: Tensor | None = None
+    """[B, T, E], the part of `seq` that lies on the motion's time line, that of music, a position for
+    `stride` frames; zero where a row has none. None = no row has any."""
 
     def rows(self, index: Tensor | slice) -> Encoded:
         """Some rows."""
-        return Encoded(self.glob[index], self.seq[index], self.mask[index])
+        timed = None if self.timed is None else self.timed[index]
+        return Encoded(self.glob[index], self.seq[index], self.mask[index], timed)
 
 
 class Mate(nn.Module):
@@ -78,7 +85,9 @@ class Mate(nn.Module):
         self.config = config
         self.widths = dict(widths)
         dim = config.dim
-        self.project = nn.ModuleDict({name: nn.Linear(width, dim) for name, width in widths.items()})
+        self.project = nn.ModuleDict(
+            {name: nn.Linear(width * self._stride(name), dim) for name, width in widths.items()}
+        )
         self.modality = nn.ParameterDict({name: _token(dim) for name in widths})
         self.aggregate = _token(dim)
         self.aggregate_of = nn.ParameterDict({name: _token(dim) for name in widths})
@@ -117,11 +126,27 @@ class Mate(nn.Module):
         x = torch.cat([(first + origin)[:, None], *pieces], dim=1)
         mask = torch.cat(masks, dim=1)
         x = self.stack(self.dropout(x), torch.cat([mask.new_ones(size, 1), mask], dim=1))
-        return Encoded(x[:, 0], x[:, 1:].masked_fill(~mask[..., None], 0.0), mask)
+        seq = x[:, 1:].masked_fill(~mask[..., None], 0.0)
+        return Encoded(x[:, 0], seq, mask, self._timed(seq, [piece.shape[1] for piece in pieces]))
 
     def unconditional(self, batch: int) -> Encoded:
         """What rows without any modality are encoded as, S = 0."""
         out: Encoded = self({}, batch)
+        return out
+
+    def _timed(self, seq: Tensor, sizes: list[int]) -> Tensor | None:
+        """The sum of the timed modalities' embeddings [B, T, E], of which T is the longest's."""
+        ends = list(accumulate(sizes))
+        found = [
+            seq[:, end - size : end]
+            for name, size, end in zip(self.widths, sizes, ends, strict=True)
+            if size and _timed(name)
+        ]
+        size = max((part.shape[1] for part in found), default=0)
+        out: Tensor | None = None
+        for part in found:
+            padded = nn.functional.pad(part, (0, 0, 0, size - part.shape[1]))
+            out = padded if out is None else out + padded
         return out
 
     def _modality(
@@ -132,14 +157,26 @@ class Mate(nn.Module):
             # wants the same parameters used on every rank.
             device = self.aggregate.device
             return (
-                self.aggregate.new_zeros(size, 0, width),
+                self.aggregate.new_zeros(size, 0, width * self._stride(name)),
                 torch.zeros(size, 0, dtype=torch.bool, device=device),
             )
         if condition.features.shape[-1] != width:
             raise UserError(
                 f"MATE was built for {width} {name} features, the data has {condition.features.shape[-1]}"
             )
-        return condition.features.masked_fill(~condition.mask[..., None], 0.0), condition.mask
+        features, mask = condition.features.masked_fill(~condition.mask[..., None], 0.0), condition.mask
+        stride = self._stride(name)
+        if stride > 1:
+            more = -mask.shape[1] % stride
+            features, mask = nn.functional.pad(features, (0, 0, 0, more)), nn.functional.pad(mask, (0, more))
+            rows, frames = mask.shape
+            features = features.reshape(rows, frames // stride, stride * width)
+            mask = mask.view(rows, frames // stride, stride).any(2)
+        return features, mask
+
+    def _stride(self, name: str) -> int:
+        """Frames of a modality that one position reads."""
+        return self.config.stride if _timed(name) else 1
 
 
 def drop_conditions(conditions: Conditions, drop: Tensor) -> dict[str, Condition]:
@@ -155,6 +192,10 @@ def drop_conditions(conditions: Conditions, drop: Tensor) -> dict[str, Condition
             None if pooled is None else pooled.masked_fill(drop[:, None], 0.0),
         )
     return out
+
+
+def _timed(name: str) -> bool:
+    return name in MODALITIES and MODALITIES[name].timed
 
 
 def _token(dim: int) -> nn.Parameter:

@@ -32,4 +32,4 @@ class ConditionedUtt(nn.Module):
     ) -> None:
         super().__init__()
         self.mate = Mate(mate, widths)
-        self.utt = Utt(utt, streams, pattern, mate.dim)
+        self.utt = Utt(utt, streams, pattern, mate.dim, mate.stride)

@@ -10,10 +10,13 @@ Notable choices:
   numbers, 256 for MATE and 512 here, leave a step open.
 - Motion positions are learned and counted from the first token, so padding of the prefix plays no part; the
   prefix has MATE's positions.
+- `beside` gives every motion token what MATE made of the music of its own frames, added to the input that
+  predicts it [ours]. In the paper music is in the prefix alone, and which of its frames belong to a token has
+  to be learnt by attention.
 - Without conditions (MATE's unconditional embedding) the same network is the unconditional model that
   guidance needs; `condition_dropout` is the share of rows that training makes so.
 
-Legend: B batch, L tokens, S prefix, D width, E MATE's width, V largest vocabulary (K + 1).
+Legend: B batch, L tokens, G groups, S prefix, D width, E MATE's width, V largest vocabulary (K + 1).
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.models.condition.mate import Encoded
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
-from motionloom.models.tokenizer.base import Stream
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
 from motionloom.models.utt.backbone import PrefixGru, PrefixTransformer, State
 
 
@@ -50,6 +53,8 @@ class UttConfig(Config):
     """Motion tokens that the network sees at once, End tokens included; longer motions slide."""
     z_dim: int = Field(default=256, ge=0)
     """Width of the noise z; 0 = a network without it."""
+    beside: bool = False
+    """Add the music of its own frames to each motion token [ours]; false is the paper: in the prefix only."""
     condition_dropout: float = Field(default=0.1, ge=0, lt=1)
     """Share of samples trained without conditions, for guidance [ours]; 0 turns guidance off."""
     pkeep: float = Field(default=1.0, gt=0, le=1)
@@ -70,10 +75,16 @@ class Utt(TokenNetwork):
         streams: The tokenizer's streams.
         pattern: Stream of every slot of a group.
         glob_dim: E, width of MATE's embeddings.
+        stride: Frames of music that one of them is about.
     """
 
     def __init__(
-        self, config: UttConfig, streams: Sequence[Stream], pattern: Sequence[str], glob_dim: int
+        self,
+        config: UttConfig,
+        streams: Sequence[Stream],
+        pattern: Sequence[str],
+        glob_dim: int,
+        stride: int = 1,
     ) -> None:
         super().__init__(streams, pattern)
         self.config = config
@@ -90,6 +101,11 @@ class Utt(TokenNetwork):
             self.z_in = nn.Sequential(
                 nn.Linear(config.z_dim, glob_dim), nn.GELU(), nn.Linear(glob_dim, glob_dim)
             )
+        self.per_group = GROUP_FRAMES // stride
+        """Embeddings of music for one group of tokens."""
+        self.beside_in: nn.Module | None = None
+        if config.beside:
+            self.beside_in = nn.Linear(self.per_group * glob_dim, config.dim, bias=False)
         self.start = nn.Parameter(torch.randn(config.dim) * 0.02)
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
         self.embeddings = self._tables(config.dim)
@@ -139,7 +155,7 @@ class Utt(TokenNetwork):
         """
         embedded = self.read(tokens, kinds, inputs, known, self.config.block_size)
         prefix, mask = self.prefix(condition, z)
-        hidden = self.backbone(prefix, mask, self.motion_inputs(embedded, 0))
+        hidden = self.backbone(prefix, mask, self.motion_inputs(embedded, 0, self.beside(condition)))
         return self.logits(hidden, kinds, self.legal(tokens, kinds))
 
     def prefix(self, condition: Encoded, z: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -156,12 +172,40 @@ class Utt(TokenNetwork):
         mask = torch.cat([condition.mask.new_ones(len(x), 1), condition.mask], dim=1)
         return self.dropout(x), mask
 
-    def motion_inputs(self, embedded: Tensor, at: int) -> Tensor:
-        """Embedded tokens [B, L, D] with their positions from `at` on; at 0 the start vector comes first."""
+    def beside(self, condition: Encoded) -> Tensor | None:
+        """What every group of motion tokens is told of the music of its frames, [B, G, D]; None = nothing."""
+        if self.beside_in is None:
+            return None
+        timed = condition.timed
+        if timed is None or not timed.shape[1]:
+            # Read nevertheless: distributed training wants the same parameters used on every rank.
+            timed = condition.glob.new_zeros(len(condition.glob), self.per_group, self.glob_dim)
+        whole = nn.functional.pad(timed, (0, 0, 0, -timed.shape[1] % self.per_group))
+        groups = whole.shape[1] // self.per_group
+        out: Tensor = self.beside_in(whole.to(self.start.dtype).reshape(len(whole), groups, -1))
+        return out
+
+    def motion_inputs(
+        self, embedded: Tensor, at: int, beside: Tensor | None = None, *, first: int = 0
+    ) -> Tensor:
+        """Embedded tokens [B, L, D] with their positions from `at` on; at 0 the start vector comes first.
+
+        Args:
+            embedded: Tokens that stand at the positions before those that they help to predict.
+            at: First position.
+            beside: Of `beside`.
+            first: Number of the token that position 0 predicts, where a long motion has slid.
+        """
         if at == 0:
-            first = self.start.to(embedded.dtype).expand(len(embedded), 1, -1)
-            embedded = torch.cat([first, embedded], dim=1)
+            start = self.start.to(embedded.dtype).expand(len(embedded), 1, -1)
+            embedded = torch.cat([start, embedded], dim=1)
         x = embedded + self.positions[at : at + embedded.shape[1]].to(embedded.dtype)
+        if beside is not None:
+            token = first + at + torch.arange(x.shape[1], device=x.device)
+            group = token // len(self.pattern)
+            # End tokens and motion that outlasts its music have none.
+            here = beside[:, group.clamp(max=beside.shape[1] - 1)]
+            x = x + here.masked_fill((group >= beside.shape[1])[:, None], 0.0).to(x.dtype)
         out: Tensor = self.dropout(x)
         return out
 

@@ -132,6 +132,7 @@ def _decode(
     counts = torch.zeros_like(limit)
     ended = torch.zeros(batch, dtype=torch.bool, device=device)
     no = torch.zeros_like(ended)
+    beside = utt.beside(condition)
     state: State | None = None
     seen = opened = 0
     for step in range(int(before.min()) * size if batch else 0, total):
@@ -147,7 +148,7 @@ def _decode(
         kinds = utt.slots[torch.arange(seen, step, device=device) % size].expand(batch, -1)
         x = utt.embed(tokens[:, seen:step], kinds)
         at = 0 if fresh else seen - first + 1
-        x = utt.motion_inputs(x.repeat(2, 1, 1) if guided else x, at)
+        x = utt.motion_inputs(x.repeat(2, 1, 1) if guided else x, at, beside, first=first)
         hidden = utt.backbone.extend(x, state)[:, -1:]
         seen = step
         # A segment is never empty, so its first group cannot be End.
@@ -169,14 +170,17 @@ def _decode(
 
 def _stacked(condition: Encoded, null: Encoded) -> Encoded:
     """Conditional rows, then the unconditional ones, padded to the longer sequence."""
-    size = max(condition.seq.shape[1], null.seq.shape[1])
-    rows = [
-        Encoded(
-            c.glob, pad(c.seq, (0, 0, 0, size - c.seq.shape[1])), pad(c.mask, (0, size - c.mask.shape[1]))
-        )
-        for c in (condition, null)
-    ]
-    return Encoded(*(torch.cat(both) for both in zip(*rows, strict=True)))
+    size = condition.seq.shape[1] - null.seq.shape[1]
+    first, second = (
+        Encoded(c.glob, pad(c.seq, (0, 0, 0, max(0, more))), pad(c.mask, (0, max(0, more))), c.timed)
+        for c, more in ((condition, -size), (null, size))
+    )
+    timed = first.timed
+    if timed is not None:
+        # Guidance goes away from no music at all.
+        timed = torch.cat([timed, torch.zeros_like(timed)])
+    glob, seq, mask = (torch.cat(both) for both in zip(first[:3], second[:3], strict=True))
+    return Encoded(glob, seq, mask, timed)
 
 
 def _limits(

@@ -34,6 +34,8 @@ class Prompt:
     """What the face does; empty takes `text`."""
     sound: Sound | None = None
     """The music."""
+    music: NDArray[np.float32] | None = None
+    """Its features, a row for each frame, where they are known already; None = made of the sound."""
 
     @property
     def modalities(self) -> frozenset[str]:

@@ -37,6 +37,8 @@ class DanceClip:
     beats: NDArray[np.float64]
     """Seconds of the music's beats: from the truth where it is known, else tracked in the sound."""
     truth: Mapping[str, Any] | None
+    music: NDArray[np.float32] | None = None
+    """Features of the music [T, 438] as the data store them: of the whole piece, as training hears it."""
 
     @property
     def seconds(self) -> float:
@@ -58,7 +60,8 @@ class DanceClip:
         seconds = frames / self.fps
         inside = self.beats[self.beats < seconds]
         sound = self.sound.slice(0.0, seconds)
-        return replace(self, joints=self.joints[:frames], sound=sound, beats=inside)
+        music = None if self.music is None else self.music[:frames]
+        return replace(self, joints=self.joints[:frames], sound=sound, beats=inside, music=music)
 
 
 def with_music(dataset: ClipDataset) -> NDArray[np.bool_]:
@@ -84,7 +87,7 @@ def dance_at(
     if frames < 1:
         return None
     truth = dataset.meta(index).truth
-    song = (truth or {}).get("song")
+    song, rows = (truth or {}).get("song"), dataset.audio(index)
     clip = DanceClip(
         index,
         dataset.ids[index],
@@ -94,6 +97,7 @@ def dance_at(
         sound,
         _beats(truth, sound),
         truth,
+        None if rows is None or len(rows) != len(motion) else rows,
     )
     return clip.cut(frames)
 

@@ -198,6 +198,7 @@ class Bundle:
         *,
         face_captions: Sequence[str] | None = None,
         sounds: Sequence[Sound | None] | None = None,
+        music: Sequence[NDArray[np.float32] | None] | None = None,
         seconds: float | Sequence[float] | None = None,
         seed: int = 0,
         sampling: SamplingConfig | Mapping[str, Any] | None = None,
@@ -207,7 +208,8 @@ class Bundle:
         """Motions for captions, sounds or both, in order; equal arguments give equal motions.
 
         A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
-        a motion is as long as its sound, or else the model decides. With `strict`, empty captions and options
+        a motion is as long as its sound, or else the model decides. `music` are the sounds' features [T, 438]
+        where they are known, such as those that a data set stores. With `strict`, empty captions and options
         without effect are refused.
         """
         sampling = sampling_of(sampling)
@@ -217,7 +219,7 @@ class Bundle:
         if strict:
             require_words(faces or [], "face_captions")
             require_used(self, faces, sampling)
-        prompts = prompts_of(texts, faces, sounds)
+        prompts = prompts_of(texts, faces, sounds, music)
         require_driven(self.generator, prompts)
         frames = self._frames(seconds, prompts)
         # One seed a motion, so that how they are batched plays no part.

@@ -6,6 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
@@ -47,9 +50,12 @@ def sampling_of(given: SamplingConfig | Mapping[str, Any] | None) -> SamplingCon
 
 
 def prompts_of(
-    captions: Sequence[str] | None, faces: Sequence[str] | None, sounds: Sequence[Sound | None] | None
+    captions: Sequence[str] | None,
+    faces: Sequence[str] | None,
+    sounds: Sequence[Sound | None] | None,
+    music: Sequence[NDArray[np.float32] | None] | None = None,
 ) -> list[Prompt]:
-    """One prompt a motion from lists of equal length; what is None is left out."""
+    """One prompt a motion from lists of equal length; None is left out. `music` goes with `sounds`."""
     given = {"captions": captions, "sounds": sounds}
     counts = {name: len(values) for name, values in given.items() if values is not None}
     if not counts:
@@ -57,6 +63,8 @@ def prompts_of(
     if len(set(counts.values())) > 1:
         raise UserError(" but ".join(f"{count} {name}" for name, count in counts.items()))
     count = next(iter(counts.values()))
+    if music is not None and (sounds is None or len(music) != count):
+        raise UserError(f"{len(music)} rows of music features but {len(sounds or [])} sounds")
     if faces is not None and len(faces) != count:
         raise UserError(f"{count} captions but {len(faces)} face captions")
     return [
@@ -64,6 +72,7 @@ def prompts_of(
             text=captions[row] if captions else "",
             face_text=faces[row] if faces else "",
             sound=sounds[row] if sounds else None,
+            music=music[row] if music else None,
         )
         for row in range(count)
     ]

@@ -183,6 +183,7 @@ class _DanceEvaluation:
                     some = clips[start : start + _AT_ONCE]
                     motions = self.bundle.generate(
                         sounds=[clip.sound for clip in some],
+                        music=[clip.music for clip in some],
                         seconds=[clip.seconds for clip in some],
                         seed=self.context.seed + 7919 * (repeat + 1) + start,
                         sampling=self.config.sampling,

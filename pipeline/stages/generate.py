@@ -102,6 +102,7 @@ def _danced(context: StageContext) -> list[tuple[GeneratedMotion, DanceClip]]:
         return []
     made = bundle.generate(
         sounds=[clip.sound for clip in clips],
+        music=[clip.music for clip in clips],
         seconds=[clip.seconds for clip in clips],
         seed=context.seed,
         sampling=config.sampling,

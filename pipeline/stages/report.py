@@ -146,6 +146,7 @@ def _danced(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
     if bundle is not None and clips:
         made = bundle.generate(
             sounds=[clip.sound for clip in clips],
+            music=[clip.music for clip in clips],
             seconds=[clip.seconds for clip in clips],
             seed=context.seed,
             sampling=config.sampling,

@@ -90,11 +90,12 @@ class TrainedStage(StageKind):
         """Train, and write weights and facts."""
         config, given = context.config, context.given
         facts = self.facts(config, given)
-        torch.manual_seed(context.seed)
+        seed = context.seed if config.train.seed is None else config.train.seed
+        torch.manual_seed(seed)
         net = self.network(facts, given)
         self.prepare(config, net, given)
-        module = self.module(config, net, given, context.seed)
-        batches = self.batches(config, net, given, context.seed, _printer(context))
+        module = self.module(config, net, given, seed)
+        batches = self.batches(config, net, given, seed, _printer(context))
         fit(context, module, config.train, batches.train, batches.validation, config.optim.grad_clip)
         if module.global_rank == 0:
             save_model(context.folder, module.net, facts)

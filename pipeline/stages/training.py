@@ -42,6 +42,9 @@ class TrainConfig(Config):
 
     steps: int = Field(1000, ge=1)
     """Optimizer steps."""
+    seed: int | None = Field(None, ge=0)
+    """Of this training's first weights, batches and draws; null = the recipe's. Trainings of one recipe that
+    differ in it alone say how far a result is chance."""
     batch_size: int = Field(256, ge=1)
     """Global batch, over all processes and accumulated parts."""
     accumulate: int = Field(1, ge=1)

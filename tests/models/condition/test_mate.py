@@ -36,7 +36,7 @@ def reference(mate: Mate, conditions: dict[str, Tensor]) -> Tensor:
     first = mate.aggregate + sinusoid(1, 16).double()[0]
     rows = []
     for name, width in WIDTHS.items():
-        x = conditions.get(name, torch.zeros(0, width, dtype=torch.float64))
+        x = conditions.get(name, torch.zeros(0, width, dtype=torch.float64))  # or strides of frames
         if len(x):
             first = first + mate.aggregate_of[name]
         places = sinusoid(100, 16).double()
@@ -67,6 +67,31 @@ def test_equals_the_formula_for_every_subset_in_one_padded_batch(mate: Mate) -> 
         torch.testing.assert_close(out.glob[row], alone[0], rtol=1e-10, atol=1e-10)
         torch.testing.assert_close(out.seq[row][out.mask[row]], alone[1:], rtol=1e-10, atol=1e-10)
     assert (out.seq[~out.mask] == 0).all()
+
+
+def test_music_may_be_read_several_frames_a_position() -> None:
+    torch.manual_seed(0)
+    mate = Mate(SMALL.model_copy(update={"stride": 4}), WIDTHS).double().eval()
+    text, audio = condition(5, 9, [4, 0, 9]), condition(7, 14, [0, 14, 5], rubbish=1e9)
+    out = mate({"audio": audio, "text": text})
+    assert out.mask.sum(1).tolist() == [4, 4, 9 + 2]
+    assert out.timed is not None
+    assert torch.equal(out.timed, out.seq[:, 9:])
+    for row, places in enumerate([0, 4, 2]):
+        frames = torch.zeros(4 * places, 7, dtype=torch.float64)
+        heard = audio.features[row][audio.mask[row]]
+        frames[: len(heard)] = heard
+        given = {"text": text.features[row][text.mask[row]], "audio": frames.reshape(places, 28)}
+        alone = reference(mate, given)
+        torch.testing.assert_close(out.glob[row], alone[0], rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(out.seq[row][out.mask[row]], alone[1:], rtol=1e-10, atol=1e-10)
+    # Of frames one by one the timed part is the music's as well; of words alone there is none.
+    plain = Mate(SMALL, WIDTHS).double().eval()
+    timed = plain({"audio": audio}).timed
+    assert timed is not None
+    assert timed.shape == (3, 14, 16)
+    assert plain({"text": text}).timed is None
+    assert mate.unconditional(2).timed is None
 
 
 def test_a_modality_that_no_row_has_may_be_left_out(mate: Mate) -> None:

@@ -56,7 +56,8 @@ def sequences(batch: int, groups: list[int]) -> tuple[Tensor, Tensor, Tensor]:
 def hidden(utt: Utt, tokens: Tensor, kinds: Tensor, condition: Encoded, z: Tensor | None = None) -> Tensor:
     """States in float64, of which `forward` gives float32 logits."""
     prefix, mask = utt.prefix(condition, z)
-    return utt.backbone(prefix, mask, utt.motion_inputs(utt.embed(tokens[:, :-1], kinds[:, :-1]), 0))
+    embedded = utt.embed(tokens[:, :-1], kinds[:, :-1])
+    return utt.backbone(prefix, mask, utt.motion_inputs(embedded, 0, utt.beside(condition)))
 
 
 def test_prefix_mask_written_out() -> None:
@@ -76,7 +77,7 @@ def test_a_row_depends_on_nothing_but_itself(utt: Utt) -> None:
     together = hidden(utt, tokens, kinds, condition, z)
     for row, groups in enumerate([5, 2, 3]):
         size, real = 3 * groups + 2, int(condition.mask[row].sum())
-        mine = Encoded(*(x[row : row + 1] for x in condition))
+        mine = condition.rows(slice(row, row + 1))
         mine = Encoded(mine.glob, mine.seq[:, :real], mine.mask[:, :real])
         alone = hidden(utt, tokens[row : row + 1, :size], kinds[row : row + 1, :size], mine, z[row : row + 1])
         torch.testing.assert_close(together[row, :size], alone[0], rtol=1e-10, atol=1e-10)
@@ -110,6 +111,32 @@ def test_z_is_added_to_the_global_embedding(utt: Utt) -> None:
     assert still.z_in is None
     with pytest.raises(UserError, match="z_dim 0"):
         still.prefix(conditions(2), z)
+
+
+def test_music_beside_a_token_is_that_of_its_own_frames() -> None:
+    torch.manual_seed(0)
+    config = TINY.model_copy(update={"beside": True})
+    utt = Utt(config, STREAMS, PATTERN, glob_dim=6, stride=2).double().eval()
+    tokens, kinds, _ = sequences(2, [4, 4])
+    timed = torch.randn(2, 7, 6, dtype=torch.float64)  # three groups and a half: the last is padded
+    condition = conditions(2)._replace(timed=timed)
+    plain = hidden(utt, tokens, kinds, condition)
+    for group in range(4):
+        changed = timed.clone()
+        changed[:, 2 * group] += 1.0
+        found = hidden(utt, tokens, kinds, condition._replace(timed=changed))
+        same = (found == plain).all(-1)
+        # Input p predicts token p; a group has three of them, and two End tokens follow the last.
+        assert same[:, : 3 * group].all()
+        assert not same[:, 3 * group :].any()
+    # Without music nothing is added, and the layer is in the graph nevertheless.
+    none = hidden(utt, tokens, kinds, conditions(2))
+    torch.testing.assert_close(
+        none, hidden(utt, tokens, kinds, condition._replace(timed=torch.zeros_like(timed)))
+    )
+    utt(tokens, kinds, conditions(2)).masked_fill(~utt.legal(tokens, kinds), 0.0).sum().backward()
+    assert utt.beside_in is not None
+    assert utt.beside_in.weight.grad is not None
 
 
 @pytest.mark.parametrize("chunks", [[1] * 14, [5, 1, 8], [14]])
@@ -196,7 +223,8 @@ def test_the_adversarial_gradient_reaches_every_parameter(kind: str, sample: boo
     groups = torch.tensor([5, 2])
     codes = {s.name: torch.randint(9, (2, 5 * s.per_group)) for s in tokenizer.streams}
     tokens, kinds, _ = interleave(codes, net.pattern, ends=net.num_codes, groups=groups)
-    condition = Encoded(*(x.float() if x.is_floating_point() else x for x in conditions(2, 4, [4, 2])))
+    glob, seq, mask = conditions(2, 4, [4, 2])[:3]
+    condition = Encoded(glob.float(), seq.float(), mask)
     condition.glob.requires_grad_()
     logits = net(tokens, kinds, condition, torch.randn(2, 3))
     made = soft_motion(net, logits, tokens, kinds, tokenizer=tokenizer, gumbel_temperature=1.0, sample=sample)

@@ -24,10 +24,14 @@ STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
 TINY = UttConfig(layers=2, dim=16, heads=4, ff=32, block_size=14, dropout=0.0, attention_dropout=0.0, z_dim=3)
 
 
-@pytest.fixture(params=["gpt", "gru"])
+@pytest.fixture(params=["gpt", "gru", "gpt beside"])
 def utt(request: pytest.FixtureRequest) -> Utt:
     torch.manual_seed(0)
-    net = Utt(TINY.model_copy(update={"kind": request.param}), STREAMS, PATTERN, glob_dim=6)
+    kind, *beside = request.param.split()
+    config = TINY.model_copy(update={"kind": kind, "beside": bool(beside)})
+    net = Utt(config, STREAMS, PATTERN, glob_dim=6, stride=2)
+    if net.beside_in is not None:
+        torch.nn.init.normal_(net.beside_in.weight, std=0.7)
     for head in net.heads:
         torch.nn.init.normal_(head.weight, std=0.7)  # peaked, so that a mixed-up draw would show
     torch.nn.init.normal_(net.condition_in.weight, std=2.0)
@@ -39,7 +43,9 @@ def conditions(batch: int, lengths: list[int] | None = None) -> Encoded:
     generator = torch.Generator().manual_seed(1)
     glob = torch.randn(batch, 6, generator=generator, dtype=torch.float64)
     seq = torch.randn(batch, 5, 6, generator=generator, dtype=torch.float64)
-    return Encoded(glob, seq, torch.arange(5) < torch.tensor(lengths or [5] * batch)[:, None])
+    mask = torch.arange(5) < torch.tensor(lengths or [5] * batch)[:, None]
+    timed = torch.randn(batch, 15, 6, generator=generator, dtype=torch.float64)
+    return Encoded(glob, seq, mask, timed)
 
 
 def null(batch: int) -> Encoded:
@@ -78,7 +84,11 @@ def slow(
         first = window_start(len(tokens), 14, 3)
         window = torch.tensor([[*tokens[first:], 0]])
         kinds = utt.slots[torch.arange(window.shape[1]) % 3][None]
-        logits = [utt(window, kinds, c, z)[:, -1] for c in (condition, guide) if c is not None]
+        # Music two positions a group, behind the groups that have slid out; none for the guide.
+        assert condition.timed is not None
+        timed = (condition.timed[:, first // 3 * 2 :], None)
+        both = zip((condition, guide), timed, strict=True)
+        logits = [utt(window, kinds, c._replace(timed=t), z)[:, -1] for c, t in both if c is not None]
         logits = [x.scatter(1, utt.ends[kinds[:, -1:]], -torch.inf) for x in logits]
         mixed = logits[0] if guide is None else logits[1] + scale * (logits[0] - logits[1])
         mixed = torch.where(torch.isfinite(logits[0]), mixed, -torch.inf)
@@ -197,6 +207,8 @@ def test_z_makes_samples_differ_and_is_the_seeds_alone(utt: Utt) -> None:
     with torch.no_grad():
         assert utt.z_in is not None
         utt.z_in[-1].weight.mul_(30)
+        if utt.beside_in is not None:
+            utt.beside_in.weight.mul_(0.1)
     noisy = generate(utt, condition, groups=groups, temperature=0)
     still = generate(utt, condition, groups=groups, temperature=0, inject_z=False)
     assert len({str(row(noisy, i)) for i in range(8)}) > 2

@@ -49,7 +49,8 @@ def test_sizes_of_ude_are_known_before_it_runs(name: str) -> None:
     recipe = load_recipe(name)
     cards = estimate(recipe)
     decoded_by_tokenizer = name.endswith(("vq-decoder", "gru"))
-    assert set(cards) == {"tokenizer", "utt"} | (set() if decoded_by_tokenizer else {"dmd"})
+    assert set(cards) == {stage.name for stage in recipe.stages if stage.kind.trains} >= {"tokenizer", "utt"}
+    assert ("dmd" in cards) == (not decoded_by_tokenizer)
     assert cards["utt"].note == "40 code + 1 End for 160 frames"
     for stage in recipe.stages:
         stage.config.require_fit(recipe.hardware)

@@ -1,0 +1,238 @@
+"""Where a UDE run loses what music and captions ask for, station by station.
+
+    motionloom run ude-learning
+    python benchmarks/ude_stations.py runs/ude-learning --utt utt utt_prefix
+
+Held-out clips as they are recorded; their true tokens decoded by the tokenizer and by DMD; tokens that each
+UTT makes for their music or caption, with and without z, decoded by both. Beat Align of dances (to their own
+music and to other songs), genre and tempo, and attributes of captions are measured on the joints; captions of
+held-out combinations apart. Stations whose stage has not finished are left out. Writes `stations.json` into
+the run's folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.synth.measure import agrees
+from motionloom.models.diffusion.dmd_sampling import decode_motions
+from motionloom.models.gpt.drawing import sample_seeds
+from motionloom.models.gpt.tokens import Codes
+from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.pipeline.contract.generation import Prompt, Stretch
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.evaluation.dance_figures import (
+    Matched,
+    alignment_of,
+    feet_of,
+    others,
+    recognition_of,
+)
+from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
+from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
+from motionloom.pipeline.inference.conditions import PromptEncoder
+from motionloom.pipeline.inference.timeline import TokenTimeline
+from motionloom.pipeline.stages.ude import UdeConfig
+from motionloom.pipeline.store.networks import TrainedTokenizer
+
+Motion = NDArray[np.float32]
+
+
+@dataclass
+class Engine:
+    """What of a run has finished."""
+
+    tokenizer: TrainedTokenizer
+    utts: dict[str, Any]
+    dmd: Any
+    ude: UdeConfig
+
+    @staticmethod
+    def of(run: Path, utts: Sequence[str]) -> Engine:
+        stages, shelf = finished_stages(run), Shelf()
+        if "tokenizer" not in stages:
+            raise SystemExit(f"{run}: stage 'tokenizer' has not finished; run it first")
+        ude = stages["ude"].config if "ude" in stages else UdeConfig()
+        return Engine(
+            shelf.get(stages["tokenizer"]),
+            {name: shelf.get(stages[name]) for name in utts if name in stages},
+            shelf.get(stages["dmd"]) if "dmd" in stages else None,
+            ude,
+        )
+
+    def true_codes(self, motions: Sequence[Motion]) -> Codes:
+        """Tokens of recorded motions [T, D], all columns."""
+        net, columns = self.tokenizer.net, self.tokenizer.columns
+        rows = [(m[:, columns] - self.tokenizer.stats.mean[columns]) for m in motions]
+        groups = torch.tensor([len(m) // GROUP_FRAMES for m in motions])
+        most = int(groups.max()) * GROUP_FRAMES
+        batch = torch.zeros(len(rows), most, len(columns))
+        for k, row in enumerate(rows):
+            batch[k, : len(row)] = torch.from_numpy(row / self.tokenizer.stats.std[columns])
+        with torch.no_grad():
+            return Codes(net.encode(batch, groups * GROUP_FRAMES), groups)
+
+    def made_codes(
+        self,
+        utt: Any,
+        prompts: Sequence[Prompt],
+        frames: Sequence[int],
+        sampling: SamplingConfig,
+        seed: int,
+        *,
+        inject_z: bool,
+    ) -> Codes:
+        """Tokens that `utt` makes for prompts, of the lengths wanted."""
+        encoder = PromptEncoder(utt.given.get("text"), torch.device("cpu"))
+        conditions = encoder.encode(
+            prompts, [p.text for p in prompts], utt.modalities, self.tokenizer.layout.fps
+        )
+        line = TokenTimeline(
+            utt.net,
+            window=utt.max_frames // GROUP_FRAMES,
+            context=self.ude.context_frames // GROUP_FRAMES,
+            audio=utt.given.get("audio"),
+            inject_z=inject_z,
+        )
+        return line.tokens([Stretch(conditions, frames)], sample_seeds(seed, len(prompts)), sampling)
+
+    def decoded(self, codes: Codes, seed: int, *, by_dmd: bool) -> list[Motion]:
+        """Motions of tokens, features in their own units."""
+        if not by_dmd:
+            return self.tokenizer.decode(codes.codes, codes.groups.tolist())
+        made = decode_motions(
+            self.dmd.net,
+            codes,
+            seeds=sample_seeds(seed, len(codes.groups)),
+            sampler=self.ude.sampler,
+            steps=self.ude.denoising_steps,
+            window=self.dmd.window,
+            overlap=self.ude.overlap_frames,
+        )
+        return [self.tokenizer.own_units(motion) for motion in made]
+
+    def stations(
+        self, recorded: Sequence[Motion], prompts: Sequence[Prompt], sampling: SamplingConfig, seed: int
+    ) -> Iterator[tuple[str, list[Motion]]]:
+        """(station, its motions), one after another."""
+        yield "recorded", list(recorded)
+        decoders = [("tokenizer", False)] + ([("DMD", True)] if self.dmd is not None else [])
+        frames = [len(m) for m in recorded]
+        true = self.true_codes(recorded)
+        for decoder, by_dmd in decoders:
+            yield f"true tokens, {decoder}", self.decoded(true, seed, by_dmd=by_dmd)
+        for name, utt in self.utts.items():
+            for noise in (True, False) if utt.net.utt.config.z_dim else (False,):
+                made = self.made_codes(utt, prompts, frames, sampling, seed, inject_z=noise)
+                for decoder, by_dmd in decoders:
+                    motions = self.decoded(made, seed, by_dmd=by_dmd)
+                    yield f"{name}, {'z' if noise else 'no z'}, {decoder}", motions
+
+
+def dance_figures(
+    clips: Sequence[DanceClip], motions: Sequence[NDArray[Any]], apart: Sequence[Sequence[int]]
+) -> dict[str, float]:
+    """Of one motion a clip."""
+    own = [Matched(m, c) for m, c in zip(motions, clips, strict=True)]
+    crossed = [Matched(m, clips[k]) for m, row in zip(motions, apart, strict=True) for k in row]
+    right, wrong = alignment_of(own), alignment_of(crossed)
+    return {
+        **{f"beats_{name}": right[name] for name in ("bailando", "mint")},
+        **{f"other_music_{name}": wrong[name] for name in ("bailando", "mint")},
+        **recognition_of(own),
+        **feet_of(motions, clips[0].fps),
+    }
+
+
+def caption_figures(
+    truths: Sequence[Mapping[str, Any]],
+    motions: Sequence[Any],
+    fps: float,
+    apart: Sequence[Mapping[str, Any]],
+) -> dict[str, float]:
+    """Shares of right attributes, "every" all together, "whole" of clips with all right, and both of these of
+    held-out combinations; faces play no part."""
+    found: dict[str, list[bool]] = {}
+    for truth, joints in zip(truths, motions, strict=True):
+        right = agrees(dict(truth), joints, None, fps)
+        new = any(all(truth.get(k) == v for k, v in combination.items()) for combination in apart)
+        for name, value in right.items():
+            found.setdefault(name, []).append(value)
+            found.setdefault("every", []).append(value)
+            if new:
+                found.setdefault("held out every", []).append(value)
+        found.setdefault("whole", []).append(all(right.values()))
+        if new:
+            found.setdefault("held out whole", []).append(all(right.values()))
+    return {name: float(np.mean(values)) for name, values in found.items()}
+
+
+def show(console: Console, title: str, rows: Mapping[str, Mapping[str, float]]) -> None:
+    names = list(next(iter(rows.values())))
+    table = Table(title=title)
+    for column in ("", *names):
+        table.add_column(column)
+    for station, figures in rows.items():
+        table.add_row(station, *(f"{figures[n]:.3f}" if n in figures else "" for n in names))
+    console.print(table)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--clips", type=int, default=100, help="held-out dances, and captions, at most")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--temperature", type=float, default=1.0)
+    parser.add_argument("--top-p", type=float, default=0.9)
+    parser.add_argument("--cfg", type=float, default=1.0)
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--utt", nargs="*", default=["utt"], help="UTT stages to compare")
+    args = parser.parse_args()
+    console, engine = Console(width=220), Engine.of(args.run, args.utt)
+    stages, shelf = finished_stages(args.run), Shelf()
+    dataset = shelf.get(stages["data"]).split(args.split)
+    layout, fps = dataset.layout, dataset.layout.fps
+    sampling = SamplingConfig(temperature=args.temperature, top_p=args.top_p, cfg_scale=args.cfg)
+    clips = dances_of(dataset, args.clips, unit=GROUP_FRAMES)
+    apart = others(clips, 5, args.seed)
+    recorded = [np.asarray(dataset.motion(c.index))[: len(c.joints)] for c in clips]
+    out: dict[str, Any] = {"arguments": {k: str(v) for k, v in vars(args).items()}}
+    prompts = [Prompt(sound=c.sound, music=c.music) for c in clips]
+    out["dances"] = {
+        name: dance_figures(clips, [joints_of(m, layout) for m in motions], apart)
+        for name, motions in engine.stations(recorded, prompts, sampling, args.seed)
+    }
+    show(console, f"{len(clips)} dances to {len({c.song for c in clips})} songs", out["dances"])
+    if has_caption(dataset).any():
+        truths = [truth_of(dataset, i) for i in spread(dataset, 10 * args.clips)]
+        said = [t for t in truths if t.truth and t.truth.get("action") != "dance"][: args.clips]
+        place = {name: number for number, name in enumerate(dataset.ids)}
+        recorded = [np.asarray(dataset.motion(place[t.id]))[: len(t.features)] for t in said]
+        prompts, records = [Prompt(text=t.caption) for t in said], [t.truth or {} for t in said]
+        held = [c for s in stages.values() for c in getattr(s.config, "hold_out", [])]
+        out["captions"] = {
+            name: caption_figures(records, [joints_of(m, layout) for m in motions], fps, held)
+            for name, motions in engine.stations(recorded, prompts, sampling, args.seed)
+        }
+        show(console, f"{len(said)} captions", out["captions"])
+    (args.run / "stations.json").write_text(json.dumps(out, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""What a model hears of music: features of whole pieces, the same for a slice of one, heard once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.audio import lineup
+from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.synth.dance_plan import DanceConfig
+from motionloom.datasets.synth.song import render_song
+from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.conditions import PromptEncoder
+from motionloom.pipeline.inference.requests import prompts_of
+
+FPS, RATE = 20.0, 16_000
+
+
+@pytest.fixture(scope="module")
+def song() -> Sound:
+    config = DanceConfig(songs=2, song_seconds=12.0)
+    return Sound(render_song(config.song(0, 3), RATE), RATE)
+
+
+def heard(sounds: list[Sound], encoder: PromptEncoder | None = None) -> list[np.ndarray]:
+    encoder = encoder or PromptEncoder(None, torch.device("cpu"))
+    prompts = [Prompt(sound=sound) for sound in sounds]
+    found = encoder.encode(prompts, [""] * len(sounds), frozenset({"audio"}), FPS)["audio"]
+    return [f[m].numpy() for f, m in zip(found.features, found.mask, strict=True)]
+
+
+def test_a_slice_is_heard_as_its_piece_is(song: Sound) -> None:
+    whole = lineup.motion_frame_features(song, None, FPS, round(song.seconds * FPS))
+    part = song.slice(4.0, 8.5)
+    assert part.piece is song
+    (found,) = heard([part])
+    assert np.array_equal(found, whole[80:170])
+    # Heard alone it would be another music: the tempogram alone spans many seconds.
+    alone = lineup.motion_frame_features(Sound(part.samples, RATE), None, FPS, 90)
+    assert np.abs(alone - whole[80:170])[:, 54:].mean() > 0.01
+
+
+def test_a_slice_of_a_slice_and_one_between_two_frames(song: Sound) -> None:
+    inner = song.slice(2.0).slice(2.0, 6.5)
+    assert inner.piece is song
+    assert inner.begin == 4.0
+    assert np.array_equal(heard([inner])[0], heard([song.slice(4.0, 8.5)])[0])
+    between = song.slice(4.02, 8.52)
+    moved = song.slice(0.02)
+    rows = lineup.motion_frame_features(Sound(moved.samples, RATE), None, FPS, round(moved.seconds * FPS))
+    assert np.array_equal(heard([between])[0], rows[80:170])
+
+
+def test_pieces_are_heard_once(song: Sound, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[float] = []
+    real = lineup.motion_frame_features
+
+    def counted(sound: Sound, *rest: object) -> np.ndarray:
+        calls.append(sound.seconds)
+        return real(sound, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(lineup, "motion_frame_features", counted)
+    encoder = PromptEncoder(None, torch.device("cpu"))
+    heard([song, song, song.slice(1.0, 3.0)], encoder)
+    heard([song.slice(3.0, 5.0)], encoder)
+    assert calls == [song.seconds]
+
+
+def test_known_features_are_taken_as_they_are(song: Sound) -> None:
+    rows = np.random.default_rng(0).normal(size=(30, 438)).astype(np.float32)
+    prompts = prompts_of(None, None, [song, song], [rows, None])
+    found = PromptEncoder(None, torch.device("cpu")).encode(prompts, ["", ""], frozenset({"audio"}), FPS)
+    assert found["audio"].mask.sum(1).tolist() == [30, round(song.seconds * FPS)]
+    assert np.array_equal(found["audio"].features[0, :30].numpy(), rows)
+    with pytest.raises(UserError, match="1 rows of music features but 2 sounds"):
+        prompts_of(None, None, [song, song], [rows])
