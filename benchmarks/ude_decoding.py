@@ -21,7 +21,7 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from rich.table import Table
 
 from motionloom.datasets.motion.joints import joints_of, local_joints_of
 from motionloom.models.diffusion.dmd_sampling import decode_motions
+from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.metrics.dance import foot_skating
@@ -88,9 +89,11 @@ def samplers(run: Path, count: int, repeats: int, console: Console) -> dict[str,
         rows = []
         for repeat in range(repeats):
             seeds, start = sample_seeds(repeat, len(clips)), time.perf_counter()
-            made = decode_motions(dmd.net, codes, seeds=seeds, sampler=name, steps=steps, window=dmd.window)  # type: ignore[arg-type]
+            made = decode_motions(
+                dmd.net, codes, seeds=seeds, sampler=cast(Sampler, name), steps=steps, window=dmd.window
+            )
             seconds = time.perf_counter() - start
-            joints = [joints_of(tokenizer.own_units(m), tokenizer.layout) for m in made]
+            joints = [joints_of(tokenizer.of_coordinates(m), tokenizer.layout) for m in made]
             rows.append({**quality(clips, joints), "seconds": seconds})
         out[f"{name}, {steps} steps"] = rows
         console.print(f"{name}, {steps} steps: {np.mean([r['seconds'] for r in rows]):.1f} s a repeat")

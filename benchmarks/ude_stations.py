@@ -1,13 +1,13 @@
 """Where a UDE run loses what music and captions ask for, station by station.
 
     motionloom run ude-learning
-    python benchmarks/ude_stations.py runs/ude-learning --utt utt utt_prefix
+    python benchmarks/ude_stations.py runs/ude-learning --utt utt prefix_7 gru_7
 
 Held-out clips as they are recorded; their true tokens decoded by the tokenizer and by DMD; tokens that each
-UTT makes for their music or caption, with and without z, decoded by both. Beat Align of dances (to their own
-music and to other songs), genre and tempo, and attributes of captions are measured on the joints; captions of
-held-out combinations apart. Stations whose stage has not finished are left out. Writes `stations.json` into
-the run's folder.
+UTT makes for their music or caption, with and without z, decoded by both and drawn twice. Beat Align of
+dances (to their own music and to other songs), genre and tempo, attributes of captions (those of held-out
+combinations apart too): all measured on the joints. `variety` is how far the two draws are apart. Stations
+whose stage has not finished are left out. Writes `stations.json` (`--out`) into the run's folder.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.joints import joints_of, local_joints_of
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.diffusion.dmd_sampling import decode_motions
 from motionloom.models.gpt.drawing import sample_seeds
@@ -123,24 +123,40 @@ class Engine:
             window=self.dmd.window,
             overlap=self.ude.overlap_frames,
         )
-        return [self.tokenizer.own_units(motion) for motion in made]
+        return [self.tokenizer.of_coordinates(motion) for motion in made]
 
     def stations(
         self, recorded: Sequence[Motion], prompts: Sequence[Prompt], sampling: SamplingConfig, seed: int
-    ) -> Iterator[tuple[str, list[Motion]]]:
-        """(station, its motions), one after another."""
-        yield "recorded", list(recorded)
+    ) -> Iterator[tuple[str, list[Motion], list[Motion]]]:
+        """(station, its motions, other motions of the same: by other draws where it draws)."""
+        yield "recorded", list(recorded), list(recorded)
         decoders = [("tokenizer", False)] + ([("DMD", True)] if self.dmd is not None else [])
         frames = [len(m) for m in recorded]
         true = self.true_codes(recorded)
         for decoder, by_dmd in decoders:
-            yield f"true tokens, {decoder}", self.decoded(true, seed, by_dmd=by_dmd)
+            both = [self.decoded(true, seed + n, by_dmd=by_dmd) for n in (0, 1)]
+            yield f"true tokens, {decoder}", both[0], both[1]
         for name, utt in self.utts.items():
             for noise in (True, False) if utt.net.utt.config.z_dim else (False,):
-                made = self.made_codes(utt, prompts, frames, sampling, seed, inject_z=noise)
+                made = [
+                    self.made_codes(utt, prompts, frames, sampling, seed + n, inject_z=noise) for n in (0, 1)
+                ]
                 for decoder, by_dmd in decoders:
-                    motions = self.decoded(made, seed, by_dmd=by_dmd)
-                    yield f"{name}, {'z' if noise else 'no z'}, {decoder}", motions
+                    both = [self.decoded(made[n], seed + n, by_dmd=by_dmd) for n in (0, 1)]
+                    yield f"{name}, {'z' if noise else 'no z'}, {decoder}", both[0], both[1]
+
+
+def variety(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]], fps: float) -> float:
+    """Mean distance of the joints of two motions for the same, root and heading aligned, millimetres."""
+    pairs = zip(one, other, strict=True)
+    return 1000 * float(
+        np.mean(
+            [
+                np.linalg.norm(local_joints_of(a, fps) - local_joints_of(b, fps), axis=-1).mean()
+                for a, b in pairs
+            ]
+        )
+    )
 
 
 def dance_figures(
@@ -202,6 +218,7 @@ def main() -> None:
     parser.add_argument("--top-p", type=float, default=0.9)
     parser.add_argument("--cfg", type=float, default=1.0)
     parser.add_argument("--split", default="test")
+    parser.add_argument("--out", default="stations.json")
     parser.add_argument("--utt", nargs="*", default=["utt"], help="UTT stages to compare")
     args = parser.parse_args()
     console, engine = Console(width=220), Engine.of(args.run, args.utt)
@@ -214,10 +231,10 @@ def main() -> None:
     recorded = [np.asarray(dataset.motion(c.index))[: len(c.joints)] for c in clips]
     out: dict[str, Any] = {"arguments": {k: str(v) for k, v in vars(args).items()}}
     prompts = [Prompt(sound=c.sound, music=c.music) for c in clips]
-    out["dances"] = {
-        name: dance_figures(clips, [joints_of(m, layout) for m in motions], apart)
-        for name, motions in engine.stations(recorded, prompts, sampling, args.seed)
-    }
+    out["dances"] = {}
+    for name, *both in engine.stations(recorded, prompts, sampling, args.seed):
+        one, other = ([joints_of(m, layout) for m in motions] for motions in both)
+        out["dances"][name] = dance_figures(clips, one, apart) | {"variety": variety(one, other, fps)}
     show(console, f"{len(clips)} dances to {len({c.song for c in clips})} songs", out["dances"])
     if has_caption(dataset).any():
         truths = [truth_of(dataset, i) for i in spread(dataset, 10 * args.clips)]
@@ -226,12 +243,13 @@ def main() -> None:
         recorded = [np.asarray(dataset.motion(place[t.id]))[: len(t.features)] for t in said]
         prompts, records = [Prompt(text=t.caption) for t in said], [t.truth or {} for t in said]
         held = [c for s in stages.values() for c in getattr(s.config, "hold_out", [])]
-        out["captions"] = {
-            name: caption_figures(records, [joints_of(m, layout) for m in motions], fps, held)
-            for name, motions in engine.stations(recorded, prompts, sampling, args.seed)
-        }
+        out["captions"] = {}
+        for name, *both in engine.stations(recorded, prompts, sampling, args.seed):
+            one, other = ([joints_of(m, layout) for m in motions] for motions in both)
+            found = caption_figures(records, one, fps, held) | {"variety": variety(one, other, fps)}
+            out["captions"][name] = found
         show(console, f"{len(said)} captions", out["captions"])
-    (args.run / "stations.json").write_text(json.dumps(out, indent=2))
+    (args.run / args.out).write_text(json.dumps(out, indent=2))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,8 @@
-"""Training of the diffusion motion decoder on tokens of real motion (UDE section 3.4)."""
+"""Training of the diffusion motion decoder on tokens of real motion (UDE section 3.4).
+
+Motion is noised and denoised in the coordinates that the tokenizer reads (`Basis`), so that what its gains
+make large, the path and the shapes of hands, is large here too [ours]. Without gains they are the features.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +42,8 @@ class DmdModule(StageModule):
         length = groups * GROUP_FRAMES
         with torch.no_grad():
             codes = self.tokenizer.module.encode(motion, length, present)
+            seen = self.tokenizer.module.coordinates(motion, present)
         step = torch.randint(0, self.net.config.schedule.steps, (len(motion),), device=motion.device)
-        noise = torch.randn_like(motion)
-        loss = dmd_loss(self.net, self.noiser, motion, codes, length, step, noise, present=present)
+        noise = torch.randn_like(seen)
+        loss = dmd_loss(self.net, self.noiser, seen, codes, length, step, noise, present=present)
         return {"loss": loss}

@@ -41,7 +41,7 @@ def decode_motions(
     overlap: int = 32,
     absent: Mapping[str, Tensor] | None = None,
 ) -> list[Tensor]:
-    """Normalised motions [T, D] of n token sequences, one seed each (UDE section 3.4).
+    """Motions [T, D] of n token sequences, in the coordinates of training, one seed each (UDE section 3.4).
 
     Args:
         net: The denoiser; runs in evaluation mode and is left as it was.

@@ -151,10 +151,17 @@ class Tokenizer(nn.Module, ABC):
         `present` [B, dim]: false where a clip does not hold a column; None = all are present.
         """
         valid = self._valid(x, length)
-        read = self._read(x, present)
+        read = self.coordinates(x, present)
         latents = self._quantize(read, valid, self._missing(present), update=True)
         written = self.decoder(latents.joined, valid)
         return TokenizerOutput(read, written, latents.penalty, latents.codes, latents.metrics)
+
+    def coordinates(self, x: Tensor, present: Tensor | None = None) -> Tensor:
+        """Motion [B, T, dim] as the encoders read it: in the coordinates of `Basis`, zero in the columns that
+        are not present. `features` is the way back.
+        """
+        read = self.basis.encode(x)
+        return read if present is None else read.masked_fill(~present[:, None], 0.0)
 
     @torch.no_grad()
     def encode(
@@ -166,7 +173,7 @@ class Tokenizer(nn.Module, ABC):
         valid codes, also those of a part that the clip does not hold.
         """
         valid = self._valid(x, length)
-        return self._quantize(self._read(x, present), valid, self._missing(present), update=False).codes
+        return self._quantize(self.coordinates(x, present), valid, self._missing(present), update=False).codes
 
     def decode(
         self, codes: dict[str, Tensor], length: Tensor | None = None, present: Tensor | None = None
@@ -213,11 +220,6 @@ class Tokenizer(nn.Module, ABC):
 
     def _decode(self, vectors: dict[str, Tensor], length: Tensor | None) -> Tensor:
         return self.features(self.decoder(self._join(vectors), _whole_groups(length)), length)
-
-    def _read(self, x: Tensor, present: Tensor | None) -> Tensor:
-        """What the encoders read: zero in the columns that are not present."""
-        read = self.basis.encode(x)
-        return read if present is None else read.masked_fill(~present[:, None], 0.0)
 
     def _valid(self, x: Tensor, length: Tensor | None) -> Tensor | None:
         if x.shape[-1] != self.dim:

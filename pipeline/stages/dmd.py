@@ -53,6 +53,7 @@ class DmdStage(TrainedStage):
     summary = "diffusion decoder of motion tokens"
     config = DmdStageConfig
     takes = ("data", "stats", "tokenizer")
+    version = 2  # the tokenizer's coordinates
 
     def gives(self, config: Any) -> frozenset[str]:
         """Motion of tokens."""

@@ -193,4 +193,4 @@ class UdeGenerator:
             window=self.dmd.window,
             overlap=min(self.config.overlap_frames, self.dmd.window - GROUP_FRAMES),
         )
-        return [self.tokenizer.own_units(motion) for motion in made]
+        return [self.tokenizer.of_coordinates(motion) for motion in made]

@@ -64,6 +64,10 @@ class TrainedTokenizer:
             out.append(self.own_units(self.net.decode(single)[0]))
         return out
 
+    def of_coordinates(self, seen: Tensor) -> NDArray[np.float32]:
+        """Motion [T, C] in the coordinates that the tokenizer reads -> its own units."""
+        return self.own_units(self.net.features(seen[None])[0])
+
     def own_units(self, motion: Tensor) -> NDArray[np.float32]:
         """Normalised features [T, C] of its columns -> metres, radians and expression values."""
         values = motion.cpu().numpy()

@@ -72,7 +72,10 @@ def test_clips_are_cut_with_their_music(data: Splits, clips: list[DanceClip]) ->
         np.testing.assert_allclose(clip.sound.samples, made.wav[0][: len(clip.sound.samples)], atol=1e-4)
         assert clip.sound.seconds == pytest.approx(clip.seconds, abs=1 / clip.sound.rate)
         assert clip.beats.tolist() == beats_of(made.truth, clip.seconds)
+        # What a model hears is what the data store: of the whole song, not of the clip alone.
+        assert clip.music is not None and np.array_equal(clip.music, data[1].audio(clip.index)[:frames])
     short = dance_at(data[1], clips[0].index, seconds=2.0)
+    assert short is not None and short.music is not None and len(short.music) == 40
     assert short is not None and short.seconds == 2.0 and short.sound.seconds == pytest.approx(2.0)
     assert (short.beats < 2.0).all() and len(short.beats) == (clips[0].beats < 2.0).sum()
 

@@ -1,0 +1,76 @@
+"""The DMD learns in the coordinates of its tokenizer, and what it makes comes back to the motion's own units."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.diffusion.dmd import Dmd, DmdConfig, dmd_loss
+from motionloom.models.diffusion.dmd_module import DmdModule
+from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import MqConfig
+from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.store.networks import TrainedTokenizer
+
+LAYOUT = MotionLayout.named("wholebody363")
+SMALL = DmdConfig(
+    dim=8, ff=8, encoder_layers=1, decoder_layers=1, heads=2, dropout=0.0, attention_dropout=0.0
+)
+
+
+def stats() -> FeatureStats:
+    rng = np.random.default_rng(0)
+    mean, std = rng.normal(size=LAYOUT.dim), rng.uniform(0.5, 2.0, size=LAYOUT.dim)
+    return FeatureStats(mean.astype(np.float32), std.astype(np.float32), 100, LAYOUT)
+
+
+def tokenizer(finger_gain: float, root_gain: float) -> Tokenizer:
+    torch.manual_seed(1)
+    config = MqConfig.model_validate(
+        {"part": "all", "width": 8, "code_dim": 6, "num_codes": 9, "quantizer": "ema", "depth": 0,
+         "finger_gain": finger_gain, "root_gain": root_gain}
+    )  # fmt: skip
+    made = build_tokenizer(config, LAYOUT)
+    made.basis.learn(stats().mean, stats().std)
+    for book in made.codebooks().values():
+        torch.nn.init.normal_(book.codebook)
+        book.initialised.fill_(True)
+        book._is_initialised = True
+    return made.freeze()
+
+
+@pytest.mark.parametrize(("finger_gain", "root_gain"), [(4.0, 5.0), (0.0, 1.0)])
+def test_the_loss_is_that_of_the_tokenizers_coordinates(finger_gain: float, root_gain: float) -> None:
+    frozen = tokenizer(finger_gain, root_gain)
+    torch.manual_seed(0)
+    net = Dmd(SMALL, frozen.streams, frozen.pattern, frozen.dim)
+    module = DmdModule(net, OptimConfig(), seed=0, max_steps=2, tokenizer=frozen)
+    motion, length = torch.randn(3, 16, frozen.dim), torch.tensor([16, 9, 12])
+    present = torch.ones(3, frozen.dim, dtype=torch.bool)
+    present[1, frozen.dim // 2 :] = False
+    torch.manual_seed(5)
+    found = module.losses({"motion": motion, "length": length, "present": present})["loss"]
+    torch.manual_seed(5)
+    step, noise = torch.randint(0, 1000, (3,)), torch.randn(3, 16, frozen.dim)
+    whole = torch.tensor([16, 8, 12])
+    seen = frozen.basis.encode(motion).masked_fill(~present[:, None], 0.0)
+    assert torch.equal(seen, motion.masked_fill(~present[:, None], 0.0)) == (root_gain == 1.0)
+    expected = dmd_loss(
+        net, net.config.schedule.noiser(), seen, frozen.encode(motion, whole, present), whole, step, noise,
+        present=present,
+    )  # fmt: skip
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(("finger_gain", "root_gain"), [(4.0, 5.0), (0.0, 1.0)])
+def test_coordinates_come_back_as_the_features(finger_gain: float, root_gain: float) -> None:
+    frozen, given = tokenizer(finger_gain, root_gain), stats()
+    trained = TrainedTokenizer(frozen, {"stats": given})
+    motion = torch.randn(8, frozen.dim)
+    found = trained.of_coordinates(frozen.coordinates(motion[None])[0])
+    # Fingers go through rotations and back in float32, at bones of a few units.
+    np.testing.assert_allclose(found, given.denormalize(motion.numpy(), trained.columns), atol=2e-4)
