@@ -1,11 +1,12 @@
-"""The pictures of the documentation: one row of poses per caption.
+"""The pictures of the documentation: one row of poses per caption or song.
 
 python docs/pictures.py runs/humantomato-tiny docs/pictures/demo.png
 python docs/pictures.py runs/bvh-body walk.png "a person walks and turns left" --seed 3
 python docs/pictures.py synthetic docs/pictures/demo.png
+python docs/pictures.py runs/ude-tiny docs/pictures/dance.png --dances 3
 
 The first argument is a run folder, an exported folder, or the word `synthetic` (clips of the synthetic
-source).
+source). With `--dances` rows are dances to songs of the run's test split, each pose on a beat of the music.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ from typing import Any
 from numpy.typing import NDArray
 
 from motionloom.datasets.synth.generate import SynthConfig, make_clip
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.render.picture import contact_sheet
 
@@ -40,12 +44,40 @@ class Row:
     label: str
     caption: str
     fps: float
+    at: list[int] | None = None
+    """Frames to show; None = spread evenly."""
 
 
 def generated_rows(run: Path, captions: tuple[str, ...], seed: int) -> list[Row]:
     """Motions that a trained run makes of the captions."""
     motions = Bundle.open(run).generate(captions, seed=seed)
     return [Row(m.joints, "generated", m.caption, m.layout.fps) for m in motions]
+
+
+def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[Row]:
+    """Dances that a trained run makes to songs of its test split, of different kinds first, on the beats."""
+    stages, bundle = finished_stages(run), Bundle.open(run)
+    dataset = Shelf().get(stages["data"]).split("test")
+    unit = bundle.generator.unit_frames
+    fps, found = dataset.layout.fps, dances_of(dataset, 1000, unit=unit)
+    kinds: dict[Any, DanceClip] = {}
+    for clip in found:
+        if len(clip.beats) >= frames:
+            kinds.setdefault((clip.truth or {}).get("genre"), clip)
+    clips = list(kinds.values())[:count]
+    motions = bundle.generate(
+        sounds=[c.sound for c in clips],
+        music=[c.music for c in clips],
+        seconds=[c.seconds for c in clips],
+        seed=seed,
+    )
+    rows = []
+    for clip, motion in zip(clips, motions, strict=True):
+        at = [min(round(beat * fps), len(motion.joints) - 1) for beat in clip.beats[:frames].tolist()]
+        truth = clip.truth or {}
+        words = f"{truth.get('genre', clip.song)}, {truth.get('bpm', '?')} beats a minute"
+        rows.append(Row(motion.joints, "to music", words, fps, at))
+    return rows
 
 
 def synthetic_rows() -> list[Row]:
@@ -62,6 +94,7 @@ def draw(path: Path, rows: list[Row], frames: int) -> None:
         [row.label for row in rows],
         [row.caption for row in rows],
         frames,
+        at=None if rows[0].at is None else [row.at or [] for row in rows],
         fps=rows[0].fps,
     )
 
@@ -73,10 +106,13 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="the PNG to write")
     parser.add_argument("captions", nargs="*", help="one row each; default: four of the docs' own")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--dances", type=int, default=0, help="rows of dances, in place of captions")
     parser.add_argument("--frames", type=int, default=6, help="poses in a row")
     args = parser.parse_args()
     if args.run == "synthetic":
         rows = synthetic_rows()
+    elif args.dances:
+        rows = dance_rows(Path(args.run), args.dances, args.frames, args.seed)
     else:
         rows = generated_rows(Path(args.run), tuple(args.captions) or CAPTIONS, args.seed)
     draw(args.out, rows, args.frames)

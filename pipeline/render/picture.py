@@ -30,6 +30,7 @@ def contact_sheet(
     captions: Sequence[str],
     frames: int = 6,
     *,
+    at: Sequence[Sequence[int]] | None = None,
     parents: Sequence[int] | None = None,
     fps: float = 20.0,
     cell: tuple[int, int] = (180, 236),
@@ -37,12 +38,15 @@ def contact_sheet(
 ) -> None:
     """Write a PNG: a row per motion [T, N, 3] (metres) with label, caption and `frames` poses over time.
 
-    `parents` may be left out for 52 or 22 SMPL-X joints. Poses stand in mid-cell, with their times.
+    `at` names the frames of every row, `frames` of them; without it they are spread evenly. `parents` may be
+    left out for 52 or 22 SMPL-X joints. Poses stand in mid-cell, with their times.
     """
     if not len(joints) == len(labels) == len(captions) or not len(joints) or frames < 1:
         raise UserError(
             "contact_sheet needs as many labels and captions as motions, and at least one of each"
         )
+    if at is not None and [len(row) for row in at] != [frames] * len(joints):
+        raise UserError(f"contact_sheet needs {frames} frames for each of {len(joints)} rows in `at`")
     width, height = cell
     heading = 48 if _two_lines(labels, captions, width * frames) else 30
     rows = [np.asarray(clip, np.float64) for clip in joints]
@@ -67,7 +71,8 @@ def contact_sheet(
             [0, 2 * (top + heading), sheet.width, 2 * (top + heading + height)], fill=(247, 248, 251)
         )
         draw.line([0, 2 * top, sheet.width, 2 * top], fill=LINE, width=2)
-        for column, k in enumerate(np.linspace(0, len(clip) - 1, frames).round().astype(int)):
+        shown = np.linspace(0, len(clip) - 1, frames).round().astype(int).tolist() if at is None else at[row]
+        for column, k in enumerate(shown):
             target = np.array([clip[k, 0, 0], floor + 0.47 * tall, clip[k, 0, 2]])
             corner = (2 * column * width, 2 * (top + heading))
             draw_pose(draw, camera, figure, Pose(nodes[k], target, floor, scale), at=corner)

@@ -1,4 +1,4 @@
-"""The DMD learns in the coordinates of its tokenizer, and what it makes comes back to the motion's own units."""
+"""The DMD learns in its tokenizer's coordinates, and what it makes comes back to the motion's own units."""
 
 from __future__ import annotations
 

@@ -328,6 +328,17 @@ def test_contact_sheet_has_a_row_a_motion_and_a_cell_a_pose(tmp_path: Path, walk
         contact_sheet(path, [walk(2)], [], ["b"])
 
 
+def test_contact_sheet_of_named_frames_is_that_of_a_clip_of_them(tmp_path: Path, walk: Walk) -> None:
+    one, other, clip = tmp_path / "a.png", tmp_path / "b.png", walk(40)
+    contact_sheet(one, [clip], ["a"], ["b"], frames=2, at=[[0, 39]], cell=(100, 140))
+    contact_sheet(other, [clip], ["a"], ["b"], frames=2, cell=(100, 140))
+    assert one.read_bytes() == other.read_bytes()
+    contact_sheet(other, [clip], ["a"], ["b"], frames=2, at=[[0, 11]], cell=(100, 140))
+    assert one.read_bytes() != other.read_bytes()
+    with pytest.raises(UserError, match="3 frames for each of 1 rows"):
+        contact_sheet(one, [clip], ["a"], ["b"], frames=3, at=[[0, 39]])
+
+
 def test_text_wraps_within_its_width() -> None:
     face = font(14)
     lines = wrap("word " * 50, 120, face, 3)
