@@ -138,10 +138,10 @@ def module_of(name: str, steps: int, *, dropout: float = 0.0) -> StageModule:
         return kind(Dmd(small, frozen.streams, frozen.pattern, frozen.dim), OPTIM, tokenizer=frozen, **given)
     frozen = tokenizer()
     net = ConditionedUtt(
-        MateConfig(dim=8, layers=1, heads=2, ff=8, dropout=dropout, attention_dropout=0.0),
+        MateConfig(dim=8, layers=1, heads=2, ff=8, dropout=dropout, attention_dropout=0.0, stride=2),
         UttConfig(
             layers=1, dim=8, heads=2, ff=8, block_size=8, dropout=dropout, attention_dropout=0.0,
-            z_dim=2 if dropout else 0, condition_dropout=dropout, pkeep=1 - dropout,
+            z_dim=2 if dropout else 0, condition_dropout=dropout, pkeep=1 - dropout, beside=True,
         ),
         {"text": 4, "audio": 3}, frozen.streams, frozen.pattern,
     )  # fmt: skip

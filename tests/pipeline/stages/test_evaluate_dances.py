@@ -179,7 +179,7 @@ stages:
     test_fraction: 0.34
     dances: {songs: 9, song_seconds: 8, share: 0.5, conditions: {audio: 1.0, both: 0.0}}
   tokenizer:
-    net: {width: 16, code_dim: 8, num_codes: 16}
+    net: {width: 16, code_dim: 8, num_codes: 16, root_gain: 1.0, finger_gain: 0.0}
     train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}
   utt:
     net: {layers: 1, dim: 16, heads: 2, ff: 16, block_size: 48, z_dim: 4}
