@@ -59,7 +59,9 @@ class Basis(nn.Module):
         if not self.bends:
             return
         if not layout.has("positions"):
-            raise UserError(f"finger_gain needs joint positions, and layout {layout.name} has none; set it to 0")
+            raise UserError(
+                f"finger_gain needs joint positions, and layout {layout.name} has none; set it to 0"
+            )
         fingers = [_columns(layout, field, range(BODY_JOINTS, 52)) for field in ("positions", "velocities")]
         wrists = [_columns(layout, field, WRISTS) for field in ("positions", "velocities")]
         needed = np.concatenate([*fingers, *wrists])
