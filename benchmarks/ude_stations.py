@@ -219,9 +219,12 @@ def main() -> None:
     parser.add_argument("--cfg", type=float, default=1.0)
     parser.add_argument("--split", default="test")
     parser.add_argument("--out", default="stations.json")
+    parser.add_argument("--no-dmd", action="store_true", help="decode by the tokenizer alone")
     parser.add_argument("--utt", nargs="*", default=["utt"], help="UTT stages to compare")
     args = parser.parse_args()
     console, engine = Console(width=220), Engine.of(args.run, args.utt)
+    if args.no_dmd:
+        engine.dmd = None
     stages, shelf = finished_stages(args.run), Shelf()
     dataset = shelf.get(stages["data"]).split(args.split)
     layout, fps = dataset.layout, dataset.layout.fps
