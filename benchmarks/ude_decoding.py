@@ -3,9 +3,9 @@
     motionloom run ude-learning
     python benchmarks/ude_decoding.py runs/ude-learning --samplers --transitions
 
-`--samplers`: true tokens of held-out dances decoded by 20 steps of DPM-Solver++, by DDIM and by all of DDPM's
-steps, several times each: distance to what was recorded, Beat Align, feet, roughness, seconds. Differences
-count against the spread of the repeats.
+`--samplers`: true tokens of one window of held-out dances decoded by 20 steps of DPM-Solver++, by DDIM and by
+all of DDPM's steps, several times each: distance to what was recorded, Beat Align, feet, roughness, seconds.
+Differences count against the spread of the repeats.
 
 `--transitions`: scripts of a caption, a song and another caption. At each border the acceleration of the
 joints and the speed of the root as percentiles among those inside the segments of the same motion
@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -33,7 +32,6 @@ from motionloom.datasets.motion.joints import joints_of, local_joints_of
 from motionloom.models.diffusion.dmd_sampling import decode_motions
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.drawing import sample_seeds
-from motionloom.models.gpt.tokens import Codes
 from motionloom.models.metrics.dance import foot_skating
 from motionloom.models.metrics.transitions import accelerations, transition_percentiles
 from motionloom.models.tokenizer.base import GROUP_FRAMES
@@ -47,18 +45,6 @@ from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.script import DrivenSegment
 
 Joints = NDArray[np.float64]
-
-
-def encoded(tokenizer: Any, motions: Sequence[NDArray[np.float32]]) -> Codes:
-    """Tokens of motions [T, D], all columns of the layout."""
-    columns, stats = tokenizer.columns, tokenizer.stats
-    groups = torch.tensor([len(m) // GROUP_FRAMES for m in motions])
-    batch = torch.zeros(len(motions), int(groups.max()) * GROUP_FRAMES, len(columns))
-    for k, motion in enumerate(motions):
-        rows = (motion[:, columns] - stats.mean[columns]) / stats.std[columns]
-        batch[k, : len(rows)] = torch.from_numpy(rows.astype(np.float32))
-    with torch.no_grad():
-        return Codes(tokenizer.net.encode(batch, groups * GROUP_FRAMES), groups)
 
 
 def quality(clips: Sequence[DanceClip], made: Sequence[Joints]) -> dict[str, float]:
@@ -82,7 +68,8 @@ def samplers(run: Path, count: int, repeats: int, console: Console) -> dict[str,
     tokenizer, dmd = shelf.get(stages["tokenizer"]), shelf.get(stages["dmd"])
     dataset = shelf.get(stages["data"]).split("test")
     clips = dances_of(dataset, count, unit=GROUP_FRAMES, seconds=dmd.window / dataset.layout.fps)
-    codes = encoded(tokenizer, [np.asarray(dataset.motion(c.index))[: len(c.joints)] for c in clips])
+    columns = tokenizer.columns
+    codes = tokenizer.encode([np.asarray(dataset.motion(c.index))[: len(c.joints), columns] for c in clips])
     whole = dmd.net.config.schedule.steps
     out: dict[str, Any] = {"recorded": [quality(clips, [c.joints for c in clips])]}
     for name, steps in (("dpm++", 20), ("ddim", 50), ("ddpm", whole)):

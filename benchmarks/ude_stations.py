@@ -74,18 +74,6 @@ class Engine:
             ude,
         )
 
-    def true_codes(self, motions: Sequence[Motion]) -> Codes:
-        """Tokens of recorded motions [T, D], all columns."""
-        net, columns = self.tokenizer.net, self.tokenizer.columns
-        rows = [(m[:, columns] - self.tokenizer.stats.mean[columns]) for m in motions]
-        groups = torch.tensor([len(m) // GROUP_FRAMES for m in motions])
-        most = int(groups.max()) * GROUP_FRAMES
-        batch = torch.zeros(len(rows), most, len(columns))
-        for k, row in enumerate(rows):
-            batch[k, : len(row)] = torch.from_numpy(row / self.tokenizer.stats.std[columns])
-        with torch.no_grad():
-            return Codes(net.encode(batch, groups * GROUP_FRAMES), groups)
-
     def made_codes(
         self,
         utt: Any,
@@ -132,7 +120,7 @@ class Engine:
         yield "recorded", list(recorded), list(recorded)
         decoders = [("tokenizer", False)] + ([("DMD", True)] if self.dmd is not None else [])
         frames = [len(m) for m in recorded]
-        true = self.true_codes(recorded)
+        true = self.tokenizer.encode([motion[:, self.tokenizer.columns] for motion in recorded])
         for decoder, by_dmd in decoders:
             both = [self.decoded(true, seed + n, by_dmd=by_dmd) for n in (0, 1)]
             yield f"true tokens, {decoder}", both[0], both[1]

@@ -80,7 +80,8 @@ class Sound:
 
     def resampled(self, rate: int) -> Sound:
         """The same sound at another sample rate."""
-        return Sound(np.clip(resample_sound(self.samples, self.rate, rate), -1.0, 1.0), rate)
+        samples = np.clip(resample_sound(self.samples, self.rate, rate), -1.0, 1.0)
+        return Sound(samples, rate, self.piece, self.begin)
 
 
 def read_sound(

@@ -17,8 +17,9 @@ from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import PRESENT_ALL
 from motionloom.datasets.text.cache import TextCache
 from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tma.network import Tma
-from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 
 CPU = torch.device("cpu")
 
@@ -51,6 +52,18 @@ class TrainedTokenizer:
         """Mean and deviation of its input."""
         stats: FeatureStats = self.given["stats"]
         return stats
+
+    @torch.no_grad()
+    def encode(self, motions: Sequence[NDArray[np.float32]]) -> Codes:
+        """Tokens of motions [T, C], its columns in their own units; what exceeds whole groups is left out."""
+        groups = torch.tensor([len(motion) // GROUP_FRAMES for motion in motions])
+        batch = torch.zeros(len(motions), int(groups.max()) * GROUP_FRAMES, self.net.dim)
+        mean, std = self.stats.mean[self.columns], self.stats.std[self.columns]
+        for row, motion, count in zip(batch, motions, (groups * GROUP_FRAMES).tolist(), strict=True):
+            row[:count] = torch.from_numpy(((motion[:count] - mean) / std).astype(np.float32))
+        device = device_of(self.net)
+        groups = groups.to(device)
+        return Codes(self.net.encode(batch.to(device), groups * GROUP_FRAMES), groups)
 
     @torch.no_grad()
     def decode(self, codes: Mapping[str, Tensor], groups: Sequence[int]) -> list[NDArray[np.float32]]:

@@ -66,6 +66,17 @@ def test_the_loss_is_that_of_the_tokenizers_coordinates(finger_gain: float, root
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
 
 
+def test_tokens_of_motions_are_those_of_each_alone() -> None:
+    frozen, given = tokenizer(4.0, 5.0), stats()
+    trained = TrainedTokenizer(frozen, {"stats": given})
+    motions = [torch.randn(frames, frozen.dim) for frames in (18, 8)]
+    found = trained.encode([given.denormalize(m.numpy(), trained.columns) for m in motions])
+    assert found.groups.tolist() == [4, 2]
+    for row, (motion, groups) in enumerate(zip(motions, (4, 2), strict=True)):
+        alone = frozen.encode(motion[None, : 4 * groups])["code"]
+        assert torch.equal(found.codes["code"][row, :groups], alone[0])
+
+
 @pytest.mark.parametrize(("finger_gain", "root_gain"), [(4.0, 5.0), (0.0, 1.0)])
 def test_coordinates_come_back_as_the_features(finger_gain: float, root_gain: float) -> None:
     frozen, given = tokenizer(finger_gain, root_gain), stats()

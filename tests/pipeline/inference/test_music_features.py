@@ -47,6 +47,7 @@ def test_a_slice_of_a_slice_and_one_between_two_frames(song: Sound) -> None:
     assert inner.piece is song
     assert inner.begin == 4.0
     assert np.array_equal(heard([inner])[0], heard([song.slice(4.0, 8.5)])[0])
+    assert np.array_equal(heard([inner.resampled(8_000)])[0], heard([inner])[0])
     between = song.slice(4.02, 8.52)
     moved = song.slice(0.02)
     rows = lineup.motion_frame_features(Sound(moved.samples, RATE), None, FPS, round(moved.seconds * FPS))
