@@ -9,6 +9,8 @@ Notable choices:
   about that alignment has to be learnt, it costs nothing, and a stretch of frames carries its own tokens,
   which is what long motions in windows need (`dmd_sampling.py`).
 - Any streams and pattern of `gpt/tokens.py`: every token of a group is one position of the encoder.
+- Trained with `hide`, the network also fills in frames whose tokens it is not shown [ours], so a change of
+  conditions can be bridged instead of decoded from tokens that no clip ever had side by side.
 - The time step is added to every frame. Positions are sinusoidal.
 
 Legend: B batch, T frames, D motion features, G groups of four frames, P slots of a group, C width.
@@ -42,6 +44,8 @@ class DmdConfig(Config):
     heads: int = Field(default=8, ge=1)
     dropout: float = Field(default=0.1, ge=0, lt=1)
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
+    hide: float = Field(default=0.0, ge=0, le=1)
+    """Share of training windows in which a stretch of tokens is hidden [ours]; 0 is the paper's."""
     schedule: ScheduleConfig = ScheduleConfig(betas="linear", predicts="epsilon")
 
     @model_validator(mode="after")
@@ -90,14 +94,19 @@ class Dmd(nn.Module):
         codes: Mapping[str, Tensor],
         length: Tensor,
         absent: Mapping[str, Tensor] | None = None,
+        hidden: Tensor | None = None,
     ) -> Tensor:
         """`denoise` of noisy [B, T, D] at step [B], given the tokens of clips of `length` [B] frames."""
         groups = (length + GROUP_FRAMES - 1) // GROUP_FRAMES
-        condition = self.encode_tokens(codes, groups, absent)
+        condition = self.encode_tokens(codes, groups, absent, hidden)
         return self.denoise(noisy, step, condition, length_mask(length, noisy.shape[1]))
 
     def encode_tokens(
-        self, codes: Mapping[str, Tensor], groups: Tensor, absent: Mapping[str, Tensor] | None = None
+        self,
+        codes: Mapping[str, Tensor],
+        groups: Tensor,
+        absent: Mapping[str, Tensor] | None = None,
+        hidden: Tensor | None = None,
     ) -> Tensor:
         """What the tokens say about each frame, [B, 4 G, C]; once a motion, not at each step.
 
@@ -105,6 +114,7 @@ class Dmd(nn.Module):
             codes: Per stream int64 [B, G * per_group].
             groups: int64 [B], groups that count; the others are padding.
             absent: Bool [B] per stream that a clip may lack: its tokens are read as zero.
+            hidden: Bool [B, G], groups whose tokens are read as zero.
         """
         slots = []
         for index, name in enumerate(self.pattern):
@@ -113,6 +123,8 @@ class Dmd(nn.Module):
             vectors = self.embeddings[name](here[:, :, self.pattern[:index].count(name)])
             if absent is not None and name in absent:
                 vectors = vectors.masked_fill(absent[name][:, None, None], 0.0)
+            if hidden is not None:
+                vectors = vectors.masked_fill(hidden[..., None], 0.0)
             slots.append(vectors)
         x = torch.stack(slots, dim=2) + self.slot
         x = x + sinusoid(x.shape[1], x.shape[3], x.device)[:, None].to(x.dtype)
@@ -166,6 +178,7 @@ def dmd_loss(
     noise: Tensor,
     *,
     absent: Mapping[str, Tensor] | None = None,
+    hidden: Tensor | None = None,
     present: Tensor | None = None,
 ) -> Tensor:
     """Squared error of the predicted noise, mean over the real frames of all ranks (equation 10).
@@ -179,9 +192,10 @@ def dmd_loss(
         step: int64 [B], time steps.
         noise: [B, T, D], standard normal.
         absent: As in `Dmd.encode_tokens`.
+        hidden: As there.
         present: bool [B, D], columns that count (None = all).
     """
-    found = net(noiser.add_noise(motion, noise, step), step, codes, length, absent)
+    found = net(noiser.add_noise(motion, noise, step), step, codes, length, absent, hidden)
     target = motion if net.config.schedule.predicts == "sample" else noise
     error = (found - target.to(found.dtype)).square()
     return masked_mean(error, length_mask(length, motion.shape[1]), present)

@@ -45,5 +45,22 @@ class DmdModule(StageModule):
             seen = self.tokenizer.module.coordinates(motion, present)
         step = torch.randint(0, self.net.config.schedule.steps, (len(motion),), device=motion.device)
         noise = torch.randn_like(seen)
-        loss = dmd_loss(self.net, self.noiser, seen, codes, length, step, noise, present=present)
+        hidden = hidden_stretch(groups, -(-motion.shape[1] // GROUP_FRAMES), self.net.config.hide)
+        loss = dmd_loss(
+            self.net, self.noiser, seen, codes, length, step, noise, hidden=hidden, present=present
+        )
         return {"loss": loss}
+
+
+def hidden_stretch(groups: Tensor, size: int, share: float) -> Tensor | None:
+    """Bool [B, size]: in a `share` of the rows one stretch, of one group to half of the row's `groups` [B],
+    is hidden; None where the share is 0.
+    """
+    if not share:
+        return None
+    chance, length, place = torch.rand(3, len(groups), device=groups.device)
+    count = 1 + (length * (groups // 2)).long().clamp(max=(groups // 2 - 1).clamp(min=0))
+    first = (place * (groups - count + 1)).long()
+    at = torch.arange(size, device=groups.device)
+    inside = (at >= first[:, None]) & (at < (first + count)[:, None])
+    return inside & (chance < share)[:, None]

@@ -40,6 +40,7 @@ def decode_motions(
     window: int = 160,
     overlap: int = 32,
     absent: Mapping[str, Tensor] | None = None,
+    hidden: Tensor | None = None,
 ) -> list[Tensor]:
     """Motions [T, D] of n token sequences, in the coordinates of training, one seed each (UDE section 3.4).
 
@@ -53,10 +54,16 @@ def decode_motions(
         window: Frames denoised at once, a multiple of 4: what the network was trained on.
         overlap: Frames that neighbouring windows share, a multiple of 4 below `window`.
         absent: Bool [n] per stream whose tokens say nothing.
+        hidden: Bool [n, G], groups that are filled in without their tokens, if the training had `hide`.
     """
     count = len(codes.groups)
     if len(seeds) != count or (frames is not None and len(frames) != count):
         raise UserError(f"{len(seeds)} seeds and {count} token sequences; each motion needs its own")
+    if hidden is not None and not net.config.hide:
+        raise UserError(
+            "this DMD was trained with every token in sight and cannot fill in for hidden ones; train it "
+            "with net.hide above 0"
+        )
     if window % GROUP_FRAMES or overlap % GROUP_FRAMES or not 0 <= overlap < window:
         raise UserError(
             f"window {window} and overlap {overlap} must be multiples of {GROUP_FRAMES}, the overlap smaller"
@@ -77,7 +84,8 @@ def decode_motions(
             index = torch.tensor(rows, device=codes.groups.device)
             mine = {name: values[index] for name, values in codes.codes.items()}
             gone = None if absent is None else {name: values[index] for name, values in absent.items()}
-            windows = _Windows(net, mine, gone, size, window, overlap)
+            unread = None if hidden is None else hidden[index]
+            windows = _Windows(net, mine, gone, unread, size, window, overlap)
             made = _denoise(net, windows, size, [seeds[row] for row in rows], sampler, steps)
             out.update(zip(rows, made, strict=True))
     finally:
@@ -120,6 +128,7 @@ class _Windows:
         net: Dmd,
         codes: Mapping[str, Tensor],
         absent: Mapping[str, Tensor] | None,
+        hidden: Tensor | None,
         frames: int,
         window: int,
         overlap: int,
@@ -129,22 +138,24 @@ class _Windows:
         self.starts = window_starts(frames, window, overlap)
         self.size = min(window, -(-frames // GROUP_FRAMES) * GROUP_FRAMES)
         count, number = len(next(iter(codes.values()))), len(self.starts)
-        cut = {}
-        for name, values in codes.items():
-            per = net.pattern.count(name)
-            pieces = [
-                values[:, start // GROUP_FRAMES * per : (start + self.size) // GROUP_FRAMES * per]
-                for start in self.starts
-            ]
-            cut[name] = torch.stack(pieces, dim=1).flatten(0, 1)
+        cut = {name: self._cut(values, net.pattern.count(name)) for name, values in codes.items()}
         device = next(iter(codes.values())).device
         self.length = torch.tensor([min(self.size, frames - s) for s in self.starts], device=device).repeat(
             count
         )
         gone = None if absent is None else {k: v.repeat_interleave(number) for k, v in absent.items()}
         groups = (self.length + GROUP_FRAMES - 1) // GROUP_FRAMES
-        self.condition = net.encode_tokens(cut, groups, gone)
+        unread = None if hidden is None else self._cut(hidden, 1)
+        self.condition = net.encode_tokens(cut, groups, gone, unread)
         self.weights = blend_weights(self.starts, self.size, overlap, frames).float().to(device)
+
+    def _cut(self, values: Tensor, per: int) -> Tensor:
+        """[n, G * per] of whole motions -> [n * K, W / 4 * per] of their windows."""
+        pieces = [
+            values[:, start // GROUP_FRAMES * per : (start + self.size) // GROUP_FRAMES * per]
+            for start in self.starts
+        ]
+        return torch.stack(pieces, dim=1).flatten(0, 1)
 
     def denoise(self, x: Tensor, step: Tensor) -> Tensor:
         """The network's prediction for motions x [n, T, D] at one time step."""

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
+from torch import Tensor
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
@@ -54,6 +55,9 @@ class UdeConfig(StageConfig):
     denoising_steps: int = Field(20, ge=1)
     overlap_frames: int = Field(32, ge=0, multiple_of=4)
     """Frames that neighbouring windows of the diffusion decoder share."""
+    bridge_frames: int = Field(0, ge=0, multiple_of=4)
+    """Frames around a change of conditions whose tokens the diffusion decoder is not shown: it bridges them
+    [ours]. It must be trained for that (`net.hide` of its stage); 0 decodes every token."""
 
 
 class UdeStage(StageKind):
@@ -77,6 +81,11 @@ class UdeStage(StageKind):
             raise UserError(
                 f"stage '{stage.name}': '{utt.name}' makes tokens of '{utt.inputs.get('tokenizer')}' and "
                 f"'{dmd.name}' decodes those of '{dmd.inputs.get('tokenizer')}'; name one tokenizer for both"
+            )
+        if stage.config.bridge_frames and not (dmd and dmd.config.net.hide):
+            raise UserError(
+                f"stage '{stage.name}': bridge_frames {stage.config.bridge_frames} need a diffusion decoder "
+                f"that is trained to fill in; give its stage net: {{hide: 0.5}}, or set bridge_frames to 0"
             )
         window = getattr(utt.config, "max_frames", None)
         if window is not None and stage.config.context_frames >= window:
@@ -170,17 +179,22 @@ class UdeGenerator:
     ) -> list[NDArray[np.float32]]:
         """Tokens that go on from stretch to stretch, then all of them decoded at once."""
         codes = self.timeline.tokens(stretches, seeds, sampling)
-        given = [stretch.frames for stretch in stretches]
-        motions = self.decode(codes, seeds, sampling)
-        if any(frames is None for frames in given):
-            return motions
-        totals = np.sum([list(frames) for frames in given if frames is not None], axis=0).tolist()
+        given = [stretch.frames for stretch in stretches if stretch.frames is not None]
+        if len(given) < len(stretches):
+            return self.decode(codes, seeds, sampling)
+        lengths = torch.tensor([list(frames) for frames in given], device=codes.groups.device)
+        hidden = None
+        if self.config.bridge_frames and len(stretches) > 1:
+            groups = (lengths + GROUP_FRAMES - 1) // GROUP_FRAMES
+            hidden = bridged(groups, self.config.bridge_frames // GROUP_FRAMES)
+        motions = self.decode(codes, seeds, sampling, hidden)
+        totals = lengths.sum(0).tolist()
         return [motion[:count] for motion, count in zip(motions, totals, strict=True)]
 
     def decode(
-        self, codes: Codes, seeds: Sequence[int], sampling: SamplingConfig
+        self, codes: Codes, seeds: Sequence[int], sampling: SamplingConfig, hidden: Tensor | None = None
     ) -> list[NDArray[np.float32]]:
-        """Features in their own units, [T, C] a row."""
+        """Features in their own units, [T, C] a row; `hidden` as `decode_motions` takes it."""
         if self.dmd is None:
             return self.tokenizer.decode(codes.codes, codes.groups.tolist())
         asked = sampling.model_fields_set
@@ -192,5 +206,23 @@ class UdeGenerator:
             steps=sampling.denoising_steps if "denoising_steps" in asked else self.config.denoising_steps,
             window=self.dmd.window,
             overlap=min(self.config.overlap_frames, self.dmd.window - GROUP_FRAMES),
+            hidden=hidden,
         )
         return [self.tokenizer.of_coordinates(motion) for motion in made]
+
+
+def bridged(groups: Tensor, count: int) -> Tensor:
+    """Which groups of motions lie in the `count` around a border, bool [B, G].
+
+    Args:
+        groups: int64 [N, B], groups of each of N stretches. Never more than half of a stretch is bridged.
+        count: Half of them before the border, the others behind it.
+    """
+    ends = groups.cumsum(0)
+    at = torch.arange(int(ends[-1].max()), device=groups.device)
+    hidden = torch.zeros(groups.shape[1], len(at), dtype=torch.bool, device=groups.device)
+    for number, end in enumerate(ends[:-1]):
+        before = (groups[number] // 2).clamp(max=count // 2)
+        behind = (groups[number + 1] // 2).clamp(max=count - count // 2)
+        hidden |= (at >= (end - before)[:, None]) & (at < (end + behind)[:, None])
+    return hidden

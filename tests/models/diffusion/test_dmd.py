@@ -11,6 +11,7 @@ from torch import Tensor
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig, dmd_loss
+from motionloom.models.diffusion.dmd_module import hidden_stretch
 from motionloom.models.diffusion.dmd_sampling import blend_weights, decode_motions, window_starts
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.tokens import Codes
@@ -105,6 +106,40 @@ def test_absent_streams_say_nothing(net: Dmd) -> None:
     a, b = (net(noisy, step, c, length, absent) for c in (codes.codes, other))
     assert torch.equal(a[0], b[0])
     assert not torch.allclose(a[1], b[1], atol=1e-4)
+
+
+def test_hidden_tokens_say_nothing_and_others_do(net: Dmd) -> None:
+    codes, length = random_codes([4, 4]), torch.tensor([16, 16])
+    noisy, step = torch.randn(2, 16, 6), torch.tensor([100, 100])
+    other = {**codes.codes, "hand": codes.codes["hand"].clone()}
+    other["hand"][:, 2] = (other["hand"][:, 2] + 1) % 5
+    hidden = torch.zeros(2, 4, dtype=torch.bool)
+    hidden[0, 2] = True
+    a, b = (net(noisy, step, c, length, None, hidden) for c in (codes.codes, other))
+    assert torch.equal(a[0], b[0])
+    assert not torch.allclose(a[1], b[1], atol=1e-4)
+    # Nothing is hidden where none is, and what is hidden is missed.
+    plain = net(noisy, step, codes.codes, length)
+    assert torch.equal(plain[1], a[1])
+    assert not torch.allclose(plain[0], a[0], atol=1e-4)
+
+
+def test_stretches_hidden_in_training() -> None:
+    """One stretch a row, within the row's groups and at most half of them, in the share asked for."""
+    assert hidden_stretch(torch.tensor([4, 4]), 4, 0.0) is None
+    torch.manual_seed(0)
+    groups = torch.tensor([1, 2, 5, 16]).repeat(2000)
+    hidden = hidden_stretch(groups, 16, 0.5)
+    assert hidden is not None and hidden.shape == (8000, 16)
+    count = hidden.sum(1)
+    assert (count <= (groups // 2).clamp(min=1)).all()
+    assert not (hidden & (torch.arange(16) >= groups[:, None])).any()
+    assert (torch.nn.functional.pad(hidden.long(), (1, 1)).diff(dim=1).abs().sum(1) <= 2).all()
+    # 8,000 fair draws: six deviations
+    assert (count > 0).float().mean().item() == pytest.approx(0.5, abs=0.034)
+    longest = count[groups == 16]
+    assert set(longest.tolist()) == set(range(9))
+    assert hidden[groups == 16].any(0).all()
 
 
 def test_loss_counts_real_frames_and_columns(net: Dmd) -> None:
@@ -250,5 +285,7 @@ def test_mistakes_are_named(net: Dmd) -> None:
         decode_motions(net, codes, seeds=[1, 2], window=16, overlap=16)
     with pytest.raises(UserError, match="2000 denoising steps"):
         decode_motions(net, codes, seeds=[1, 2], steps=2000)
+    with pytest.raises(UserError, match="cannot fill in for hidden ones"):
+        decode_motions(net, codes, seeds=[1, 2], hidden=torch.zeros(2, 4, dtype=torch.bool))
     with pytest.raises(ValueError, match="tokens of 12 frames were given for 16"):
         net(torch.zeros(1, 16, 6), torch.tensor([1]), random_codes([3]).codes, torch.tensor([12]))
