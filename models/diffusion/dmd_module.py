@@ -62,5 +62,5 @@ def hidden_stretch(groups: Tensor, size: int, share: float) -> Tensor | None:
     count = 1 + (length * (groups // 2)).long().clamp(max=(groups // 2 - 1).clamp(min=0))
     first = (place * (groups - count + 1)).long()
     at = torch.arange(size, device=groups.device)
-    inside = (at >= first[:, None]) & (at < (first + count)[:, None])
-    return inside & (chance < share)[:, None]
+    hidden: Tensor = (at >= first[:, None]) & (at < (first + count)[:, None]) & (chance < share)[:, None]
+    return hidden
