@@ -2,7 +2,7 @@
 
     motionloom run ude-learning
     python benchmarks/ude_stations.py runs/ude-learning --utt utt prefix_7 gru_7
-    python benchmarks/ude_stations.py runs/ude-learning --tokenizer parts --utt parts_utt --dmd parts_dmd
+    python benchmarks/ude_stations.py runs/ude-learning --tokenizer parts --utt parts_utt --no-dmd
 
 Held-out clips as they are recorded; their true tokens decoded by the tokenizer and by DMD; tokens that each
 UTT makes for their music or caption, with and without z, decoded by both and drawn twice. Beat Align of
