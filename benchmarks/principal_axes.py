@@ -24,7 +24,8 @@ from motionloom.datasets.synth.measure import agrees
 from motionloom.models.layers.basis import Basis
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.figures import local_joints, pose_errors
+from motionloom.pipeline.evaluation.nearest import local_joints
+from motionloom.pipeline.evaluation.reconstruction import pose_errors
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.inference.bundle import joint_layout
 
@@ -74,7 +75,7 @@ def main() -> None:
                 ).items():
                     found[name].append(float(value.mean()))
             rates = [f"{100 * np.mean(found[name]):.0f} %" for name in ("shape", "action")]
-            errors = [f"{np.mean(found[name]):.1f}" for name in ("mpjpe", "mpjpe_hand")]
+            errors = [f"{np.mean(found[name]):.1f}" for name in ("pose", "pose_hand")]
             table.add_row(title, str(count), *rates, *errors)
     Console().print(table)
 

@@ -25,7 +25,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.figures import reconstruction_figures
+from motionloom.pipeline.evaluation.reconstruction import reconstruction_figures
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.api import run_recipe
 
@@ -51,7 +51,7 @@ COMMON = {
     "root_gain": 5.0,
     "finger_gain": 4.0,
 }
-COLUMNS = {"mpjpe": "all", "mpjpe_body": "body", "mpjpe_hand": "fingers", "global_mpjpe": "world"}
+COLUMNS = {"mpjpe": "MPJPE", "mpjpe_body": "body", "mpjpe_hand": "hands", "pose": "pose", "world": "world"}
 
 
 HANDED = ("h2vq", "separate")

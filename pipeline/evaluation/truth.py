@@ -127,6 +127,16 @@ def spread_any(dataset: ClipDataset, count: int) -> list[int]:
     return order[:count]
 
 
+def drawn(dataset: ClipDataset, count: int) -> list[int]:
+    """Numbers of captioned clips drawn at random from a split, at most `count`, as the papers' evaluations
+    draw them: two may have the same caption.
+    """
+    usable = captioned(dataset)
+    order = np.random.default_rng(0).permutation(len(dataset))
+    out: list[int] = order[usable[order]].tolist()
+    return out[:count]
+
+
 def spread(dataset: ClipDataset, count: int) -> list[int]:
     """Numbers of captioned clips spread evenly over a split, at most `count`, different captions first."""
     seen: set[str] = set()

@@ -9,9 +9,11 @@ from typing import Any
 import torch
 from pydantic import Field
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.dance_choice import accuracy_among
+from motionloom.models.metrics.retrieval import matching_score
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import FigureTable, Showing
 from motionloom.pipeline.contract.stage import (
@@ -24,16 +26,17 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
     StageKind,
 )
+from motionloom.pipeline.evaluation.figure_rows import figure_rows
 from motionloom.pipeline.evaluation.figures import (
     Interval,
     chance,
     embed_motions,
-    reconstruction_figures,
     retrieval_figures,
     truth_agreement,
 )
+from motionloom.pipeline.evaluation.reconstruction import reconstruction_figures
 from motionloom.pipeline.evaluation.tables import plain, print_tables
-from motionloom.pipeline.evaluation.truth import Truth, has_caption, spread, spread_any, truth_of
+from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.stages.progress import bar
@@ -63,8 +66,8 @@ class EvaluateStage(StageKind):
     name = "evaluate"
     summary = "figures on the test split"
     config = EvaluateConfig
-    takes = ("data", "text?", "tokenizer?", "tma?", Every("generators", GENERATOR))
-    version = 4  # clips without captions are reconstructed too; accuracy among 61
+    takes = ("data", "tokenizer?", "tma?", Every("generators", GENERATOR))
+    version = 5  # the papers' definitions, clips drawn as they come; TMA reads captions by its own encoder
 
     def gives(self, config: Any) -> frozenset[str]:
         """Its tables."""
@@ -98,7 +101,7 @@ class _Evaluation:
         dataset, context = self.dataset, self.context
         unit = self.tokenizer.net.group_frames if self.tokenizer else self.bundle.generator.unit_frames
         said = has_caption(dataset)
-        chosen = spread(dataset, self.config.clips) if said.any() else []
+        chosen = drawn(dataset, self.config.clips) if said.any() else []
         truths = self.truths(chosen, unit)
         figures: dict[str, Any] = {"split": dataset.split, "clips": len(truths)}
         if self.tokenizer is not None:
@@ -152,44 +155,50 @@ class _Evaluation:
     def retrieval(
         self, tma: LoadedTma, truths: list[Truth], generated: list[list[GeneratedMotion]]
     ) -> dict[str, Any]:
-        """Recall among `size`, of real and of generated motion."""
-        config, seed = self.config, self.context.seed
-        size = min(config.size, len(truths))
-        text = tma.embed_captions([t.caption for t in truths], self.context.given["text"].cache)
-        real = embed_motions(tma, [t.features for t in truths], [t.present for t in truths])
-        repeats = max(config.repeats, 5)
-        # A caption that says the same as the own one is no wrong answer.
+        """Recall among `size` and the matching score, of real and of generated motion.
+
+        Clips are those drawn, as in the paper, so two of a batch may have one caption; the same of clips with
+        different captions alone stands beside it. TMA reads captions by the encoder that it was trained with,
+        whatever the generator reads.
+        """
         words = [t.caption for t in truths]
+        text = tma.embed_captions(words, tma.given["text"].cache)
+        real = embed_motions(tma, [t.features for t in truths], [t.present for t in truths])
+        made = [embed_motions(tma, [g.features for g in motions]) for motions in generated]
+        # A caption that says the same as the own one is no wrong answer.
         same = torch.tensor([[one == other for other in words] for one in words])
-        among = min(config.among, 1 + int((~same).sum(1).min()))
+        among = min(self.config.among, 1 + int((~same).sum(1).min()))
+        first = sorted({caption: row for row, caption in reversed(list(enumerate(words)))}.values())
+        out = {"among": among, **self._recalls(text, real, made)}
+        if len(first) > 1:
+            out["different_captions"] = self._recalls(text[first], real[first], [m[first] for m in made])
+        if among > 1:
+            for name, latents in (("real", [real]), ("generated", made)):
+                rows = [
+                    accuracy_among(m, text, candidates=among, same=same, seed=self.context.seed)
+                    for m in latents
+                ]
+                out[name] |= {key: Interval.of([row[key] for row in rows]) for key in rows[0]}
+        return out
 
-        def accuracy(latent: Tensor) -> dict[str, float]:
-            if among < 2:
-                return {}
-            return accuracy_among(latent, text, candidates=among, same=same, seed=seed)
-
-        figures = retrieval_figures(text, real, size=size, repeats=repeats, seed=seed)
-        made: dict[str, list[float]] = {}
-        for repeat, motions in enumerate(generated):
-            latent = embed_motions(tma, [g.features for g in motions])
+    def _recalls(self, text: Tensor, real: Tensor, made: Sequence[Tensor]) -> dict[str, Any]:
+        """Recall both ways, TMA-Matching score (of latents of length 1, the paper's scale) and the distance
+        of the latents as they are, by row-aligned latents [n, Z].
+        """
+        config, seed = self.config, self.context.seed
+        size = min(config.size, len(text))
+        known = retrieval_figures(text, real, size=size, repeats=max(config.repeats, 5), seed=seed)
+        rows: dict[str, list[float]] = {}
+        for repeat, latent in enumerate(made):
             once = retrieval_figures(text, latent, size=size, repeats=1, seed=seed + repeat)
-            for name, value in once.items():
-                made.setdefault(name, []).append(value.mean)
-            for name, share in accuracy(latent).items():
-                made.setdefault(name, []).append(share)
-            distance = torch.linalg.vector_norm(text - latent, dim=-1).mean()
-            made.setdefault("matching_score", []).append(float(distance))
-        real_distance = float(torch.linalg.vector_norm(text - real, dim=-1).mean())
+            for name, value in {**once, **_distances(text, latent)}.items():
+                rows.setdefault(name, []).append(value.mean)
         return {
+            "clips": len(text),
             "size": size,
-            "among": among,
             "chance": {f"r{k}": chance(k, size) for k in (1, 2, 3)},
-            "real": {
-                **figures,
-                **{name: Interval(share, 0.0) for name, share in accuracy(real).items()},
-                "matching_score": Interval(real_distance, 0.0),
-            },
-            "generated": {name: Interval.of(values) for name, values in made.items()},
+            "real": {**known, **_distances(text, real)},
+            "generated": {name: Interval.of(values) for name, values in rows.items()},
         }
 
     def agreement(self, truths: list[Truth], generated: list[list[GeneratedMotion]]) -> dict[str, Any]:
@@ -202,77 +211,11 @@ class _Evaluation:
         }
 
 
-def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """(title, columns, rows) of each table; the report draws the same ones."""
-    out = []
-    if "reconstruction_mm" in figures:
-        out.append(_reconstruction_rows(figures))
-    if "retrieval" in figures:
-        found = figures["retrieval"]
-        rows = [
-            [
-                "chance",
-                *(f"{found['chance'][f'r{k}']:.3f}" for k in (1, 3)),
-                *(f"{found['chance'][f'r{k}']:.3f}" for k in (1, 3)),
-                "",
-            ]
-        ]
-        for name in ("real", "generated"):
-            keys = ("t2m_r1", "t2m_r3", "m2t_r1", "m2t_r3", "matching_score")
-            rows.append([f"{name} motion", *(_interval(found[name][key]) for key in keys)])
-        columns = ["", "text to motion R@1", "R@3", "motion to text R@1", "R@3", "matching score"]
-        out.append((f"TMA retrieval among {found['size']}", columns, rows))
-        if "top-1" in found["real"]:
-            tops = [
-                [f"{name} motion", *(_interval(found[name][f"top-{k}"]) for k in (1, 5))]
-                for name in ("real", "generated")
-            ]
-            guess = ["chance", *(f"{min(1.0, chance(k, found['among'])):.3f}" for k in (1, 5))]
-            columns = ["", "top-1", "top-5"]
-            out.append((f"Own caption among {found['among']}, by TMA", columns, [guess, *tops]))
-    if "agreement_with_caption" in figures:
-        found = figures["agreement_with_caption"]
-        names = sorted({*found["truth"], *found["generated"]})
-        rows = [[n, *(_percent(found[k].get(n)) for k in ("truth", "generated"))] for n in names]
-        out.append(
-            (
-                "Does the motion do what its caption says? (measured on the joints)",
-                ["", "real", "generated"],
-                rows,
-            )
-        )
-    return out
-
-
-def _reconstruction_rows(figures: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
-    r = figures["reconstruction_mm"]
-    return (
-        f"Reconstruction on {figures['reconstructed_clips']} {figures['split']} clips, mm (lower is better); "
-        f"codes of {figures['bits_per_second']:.0f} bit/s",
-        ["", "pose", "body", "fingers from the wrist", "in the world", "PA-MPJPE", "ACCEL"],
-        [
-            [
-                title,
-                *(_mm(r.get(f"{key}{suffix}")) for key in ("mpjpe", "mpjpe_body", "mpjpe_hand")),
-                _mm(r[f"global_mpjpe{suffix}"]),
-                *(_mm(r.get(key)) if not suffix else "" for key in ("pa_mpjpe", "accel")),
-            ]
-            for title, suffix in (
-                ("tokenizer", ""),
-                ("nearest training clip", "_nearest_train_clip"),
-                ("mean pose", "_mean_pose"),
-            )
-        ],
-    )
-
-
-def _mm(value: float | None) -> str:
-    return "" if value is None else f"{value:.1f}"
-
-
-def _percent(value: float | None) -> str:
-    return "" if value is None else f"{100 * value:.0f} %"
-
-
-def _interval(value: dict[str, float]) -> str:
-    return f"{value['mean']:.3f} ± {value['half_width']:.3f}"
+def _distances(text: Tensor, motion: Tensor) -> dict[str, Interval]:
+    """Mean distance of each text's latent from its motion's, both of length 1, and as they are."""
+    unit = matching_score(normalize(text.double(), dim=-1), normalize(motion.double(), dim=-1))
+    plain_distance = matching_score(text, motion)
+    return {
+        "matching_score": Interval(float(unit), 0.0),
+        "latent_distance": Interval(float(plain_distance), 0.0),
+    }

@@ -233,7 +233,7 @@ def test_dances_of_a_run_are_evaluated(run: tuple[Path, str]) -> None:
     captions = json.loads((folder / "stages/evaluate/metrics.json").read_text())
     assert captions["clips"] == 4 == captions["reconstructed_clips"] and "retrieval" not in captions
     errors = captions["reconstruction_mm"]
-    assert {"mpjpe", "global_mpjpe", "mpjpe_nearest_train_clip", "pa_mpjpe"} <= errors.keys()
+    assert {"mpjpe", "world", "mpjpe_nearest_train_clip", "pa_mpjpe"} <= errors.keys()
     assert 0 < errors["mpjpe_nearest_train_clip"] < errors["mpjpe_mean_pose"]
 
 

@@ -19,7 +19,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
-from motionloom.pipeline.evaluation.figures import reconstruction_figures
+from motionloom.pipeline.evaluation.reconstruction import reconstruction_figures
 from motionloom.pipeline.evaluation.truth import reconstruct_truth, truth_of
 from motionloom.pipeline.stages.gpt_data import gpt_clips
 from motionloom.pipeline.stages.tokens import encode_split

@@ -1,0 +1,107 @@
+"""Tables of what an evaluation by captions found; terminal and report show the same ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from motionloom.pipeline.evaluation.figures import chance
+
+Rows = tuple[str, list[str], list[list[str]]]
+"""Title, columns, rows."""
+
+
+def figure_rows(figures: dict[str, Any]) -> list[Rows]:
+    """(title, columns, rows) of each table; the report draws the same ones."""
+    out: list[Rows] = []
+    if "reconstruction_mm" in figures:
+        out += _reconstruction_rows(figures)
+    if "retrieval" in figures:
+        found = figures["retrieval"]
+        out.append(_retrieval_rows(found))
+        if "top-1" in found["real"]:
+            tops = [
+                [f"{name} motion", *(_interval(found[name][f"top-{k}"]) for k in (1, 5))]
+                for name in ("real", "generated")
+            ]
+            guess = ["chance", *(f"{min(1.0, chance(k, found['among'])):.3f}" for k in (1, 5))]
+            columns = ["", "top-1", "top-5"]
+            out.append((f"Own caption among {found['among']}, by TMA", columns, [guess, *tops]))
+    if "agreement_with_caption" in figures:
+        found = figures["agreement_with_caption"]
+        names = sorted({*found["truth"], *found["generated"]})
+        rows = [[n, *(_percent(found[k].get(n)) for k in ("truth", "generated"))] for n in names]
+        out.append(
+            (
+                "Does the motion do what its caption says? (measured on the joints)",
+                ["", "real", "generated"],
+                rows,
+            )
+        )
+    return out
+
+
+def _retrieval_rows(found: dict[str, Any]) -> Rows:
+    guesses = [f"{found['chance'][f'r{k}']:.3f}" for k in (1, 3)]
+    rows = [["chance", *guesses, *guesses, ""]]
+    keys = ("t2m_r1", "t2m_r3", "m2t_r1", "m2t_r3", "matching_score")
+    for title, part in (("", found), (", different captions", found.get("different_captions"))):
+        if part is not None and part["size"] == found["size"]:
+            for name in ("real", "generated"):
+                rows.append([f"{name} motion{title}", *(_interval(part[name][key]) for key in keys)])
+    columns = ["", "text to motion R@1", "R@3", "motion to text R@1", "R@3", "TMA-Matching score"]
+    return (
+        f"TMA-R-Precision among {found['size']}, {found['clips']} clips as they are drawn",
+        columns,
+        rows,
+    )
+
+
+def _reconstruction_rows(figures: dict[str, Any]) -> list[Rows]:
+    r = figures["reconstruction_mm"]
+    answers = (
+        ("tokenizer", ""),
+        ("nearest training clip", "_nearest_train_clip"),
+        ("mean pose", "_mean_pose"),
+    )
+
+    def rows(keys: Sequence[str]) -> list[list[str]]:
+        return [[title, *(_mm(r[f"{key}{suffix}"]) for key in keys)] for title, suffix in answers]
+
+    parts = [part for part in ("", "_body", "_hand") if f"mpjpe{part}" in r]
+    names = {"": "all", "_body": "body", "_hand": "hands"}
+    published = [f"{metric}{part}" for metric in ("mpjpe", "pa_mpjpe", "accel") for part in parts]
+    columns = [
+        f"{metric} {names[part]}" if len(parts) > 1 else metric
+        for metric in ("MPJPE", "PA-MPJPE", "ACCEL")
+        for part in parts
+    ]
+    ours = {
+        "pose": "pose",
+        "pose_body": "body",
+        "pose_hand": "fingers from the wrist",
+        "world": "in the world",
+    }
+    ours = {key: title for key, title in ours.items() if key in r}
+    clips = f"{figures['reconstructed_clips']} {figures['split']} clips"
+    return [
+        (
+            f"Reconstruction of {clips} as the papers count it, mm (lower is better); codes of "
+            f"{figures['bits_per_second']:.0f} bit/s",
+            ["", *columns],
+            rows(published),
+        ),
+        ("The same with root and heading aligned, and in the world, mm", ["", *ours.values()], rows([*ours])),
+    ]
+
+
+def _mm(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{100 * value:.0f} %"
+
+
+def _interval(value: dict[str, float]) -> str:
+    return f"{value['mean']:.3f} ± {value['half_width']:.3f}"

@@ -1,0 +1,105 @@
+"""How far a tokenizer's motions are from what was recorded, beside two trivial answers, in millimetres.
+
+As the papers count it (HumanTOMATO Tables 3, 6 and 7; `joint_errors`, equal to the public code): `mpjpe` with
+the root of each frame moved to the origin, `pa_mpjpe` after a similarity alignment of each frame, `accel` of
+positions in the world, in mm / frame^2; of all joints, of the body's (`_body`) and of the hands' (`_hand`),
+means over frames. The paper does not say what its hands are aligned by; their errors there are below the
+body's, and so must be measured from the wrist, as here.
+
+Our own **[ours]**, means over clips: `pose` with root and heading aligned, so that a figure that faces
+another way is no other pose, `pose_body`, `pose_hand`; and `world`, where the path counts.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
+from motionloom.datasets.schema import HANDS
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.models.metrics.reconstruction import JointErrors, joint_errors, mpjpe
+from motionloom.pipeline.evaluation.nearest import NearestClip, local_joints
+from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth
+from motionloom.pipeline.store.networks import TrainedTokenizer
+
+FINGERS = (range(22, 37), range(37, 52))
+"""Joints of `smplx52`, left and right."""
+
+
+def reconstruction_figures(
+    tokenizer: TrainedTokenizer, train: ClipDataset, truths: Sequence[Truth]
+) -> dict[str, float]:
+    """Both families of errors, of the tokenizer, of the mean pose (`_mean_pose`) and of the nearest training
+    clip (`_nearest_train_clip`).
+
+    Of a clip without hands the body's joints alone count, and nothing in `_hand`.
+    """
+    layout = tokenizer.layout
+    body = tokenizer.stats.mean[layout.part("bodyhand")].astype(np.float32)
+    nearest = NearestClip(train)
+    sums: dict[str, JointErrors] = {}
+    clips: dict[str, list[float]] = defaultdict(list)
+    for truth in truths:
+        real = torch.from_numpy(local_joints(truth.features, layout))
+        target = torch.from_numpy(truth.joints)
+        found = reconstruct_truth(tokenizer, truth)
+        constant = np.broadcast_to(body, truth.features.shape)
+        compared = {
+            "": (local_joints(found, layout), joints_of(found, layout)),
+            "_mean_pose": (local_joints(constant, layout), joints_of(constant, layout)),
+            "_nearest_train_clip": nearest.motion(truth.features, truth.present),
+        }
+        joints = slice(None) if truth.present & HANDS else slice(BODY_JOINTS)
+        for suffix, motion in compared.items():
+            pose, place = (torch.from_numpy(array)[:, joints] for array in motion)
+            for part, errors in published_errors(place, target[:, joints]).items():
+                if layout.num_joints == BODY_JOINTS and part:
+                    continue  # all of its joints are the body's
+                key = f"{part}{suffix}"
+                sums[key] = sums[key] + errors if key in sums else errors
+            ours = pose_errors(pose, real[:, joints])
+            if layout.num_joints > BODY_JOINTS:
+                ours.setdefault("pose_body", ours["pose"])
+            ours["world"] = mpjpe(place, target[:, joints], root=None)
+            for name, value in ours.items():
+                clips[f"{name}{suffix}"].append(float(value.mean()))
+    out = {name: float(np.mean(values)) for name, values in clips.items()}
+    for key, errors in sums.items():
+        out |= {f"{name}{key}": value for name, value in errors.means().items()}
+    return out
+
+
+def published_errors(made: Tensor, real: Tensor) -> dict[str, JointErrors]:
+    """Sums over the frames of positions [T, N, 3]: "" of all joints, "_body", and "_hand" where there are."""
+    length = torch.tensor([len(real)])
+    pair = (made[None], real[None], length)
+    out = {"": joint_errors(*pair), "_body": joint_errors(*pair, joints=torch.arange(BODY_JOINTS))}
+    if real.shape[1] > BODY_JOINTS:
+        left, right = (
+            joint_errors(*pair, joints=torch.tensor(list(fingers)), root=wrist)
+            for wrist, fingers in zip(WRISTS, FINGERS, strict=True)
+        )
+        out["_hand"] = left + right
+    return out
+
+
+def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
+    """Errors per frame [T] in mm of poses [T, N, 3] that are aligned already: all joints and the body's from
+    the root (`pose`, `pose_body`), fingers from their wrists (`pose_hand`).
+    """
+    out = {"pose": mpjpe(pose, real)}
+    if pose.shape[1] > BODY_JOINTS:
+        out["pose_body"] = mpjpe(pose[:, :BODY_JOINTS], real[:, :BODY_JOINTS])
+        hands = []
+        for wrist, fingers in zip(WRISTS, FINGERS, strict=True):
+            hands.append([wrist, *fingers])
+        # The wrist itself is at the origin of both, so its zero is taken out of the mean again.
+        each = [mpjpe(pose[:, hand], real[:, hand]) * len(hand) / (len(hand) - 1) for hand in hands]
+        out["pose_hand"] = torch.stack(each).mean(0)
+    return out

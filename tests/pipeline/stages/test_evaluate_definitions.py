@@ -1,0 +1,125 @@
+"""What an evaluation prints is what its names say: joint errors, matching score, whose words TMA reads."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from motionloom.datasets.motion.layout import WRISTS
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.evaluation.figure_rows import figure_rows
+from motionloom.pipeline.evaluation.figures import embed_motions
+from motionloom.pipeline.evaluation.reconstruction import FINGERS, published_errors
+from motionloom.pipeline.evaluation.truth import drawn, truth_of
+from motionloom.pipeline.runs.api import run_recipe
+
+RECIPE = """
+extends: t2m-gpt-tiny
+name: two-encoders
+hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
+stages:
+  data:
+    {clips: 90, min_seconds: 2.0, max_seconds: 5.0, test_fraction: 0.5, actions: [raise], hand_shapes: [fist]}
+  text: {encoder: DISTILBERT}
+  words: {kind: text, encoder: CLIP}
+  tma:
+    inputs: {text: words}
+    net: {latent: 8, ff: 16, layers: 1}
+    train: {steps: 2, batch_size: 4}
+  tokenizer:
+    net: {width: 8, depth: 1, code_dim: 8, num_codes: 8}
+    train: {steps: 2, batch_size: 4}
+  gpt:
+    net: {layers: 1, dim: 16, heads: 2, ff: 16}
+    train: {steps: 2, batch_size: 4}
+  face_tokenizer: null
+  face_tokens: null
+  face_gpt: null
+  generate: null
+  report: null
+  evaluate: {repeats: 1, size: 4}
+"""
+
+
+@pytest.fixture(scope="module")
+def models() -> Iterator[ModuleType]:
+    """Makers of tiny text encoders, of equal width."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[2] / "datasets" / "text"))
+        yield importlib.import_module("test_text_cache")
+
+
+@pytest.mark.slow
+def test_tma_reads_captions_by_its_own_encoder(models: ModuleType, tmp_path: Path) -> None:
+    """The GPT's prior is one encoder's, the judge another's of the same width (Table 8, first row)."""
+    for kind in ("distilbert", "clip"):
+        (tmp_path / kind).mkdir()
+    encoders = models.tiny_distilbert(tmp_path / "distilbert"), models.tiny_clip(tmp_path / "clip")
+    recipe = RECIPE.replace("DISTILBERT", str(encoders[0])).replace("CLIP", str(encoders[1]))
+    (tmp_path / "recipe.yaml").write_text(recipe)
+    run_recipe(tmp_path / "recipe.yaml", tmp_path / "run", console=Console(quiet=True))
+    figures = json.loads((tmp_path / "run/stages/evaluate/metrics.json").read_text())
+    stages, shelf = finished_stages(tmp_path / "run"), Shelf()
+    dataset, tma = shelf.get(stages["data"]).split("test"), shelf.get(stages["tma"])
+    truths = [truth_of(dataset, i) for i in sorted(drawn(dataset, 400))]
+    assert figures["clips"] == len(truths) == len(dataset)
+    motion = embed_motions(tma, [t.features for t in truths]).double()
+    distance = {}
+    for name in ("words", "text"):
+        latent = tma.embed_captions([t.caption for t in truths], shelf.get(stages[name]).cache).double()
+        units = [x / x.norm(dim=-1, keepdim=True) for x in (latent, motion)]
+        distance[name] = (units[0] - units[1]).norm(dim=-1).mean().item()
+        plain = (latent - motion).norm(dim=-1).mean().item()
+        if name == "words":
+            found = figures["retrieval"]["real"]
+            assert found["matching_score"]["mean"] == pytest.approx(distance["words"], rel=1e-5)
+            assert found["latent_distance"]["mean"] == pytest.approx(plain, rel=1e-5)
+    assert abs(distance["words"] - distance["text"]) > 1e-4, "ten times what the comparison above allows"
+    several = len({t.caption for t in truths})
+    assert several < len(truths), "captions occur twice, as they do in the papers' splits"
+    assert figures["retrieval"]["different_captions"]["clips"] == several
+    assert figures["retrieval"]["clips"] == len(truths)
+    titles = {title: (columns, rows) for title, columns, rows in figure_rows(figures)}
+    columns, rows = next(found for title, found in titles.items() if "as the papers count it" in title)
+    assert columns[1:4] == ["MPJPE all", "MPJPE body", "MPJPE hands"] and len(columns) == 10
+    assert [row[0] for row in rows] == ["tokenizer", "nearest training clip", "mean pose"]
+    columns, rows = next(found for title, found in titles.items() if "TMA-R-Precision" in title)
+    assert [row[0] for row in rows] == [
+        "chance", "real motion", "generated motion", "real motion, different captions",
+        "generated motion, different captions",
+    ]  # fmt: skip
+
+
+def test_errors_of_body_and_hands_by_hand() -> None:
+    """Root of each frame at the origin for all and the body, each hand's wrist for its fingers."""
+    generator = np.random.default_rng(0)
+    real, made = generator.normal(size=(2, 7, 52, 3))
+    found = published_errors(torch.from_numpy(made), torch.from_numpy(real))
+    want: dict[str, list[float]] = {"": [], "_body": [], "_hand": []}
+    for a, b in zip(made, real, strict=True):
+        distance = [float(np.linalg.norm((a[j] - a[0]) - (b[j] - b[0]))) for j in range(52)]
+        want[""].append(1000 * sum(distance) / 52)
+        want["_body"].append(1000 * sum(distance[:22]) / 22)
+        fingers = [
+            float(np.linalg.norm((a[j] - a[wrist]) - (b[j] - b[wrist])))
+            for wrist, hand in zip(WRISTS, FINGERS, strict=True)
+            for j in hand
+        ]
+        want["_hand"].append(1000 * sum(fingers) / 30)
+    for part, values in want.items():
+        assert found[part].means()["mpjpe"] == pytest.approx(np.mean(values), rel=1e-12)
+    second = made - real
+    jerk = np.linalg.norm(second[2:] - 2 * second[1:-1] + second[:-2], axis=-1)
+    assert found[""].means()["accel"] == pytest.approx(1000 * jerk.mean(), rel=1e-12)
+    assert found["_hand"].means()["accel"] == pytest.approx(1000 * jerk[:, 22:].mean(), rel=1e-12)
+    body = published_errors(torch.from_numpy(made[:, :22]), torch.from_numpy(real[:, :22]))
+    assert set(body) == {"", "_body"}
