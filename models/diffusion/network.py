@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.schedule import ScheduleConfig
-from motionloom.models.layers.transformer import Transformer, sinusoid
+from motionloom.models.layers.transformer import Norm, Transformer, sinusoid
 
 
 class DiffusionConfig(Config):
@@ -29,6 +29,8 @@ class DiffusionConfig(Config):
     layers: int = Field(default=8, ge=1)
     heads: int = Field(default=4, ge=1)
     dropout: float = Field(default=0.1, ge=0, lt=1)
+    norm: Norm = "pre"
+    """`post` is MDM's; `pre` needs no warm-up [ours]."""
     condition_dropout: float = Field(default=0.1, ge=0, lt=1)
     """Share of samples trained without text; 0 turns guidance off."""
     schedule: ScheduleConfig = ScheduleConfig()
@@ -53,7 +55,9 @@ class MotionDiffusion(nn.Module):
         self.time = nn.Sequential(
             nn.Linear(config.dim, config.dim), nn.SiLU(), nn.Linear(config.dim, config.dim)
         )
-        self.stack = Transformer(config.layers, config.dim, config.heads, config.ff, dropout=config.dropout)
+        self.stack = Transformer(
+            config.layers, config.dim, config.heads, config.ff, dropout=config.dropout, norm=config.norm
+        )
         self.leave = nn.Linear(config.dim, motion_dim)
 
     def forward(self, noisy: Tensor, step: Tensor, text: Tensor, mask: Tensor, conditioned: Tensor) -> Tensor:

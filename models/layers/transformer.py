@@ -1,7 +1,8 @@
-"""Transformer blocks shared by TMA and the GPTs: pre-norm, GELU, scaled-dot-product attention, optional KV
-cache.
+"""Transformer blocks shared by all networks: GELU, scaled-dot-product attention, optional KV cache.
 
 Notable choices:
+- LayerNorm stands before attention and feed-forward ("pre"), as in the GPTs. With "post" it stands behind
+  their sums, as in torch's own encoder, which TEMOS, TMR and MDM are made of.
 - Attention is always `F.scaled_dot_product_attention`, so fused kernels are used wherever the device has
   them.
 - Masks are boolean and say what *may* be attended (True = visible), as SDPA wants them.
@@ -16,11 +17,15 @@ Legend: B batch, L positions, S visible positions, D width, H heads.
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
+
+Norm = Literal["pre", "post"]
+"""Where LayerNorm stands: before attention and feed-forward, or behind their sums."""
 
 
 def length_mask(length: Tensor, size: int) -> Tensor:
@@ -113,10 +118,13 @@ class SelfAttention(nn.Module):
 
 
 class Block(nn.Module):
-    """Pre-norm transformer block: attention, then a GELU feed-forward."""
+    """Transformer block: attention, then a GELU feed-forward."""
 
-    def __init__(self, dim: int, heads: int, ff: int, dropout: float, attention_dropout: float) -> None:
+    def __init__(
+        self, dim: int, heads: int, ff: int, dropout: float, attention_dropout: float, norm: Norm = "pre"
+    ) -> None:
         super().__init__()
+        self.post = norm == "post"
         self.norm_attention = nn.LayerNorm(dim)
         self.attention = SelfAttention(dim, heads, attention_dropout)
         self.norm_ff = nn.LayerNorm(dim)
@@ -128,13 +136,21 @@ class Block(nn.Module):
         self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: LayerCache | None = None
     ) -> Tensor:
         """[B, L, D] -> [B, L, D]; arguments as `SelfAttention`."""
+        if self.post:
+            x = self.norm_attention(x + self.dropout(self.attention(x, mask, causal, cache)))
+            last: Tensor = self.norm_ff(x + self.dropout(self._feed(x)))
+            return last
         x = x + self.dropout(self.attention(self.norm_attention(x), mask, causal, cache))
-        out: Tensor = x + self.dropout(self.ff_out(F.gelu(self.ff_in(self.norm_ff(x)))))
+        out: Tensor = x + self.dropout(self._feed(self.norm_ff(x)))
+        return out
+
+    def _feed(self, x: Tensor) -> Tensor:
+        out: Tensor = self.ff_out(F.gelu(self.ff_in(x)))
         return out
 
 
 class Transformer(nn.Module):
-    """A stack of blocks and a last LayerNorm.
+    """A stack of blocks and, of pre-norm blocks, a last LayerNorm.
 
     Weights start at N(0, 2 / (5 dim)), which is GPT-2's 0.02 at width 1024 and grows with narrower stacks so
     that attention carries signal from the first step; outputs into the residual stream are smaller by sqrt(2
@@ -150,11 +166,12 @@ class Transformer(nn.Module):
         *,
         dropout: float = 0.1,
         attention_dropout: float | None = None,
+        norm: Norm = "pre",
     ) -> None:
         super().__init__()
         inner = dropout if attention_dropout is None else attention_dropout
-        self.blocks = nn.ModuleList(Block(dim, heads, ff, dropout, inner) for _ in range(layers))
-        self.norm = nn.LayerNorm(dim)
+        self.blocks = nn.ModuleList(Block(dim, heads, ff, dropout, inner, norm) for _ in range(layers))
+        self.norm = nn.LayerNorm(dim) if norm == "pre" else nn.Identity()
         self.checkpointed = False
         """Compute the inside of each block again in the backward pass instead of keeping it."""
         std = math.sqrt(2 / (5 * dim))

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import Config
 from motionloom.models.layers.basis import Basis
-from motionloom.models.layers.transformer import Transformer, length_mask, sinusoid
+from motionloom.models.layers.transformer import Norm, Transformer, length_mask, sinusoid
 
 
 class TmaConfig(Config):
@@ -37,6 +37,8 @@ class TmaConfig(Config):
     heads: int = Field(default=4, ge=1)
     dropout: float = Field(default=0.1, ge=0, lt=1)
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
+    norm: Norm = "pre"
+    """`post` is TEMOS' and TMR's; `pre` needs no warm-up [ours]."""
     frame_stride: int = Field(default=1, ge=1)
     """Every n-th frame is fed and reconstructed; 1 is the paper."""
     root_gain: float = Field(default=1.0, gt=0)
@@ -97,6 +99,7 @@ def _stack(config: TmaConfig) -> Transformer:
         config.ff,
         dropout=config.dropout,
         attention_dropout=config.attention_dropout,
+        norm=config.norm,
     )
 
 

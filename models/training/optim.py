@@ -24,6 +24,9 @@ class OptimConfig(Config):
     weight_decay: float = Field(0.0, ge=0)
     warmup_steps: int = Field(0, ge=0)
     schedule: Literal["constant", "cosine"] = "constant"
+    drop_at: tuple[int, ...] = ()
+    """Steps from which on the rate is `drop_factor` times what it was."""
+    drop_factor: float = Field(0.1, gt=0, lt=1)
     grad_clip: float = Field(1.0, ge=0)
     """Largest gradient norm; 0 turns clipping off."""
 
@@ -33,7 +36,11 @@ class OptimConfig(Config):
         return kind(params, lr=self.lr, betas=self.betas, weight_decay=self.weight_decay, fused=fused)
 
     def factor(self, step: int, max_steps: int) -> float:
-        """What `lr` is multiplied by in step `step` of `max_steps`: linear warm-up, then the schedule."""
+        """What `lr` is multiplied by in step `step` of `max_steps`: warm-up, then schedule and drops."""
+        dropped = self.drop_factor ** sum(step >= at for at in self.drop_at)
+        return dropped * self._scheduled(step, max_steps)
+
+    def _scheduled(self, step: int, max_steps: int) -> float:
         if step < self.warmup_steps:
             return (step + 1) / self.warmup_steps
         if self.schedule == "constant":

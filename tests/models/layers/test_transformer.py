@@ -1,0 +1,73 @@
+"""The transformer beside torch's own, with LayerNorm before and behind, and step by step."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+import torch
+from torch import nn
+
+from motionloom.models.layers.transformer import Norm, Transformer, length_mask
+
+pytestmark = pytest.mark.numeric
+
+
+def theirs(ours: Transformer, norm: Norm, heads: int, ff: int) -> nn.TransformerEncoder:
+    """torch's encoder with the same weights."""
+    dim = ours.blocks[0].ff_in.in_features
+    layer = nn.TransformerEncoderLayer(
+        dim, heads, ff, dropout=0.0, activation="gelu", batch_first=True, norm_first=norm == "pre"
+    )
+    last = nn.LayerNorm(dim) if norm == "pre" else None
+    encoder = nn.TransformerEncoder(layer, len(ours.blocks), norm=last, enable_nested_tensor=False)
+    with torch.no_grad():
+        for block, own in zip(ours.blocks, encoder.layers, strict=True):
+            own.self_attn.in_proj_weight.copy_(block.attention.qkv.weight)
+            own.self_attn.in_proj_bias.copy_(block.attention.qkv.bias)
+            own.self_attn.out_proj.load_state_dict(block.attention.out.state_dict())
+            for mine, name in (
+                (block.norm_attention, "norm1"),
+                (block.norm_ff, "norm2"),
+                (block.ff_in, "linear1"),
+                (block.ff_out, "linear2"),
+            ):
+                getattr(own, name).load_state_dict(mine.state_dict())
+        if last is not None:
+            last.load_state_dict(ours.norm.state_dict())
+    return encoder.double().eval()
+
+
+@pytest.mark.parametrize("norm", get_args(Norm))
+def test_equals_torchs(norm: Norm) -> None:
+    torch.manual_seed(0)
+    net = Transformer(3, 16, 4, 40, dropout=0.0, norm=norm)
+    for name, parameter in net.named_parameters():
+        if "norm" in name or name.endswith("bias"):
+            nn.init.normal_(parameter, mean=1.0 if name.endswith("weight") else 0.0, std=0.3)
+    net = net.double().eval()
+    x, length = torch.randn(3, 9, 16).double(), torch.tensor([9, 5, 1])
+    mask = length_mask(length, 9)
+    found = net(x, mask)
+    want = theirs(net, norm, 4, 40)(x, src_key_padding_mask=~mask)
+    torch.testing.assert_close(found[mask], want[mask], rtol=1e-10, atol=1e-10)
+    other: Norm = "post" if norm == "pre" else "pre"
+    assert not torch.allclose(found[mask], theirs_of_other(net, other)(x, src_key_padding_mask=~mask)[mask])
+
+
+def theirs_of_other(net: Transformer, norm: Norm) -> nn.TransformerEncoder:
+    """The same weights with LayerNorm in the other place."""
+    if norm == "pre" and not isinstance(net.norm, nn.LayerNorm):
+        net.norm = nn.LayerNorm(16).double()
+    return theirs(net, norm, 4, 40)
+
+
+@pytest.mark.parametrize("norm", get_args(Norm))
+def test_step_by_step_equals_at_once(norm: Norm) -> None:
+    torch.manual_seed(0)
+    net = Transformer(2, 16, 2, 32, dropout=0.0, norm=norm).double().eval()
+    x = torch.randn(2, 7, 16).double()
+    cache = net.cache(7)
+    with torch.no_grad():
+        steps = torch.cat([net(x[:, k : k + 1], causal=True, cache=cache) for k in range(7)], dim=1)
+        torch.testing.assert_close(steps, net(x, causal=True), rtol=1e-10, atol=1e-10)
