@@ -27,6 +27,24 @@ def figure_rows(figures: dict[str, Any]) -> list[Rows]:
             guess = ["chance", *(f"{min(1.0, chance(k, found['among'])):.3f}" for k in (1, 5))]
             columns = ["", "top-1", "top-5"]
             out.append((f"Own caption among {found['among']}, by TMA", columns, [guess, *tops]))
+    if figures.get("distribution", {}).get("rows"):
+        found = figures["distribution"]
+        keys = ("fid", "fid_unit", "diversity", "multimodality")
+        titles = {
+            "recorded": "recorded motion",
+            "training": f"{found['training_clips']} training clips",
+            "generated": "generated motion",
+            "mean_pose": "mean pose, still",
+        }
+        rows = [
+            [
+                title,
+                *(_interval(found["rows"][name][key]) if key in found["rows"][name] else "" for key in keys),
+            ]
+            for name, title in titles.items()
+        ]
+        columns = ["", "FID", "FID, length 1", "Diversity", "MModality"]
+        out.append((f"TMA's latents: FID to {found['clips']} recorded motions", columns, rows))
     if "agreement_with_caption" in figures:
         found = figures["agreement_with_caption"]
         names = sorted({*found["truth"], *found["generated"]})

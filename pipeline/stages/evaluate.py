@@ -6,14 +6,10 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-import torch
+import numpy as np
 from pydantic import Field
-from torch import Tensor
-from torch.nn.functional import normalize
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.metrics.dance_choice import accuracy_among
-from motionloom.models.metrics.retrieval import matching_score
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import FigureTable, Showing
 from motionloom.pipeline.contract.stage import (
@@ -28,14 +24,12 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.evaluation.figure_rows import figure_rows
 from motionloom.pipeline.evaluation.figures import (
-    Interval,
-    chance,
     embed_motions,
-    retrieval_figures,
     truth_agreement,
 )
 from motionloom.pipeline.evaluation.reconstruction import reconstruction_figures
 from motionloom.pipeline.evaluation.tables import plain, print_tables
+from motionloom.pipeline.evaluation.text_motion import Latents, distribution, retrieval
 from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
@@ -123,7 +117,7 @@ class _Evaluation:
             return figures
         generated = self.generate(truths)
         if self.tma is not None:
-            figures["retrieval"] = self.retrieval(self.tma, truths, generated)
+            figures |= self.by_tma(self.tma, truths, generated)
         if any(t.truth for t in truths):
             figures["agreement_with_caption"] = self.agreement(truths, generated)
         return figures
@@ -152,53 +146,27 @@ class _Evaluation:
                 out.append(motions)
         return out
 
-    def retrieval(
+    def by_tma(
         self, tma: LoadedTma, truths: list[Truth], generated: list[list[GeneratedMotion]]
     ) -> dict[str, Any]:
-        """Recall among `size` and the matching score, of real and of generated motion.
-
-        Clips are those drawn, as in the paper, so two of a batch may have one caption; the same of clips with
-        different captions alone stands beside it. TMA reads captions by the encoder that it was trained with,
-        whatever the generator reads.
-        """
-        words = [t.caption for t in truths]
-        text = tma.embed_captions(words, tma.given["text"].cache)
-        real = embed_motions(tma, [t.features for t in truths], [t.present for t in truths])
-        made = [embed_motions(tma, [g.features for g in motions]) for motions in generated]
-        # A caption that says the same as the own one is no wrong answer.
-        same = torch.tensor([[one == other for other in words] for one in words])
-        among = min(self.config.among, 1 + int((~same).sum(1).min()))
-        first = sorted({caption: row for row, caption in reversed(list(enumerate(words)))}.values())
-        out = {"among": among, **self._recalls(text, real, made)}
-        if len(first) > 1:
-            out["different_captions"] = self._recalls(text[first], real[first], [m[first] for m in made])
-        if among > 1:
-            for name, latents in (("real", [real]), ("generated", made)):
-                rows = [
-                    accuracy_among(m, text, candidates=among, same=same, seed=self.context.seed)
-                    for m in latents
-                ]
-                out[name] |= {key: Interval.of([row[key] for row in rows]) for key in rows[0]}
-        return out
-
-    def _recalls(self, text: Tensor, real: Tensor, made: Sequence[Tensor]) -> dict[str, Any]:
-        """Recall both ways, TMA-Matching score (of latents of length 1, the paper's scale) and the distance
-        of the latents as they are, by row-aligned latents [n, Z].
-        """
+        """Retrieval and distribution by TMA's latents, beside as many training clips and the mean pose."""
         config, seed = self.config, self.context.seed
-        size = min(config.size, len(text))
-        known = retrieval_figures(text, real, size=size, repeats=max(config.repeats, 5), seed=seed)
-        rows: dict[str, list[float]] = {}
-        for repeat, latent in enumerate(made):
-            once = retrieval_figures(text, latent, size=size, repeats=1, seed=seed + repeat)
-            for name, value in {**once, **_distances(text, latent)}.items():
-                rows.setdefault(name, []).append(value.mean)
+        train = self.context.given["data"].split("train")
+        others = [truth_of(train, i) for i in spread_any(train, len(truths))]
+        mean = tma.stats.mean[tma.layout.part(tma.part)].astype("float32")
+        latents = Latents(
+            text=tma.embed_captions([t.caption for t in truths], tma.given["text"].cache),
+            real=embed_motions(tma, [t.features for t in truths], [t.present for t in truths]),
+            made=[embed_motions(tma, [g.features for g in motions]) for motions in generated],
+            others=embed_motions(tma, [t.features for t in others], [t.present for t in others]),
+            still=embed_motions(tma, [np.tile(mean, (len(t.features), 1)) for t in truths]),
+        )
+        words = [t.caption for t in truths]
         return {
-            "clips": len(text),
-            "size": size,
-            "chance": {f"r{k}": chance(k, size) for k in (1, 2, 3)},
-            "real": {**known, **_distances(text, real)},
-            "generated": {name: Interval.of(values) for name, values in rows.items()},
+            "retrieval": retrieval(
+                latents, words, size=config.size, among=config.among, repeats=config.repeats, seed=seed
+            ),
+            "distribution": distribution(latents, seed=seed),
         }
 
     def agreement(self, truths: list[Truth], generated: list[list[GeneratedMotion]]) -> dict[str, Any]:
@@ -209,13 +177,3 @@ class _Evaluation:
             "truth": truth_agreement([(t, t.joints, t.face) for t in truths], fps),
             "generated": truth_agreement(made, fps),
         }
-
-
-def _distances(text: Tensor, motion: Tensor) -> dict[str, Interval]:
-    """Mean distance of each text's latent from its motion's, both of length 1, and as they are."""
-    unit = matching_score(normalize(text.double(), dim=-1), normalize(motion.double(), dim=-1))
-    plain_distance = matching_score(text, motion)
-    return {
-        "matching_score": Interval(float(unit), 0.0),
-        "latent_distance": Interval(float(plain_distance), 0.0),
-    }

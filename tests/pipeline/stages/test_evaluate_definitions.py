@@ -10,6 +10,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import scipy.linalg
 import torch
 from rich.console import Console
 
@@ -19,6 +20,7 @@ from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.figure_rows import figure_rows
 from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.reconstruction import FINGERS, published_errors
+from motionloom.pipeline.evaluation.text_motion import Latents, distribution
 from motionloom.pipeline.evaluation.truth import drawn, truth_of
 from motionloom.pipeline.runs.api import run_recipe
 
@@ -88,6 +90,14 @@ def test_tma_reads_captions_by_its_own_encoder(models: ModuleType, tmp_path: Pat
     assert several < len(truths), "captions occur twice, as they do in the papers' splits"
     assert figures["retrieval"]["different_captions"]["clips"] == several
     assert figures["retrieval"]["clips"] == len(truths)
+    spread = figures["distribution"]
+    assert spread["clips"] == len(truths)
+    recorded, other, made, still = (
+        spread["rows"][name] for name in ("recorded", "training", "generated", "mean_pose")
+    )
+    assert set(recorded) == {"diversity"} and recorded["diversity"]["mean"] > 0
+    assert 0 < other["fid"]["mean"] < still["fid"]["mean"], "other recorded clips are nearer than a statue"
+    assert "multimodality" not in made, "one motion a caption has no variety"
     titles = {title: (columns, rows) for title, columns, rows in figure_rows(figures)}
     columns, rows = next(found for title, found in titles.items() if "as the papers count it" in title)
     assert columns[1:4] == ["MPJPE all", "MPJPE body", "MPJPE hands"] and len(columns) == 10
@@ -123,3 +133,35 @@ def test_errors_of_body_and_hands_by_hand() -> None:
     assert found["_hand"].means()["accel"] == pytest.approx(1000 * jerk[:, 22:].mean(), rel=1e-12)
     body = published_errors(torch.from_numpy(made[:, :22]), torch.from_numpy(real[:, :22]))
     assert set(body) == {"", "_body"}
+
+
+def test_distribution_by_hand() -> None:
+    """FID by scipy's matrix root, Diversity and MModality pair by pair."""
+    generator = torch.Generator().manual_seed(0)
+    real, others = torch.randn(2, 400, 6, generator=generator)
+    shift = torch.linspace(0.5, 2, 6)
+    made = [shift * torch.randn(400, 6, generator=generator) + 1 for _ in range(3)]
+    latents = Latents(text=real, real=real, made=made, others=others, still=torch.ones(400, 6))
+    rows = distribution(latents, seed=0)["rows"]
+
+    def by_scipy(a: torch.Tensor, b: torch.Tensor) -> float:
+        x, y = a.double().numpy(), b.double().numpy()
+        root = scipy.linalg.sqrtm(np.cov(x.T) @ np.cov(y.T)).real
+        trace = np.trace(np.cov(x.T) + np.cov(y.T) - 2 * root)
+        return float(((x.mean(0) - y.mean(0)) ** 2).sum() + trace)
+
+    def unit(x: torch.Tensor) -> torch.Tensor:
+        return x.double() / x.double().norm(dim=-1, keepdim=True)
+
+    found = rows["generated"]
+    assert found["fid"].mean == pytest.approx(np.mean([by_scipy(real, m) for m in made]), rel=1e-8)
+    assert found["fid_unit"].mean == pytest.approx(
+        np.mean([by_scipy(unit(real), unit(m)) for m in made]), rel=1e-8
+    )
+    assert rows["training"]["fid"].mean == pytest.approx(by_scipy(real, others), rel=1e-8)
+    assert rows["training"]["fid"].mean < 0.1 < 5 < found["fid"].mean
+    # Two draws of one Gaussian are sqrt(2) as far apart as it is wide: 300 pairs, five deviations.
+    wide = float((2 * shift.square().sum()).sqrt())
+    assert found["diversity"].mean == pytest.approx(wide, rel=0.15)
+    apart = [float((made[a] - made[b]).norm(dim=-1).mean()) for a, b in ((0, 1), (0, 2), (1, 2))]
+    assert 0 < found["multimodality"].mean <= max(apart)
