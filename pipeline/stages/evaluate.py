@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -51,6 +51,9 @@ class EvaluateConfig(StageConfig):
     """Candidates in retrieval (32: protocol D; 256: protocol C)."""
     among: int = Field(61, ge=2)
     """Candidates of the accuracy of UDE's Table 1."""
+    lengths: Literal["free", "recorded"] = "free"
+    """How long generated motions are: as the generator decides, or as the recorded clip is, which is all that
+    VAEs and diffusion models can do."""
     sampling: SamplingConfig = SamplingConfig()
 
 
@@ -136,9 +139,11 @@ class _Evaluation:
                 motions: list[GeneratedMotion] = []
                 for start in range(0, len(truths), 64):
                     part = truths[start : start + 64]
+                    seconds = [len(t.features) / self.dataset.layout.fps for t in part]
                     motions += self.bundle.generate(
                         [t.caption for t in part],
                         face_captions=[t.face_caption for t in part],
+                        seconds=seconds if config.lengths == "recorded" else None,
                         seed=seed + 7919 * (repeat + 1) + start,
                         sampling=config.sampling,
                     )

@@ -68,8 +68,12 @@ class TmaStage(TrainedStage):
     version = 2  # the filter of negatives is sBERT's
 
     def gives(self, config: TmaStageConfig) -> frozenset[str]:
-        """One space for text and motion; of the face also motion of text (B.5.1)."""
-        return super().gives(config) | {GENERATOR if config.part == "face" else ALIGNMENT}
+        """One space for text and motion, but for faces; motion of text where that is what it is for: the
+        facial cVAE (B.5.1), and TEMOS, which is TMA without InfoNCE (4.1.2).
+        """
+        makes = config.part == "face" or config.loss.contrastive == 0
+        aligns = config.part != "face"
+        return super().gives(config) | ({GENERATOR} if makes else set()) | ({ALIGNMENT} if aligns else set())
 
     def facts(self, config: TmaStageConfig, given: Given) -> ModelFacts:
         """Config, layout and the widths of both sides."""
@@ -113,8 +117,8 @@ class TmaStage(TrainedStage):
         return LoadedTma(net, facts.layout.layout(), frames, part, given)
 
     def generator(self, stage: Finished, given: Given, device: torch.device) -> MotionGenerator:
-        """The facial cVAE."""
-        return VaeFace(self.load(stage, given, device))
+        """The facial cVAE, or TEMOS."""
+        return VaeMotion(self.load(stage, given, device))
 
     def exported(self, config: Any) -> tuple[str, ...]:
         """Statistics, and the encoder of its words."""
@@ -146,8 +150,8 @@ def caption_batches(config: Any, given: Given, seed: int) -> Batches:
 
 
 @dataclass(frozen=True)
-class VaeFace:
-    """One latent of the text, decoded to all frames at once (B.5.1)."""
+class VaeMotion:
+    """One latent of the text, decoded to all frames at once: TEMOS, and the facial cVAE (B.5.1)."""
 
     tma: LoadedTma
     method = "vae"
@@ -155,12 +159,16 @@ class VaeFace:
     settings = frozenset({"temperature"})
     unit_frames = 1
     max_frames = None
-    part: Part = "face"
 
     @property
     def layout(self) -> MotionLayout:
         """Layout of whole frames."""
         return self.tma.layout
+
+    @property
+    def part(self) -> Part:
+        """The columns that it reads and writes."""
+        return self.tma.part
 
     @property
     def text(self) -> TextSource | None:
@@ -170,17 +178,35 @@ class VaeFace:
 
     @torch.no_grad()
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
-        """The latent is drawn from the text's Gaussian; temperature scales its width."""
+        """The latent is drawn from the text's Gaussian; temperature scales its width. Of a network that
+        writes every n-th frame, those between are on the straight line.
+        """
         if request.frames is None:
-            raise UserError("the face's VAE makes a length that it is given, and none was")
+            raise UserError(
+                "this VAE makes a motion of a length that it is given, and none was; give --seconds, or to "
+                "evaluate it lengths: recorded"
+            )
         frames, seeds, device, net = request.frames, request.seeds, self.tma.device, self.tma.net
-        text = request.text("the face's VAE")
+        text = request.text("this VAE")
         mu, logvar = net.encode_text(text.features.to(device), text.mask.to(device))
         noise = torch.stack(
             [torch.randn(mu.shape[1], generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         )
         z = mu + request.sampling.temperature * (0.5 * logvar).exp() * noise.to(device)
         made = net.decode(z, torch.tensor(list(frames)).to(device), max(frames))
-        columns = self.layout.part(self.part)
-        values = [made[row, :count].cpu().numpy() for row, count in enumerate(frames)]
+        columns, stride = self.layout.part(self.part), net.config.frame_stride
+        values = [between(made[row].cpu().numpy(), count, stride) for row, count in enumerate(frames)]
         return [np.asarray(self.tma.stats.denormalize(v, columns), dtype=np.float32) for v in values]
+
+
+def between(values: NDArray[np.float32], frames: int, stride: int) -> NDArray[np.float32]:
+    """Every `stride`-th frame [L, D] to `frames` frames [T, D]: linear between, constant behind the last."""
+    if stride == 1:
+        return values[:frames]
+    last = (frames - 1) // stride
+    at = np.minimum(np.arange(frames) / stride, last)
+    low = at.astype(int)
+    high = np.minimum(low + 1, last)
+    share = (at - low)[:, None].astype(values.dtype)
+    out: NDArray[np.float32] = values[low] * (1 - share) + values[high] * share
+    return out

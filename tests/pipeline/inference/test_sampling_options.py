@@ -26,7 +26,7 @@ from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.requests import require_used
 from motionloom.pipeline.stages.diffusion import DiffusionFace
 from motionloom.pipeline.stages.gpt import GptGenerator
-from motionloom.pipeline.stages.tma import VaeFace
+from motionloom.pipeline.stages.tma import VaeMotion
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer
 
 GPT = GptConfig(layers=1, dim=16, heads=2, ff=16, block_size=32)
@@ -79,7 +79,7 @@ def bundle(
         denoiser = MotionDiffusion(face or DENOISER, 50, 8)
         made.append(DiffusionFace(denoiser.eval().requires_grad_(False), layout, given))
     if "vae" in faces:
-        made.append(VaeFace(SimpleNamespace(given=given)))  # type: ignore[arg-type]
+        made.append(VaeMotion(SimpleNamespace(given=given, part="face")))  # type: ignore[arg-type]
     return Bundle([stage(f"stage{k}", one) for k, one in enumerate(made)], Shelf())
 
 
