@@ -53,11 +53,12 @@ from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.text.emotions import emotion_of
 
 __all__ = ["MotionXConfig", "convert_clip", "plan_motionx", "prepare_motionx", "read_parameters"]
 
 CONVERTER = "motionx"
-CONVERTER_VERSION = 1
+CONVERTER_VERSION = 2  # emotion words of captions
 
 
 def prepare_motionx(
@@ -110,7 +111,11 @@ def convert_clip(config: MotionXConfig, body: BodyModel, clip: MotionXClip) -> S
         mirror_of=original_of(clip.id),
     )
     texts = [*clip.texts, *_frame_captions(config, clip)]
-    return Sample(meta=meta, motion=motion, texts=texts, face_texts=list(clip.face_texts))
+    faces = list(clip.face_texts)
+    emotion = None if faces or not meta.has_face else emotion_of(caption.text for caption in clip.texts)
+    if emotion is not None:
+        faces = [Caption(text=emotion, source="emotion")]
+    return Sample(meta=meta, motion=motion, texts=texts, face_texts=faces)
 
 
 def read_parameters(config: MotionXConfig, clip: MotionXClip) -> NDArray[np.float64]:

@@ -188,6 +188,21 @@ def test_grab_keeps_its_jaw(copy: Path) -> None:
     assert (with_face(own.astype(np.float64), np.ones((3, 153)), keep_jaw=False)[:, 156:309] == 1.0).all()
 
 
+def test_a_face_without_a_text_takes_the_emotion_of_its_caption(copy: Path) -> None:
+    assert [(c.text, c.source) for c in sample(copy, BOW).face_texts] == [("happy", "face")]
+    shutil.rmtree(copy / "texts/face_texts")
+    caption = copy / TEXTS / f"{BOW}.txt"
+    caption.write_text("a person bows sadly\n")
+    assert [(c.text, c.source) for c in sample(copy, BOW).face_texts] == [("sad", "emotion")]
+    caption.write_text("a person bows\n")
+    assert sample(copy, BOW).face_texts == [], "none is made up"
+    caption.write_text("a person bows sadly\n")
+    rewrite(copy / MOTION / f"{BOW}.npy", lambda values: values[:, 159:209].fill(0))
+    shutil.rmtree(copy / "face_motion_data")
+    made = sample(copy, BOW)
+    assert not made.meta.has_face and made.face_texts == []
+
+
 def test_absent_face_and_hands_are_masked(copy: Path) -> None:
     shutil.rmtree(copy / "face_motion_data")
     made = sample(copy, HUMANML)
