@@ -1,11 +1,14 @@
 """Tokenizers at an equal training budget: H2VQ, RVQ, VQ, body and hands apart, FSQ (Tables 3 and 7).
 
     python benchmarks/reconstruction_order.py WORK [--shards FOLDER] [--seeds 3] [--steps 1600]
+    python benchmarks/reconstruction_order.py WORK --features paper --steps 5000
 
 Every tokenizer is trained by the same recipe on the same windows with the same widths, one run a seed, and
 measured on the test split: MPJPE in mm of all joints and of the body from the root, of the fingers from their
-wrists, and the world positions with the path. Shards without hands leave out tokenizers of body and hands.
-Killed and started again it goes on where it was.
+wrists (docs/evaluation.md), our pose and the world positions with the path. `--features paper` trains on the
+published features with the published loss: deviations averaged over each kind of column, squared error, no
+velocity term, no gains. Shards without hands leave out tokenizers of body and hands. Killed and started again
+it goes on where it was.
 """
 
 from __future__ import annotations
@@ -51,6 +54,7 @@ COMMON = {
     "root_gain": 5.0,
     "finger_gain": 4.0,
 }
+PAPER = {"recon": "l2", "velocity_weight": 0.0, "root_gain": 1.0, "finger_gain": 0.0}
 COLUMNS = {"mpjpe": "MPJPE", "mpjpe_body": "body", "mpjpe_hand": "hands", "pose": "pose", "world": "world"}
 
 
@@ -63,10 +67,10 @@ def recipe(work: Path, kind: str, net: dict, seed: int, args: argparse.Namespace
     train = {"steps": args.steps, "batch_size": 16, "checkpoint_every": 200, "validate_every": 0}
     stages = {
         "data": {"kind": "shards", "path": str(args.shards.resolve()), "verify": False},
-        "stats": {"kind": "stats"},
+        "stats": {"kind": "stats", "group": args.features == "paper"},
         "tokenizer": {
             "kind": kind,
-            "net": {**COMMON, **net},
+            "net": {**COMMON, **net, **(PAPER if args.features == "paper" else {})},
             "optim": {"lr": 2.0e-3, "warmup_steps": 30, "schedule": "cosine"},
             "train": train,
         },
@@ -137,6 +141,7 @@ def main() -> None:
     parser.add_argument("--shards", type=Path, help="whole-body shards; default: synthetic clips")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=1600)
+    parser.add_argument("--features", choices=("ours", "paper"), default="ours")
     parser.add_argument("--nets", nargs="*", choices=list(NETS), default=list(NETS))
     parser.add_argument("--made", type=int, default=2000, help="synthetic clips to make")
     parser.add_argument("--clips", type=int, default=100, help="test clips at most")
@@ -154,13 +159,14 @@ def main() -> None:
             if not handed and kind in HANDED:
                 continue
             net = net if handed else {**net, "part": "body", "finger_gain": 0.0}
-            run = args.work / f"{title.replace(' ', '-').replace(',', '')}-{seed}"
+            run = args.work / args.features / f"{title.replace(' ', '-').replace(',', '')}-{seed}"
             run_recipe(recipe(run, kind, net, seed, args), run, console=console)
             results.setdefault(title, []).append(measure(run, args.clips))
         show(results, console)
-    draw(results, args.work / "order.png")
-    (args.work / "order.json").write_text(json.dumps(results, indent=1))
-    console.print(f"{args.work / 'order.json'}, {args.work / 'order.png'}")
+    place = args.work / args.features
+    draw(results, place / "order.png")
+    (place / "order.json").write_text(json.dumps(results, indent=1))
+    console.print(f"{place / 'order.json'}, {place / 'order.png'}")
 
 
 if __name__ == "__main__":

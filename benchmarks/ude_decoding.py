@@ -9,7 +9,8 @@ Differences count against the spread of the repeats.
 
 `--transitions`: scripts of a caption, a song and another caption. At each border the acceleration of the
 joints and the speed of the root as percentiles among those inside the segments of the same motion
-(`models/metrics/transitions.py`), beside the same segments made apart and joined, and foot skating.
+(`models/metrics/transitions.py`), with bridges, with every token decoded, and beside the same segments made
+apart and joined; close to the border and so far around it that a bridge is covered; and foot skating.
 
 Writes `decoding.json` into the run's folder.
 """
@@ -20,6 +21,7 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -37,6 +39,7 @@ from motionloom.models.metrics.transitions import accelerations, transition_perc
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.dance_figures import Matched, alignment_of
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
@@ -45,6 +48,9 @@ from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.script import DrivenSegment
 
 Joints = NDArray[np.float64]
+
+REACH = {"at the border": 2, "around it": 10}
+"""Frames to either side of which the largest figure counts; ten cover a bridge of sixteen."""
 
 
 def quality(clips: Sequence[DanceClip], made: Sequence[Joints]) -> dict[str, float]:
@@ -87,30 +93,43 @@ def samplers(run: Path, count: int, repeats: int, console: Console) -> dict[str,
     return out
 
 
-def transitions(run: Path, count: int) -> dict[str, Any]:
-    """Percentiles at borders and skating, of scripts and of their segments made apart and joined."""
+def transitions(run: Path, count: int, sampling: SamplingConfig) -> dict[str, Any]:
+    """Percentiles at borders, near them and skating: of scripts with bridges, of the same tokens all decoded,
+    and of the segments made apart and joined.
+    """
     stages, shelf = finished_stages(run), Shelf()
     dataset = shelf.get(stages["data"]).split("test")
-    bundle = Bundle([stages["ude"]], shelf)
+    ude = stages["ude"]
+    every = replace(ude, config=ude.config.model_copy(update={"bridge_frames": 0}))
+    bundles = {"bridged": Bundle([ude], shelf), "every token": Bundle([every], shelf)}
+    bundle = bundles["every token"]
     fps, unit = dataset.layout.fps, bundle.generator.unit_frames / dataset.layout.fps
     clips = dances_of(dataset, count, unit=GROUP_FRAMES)
     truths = [truth_of(dataset, i) for i in spread(dataset, 6 * count)]
     said = [t.caption for t in truths if t.truth and t.truth.get("action") != "dance"]
     out: dict[str, dict[str, list[float]]] = {
-        name: {"acceleration": [], "root velocity": [], "skating": []} for name in ("script", "joined")
+        name: {f"{kind}, {near}": [] for near in REACH for kind in ("acceleration", "root velocity")}
+        | {"skating": []}
+        for name in (*bundles, "joined")
     }
     for k, clip in enumerate(clips):
         lengths = [round(s / unit) * unit for s in (3.0, clip.seconds, 3.0)]
         prompts = [Prompt(said[2 * k]), Prompt(sound=clip.sound, music=clip.music), Prompt(said[2 * k + 1])]
         segments = [DrivenSegment(p, s, "") for p, s in zip(prompts, lengths, strict=True)]
         borders = np.cumsum([round(s * fps) for s in lengths])[:-1].tolist()
-        (whole,) = bundle.perform(segments, seed=k)
-        apart = [bundle.perform([segment], seed=100 * k + n)[0] for n, segment in enumerate(segments)]
-        joined = joints_of(np.concatenate([m.features for m in apart]), dataset.layout)
-        for name, joints in (("script", whole.joints), ("joined", joined)):
-            found = transition_percentiles(joints, borders, fps)
-            out[name]["acceleration"] += found.acceleration.tolist()
-            out[name]["root velocity"] += found.root_velocity.tolist()
+        made = {
+            name: one.perform(segments, seed=k, sampling=sampling)[0].joints for name, one in bundles.items()
+        }
+        apart = [
+            bundle.perform([segment], seed=100 * k + n, sampling=sampling)[0]
+            for n, segment in enumerate(segments)
+        ]
+        made["joined"] = joints_of(np.concatenate([m.features for m in apart]), dataset.layout)
+        for name, joints in made.items():
+            for near, reach in REACH.items():
+                found = transition_percentiles(joints, borders, fps, reach=reach)
+                out[name][f"acceleration, {near}"] += found.acceleration.tolist()
+                out[name][f"root velocity, {near}"] += found.root_velocity.tolist()
             out[name]["skating"].append(foot_skating(joints, fps))
     return out
 
@@ -124,6 +143,9 @@ def main() -> None:
     parser.add_argument("--transitions", action="store_true")
     parser.add_argument("--clips", type=int, default=30)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--temperature", type=float, default=1.0, help="of scripts")
+    parser.add_argument("--top-p", type=float, default=0.9)
+    parser.add_argument("--cfg", type=float, default=1.0)
     args = parser.parse_args()
     console, path = Console(width=160), args.run / "decoding.json"
     found: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
@@ -136,15 +158,15 @@ def main() -> None:
             table.add_row(title, *(f"{np.mean(c):.3f} ± {np.std(c):.3f}" if c else "" for c in cells))
         console.print(table)
     if args.transitions:
-        found["transitions"] = transitions(args.run, args.clips)
-        table = Table(
-            "", "percentile", "within the 95th", "percentile of root speed", "within", "foot skating"
-        )
+        sampling = SamplingConfig(temperature=args.temperature, top_p=args.top_p, cfg_scale=args.cfg)
+        found["transitions"] = transitions(args.run, args.clips, sampling)
+        keys = [key for key in next(iter(found["transitions"].values())) if key != "skating"]
+        table = Table("", *keys, "foot skating", title="mean percentile, share within the 95th")
         for name, figures in found["transitions"].items():
             cells = []
-            for key in ("acceleration", "root velocity"):
+            for key in keys:
                 values = np.array(figures[key])
-                cells += [f"{values.mean():.2f}", f"{(values <= 0.95).mean():.2f}"]
+                cells.append(f"{values.mean():.2f}, {(values <= 0.95).mean():.2f}")
             table.add_row(name, *cells, f"{np.mean(figures['skating']):.3f}")
         console.print(table)
     path.write_text(json.dumps(found, indent=2))
