@@ -16,6 +16,13 @@ def figure_rows(figures: dict[str, Any]) -> list[Rows]:
     out: list[Rows] = []
     if "reconstruction_mm" in figures:
         out += _reconstruction_rows(figures)
+    if "reconstruction_face" in figures:
+        found = figures["reconstruction_face"]
+        rows = [
+            [title, f"{found[key]:.3f}"]
+            for title, key in (("tokenizer", "expression"), ("mean expression", "expression_mean"))
+        ]
+        out.append(("Reconstruction of faces (lower is better)", ["", "expression error"], rows))
     if "retrieval" in figures:
         found = figures["retrieval"]
         out.append(_retrieval_rows(found))

@@ -27,7 +27,7 @@ from motionloom.pipeline.evaluation.figures import (
     embed_motions,
     truth_agreement,
 )
-from motionloom.pipeline.evaluation.reconstruction import reconstruction_figures
+from motionloom.pipeline.evaluation.reconstruction import face_figures, reconstruction_figures
 from motionloom.pipeline.evaluation.tables import plain, print_tables
 from motionloom.pipeline.evaluation.text_motion import Latents, distribution, retrieval
 from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
@@ -63,7 +63,7 @@ class EvaluateStage(StageKind):
     name = "evaluate"
     summary = "figures on the test split"
     config = EvaluateConfig
-    takes = ("data", "tokenizer?", "tma?", Every("generators", GENERATOR))
+    takes = ("data", "tokenizer?", "face_tokenizer?: tokenizer", "tma?", Every("generators", GENERATOR))
     version = 5  # the papers' definitions, clips drawn as they come; TMA reads captions by its own encoder
 
     def gives(self, config: Any) -> frozenset[str]:
@@ -108,6 +108,7 @@ class _Evaluation:
             figures["reconstructed_clips"] = len(shown)
             if shown:
                 figures["reconstruction_mm"] = reconstruction_figures(self.tokenizer, train, shown)
+                figures |= self.faces(shown)
         if not truths and "reconstruction_mm" not in figures:
             raise UserError(
                 f"{dataset.where}: no captioned clip of split '{dataset.split}' is long enough for one group "
@@ -124,6 +125,14 @@ class _Evaluation:
         if any(t.truth for t in truths):
             figures["agreement_with_caption"] = self.agreement(truths, generated)
         return figures
+
+    def faces(self, truths: list[Truth]) -> dict[str, Any]:
+        """Reconstruction of expressions, where a tokenizer models them and a clip has one."""
+        tokenizer = self.context.given.get("face_tokenizer", self.tokenizer)
+        if not tokenizer.layout.has("face") or tokenizer.net.part not in ("face", "all"):
+            return {}
+        found = face_figures(tokenizer, truths)
+        return {"reconstruction_face": found} if found else {}
 
     def truths(self, chosen: Sequence[int], unit: int) -> list[Truth]:
         """The clips `chosen` that are long enough for one group of tokens."""

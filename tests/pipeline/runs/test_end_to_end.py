@@ -280,6 +280,7 @@ def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..
     figures = json.loads((copy / "evaluate/metrics.json").read_text())
     assert figures["clips"] == 4 and figures["split"] == "test"
     assert figures["reconstruction_mm"]["mpjpe"] > 0
+    assert figures["reconstruction_face"]["expression"] > 0 and "expression error" in done.out
     found = figures["retrieval"]
     assert 2 <= found["among"] <= 4, "61 wrong captions, or as many as there are"
     for name in ("real", "generated"):

@@ -19,7 +19,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
-from motionloom.pipeline.evaluation.reconstruction import reconstruction_figures
+from motionloom.pipeline.evaluation.reconstruction import face_figures, reconstruction_figures
 from motionloom.pipeline.evaluation.truth import reconstruct_truth, truth_of
 from motionloom.pipeline.stages.gpt_data import gpt_clips
 from motionloom.pipeline.stages.tokens import encode_split
@@ -132,3 +132,19 @@ def test_a_clip_through_a_tokenizer_of_any_part(data: Data, part: Part) -> None:
         assert not np.allclose(rebuilt[:, ~hand], mean[~hand])
     figures = reconstruction_figures(trained, dataset, [truth_of(dataset, 0)])
     assert np.isfinite(list(figures.values())).all()
+
+
+def test_faces_count_where_there_are_any(data: Data) -> None:
+    """Garbage in faces that were never recorded changes nothing, and a face by hand."""
+    net, found = tokenizer(data, "face"), []
+    for dataset, stats in data:
+        trained = TrainedTokenizer(net, {"stats": stats})
+        truths = [truth_of(dataset, i) for i in range(len(dataset))]
+        found.append(face_figures(trained, truths))
+        faces = [t.face for t in truths if t.face is not None]
+        assert 0 < len(faces) < len(truths)
+        columns = dataset.layout.slice("face")
+        apart = np.concatenate([np.linalg.norm(face - stats.mean[columns], axis=1) for face in faces])
+        assert found[-1]["expression_mean"] == pytest.approx(apart.mean(), rel=1e-5)
+        assert face_figures(trained, [t for t in truths if t.face is None]) == {}
+    assert found[0] == pytest.approx(found[1], rel=1e-6) and found[0]["expression"] > 0
