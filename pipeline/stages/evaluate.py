@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import FigureTable, Showing
@@ -119,12 +120,30 @@ class _Evaluation:
             context.console.print(f"    {dataset.split}: {left} clips without a caption {rest}")
         if not truths or "text" not in self.bundle.generator.modalities:
             return figures
+        figures["protocol"] = self.protocol()
         generated = self.generate(truths)
         if self.tma is not None:
             figures |= self.by_tma(self.tma, truths, generated)
         if any(t.truth for t in truths):
             figures["agreement_with_caption"] = self.agreement(truths, generated)
         return figures
+
+    def protocol(self) -> dict[str, Any]:
+        """What else one has to know to get the same figures again."""
+        config, context = self.config, self.context
+        facts = {
+            "clips": f"at most {config.clips} captioned ones, drawn at random",
+            "caption": "the first about the whole clip, else the first",
+            "lengths": config.lengths,
+            "repeats": config.repeats,
+            "seed": context.seed,
+            "sampling": config.sampling.dump(),
+            "generators": [stage.name for stage in context.every("generators")],
+        }
+        if self.tma is not None:
+            weights = sha256_of(context.input("tma") / "model.safetensors")
+            facts["evaluator"] = {"stage": context.inputs["tma"].name, "sha256": weights}
+        return facts
 
     def faces(self, truths: list[Truth]) -> dict[str, Any]:
         """Reconstruction of expressions, where a tokenizer models them and a clip has one."""

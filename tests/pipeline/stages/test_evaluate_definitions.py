@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import json
 from collections.abc import Iterator
@@ -86,6 +87,10 @@ def test_tma_reads_captions_by_its_own_encoder(models: ModuleType, tmp_path: Pat
             assert found["matching_score"]["mean"] == pytest.approx(distance["words"], rel=1e-5)
             assert found["latent_distance"]["mean"] == pytest.approx(plain, rel=1e-5)
     assert abs(distance["words"] - distance["text"]) > 1e-4, "ten times what the comparison above allows"
+    protocol = figures["protocol"]
+    weights = (tmp_path / "run/stages/tma/model.safetensors").read_bytes()
+    assert protocol["evaluator"] == {"stage": "tma", "sha256": hashlib.sha256(weights).hexdigest()}
+    assert (protocol["repeats"], protocol["lengths"], protocol["generators"]) == (1, "free", ["gpt"])
     several = len({t.caption for t in truths})
     assert several < len(truths), "captions occur twice, as they do in the papers' splits"
     assert figures["retrieval"]["different_captions"]["clips"] == several
