@@ -2,7 +2,7 @@
 
     motionloom run ude-learning
     python benchmarks/ude_stations.py runs/ude-learning --utt utt prefix_7 gru_7
-    python benchmarks/ude_stations.py runs/ude-learning --tokenizer parts --utt parts_utt --no-dmd
+    python benchmarks/ude_stations.py runs/ude-learning --tokenizer parts --utt parts_utt --no-dmd --no-dances
 
 Held-out clips as they are recorded; their true tokens decoded by the tokenizer and by DMD; tokens that each
 UTT makes for their music or caption, with and without z, decoded by both and drawn twice. Beat Align of
@@ -208,6 +208,7 @@ def main() -> None:
     parser.add_argument("--cfg", type=float, default=1.0)
     parser.add_argument("--split", default="test")
     parser.add_argument("--out", default="stations.json")
+    parser.add_argument("--no-dances", action="store_true", help="for models of words alone")
     parser.add_argument("--no-dmd", action="store_true", help="decode by the tokenizer alone")
     parser.add_argument("--tokenizer", default="tokenizer", help="tokenizer stage")
     parser.add_argument("--dmd", default="dmd", help="decoder stage")
@@ -220,16 +221,17 @@ def main() -> None:
     dataset = shelf.get(stages["data"]).split(args.split)
     layout, fps = dataset.layout, dataset.layout.fps
     sampling = SamplingConfig(temperature=args.temperature, top_p=args.top_p, cfg_scale=args.cfg)
-    clips = dances_of(dataset, args.clips, unit=GROUP_FRAMES)
-    apart = others(clips, 5, args.seed)
-    recorded = [np.asarray(dataset.motion(c.index))[: len(c.joints)] for c in clips]
     out: dict[str, Any] = {"arguments": {k: str(v) for k, v in vars(args).items()}}
-    prompts = [Prompt(sound=c.sound, music=c.music) for c in clips]
-    out["dances"] = {}
-    for name, *both in engine.stations(recorded, prompts, sampling, args.seed):
-        one, other = ([joints_of(m, layout) for m in motions] for motions in both)
-        out["dances"][name] = dance_figures(clips, one, apart) | {"variety": variety(one, other, fps)}
-    show(console, f"{len(clips)} dances to {len({c.song for c in clips})} songs", out["dances"])
+    if not args.no_dances:
+        clips = dances_of(dataset, args.clips, unit=GROUP_FRAMES)
+        apart = others(clips, 5, args.seed)
+        recorded = [np.asarray(dataset.motion(c.index))[: len(c.joints)] for c in clips]
+        prompts = [Prompt(sound=c.sound, music=c.music) for c in clips]
+        out["dances"] = {}
+        for name, *both in engine.stations(recorded, prompts, sampling, args.seed):
+            one, other = ([joints_of(m, layout) for m in motions] for motions in both)
+            out["dances"][name] = dance_figures(clips, one, apart) | {"variety": variety(one, other, fps)}
+        show(console, f"{len(clips)} dances to {len({c.song for c in clips})} songs", out["dances"])
     if has_caption(dataset).any():
         truths = [truth_of(dataset, i) for i in spread(dataset, 10 * args.clips)]
         said = [t for t in truths if t.truth and t.truth.get("action") != "dance"][: args.clips]

@@ -46,12 +46,17 @@ class DmdConfig(Config):
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
     hide: float = Field(default=0.0, ge=0, le=1)
     """Share of training windows in which a stretch of tokens is hidden [ours]; 0 is the paper's."""
+    velocity_weight: float = Field(default=0.0, ge=0)
+    """Weight of the same error between frame-to-frame differences, which makes motion smoother [ours, after
+    MDM]; for networks that predict the motion. 0 is the paper's."""
     schedule: ScheduleConfig = ScheduleConfig(betas="linear", predicts="epsilon")
 
     @model_validator(mode="after")
-    def _heads_divide(self) -> Self:
+    def _fits(self) -> Self:
         if self.dim % self.heads:
             raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
+        if self.velocity_weight and self.schedule.predicts != "sample":
+            raise ValueError("velocity_weight is for schedule: {predicts: sample}; noise has no velocity")
         return self
 
 
@@ -181,7 +186,8 @@ def dmd_loss(
     hidden: Tensor | None = None,
     present: Tensor | None = None,
 ) -> Tensor:
-    """Squared error of the predicted noise, mean over the real frames of all ranks (equation 10).
+    """Squared error of the predicted noise, mean over the real frames of all ranks (equation 10), and of what
+    is predicted between frames, by `velocity_weight`.
 
     Args:
         net: The denoiser.
@@ -197,5 +203,10 @@ def dmd_loss(
     """
     found = net(noiser.add_noise(motion, noise, step), step, codes, length, absent, hidden)
     target = motion if net.config.schedule.predicts == "sample" else noise
-    error = (found - target.to(found.dtype)).square()
-    return masked_mean(error, length_mask(length, motion.shape[1]), present)
+    error = found - target.to(found.dtype)
+    loss = masked_mean(error.square(), length_mask(length, motion.shape[1]), present)
+    weight = net.config.velocity_weight
+    if weight:
+        between = length_mask(length - 1, motion.shape[1] - 1)
+        loss = loss + weight * masked_mean(error.diff(dim=1).square(), between, present)
+    return loss

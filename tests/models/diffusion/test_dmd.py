@@ -13,7 +13,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig, dmd_loss
 from motionloom.models.diffusion.dmd_module import hidden_stretch
 from motionloom.models.diffusion.dmd_sampling import blend_weights, decode_motions, window_starts
-from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import Stream
 
@@ -153,6 +153,22 @@ def test_loss_counts_real_frames_and_columns(net: Dmd) -> None:
     error = (found - noise).square()
     total = error[0].sum() + error[1, :7, :4].sum()
     assert loss.item() == pytest.approx(total.item() / (16 * 6 + 7 * 4), rel=1e-5)
+
+
+def test_velocity_counts_between_real_frames() -> None:
+    torch.manual_seed(0)
+    config = SMALL.model_copy(update={"velocity_weight": 3.0, "schedule": ScheduleConfig(predicts="sample")})
+    net = Dmd(config, STREAMS, PATTERN, 6).eval()
+    codes, length = random_codes([4, 2]), torch.tensor([16, 7])
+    motion, noise, step = torch.randn(2, 16, 6), torch.randn(2, 16, 6), torch.tensor([10, 900])
+    noiser = config.schedule.noiser()
+    loss = dmd_loss(net, noiser, motion, codes.codes, length, step, noise)
+    error = net(noiser.add_noise(motion, noise, step), step, codes.codes, length) - motion
+    plain = (error[0].square().sum() + error[1, :7].square().sum()) / (23 * 6)
+    moved = (error[0].diff(dim=0).square().sum() + error[1, :7].diff(dim=0).square().sum()) / (21 * 6)
+    assert loss.item() == pytest.approx((plain + 3 * moved).item(), rel=1e-5)
+    with pytest.raises(ValueError, match="noise has no velocity"):
+        DmdConfig(velocity_weight=1.0)
 
 
 def test_sizes_of_the_paper() -> None:
