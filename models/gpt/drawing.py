@@ -45,10 +45,18 @@ class Drawing:
         """Tokens int64 [B] from logits [B, V] and uniform float64 [B]."""
         return draw(logits, uniform, temperature=self.temperature, top_k=self.top_k, top_p=self.top_p)
 
-    def guided(self, logits: Tensor, legal: Tensor) -> Tensor:
-        """[B, V] of the conditional and the unconditional half [2B, V]; -inf where not `legal` [B, V]."""
+    def guided(self, logits: Tensor, legal: Tensor, scale: Tensor | None = None) -> Tensor:
+        """[B, V] of the conditional and the unconditional half [2B, V]; -inf where not `legal` [B, V].
+
+        `scale` [B] is each row's guidance in place of one for all; a row of 1 is as without guidance, to the
+        bit.
+        """
         on, off = logits.chunk(2)
-        return torch.where(legal, off + self.cfg_scale * (on - off), -torch.inf)
+        if scale is None:
+            return torch.where(legal, off + self.cfg_scale * (on - off), -torch.inf)
+        strength = scale[:, None].to(logits.dtype)
+        mixed = torch.where(strength == 1, on, off + strength * (on - off))
+        return torch.where(legal, mixed, -torch.inf)
 
 
 def sample_seeds(seed: int, count: int) -> list[int]:

@@ -52,7 +52,7 @@ def generate(
     temperature: float = 1.0,
     top_k: int | None = None,
     top_p: float = 1.0,
-    cfg_scale: float = 1.0,
+    cfg_scale: float | Sequence[float] = 1.0,
     seed: int | Sequence[int] = 0,
 ) -> Codes:
     """Sample code streams for embedded conditions (UDE section 3.3).
@@ -71,15 +71,20 @@ def generate(
         temperature: 0 is greedy.
         top_k: Keep the k most likely tokens.
         top_p: Keep the smallest set of tokens with this mass.
-        cfg_scale: Guidance; 1 is off. Needs a model trained with condition dropout.
+        cfg_scale: Guidance, one for all rows or one each; 1 is off. Needs a model trained with condition
+            dropout.
         seed: One seed, from which `sample_seeds` makes one per row, or one per sample.
 
     Returns:
         The new codes per stream int64 [B, G * per_group], 0 behind each sample's `groups`.
     """
     batch, device = len(condition.glob), condition.glob.device
-    how = Drawing(temperature, top_k, top_p, cfg_scale)
-    _check(utt, how, null, max_groups, context)
+    scales = [cfg_scale] * batch if isinstance(cfg_scale, (int, float)) else list(cfg_scale)
+    if len(scales) != batch:
+        raise UserError(f"{len(scales)} strengths of guidance were given for {batch} conditions")
+    how = Drawing(temperature, top_k, top_p)
+    guided = any(scale != 1 for scale in scales)
+    _check(utt, guided, null, max_groups, context)
     limit = _limits(utt, batch, max_groups, groups, device)
     seeds = seeds_of(seed, batch, "conditions")
     if start is None:
@@ -95,13 +100,14 @@ def generate(
         z = None
     elif z is None:
         z = draw_z(seeds, utt.config.z_dim).to(device)
-    if how.cfg_scale != 1 and null is not None:
+    scale = torch.tensor(scales, device=device) if guided else None
+    if guided and null is not None:
         condition = _stacked(condition, null)
         z = None if z is None else torch.cat([z, z])
     was_training = utt.training
     utt.eval()
     try:
-        tokens, counts = _decode(utt, condition, z, given, before, limit, uniform, groups is None, how)
+        tokens, counts = _decode(utt, condition, z, given, before, limit, uniform, groups is None, how, scale)
     finally:
         utt.train(was_training)
     longest = int(counts.max()) if batch else 0
@@ -120,13 +126,14 @@ def _decode(
     uniform: Tensor,
     free: bool,
     how: Drawing,
+    scale: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """All tokens int64 [B, N * P], `given` ones included, and the numbers of new groups int64 [B].
 
     given [B, N * P] holds the tokens of `before` [B] groups a row; the others are drawn.
     """
     batch, size, device = len(limit), len(utt.pattern), limit.device
-    guided = len(condition.glob) > batch
+    guided = scale is not None
     total = int((before + limit).max()) * size if batch else 0
     tokens = pad(given, (0, max(0, total - given.shape[1])))
     counts = torch.zeros_like(limit)
@@ -157,7 +164,7 @@ def _decode(
         rows = legal.repeat(2, 1) if guided else legal
         logits = utt.logits(hidden, utt.slots[slot].expand(len(rows), 1), rows[:, None])[:, 0]
         if guided:
-            logits = how.guided(logits, legal)
+            logits = how.guided(logits, legal, scale)
         index = (step - before * size).clamp(0, uniform.shape[1] - 1)
         token = how(logits, uniform.gather(1, index[:, None])[:, 0])
         if slot == 0:
@@ -199,12 +206,12 @@ def _limits(
     return limit
 
 
-def _check(utt: Utt, how: Drawing, null: Encoded | None, max_groups: int | None, context: int | None) -> None:
+def _check(utt: Utt, guided: bool, null: Encoded | None, max_groups: int | None, context: int | None) -> None:
     if max_groups is not None and max_groups < 1:
         raise UserError(f"max_groups {max_groups} must be at least 1")
     if context is not None and context < 0:
         raise UserError(f"context {context} must not be negative; 0 starts afresh")
-    if how.cfg_scale != 1 and (utt.config.condition_dropout == 0 or null is None):
+    if guided and (utt.config.condition_dropout == 0 or null is None):
         raise UserError(
             "guidance needs a UTT trained with condition_dropout > 0 and its unconditional embedding; set "
             "cfg_scale to 1"

@@ -141,6 +141,9 @@ def generate(
     ] = 0.95,
     cfg: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
     face_cfg: Annotated[float | None, typer.Option(help="Guidance of the face; default: as --cfg.")] = None,
+    music_cfg: Annotated[
+        float | None, typer.Option(help="Guidance where there is music; default: as --cfg.")
+    ] = None,
     face_model: Annotated[
         str | None, typer.Option(help="gpt, vae or diffusion; default: the first the run has.")
     ] = None,
@@ -161,7 +164,12 @@ def generate(
     """
     from motionloom.pipeline.runs.api import generate_motions
 
-    of_models = {"face_cfg_scale": face_cfg, "sampler": sampler, "denoising_steps": steps}
+    of_models = {
+        "face_cfg_scale": face_cfg,
+        "music_cfg_scale": music_cfg,
+        "sampler": sampler,
+        "denoising_steps": steps,
+    }
     generate_motions(
         run_folder,
         captions or [],

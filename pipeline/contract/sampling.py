@@ -18,6 +18,8 @@ class SamplingConfig(Config):
     top_p: float = Field(0.95, gt=0, le=1)
     cfg_scale: float = Field(1.0, ge=1)
     """Classifier-free guidance; 1 is off. Needs a model trained with `condition_dropout` > 0."""
+    music_cfg_scale: float | None = Field(None, ge=1)
+    """The same where there is music; None takes `cfg_scale`."""
     face_cfg_scale: float | None = Field(None, ge=1)
     """The same of the face's GPT or diffusion model; None takes `cfg_scale`."""
     face_model: str | None = None
@@ -26,6 +28,11 @@ class SamplingConfig(Config):
     """Sampler of diffusion models."""
     denoising_steps: int = Field(50, ge=1)
     """Steps of diffusion models, at most those of the training; the paper takes all 1000."""
+
+    @property
+    def music_guidance(self) -> float:
+        """Guidance where there is music."""
+        return self.cfg_scale if self.music_cfg_scale is None else self.music_cfg_scale
 
     @property
     def face_guidance(self) -> float:

@@ -16,7 +16,12 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
 
-_OPTIONS = {"face_cfg_scale": "--face-cfg", "sampler": "--sampler", "denoising_steps": "--steps"}
+_OPTIONS = {
+    "face_cfg_scale": "--face-cfg",
+    "music_cfg_scale": "--music-cfg",
+    "sampler": "--sampler",
+    "denoising_steps": "--steps",
+}
 """Settings that some generators take, and how the command line calls them."""
 
 

@@ -116,7 +116,10 @@ class TokenTimeline:
         """New codes that follow `before`."""
         count = len(seeds)
         encoded = self.net.mate(conditions, count)
-        guided = sampling.cfg_scale != 1
+        audio = conditions.get("audio")
+        music = [False] * count if audio is None else audio.mask.any(1).tolist()
+        scales = [sampling.music_guidance if heard else sampling.cfg_scale for heard in music]
+        guided = any(scale != 1 for scale in scales)
         return generate(
             self.net.utt,
             encoded,
@@ -130,7 +133,7 @@ class TokenTimeline:
             temperature=sampling.temperature,
             top_k=sampling.top_k or None,
             top_p=sampling.top_p,
-            cfg_scale=sampling.cfg_scale,
+            cfg_scale=scales,
             seed=list(seeds),
         )
 

@@ -150,8 +150,9 @@ class UdeGenerator:
     @property
     def settings(self) -> frozenset[str]:
         """How tokens are drawn and decoded."""
-        of_decoder = {"sampler", "denoising_steps"} if self.dmd is not None else set()
-        return frozenset({"temperature", "top_k", "top_p", "cfg_scale"} | of_decoder)
+        more = {"sampler", "denoising_steps"} if self.dmd is not None else set()
+        more |= {"music_cfg_scale"} if "audio" in self.modalities else set()
+        return frozenset({"temperature", "top_k", "top_p", "cfg_scale"} | more)
 
     @property
     def unit_frames(self) -> int:

@@ -192,6 +192,23 @@ def test_alone_equals_in_a_batch(utt: Utt, scale: float) -> None:
     assert any(row(other, i) != row(together, i) for i in range(6))
 
 
+def test_every_row_may_have_its_own_guidance(utt: Utt) -> None:
+    condition, seeds, scales = conditions(4, [5, 0, 2, 3]), sample_seeds(3, 4), [1.0, 3.0, 1.0, 1.5]
+    together = generate(utt, condition, null=null(4), seed=3, max_groups=8, cfg_scale=scales)
+    for index, scale in enumerate(scales):
+        alone = generate(
+            utt,
+            condition.rows(slice(index, index + 1)),
+            null=null(1),
+            seed=[seeds[index]],
+            max_groups=8,
+            cfg_scale=scale,
+        )
+        assert row(alone, 0) == row(together, index)
+    with pytest.raises(UserError, match="3 strengths of guidance were given for 4 conditions"):
+        generate(utt, condition, null=null(4), cfg_scale=scales[:3])
+
+
 def test_guidance_equals_the_slow_mix(utt: Utt) -> None:
     condition, seeds = conditions(1), sample_seeds(2, 1)
     out = generate(

@@ -240,10 +240,12 @@ def test_the_commands_options_reach_the_sampling(
     seen: dict[str, Any] = {}
     monkeypatch.setattr("motionloom.pipeline.runs.api.Bundle.open", lambda *_: _Watching(seen))
     words = ("--sampler", "dpm++", "--steps", "7", "--cfg", "3", "--face-cfg", "1.5", "--temperature", "0")
+    words += ("--music-cfg", "1.2")
     assert call("generate", "somewhere", "a person walks", *words, "-o", tmp_path, "-f", "npz").code == 0
     assert seen["sampling"] == SamplingConfig(
-        sampler="dpm++", denoising_steps=7, cfg_scale=3, face_cfg_scale=1.5, temperature=0
-    )
+        sampler="dpm++", denoising_steps=7, cfg_scale=3, face_cfg_scale=1.5, music_cfg_scale=1.2,
+        temperature=0,
+    )  # fmt: skip
     assert seen["strict"] and seen["sampling"].model_fields_set >= {"sampler", "denoising_steps"}
     assert call("generate", "somewhere", "a person walks", "-o", tmp_path, "-f", "npz").code == 0
     assert not seen["sampling"].model_fields_set & {"sampler", "denoising_steps", "face_cfg_scale"}

@@ -225,6 +225,17 @@ def slow(net: ConditionedUtt, stretches: list[Stretch], row: int, seed: int) -> 
     return groups
 
 
+def test_music_has_its_own_guidance(timeline: TokenTimeline, net: ConditionedUtt) -> None:
+    """Rows with music take it, rows of words alone do not."""
+    given = {**text(4), **music(4, [24, 0, 24, 0])}
+    frames, mean = [24] * 4, SamplingConfig(cfg_scale=3.0, music_cfg_scale=1.0)
+    made = timeline.tokens([Stretch(given, frames)], SEEDS, mean)
+    for sampling, rows in ((SamplingConfig(), (0, 2)), (SamplingConfig(cfg_scale=3.0), (1, 3))):
+        plain = timeline.tokens([Stretch(given, frames)], SEEDS, sampling)
+        for at in range(4):
+            assert (codes_of(made, at) == codes_of(plain, at)) == (at in rows)
+
+
 @pytest.fixture(scope="module")
 def show() -> list[Stretch]:
     """Text, music, both, text; four rows of different lengths."""
@@ -249,7 +260,14 @@ def test_a_show_equals_the_slow_version(
         assert found["hand"] == [group[2] for group in expected]
 
 
-@pytest.mark.parametrize("sampling", [SamplingConfig(), SamplingConfig(cfg_scale=1.7, top_k=4)])
+@pytest.mark.parametrize(
+    "sampling",
+    [
+        SamplingConfig(),
+        SamplingConfig(cfg_scale=1.7, top_k=4),
+        SamplingConfig(cfg_scale=1.7, music_cfg_scale=1.0),
+    ],
+)
 def test_batches_play_no_part(timeline: TokenTimeline, show: list[Stretch], sampling: SamplingConfig) -> None:
     """Neither the other rows nor their lengths; and the same seeds give the same tokens."""
     together, again = (timeline.tokens(show, SEEDS, sampling) for _ in range(2))
