@@ -2,7 +2,6 @@
 
     motionloom run ude-learning
     python benchmarks/ude_stations.py runs/ude-learning --utt utt prefix_7 gru_7
-    python benchmarks/ude_stations.py runs/ude-learning --tokenizer parts --utt parts_utt --no-dmd --no-dances
 
 Held-out clips as they are recorded; their true tokens decoded by the tokenizer and by DMD; tokens that each
 UTT makes for their music or caption, with and without z, decoded by both and drawn twice. Beat Align of
@@ -63,15 +62,15 @@ class Engine:
     ude: UdeConfig
 
     @staticmethod
-    def of(run: Path, utts: Sequence[str], tokenizer: str, dmd: str) -> Engine:
+    def of(run: Path, utts: Sequence[str]) -> Engine:
         stages, shelf = finished_stages(run), Shelf()
-        if tokenizer not in stages:
-            raise SystemExit(f"{run}: stage '{tokenizer}' has not finished; run it first")
+        if "tokenizer" not in stages:
+            raise SystemExit(f"{run}: stage 'tokenizer' has not finished; run it first")
         ude = stages["ude"].config if "ude" in stages else UdeConfig()
         return Engine(
-            shelf.get(stages[tokenizer]),
+            shelf.get(stages["tokenizer"]),
             {name: shelf.get(stages[name]) for name in utts if name in stages},
-            shelf.get(stages[dmd]) if dmd in stages else None,
+            shelf.get(stages["dmd"]) if "dmd" in stages else None,
             ude,
         )
 
@@ -211,11 +210,9 @@ def main() -> None:
     parser.add_argument("--out", default="stations.json")
     parser.add_argument("--no-dances", action="store_true", help="for models of words alone")
     parser.add_argument("--no-dmd", action="store_true", help="decode by the tokenizer alone")
-    parser.add_argument("--tokenizer", default="tokenizer", help="tokenizer stage")
-    parser.add_argument("--dmd", default="dmd", help="decoder stage")
     parser.add_argument("--utt", nargs="*", default=["utt"], help="UTT stages to compare")
     args = parser.parse_args()
-    console, engine = Console(width=220), Engine.of(args.run, args.utt, args.tokenizer, args.dmd)
+    console, engine = Console(width=220), Engine.of(args.run, args.utt)
     if args.no_dmd:
         engine.dmd = None
     stages, shelf = finished_stages(args.run), Shelf()
