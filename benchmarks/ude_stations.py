@@ -169,7 +169,7 @@ def caption_figures(
     apart: Sequence[Mapping[str, Any]],
 ) -> dict[str, float]:
     """Shares of right attributes, "every" all together, "whole" of clips with all right, and both of these of
-    held-out combinations; faces play no part."""
+    held-out combinations and of the other clips; faces play no part."""
     found: dict[str, list[bool]] = {}
     for truth, joints in zip(truths, motions, strict=True):
         right = agrees(dict(truth), joints, None, fps)
@@ -177,11 +177,9 @@ def caption_figures(
         for name, value in right.items():
             found.setdefault(name, []).append(value)
             found.setdefault("every", []).append(value)
-            if new:
-                found.setdefault("held out every", []).append(value)
+            found.setdefault(f"{'held out' if new else 'other'} every", []).append(value)
         found.setdefault("whole", []).append(all(right.values()))
-        if new:
-            found.setdefault("held out whole", []).append(all(right.values()))
+        found.setdefault(f"{'held out' if new else 'other'} whole", []).append(all(right.values()))
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 

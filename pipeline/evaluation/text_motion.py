@@ -61,7 +61,7 @@ def retrieval(
     among = min(among, 1 + int((~same).sum(1).min()))
     first = sorted({caption: row for row, caption in reversed(list(enumerate(words)))}.values())
     out = {"among": among, **_recalls(text, real, made, size, repeats, seed)}
-    if len(first) > 1:
+    if 1 < len(first) < len(words):
         out["different_captions"] = _recalls(
             text[first], real[first], [m[first] for m in made], size, repeats, seed
         )
