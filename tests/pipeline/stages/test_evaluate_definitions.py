@@ -105,7 +105,7 @@ def test_tma_reads_captions_by_its_own_encoder(models: ModuleType, tmp_path: Pat
     assert "multimodality" not in made, "one motion a caption has no variety"
     titles = {title: (columns, rows) for title, columns, rows in figure_rows(figures)}
     columns, rows = next(found for title, found in titles.items() if "as the papers count it" in title)
-    assert columns[1:4] == ["MPJPE all", "MPJPE body", "MPJPE hands"] and len(columns) == 10
+    assert columns[1:4] == ["MPJPE", "body", "hands"] and len(columns) == 10
     assert [row[0] for row in rows] == ["tokenizer", "nearest training clip", "mean pose"]
     columns, rows = next(found for title, found in titles.items() if "TMA-R-Precision" in title)
     assert [row[0] for row in rows] == [
