@@ -148,10 +148,10 @@ stages:
     max_frames: 64
     train: {steps: 12, batch_size: 8, checkpoint_every: 4, validate_every: 6}
   dmd:
-    net: {dim: 32, ff: 32, encoder_layers: 1, decoder_layers: 1, heads: 2}
+    net: {dim: 32, ff: 32, hide: 0.25, velocity_weight: 1.0, encoder_layers: 1, decoder_layers: 1, heads: 2}
     window: 64
     train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}
-  ude: {denoising_steps: 4}
+  ude: {denoising_steps: 4, bridge_frames: 16}
 """
 
 
