@@ -30,8 +30,6 @@ class Drawing:
     """Keep the k most likely tokens."""
     top_p: float = 1.0
     """Keep the smallest set of tokens with this mass."""
-    cfg_scale: float = 1.0
-    """Guidance; 1 is off."""
 
     def __post_init__(self) -> None:
         if self.temperature < 0:
@@ -45,18 +43,17 @@ class Drawing:
         """Tokens int64 [B] from logits [B, V] and uniform float64 [B]."""
         return draw(logits, uniform, temperature=self.temperature, top_k=self.top_k, top_p=self.top_p)
 
-    def guided(self, logits: Tensor, legal: Tensor, scale: Tensor | None = None) -> Tensor:
-        """[B, V] of the conditional and the unconditional half [2B, V]; -inf where not `legal` [B, V].
 
-        `scale` [B] is each row's guidance in place of one for all; a row of 1 is as without guidance, to the
-        bit.
-        """
-        on, off = logits.chunk(2)
-        if scale is None:
-            return torch.where(legal, off + self.cfg_scale * (on - off), -torch.inf)
-        strength = scale[:, None].to(logits.dtype)
-        mixed = torch.where(strength == 1, on, off + strength * (on - off))
-        return torch.where(legal, mixed, -torch.inf)
+def guide(logits: Tensor, legal: Tensor, scale: float | Tensor) -> Tensor:
+    """Guided logits [B, V] of the conditional and the unconditional half [2B, V]; -inf where not `legal`
+    [B, V].
+
+    `scale` is one strength for all rows or one each [B]; a row of 1 is as without guidance, to the bit.
+    """
+    on, off = logits.chunk(2)
+    strength = torch.as_tensor(scale, dtype=logits.dtype, device=logits.device).reshape(-1, 1)
+    mixed = torch.where(strength == 1, on, off + strength * (on - off))
+    return torch.where(legal, mixed, -torch.inf)
 
 
 def sample_seeds(seed: int, count: int) -> list[int]:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.drawing import Drawing, as_codes, seeds_of, uniform_numbers
+from motionloom.models.gpt.drawing import Drawing, as_codes, guide, seeds_of, uniform_numbers
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes
 
@@ -56,7 +56,7 @@ def generate(
     """
     batch, device = len(text), text.device
     limit = _limits(gpt, batch, max_groups, groups, device)
-    how = Drawing(temperature, top_k, top_p, cfg_scale)
+    how = Drawing(temperature, top_k, top_p)
     if cfg_scale != 1 and gpt.config.condition_dropout == 0:
         raise UserError(
             "guidance needs a GPT trained with condition_dropout > 0; set cfg_scale to 1, for the face's GPT "
@@ -67,18 +67,24 @@ def generate(
     was_training = gpt.training
     gpt.eval()
     try:
-        tokens, counts = _decode(gpt, text, limit, uniform, groups is None, how)
+        tokens, counts = _decode(gpt, text, limit, uniform, groups is None, how, cfg_scale)
     finally:
         gpt.train(was_training)
     return as_codes(gpt, tokens.view(batch, most, size), counts)
 
 
 def _decode(
-    gpt: InterleavedGPT, text: Tensor, limit: Tensor, uniform: Tensor, free: bool, how: Drawing
+    gpt: InterleavedGPT,
+    text: Tensor,
+    limit: Tensor,
+    uniform: Tensor,
+    free: bool,
+    how: Drawing,
+    cfg_scale: float,
 ) -> tuple[Tensor, Tensor]:
     """Tokens int64 [B, G * P] and group counts int64 [B]; `limit` [B] is where each sample must stop."""
     batch, size, device = len(text), len(gpt.pattern), text.device
-    guided = how.cfg_scale != 1
+    guided = cfg_scale != 1
     x = gpt.embed_text(text)
     if guided:
         x = torch.cat([x, gpt.embed_text(text, torch.ones(batch, dtype=torch.bool, device=device))])
@@ -101,7 +107,7 @@ def _decode(
         rows = legal.repeat(2, 1) if guided else legal
         logits = gpt.logits(hidden, kinds, rows[:, None])[:, 0]
         if guided:
-            logits = how.guided(logits, legal)
+            logits = guide(logits, legal, cfg_scale)
         token = how(logits, uniform[:, step])
         if slot == 0:
             alive = alive & (token != gpt.ends[gpt.slots[0]])

@@ -22,7 +22,7 @@ from torch.nn.functional import pad
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.drawing import Drawing, as_codes, seeds_of, uniform_numbers
+from motionloom.models.gpt.drawing import Drawing, as_codes, guide, seeds_of, uniform_numbers
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.utt.backbone import State
 from motionloom.models.utt.continuing import last_groups, window_start
@@ -163,8 +163,8 @@ def _decode(
         legal = utt.legal_at(utt.ends[utt.slots[slot]].expand(batch), may_end, no)
         rows = legal.repeat(2, 1) if guided else legal
         logits = utt.logits(hidden, utt.slots[slot].expand(len(rows), 1), rows[:, None])[:, 0]
-        if guided:
-            logits = how.guided(logits, legal, scale)
+        if scale is not None:
+            logits = guide(logits, legal, scale)
         index = (step - before * size).clamp(0, uniform.shape[1] - 1)
         token = how(logits, uniform.gather(1, index[:, None])[:, 0])
         if slot == 0:
