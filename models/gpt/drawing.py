@@ -44,14 +44,14 @@ class Drawing:
         return draw(logits, uniform, temperature=self.temperature, top_k=self.top_k, top_p=self.top_p)
 
 
-def guide(logits: Tensor, legal: Tensor, scale: float | Tensor) -> Tensor:
+def guide(logits: Tensor, legal: Tensor, scale: Tensor) -> Tensor:
     """Guided logits [B, V] of the conditional and the unconditional half [2B, V]; -inf where not `legal`
     [B, V].
 
-    `scale` is one strength for all rows or one each [B]; a row of 1 is as without guidance, to the bit.
+    `scale` is each row's strength [B]; a row of 1 is as without guidance, to the bit.
     """
     on, off = logits.chunk(2)
-    strength = torch.as_tensor(scale, dtype=logits.dtype, device=logits.device).reshape(-1, 1)
+    strength = scale.to(logits.dtype)[:, None]
     mixed = torch.where(strength == 1, on, off + strength * (on - off))
     return torch.where(legal, mixed, -torch.inf)
 

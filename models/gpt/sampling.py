@@ -85,6 +85,7 @@ def _decode(
     """Tokens int64 [B, G * P] and group counts int64 [B]; `limit` [B] is where each sample must stop."""
     batch, size, device = len(text), len(gpt.pattern), text.device
     guided = cfg_scale != 1
+    scale = torch.full((batch,), cfg_scale, device=device)
     x = gpt.embed_text(text)
     if guided:
         x = torch.cat([x, gpt.embed_text(text, torch.ones(batch, dtype=torch.bool, device=device))])
@@ -107,7 +108,7 @@ def _decode(
         rows = legal.repeat(2, 1) if guided else legal
         logits = gpt.logits(hidden, kinds, rows[:, None])[:, 0]
         if guided:
-            logits = guide(logits, legal, cfg_scale)
+            logits = guide(logits, legal, scale)
         token = how(logits, uniform[:, step])
         if slot == 0:
             alive = alive & (token != gpt.ends[gpt.slots[0]])
