@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from motionloom.pipeline.contract.registry import register
+from motionloom.pipeline.stages.aligned_text import AlignedTextStage
 from motionloom.pipeline.stages.audio import AudioStage
 from motionloom.pipeline.stages.convert import CONVERTED, ConvertStage, run_convert
 from motionloom.pipeline.stages.data import (
@@ -35,6 +36,7 @@ register(ShardsStage("shards", "existing shards", ShardsStageConfig, run_shards)
 register(MixStage())
 register(StatsStage())
 register(TextStage())
+register(AlignedTextStage())
 register(AudioStage())
 for name, summary, config in TOKENIZERS:
     register(TokenizerStage(name, summary, config))
