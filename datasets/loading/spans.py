@@ -15,6 +15,8 @@ class CaptionSpan(NamedTuple):
     first: int
     end: int
     """The frame behind the last."""
+    tokens: tuple[str, ...] = ()
+    """Its `word/POS` tags, where the source brings them."""
 
     @property
     def frames(self) -> int:
@@ -36,6 +38,9 @@ def caption_spans(
 
     When none does, the one that covers most: a clip with a caption always gives one.
     """
-    spans = [CaptionSpan(caption.text, *frame_span(caption, fps, frames)) for caption in captions]
+    spans = [
+        CaptionSpan(caption.text, *frame_span(caption, fps, frames), tuple(caption.tokens or ()))
+        for caption in captions
+    ]
     long = [span for span in spans if span.frames >= min_frames]
     return long or ([max(spans, key=lambda span: span.frames)] if spans else [])

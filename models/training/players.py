@@ -39,10 +39,13 @@ class Player:
     """Steps from one turn to the next."""
     start_step: int = 0
     """First step with a turn; its warm-up and schedule begin there."""
+    end_step: int | None = None
+    """First step without a turn any more; its schedule ends there (None = with the training)."""
 
     def plays(self, step: int) -> bool:
         """Whether it has a turn in this step."""
-        return step >= self.start_step and (step - self.start_step) % self.every == 0
+        over = self.end_step is not None and step >= self.end_step
+        return not over and step >= self.start_step and (step - self.start_step) % self.every == 0
 
     def params(self) -> list[nn.Parameter]:
         """What it trains."""
@@ -154,7 +157,8 @@ class PlayersModule(StageModule):
         if all(param.grad is None for param in params):
             return False
         step = self.global_step - player.start_step
-        rate = player.optim.lr * player.optim.factor(step, self.max_steps - player.start_step)
+        end = self.max_steps if player.end_step is None else player.end_step
+        rate = player.optim.lr * player.optim.factor(step, end - player.start_step)
         for group in optimizer.param_groups:
             group["lr"] = rate
         if scaler is not None:

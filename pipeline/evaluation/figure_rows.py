@@ -35,23 +35,9 @@ def figure_rows(figures: dict[str, Any]) -> list[Rows]:
             columns = ["", "top-1", "top-5"]
             out.append((f"Own caption among {found['among']}, by TMA", columns, [guess, *tops]))
     if figures.get("distribution", {}).get("rows"):
-        found = figures["distribution"]
-        keys = ("fid", "fid_unit", "diversity", "multimodality")
-        titles = {
-            "recorded": "recorded motion",
-            "training": f"{found['training_clips']} training clips",
-            "generated": "generated motion",
-            "mean_pose": "mean pose, still",
-        }
-        rows = [
-            [
-                title,
-                *(_interval(found["rows"][name][key]) if key in found["rows"][name] else "" for key in keys),
-            ]
-            for name, title in titles.items()
-        ]
-        columns = ["", "FID", "FID, length 1", "Diversity", "MModality"]
-        out.append((f"TMA's latents: FID to {found['clips']} recorded motions", columns, rows))
+        out.append(_distribution_rows(figures["distribution"], "TMA's latents"))
+    if "by_evaluator" in figures:
+        out += _evaluator_rows(figures["by_evaluator"])
     if "agreement_with_caption" in figures:
         found = figures["agreement_with_caption"]
         names = sorted({*found["truth"], *found["generated"]})
@@ -80,6 +66,40 @@ def _retrieval_rows(found: dict[str, Any]) -> Rows:
         columns,
         rows,
     )
+
+
+def _distribution_rows(found: dict[str, Any], whose: str) -> Rows:
+    keys = ("fid", "fid_unit", "diversity", "multimodality")
+    titles = {
+        "recorded": "recorded motion",
+        "training": f"{found['training_clips']} training clips",
+        "generated": "generated motion",
+        "mean_pose": "mean pose, still",
+    }
+    rows = [
+        [
+            title,
+            *(_interval(found["rows"][name][key]) if key in found["rows"][name] else "" for key in keys),
+        ]
+        for name, title in titles.items()
+    ]
+    columns = ["", "FID", "FID, length 1", "Diversity", "MModality"]
+    return f"{whose}: FID to {found['clips']} recorded motions", columns, rows
+
+
+def _evaluator_rows(figures: dict[str, Any]) -> list[Rows]:
+    found = figures["matching"]
+    keys = ("top-1", "top-2", "top-3", "matching_score")
+    rows = [["chance", *(f"{found['chance'][key]:.3f}" for key in keys[:3]), ""]]
+    for name, title in (
+        ("real", "real motion"), ("generated", "generated motion"), ("mean_pose", "mean pose, still"),
+    ):  # fmt: skip
+        rows.append([title, *(_interval(found[name][key]) for key in keys)])
+    title = f"R-Precision among {found['size']} by the evaluator, {found['clips']} clips as they are drawn"
+    out: list[Rows] = [(title, ["", "top-1", "top-2", "top-3", "Matching score"], rows)]
+    if figures["distribution"]["rows"]:
+        out.append(_distribution_rows(figures["distribution"], "The evaluator's latents"))
+    return out
 
 
 def _reconstruction_rows(figures: dict[str, Any]) -> list[Rows]:

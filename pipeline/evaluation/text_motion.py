@@ -1,4 +1,4 @@
-"""What TMA's latents say of motions that were made for captions: retrieval, distribution, variety.
+"""What a judge's latents say of motions that were made for captions: retrieval, distribution, variety.
 
 Definitions and whose they are: docs/evaluation.md. Legend: n clips, Z latent width.
 """
@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from motionloom.models.metrics.dance_choice import accuracy_among
 from motionloom.models.metrics.diversity import diversity, multimodality
 from motionloom.models.metrics.frechet import fid
-from motionloom.models.metrics.retrieval import matching_score
+from motionloom.models.metrics.retrieval import matching_score, r_precision
 from motionloom.pipeline.evaluation.figures import Interval, chance, retrieval_figures
 
 PAIRS = 10
@@ -70,6 +70,41 @@ def retrieval(
             rows = [accuracy_among(m, text, candidates=among, same=same, seed=seed) for m in motions]
             out[name] |= {key: Interval.of([row[key] for row in rows]) for key in rows[0]}
     return out
+
+
+def matching(latents: Latents, *, size: int, repeats: int, seed: int) -> dict[str, Any]:
+    """R-Precision top-1, 2 and 3 among `size` and the Matching score as Guo et al. define them: Euclidean
+    distances of the latents as they are, in batches of clips as they are drawn.
+
+    Of real motion, of generated one, and of the mean pose.
+
+    Args:
+        latents: Of the clips.
+        size: Captions and motions of a batch.
+        repeats: Draws of batches for what is there once; each repeat of generation has one.
+        seed: Of the draws.
+    """
+    text, size = latents.text, min(size, len(latents.text))
+
+    def row(motions: Sequence[Tensor]) -> dict[str, Interval]:
+        found: dict[str, list[float]] = {}
+        for number, motion in enumerate(motions):
+            precision = r_precision(text, motion, batch=size, seed=seed + number).tolist()
+            score = matching_score(text, motion, batch=size, seed=seed + number)
+            once = {f"top-{k}": share for k, share in enumerate(precision, start=1)}
+            for name, value in {**once, "matching_score": float(score)}.items():
+                found.setdefault(name, []).append(value)
+        return {name: Interval.of(values) for name, values in found.items()}
+
+    draws = max(repeats, 5)
+    return {
+        "clips": len(text),
+        "size": size,
+        "chance": {f"top-{k}": min(1.0, chance(k, size)) for k in (1, 2, 3)},
+        "real": row([latents.real] * draws),
+        "generated": row(latents.made),
+        "mean_pose": row([latents.still] * draws),
+    }
 
 
 def distribution(latents: Latents, *, seed: int) -> dict[str, Any]:

@@ -31,6 +31,8 @@ class Truth:
     face_caption: str
     truth: dict | None
     present: int = PRESENT_ALL
+    tokens: tuple[str, ...] = ()
+    """`word/POS` tags of the caption, where the source brings them."""
 
 
 def truth_of(
@@ -72,6 +74,7 @@ def _truth(
         face_caption=max(faces, key=lambda face: _overlap(face, span)).text if faces else span.text,
         truth=truth,
         present=present,
+        tokens=span.tokens,
     )
 
 

@@ -6,8 +6,8 @@ import json
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import numpy as np
 from pydantic import Field
+from torch import Tensor
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
@@ -24,17 +24,16 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
 )
 from motionloom.pipeline.evaluation.figure_rows import figure_rows
-from motionloom.pipeline.evaluation.figures import (
-    embed_motions,
-    truth_agreement,
-)
+from motionloom.pipeline.evaluation.figures import truth_agreement
+from motionloom.pipeline.evaluation.judges import judged, texts_by_evaluator, texts_by_tma
 from motionloom.pipeline.evaluation.reconstruction import face_figures, reconstruction_figures
 from motionloom.pipeline.evaluation.tables import plain, print_tables
-from motionloom.pipeline.evaluation.text_motion import Latents, distribution, retrieval
+from motionloom.pipeline.evaluation.text_motion import distribution, matching, retrieval
 from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.stages.progress import bar
+from motionloom.pipeline.store.evaluator import LoadedEvaluator
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.networks import LoadedTma, TrainedTokenizer
 
@@ -64,7 +63,10 @@ class EvaluateStage(StageKind):
     name = "evaluate"
     summary = "figures on the test split"
     config = EvaluateConfig
-    takes = ("data", "tokenizer?", "face_tokenizer?: tokenizer", "tma?", Every("generators", GENERATOR))
+    takes = (
+        "data", "tokenizer?", "face_tokenizer?: tokenizer", "tma?", "evaluator?",
+        Every("generators", GENERATOR),
+    )  # fmt: skip
     version = 5  # the papers' definitions, clips drawn as they come; TMA reads captions by its own encoder
 
     def gives(self, config: Any) -> frozenset[str]:
@@ -90,9 +92,12 @@ class _Evaluation:
         self.context, self.config = context, context.config
         self.tokenizer: TrainedTokenizer | None = context.given.get("tokenizer")
         self.tma: LoadedTma | None = context.given.get("tma")
+        self.evaluator: LoadedEvaluator | None = context.given.get("evaluator")
         makers = context.every("generators")
         self.bundle = bundle_driven_by("text", makers, context.shelf) or Bundle(makers, context.shelf)
         self.dataset = context.given["data"].held_out(prefer="test")
+        if self.evaluator is not None:
+            self.evaluator.require_layout(self.dataset.layout, context.inputs["evaluator"].name)
 
     def figures(self) -> dict[str, Any]:
         """All figures, each beside its trivial answer."""
@@ -121,9 +126,10 @@ class _Evaluation:
         if not truths or "text" not in self.bundle.generator.modalities:
             return figures
         figures["protocol"] = self.protocol()
+        # Captions first: what a judge cannot read is refused before anything is generated.
+        texts = self.texts(truths)
         generated = self.generate(truths)
-        if self.tma is not None:
-            figures |= self.by_tma(self.tma, truths, generated)
+        figures |= self.by_judges(texts, truths, generated)
         if any(t.truth for t in truths):
             figures["agreement_with_caption"] = self.agreement(truths, generated)
         return figures
@@ -143,6 +149,10 @@ class _Evaluation:
         if self.tma is not None:
             weights = sha256_of(context.input("tma") / "model.safetensors")
             facts["evaluator"] = {"stage": context.inputs["tma"].name, "sha256": weights}
+        if self.evaluator is not None:
+            stage, weights = context.inputs["evaluator"], context.input("evaluator") / "model.safetensors"
+            named = {"stage": stage.name, "kind": stage.kind.name, "sha256": sha256_of(weights)}
+            facts["by_evaluator"] = named | self.evaluator.facts
         return facts
 
     def faces(self, truths: list[Truth]) -> dict[str, Any]:
@@ -179,28 +189,34 @@ class _Evaluation:
                 out.append(motions)
         return out
 
-    def by_tma(
-        self, tma: LoadedTma, truths: list[Truth], generated: list[list[GeneratedMotion]]
-    ) -> dict[str, Any]:
-        """Retrieval and distribution by TMA's latents, beside as many training clips and the mean pose."""
-        config, seed = self.config, self.context.seed
-        train = self.context.given["data"].split("train")
-        others = [truth_of(train, i) for i in spread_any(train, len(truths))]
-        mean = tma.stats.mean[tma.layout.part(tma.part)].astype("float32")
-        latents = Latents(
-            text=tma.embed_captions([t.caption for t in truths], tma.given["text"].cache),
-            real=embed_motions(tma, [t.features for t in truths], [t.present for t in truths]),
-            made=[embed_motions(tma, [g.features for g in motions]) for motions in generated],
-            others=embed_motions(tma, [t.features for t in others], [t.present for t in others]),
-            still=embed_motions(tma, [np.tile(mean, (len(t.features), 1)) for t in truths]),
+    def texts(self, truths: list[Truth]) -> dict[str, Tensor]:
+        """The judges' latents of the captions, by role."""
+        tma = {} if self.tma is None else {"tma": texts_by_tma(self.tma, truths)}
+        return (
+            tma if self.evaluator is None else tma | {"evaluator": texts_by_evaluator(self.evaluator, truths)}
         )
-        words = [t.caption for t in truths]
-        return {
-            "retrieval": retrieval(
-                latents, words, size=config.size, among=config.among, repeats=config.repeats, seed=seed
-            ),
-            "distribution": distribution(latents, seed=seed),
-        }
+
+    def by_judges(
+        self, texts: dict[str, Tensor], truths: list[Truth], generated: list[list[GeneratedMotion]]
+    ) -> dict[str, Any]:
+        """Figures by the latents of both judges, beside as many training clips and the mean pose."""
+        config, seed, out = self.config, self.context.seed, dict[str, Any]()
+        train = self.context.given["data"].split("train") if texts else None
+        others = [] if train is None else [truth_of(train, i) for i in spread_any(train, len(truths))]
+        if self.tma is not None:
+            latents = judged(self.tma, texts["tma"], truths, generated, others)
+            words, repeats = [t.caption for t in truths], config.repeats
+            out["retrieval"] = retrieval(
+                latents, words, size=config.size, among=config.among, repeats=repeats, seed=seed
+            )
+            out["distribution"] = distribution(latents, seed=seed)
+        if self.evaluator is not None:
+            latents = judged(self.evaluator, texts["evaluator"], truths, generated, others)
+            out["by_evaluator"] = {
+                "matching": matching(latents, size=config.size, repeats=config.repeats, seed=seed),
+                "distribution": distribution(latents, seed=seed),
+            }
+        return out
 
     def agreement(self, truths: list[Truth], generated: list[list[GeneratedMotion]]) -> dict[str, Any]:
         """Whether motions do what their captions say, by their joints."""

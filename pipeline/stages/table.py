@@ -18,8 +18,10 @@ from motionloom.pipeline.stages.diffusion import DiffusionStage
 from motionloom.pipeline.stages.dmd import DmdStage
 from motionloom.pipeline.stages.evaluate import EvaluateStage
 from motionloom.pipeline.stages.evaluate_dances import EvaluateDancesStage
+from motionloom.pipeline.stages.evaluator import EvaluatorStage
 from motionloom.pipeline.stages.generate import GenerateStage
 from motionloom.pipeline.stages.gpt import GptStage
+from motionloom.pipeline.stages.guo_evaluator import GuoEvaluatorStage
 from motionloom.pipeline.stages.mix import MixStage
 from motionloom.pipeline.stages.prepare import StatsStage, TextStage
 from motionloom.pipeline.stages.report import ReportStage
@@ -42,6 +44,8 @@ for name, summary, config in TOKENIZERS:
     register(TokenizerStage(name, summary, config))
 register(TmaStage())
 register(DiffusionStage())
+register(EvaluatorStage())
+register(GuoEvaluatorStage())
 register(TokensStage())
 register(GptStage())
 register(UttStage())

@@ -1,0 +1,72 @@
+"""Training of the evaluator (Guo et al., CVPR 2022): movements by an autoencoder, then the pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor
+
+from motionloom.models.evaluator.losses import EvaluatorLossConfig, matching_loss, movement_loss
+from motionloom.models.evaluator.network import UNIT, Evaluator
+from motionloom.models.training.optim import OptimConfig
+from motionloom.models.training.players import Player, PlayersModule
+
+MOVEMENT, MATCHING = "movement", "matching"
+"""The players, in the order in which they are trained."""
+
+
+class EvaluatorModule(PlayersModule):
+    """Trains an `Evaluator` on the batches of `CaptionBatches`.
+
+    For the first `movement_steps` the movement encoder is trained with a decoder that no latent needs, from
+    then on the two GRUs on units that stay as they are.
+    """
+
+    net: Evaluator
+
+    def __init__(
+        self,
+        net: Evaluator,
+        optim: OptimConfig,
+        *,
+        seed: int,
+        max_steps: int,
+        movement_optim: OptimConfig,
+        movement_steps: int,
+        loss: EvaluatorLossConfig | None = None,
+    ) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.decoder = net.decoder()
+        self.movement_optim, self.movement_steps = movement_optim, movement_steps
+        self.loss_config = loss or EvaluatorLossConfig()
+
+    def players(self) -> Sequence[Player]:
+        """One behind the other, not in turn."""
+        net = self.net
+        texts = (
+            (net.text_encoder,) if net.class_embedding is None else (net.text_encoder, net.class_embedding)
+        )
+        return (
+            Player(
+                MOVEMENT,
+                (net.movement_encoder, self.decoder),
+                self.movement_optim,
+                end_step=self.movement_steps,
+            ),
+            Player(MATCHING, (net.motion_encoder, *texts), self.optim_config, start_step=self.movement_steps),
+        )
+
+    def play(self, player: str, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Losses of a batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
+        [B, D] (optional: all).
+        """
+        net, motion, length, present = self.net, batch["motion"], batch["length"], batch.get("present")
+        if player == MATCHING:
+            words = batch["conditions"]["text"]
+            latents = net.encode_text(words.features, words.mask), net.encode_motion(motion, length, present)
+            return matching_loss(*latents, margin=self.loss_config.margin)
+        target, count = net.whole_units(motion, length, present)
+        target = target[:, : target.shape[1] // UNIT * UNIT]
+        units = net.movement_encoder(target[..., net.read], dropout=True)
+        return movement_loss(self.decoder(units), target, units, count, present, config=self.loss_config)

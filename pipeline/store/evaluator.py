@@ -1,0 +1,118 @@
+"""A trained evaluator as later stages use it: its motions' statistics, and what reads its captions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.text.cache import key_of
+from motionloom.models.evaluator.network import PART, Evaluator
+from motionloom.pipeline.store.networks import device_of
+from motionloom.pipeline.store.text import TextSource
+
+_BATCH = 256
+
+
+class Words(NamedTuple):
+    """Captions as a text encoder takes them."""
+
+    features: Tensor
+    """[n, S, E]"""
+    mask: Tensor
+    """bool [n, S]"""
+    classes: Tensor | None = None
+    """One-hot [n, S, G], of words that come with classes."""
+
+
+class CaptionReader(Protocol):
+    """What turns captions into the words that an evaluator was trained on."""
+
+    def read(self, captions: Sequence[str], tokens: Sequence[Sequence[str]]) -> Words:
+        """`tokens`: the `word/POS` tags of each caption, empty where there are none."""
+        ...
+
+
+@dataclass(frozen=True)
+class StageWords:
+    """Token features of a run's text stage: of the one that the evaluator was trained with, and no other."""
+
+    text: TextSource
+    encoder: str
+    """Name of the encoder that it was trained with."""
+    where: str
+    """The evaluator's file, for messages."""
+
+    def read(self, captions: Sequence[str], tokens: Sequence[Sequence[str]]) -> Words:
+        """See `CaptionReader`; tags play no part."""
+        cache = self.text.cache
+        if cache.encoder != self.encoder:
+            raise UserError(
+                f"{self.where}: this evaluator was trained on captions as {self.encoder} encodes them and is "
+                f"given those of {cache.encoder}; give it its own text stage, or train it again"
+            )
+        unknown = [caption for caption in captions if cache.row(key_of(caption)) is None]
+        if unknown:
+            raise UserError(
+                f"{cache.folder}: {len(unknown)} of the {len(captions)} captions to be judged are not here, "
+                f"such as '{unknown[0][:80]}'; train the evaluator on the data that it shall judge"
+            )
+        features, mask = cache.tokens(captions)
+        return Words(torch.as_tensor(features), torch.as_tensor(mask))
+
+
+@dataclass(frozen=True)
+class LoadedEvaluator:
+    """An evaluator with what it reads by. Its methods take tensors of any device."""
+
+    net: Evaluator
+    layout: MotionLayout
+    stats: FeatureStats
+    """Mean and deviation of its motion."""
+    words: CaptionReader
+    facts: dict[str, Any] = field(default_factory=dict)
+    """What else has to be known of its figures, for the protocol of an evaluation."""
+    part: Part = PART
+
+    @property
+    def max_frames(self) -> int:
+        """Longer motions are cut to this."""
+        return self.net.max_frames
+
+    def require_layout(self, layout: MotionLayout, stage: str) -> None:
+        """Refuse to judge motions of another layout than it was trained on; `stage` is its name."""
+        if layout != self.layout:
+            raise UserError(
+                f"evaluator '{stage}' judges {_said(self.layout)}, and the data are {_said(layout)}; train "
+                f"one on these data, or leave it out (inputs: {{evaluator: null}})"
+            )
+
+    @torch.no_grad()
+    def embed_motion(self, motion: Tensor, length: Tensor, present: Tensor | None = None) -> Tensor:
+        """Latents [B, Z] of normalised features [B, T, D], the columns of `part`; length int64 [B]; `present`
+        bool [B, D]: those that each motion holds (None = all).
+        """
+        device = device_of(self.net)
+        near = None if present is None else present.to(device)
+        return self.net.encode_motion(motion.to(device), length.to(device), near)
+
+    @torch.no_grad()
+    def embed_captions(self, captions: Sequence[str], tokens: Sequence[Sequence[str]]) -> Tensor:
+        """Latents [n, Z] of captions, and their `word/POS` tags as in `CaptionReader`, on the CPU."""
+        device, out = device_of(self.net), []
+        for start in range(0, len(captions), _BATCH):
+            rows = slice(start, start + _BATCH)
+            words = self.words.read(captions[rows], tokens[rows])
+            near = [None if value is None else value.to(device) for value in words]
+            out.append(self.net.encode_text(*near).cpu())  # type: ignore[arg-type]
+        return torch.cat(out)
+
+
+def _said(layout: MotionLayout) -> str:
+    return f"{layout.name} at {layout.fps:g} fps (family {layout.family})"
