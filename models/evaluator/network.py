@@ -212,7 +212,8 @@ class Evaluator(nn.Module):
         if self.class_embedding is not None:
             if classes is None:
                 raise ValueError(f"this evaluator reads words with their classes, {self.classes} of them")
-            words = words + self.class_embedding(classes)
+            kind = self.class_embedding.weight.dtype
+            words = words.to(kind) + self.class_embedding(classes.to(kind))
         latent: Tensor = self.text_encoder(words, mask.sum(1))
         return latent
 

@@ -72,6 +72,8 @@ def test_steps_are_counted_once(tmp_path: Path) -> None:
 def test_turns() -> None:
     player = Player("critic", (nn.Linear(2, 2),), OptimConfig(), every=3, start_step=5)
     assert [step for step in range(15) if player.plays(step)] == [5, 8, 11, 14]
+    over = Player("critic", (nn.Linear(2, 2),), OptimConfig(), every=3, start_step=5, end_step=11)
+    assert [step for step in range(15) if over.plays(step)] == [5, 8]
 
 
 def test_a_parameter_of_two_players_is_refused() -> None:

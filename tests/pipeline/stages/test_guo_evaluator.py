@@ -1,0 +1,322 @@
+"""The published evaluator: what `docs/guo_evaluator.py` makes of a release is read back, judges as the
+published definition says, written out slowly, and every fault of the folder is one sentence.
+
+The release here is made up: weights by chance in the published shapes, a small vocabulary.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from shard_samples import facts
+from slow_evaluator import SHAPES, slow_motion, slow_text
+
+from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.motion.h3d import encode_h3d
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.shards.options import WriteOptions
+from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.shards.writer import write_dataset
+from motionloom.pipeline.evaluation.figures import embed_motions
+from motionloom.pipeline.store.published_evaluator import load_published
+
+SCRIPT = Path(__file__).parents[3] / "docs" / "guo_evaluator.py"
+LAYOUT = MotionLayout.named("h3d263")
+WORDS = ["the", "unk", "person", "eos", "walk", "left", "sos", "hop"]
+CLASSES = [
+    "VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV", "Loc_VIP", "Body_VIP", "Obj_VIP",
+    "Act_VIP", "Desc_VIP", "OTHER",
+]  # fmt: skip
+MODULE = f"""
+import os
+
+POS_enumerator = {{{", ".join(f"'{name}': {row}" for row, name in enumerate(CLASSES))}}}
+PLACES = ('left', 'up')
+ACTS = ('walk', 'left')
+VIP_dict = {{'Loc_VIP': PLACES, 'Act_VIP': ACTS}}
+raise RuntimeError("this is never run")
+"""
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the authors' repository, with weights."""
+    root = tmp_path_factory.mktemp("release")
+    generator = torch.Generator().manual_seed(0)
+    checkpoint: dict[str, Any] = {"epoch": 3, "iter": 4, "opt_text_encoder": {"state": {}}}
+    for name, shape in SHAPES.items():
+        encoder, _, rest = name.partition(".")
+        spread = shape[-1] ** -0.5 if len(shape) > 1 else 0.3
+        checkpoint.setdefault(encoder, {})[rest] = torch.randn(shape, generator=generator) * spread
+    path = root / "checkpoints/t2m/text_mot_match/model/finest.tar"
+    path.parent.mkdir(parents=True)
+    torch.save(checkpoint, path)
+    meta = root / "checkpoints/t2m/Comp_v6_KLD01/meta"
+    meta.mkdir(parents=True)
+    random = np.random.default_rng(0)
+    np.save(meta / "mean.npy", random.normal(size=263))
+    np.save(meta / "std.npy", random.uniform(0.5, 2, size=263))
+    (root / "glove").mkdir()
+    np.save(root / "glove/our_vab_data.npy", random.normal(size=(len(WORDS), 300)))
+    order = random.permutation(len(WORDS)).tolist()
+    (root / "glove/our_vab_words.pkl").write_bytes(pickle.dumps(WORDS))
+    (root / "glove/our_vab_idx.pkl").write_bytes(pickle.dumps(dict(zip(WORDS, order, strict=True))))
+    (root / "utils").mkdir()
+    (root / "utils/word_vectorizer.py").write_text(MODULE)
+    return root
+
+
+def convert(release: Path, out: Path) -> subprocess.CompletedProcess[str]:
+    words = [sys.executable, "-P", str(SCRIPT), str(release), str(out)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.fixture(scope="module")
+def folder(release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the script makes of it."""
+    out = tmp_path_factory.mktemp("made") / "evaluator"
+    done = convert(release, out)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def published(release: Path) -> dict[str, torch.Tensor]:
+    """Weights by their published names, float64."""
+    path = release / "checkpoints/t2m/text_mot_match/model/finest.tar"
+    checkpoint = torch.load(path, weights_only=True)
+    encoders = ("movement_encoder", "motion_encoder", "text_encoder")
+    return {f"{e}.{name}": value.double() for e in encoders for name, value in checkpoint[e].items()}
+
+
+def test_latents_are_those_of_the_published_definition(release: Path, folder: Path) -> None:
+    """Float64 to 1e-5: motions of many lengths in one batch, the longest without a frame behind it."""
+    weights = published(release)
+    assert {name: tuple(value.shape) for name, value in weights.items()} == SHAPES
+    judge = load_published(folder)
+    judge.net.double()
+    lengths = [196, 41, 64, 7, 195]
+    random = np.random.default_rng(1)
+    motions = [random.normal(size=(frames, 263)) for frames in lengths]
+    meta = release / "checkpoints/t2m/Comp_v6_KLD01/meta"
+    mean, std = (np.load(meta / f"{name}.npy").astype(np.float32) for name in ("mean", "std"))
+    batch = torch.zeros(len(lengths), 196, 263, dtype=torch.float64)
+    for row, motion in enumerate(motions):
+        batch[row, : len(motion)] = torch.from_numpy((motion - mean) / std)
+    found = judge.embed_motion(batch, torch.tensor(lengths))
+    for row, motion in enumerate(motions):
+        expected = slow_motion(weights, torch.from_numpy((motion - mean) / std))
+        torch.testing.assert_close(found[row], expected, rtol=1e-5, atol=1e-5)
+    assert found.std() > 0.1, "latents that say something"
+    # As an evaluation embeds them, float32 in and cut to 196 frames.
+    whole = embed_motions(
+        load_published(folder), [m.astype(np.float32) for m in [*motions, np.concatenate([motions[0]] * 2)]]
+    )
+    torch.testing.assert_close(whole[:5].double(), found, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(whole[5], whole[0])
+
+
+def test_captions_are_read_as_published(release: Path, folder: Path) -> None:
+    """Marks at both ends, 20 words, lists before tags, unknown words and tags."""
+    judge, weights = load_published(folder), published(release)
+    judge.net.double()
+    captions = {
+        "the person walks": ["the/DET", "person/NOUN", "walk/VERB"],
+        "left of the hop": ["left/ADJ", "hop/SPACE", "quokka/NOUN"],
+        "the " * 30: ["the/DET"] * 30,
+    }
+    vectors = torch.from_numpy(np.load(release / "glove/our_vab_data.npy")).float().double()
+    rows = pickle.loads((release / "glove/our_vab_idx.pkl").read_bytes())
+
+    def word(name: str, kind: str) -> tuple[torch.Tensor, int]:
+        return vectors[rows[name]], CLASSES.index(kind)
+
+    begin, end, the = word("sos", "OTHER"), word("eos", "OTHER"), word("the", "DET")
+    expected = [
+        [begin, the, word("person", "NOUN"), word("walk", "Act_VIP"), end],
+        [begin, word("left", "Loc_VIP"), word("hop", "OTHER"), word("unk", "OTHER"), end],
+        [begin, *[the] * 20, end],
+    ]
+    found = judge.embed_captions(list(captions), list(captions.values()))
+    for row, words in enumerate(expected):
+        torch.testing.assert_close(found[row], slow_text(weights, words), rtol=1e-5, atol=1e-5)
+
+
+def test_a_caption_without_tags_is_refused_unless_asked_for(release: Path, folder: Path) -> None:
+    with pytest.raises(UserError, match=r"caption 'The person hops' has no word/POS tags.*untagged: other"):
+        load_published(folder).embed_captions(["The person hops"], [()])
+    judge = load_published(folder, untagged="other")
+    found = judge.embed_captions(["The per-son, left!"], [()])
+    tagged = judge.embed_captions([""], [["the/OTHER", "person/OTHER", "left/OTHER"]])
+    assert torch.equal(found, tagged) and judge.facts == {"untagged": "other"}
+
+
+def spoil(folder: Path, name: str, change: Callable[[dict[str, torch.Tensor]], None]) -> None:
+    """Change tensors of a file, and its checksum with it."""
+    tensors = load_file(folder / name)
+    change(tensors)
+    save_file(tensors, folder / name)
+    sign(folder, name)
+
+
+def sign(folder: Path, name: str) -> None:
+    about = json.loads((folder / "evaluator.json").read_text())
+    about["sha256"][name] = sha256_of(folder / name)
+    (folder / "evaluator.json").write_text(json.dumps(about))
+
+
+def rewrite(folder: Path, name: str, **changes: Any) -> None:
+    about = json.loads((folder / name).read_text()) | changes
+    (folder / name).write_text(json.dumps(about))
+    if name != "evaluator.json":
+        sign(folder, name)
+
+
+BIAS = "movement_encoder.out_net.bias"
+FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no folder": (shutil.rmtree, "no such folder"),
+    "no facts": (lambda f: (f / "evaluator.json").unlink(), r"evaluator\.json: no such file"),
+    "no file": (lambda f: (f / "stats.safetensors").unlink(), r"stats\.safetensors: no such file"),
+    "other layout": (
+        lambda f: rewrite(f, "evaluator.json", layout="body133"),
+        "key 'layout' = 'body133'",
+    ),
+    "no checksum": (
+        lambda f: rewrite(f, "evaluator.json", sha256={}),
+        r"key 'sha256\.model\.safetensors' is required",
+    ),
+    "other bytes": (
+        lambda f: (f / "words.json").write_text("{}"),
+        r"words\.json: not the file whose sha256 evaluator\.json names",
+    ),
+    "torn": (
+        lambda f: ((f / "stats.safetensors").write_bytes(b"torn"), sign(f, "stats.safetensors")),
+        r"stats\.safetensors: cannot be read",
+    ),
+    "missing": (
+        lambda f: spoil(f, "model.safetensors", lambda t: t.pop(BIAS)),  # type: ignore[arg-type, return-value]
+        f"tensor '{BIAS}' is missing",
+    ),
+    "unknown": (
+        lambda f: spoil(f, "model.safetensors", lambda t: t.update(more=torch.ones(1))),
+        "tensor 'more' is not of this evaluator",
+    ),
+    "shape": (
+        lambda f: spoil(f, "model.safetensors", lambda t: t.update({BIAS: torch.ones(511)})),
+        rf"tensor '{BIAS}' is \[511\], and the published one is \[512\]",
+    ),
+    "not finite": (
+        lambda f: spoil(f, "stats.safetensors", lambda t: t["mean"].fill_(torch.nan)),  # type: ignore[arg-type, return-value]
+        "tensor 'mean' holds numbers that are not finite",
+    ),
+    "no width": (
+        lambda f: spoil(f, "stats.safetensors", lambda t: t["std"].zero_()),  # type: ignore[arg-type, return-value]
+        "std has columns that are not above 0",
+    ),
+    "no unknown word": (
+        lambda f: rewrite(f, "words.json", words=[w for w in WORDS if w != "unk"]),
+        "key 'words' lacks 'unk'",
+    ),
+    "other class": (
+        lambda f: rewrite(f, "words.json", lists={"Nowhere": ["left"]}),
+        "key 'classes' lacks 'Nowhere'",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", list(FAULTS))
+def test_every_fault_is_one_sentence(fault: str, folder: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "evaluator"
+    shutil.copytree(folder, broken)
+    spoiler, sentence = FAULTS[fault]
+    spoiler(broken)
+    with pytest.raises(UserError, match=sentence) as caught:
+        load_published(broken)
+    assert "\n" not in str(caught.value) and str(broken) in str(caught.value)
+
+
+def test_the_script_reads_no_objects_from_pickles(release: Path, tmp_path: Path) -> None:
+    bad = tmp_path / "release"
+    shutil.copytree(release, bad)
+    (bad / "glove/our_vab_words.pkl").write_bytes(pickle.dumps([Path("x")]))
+    done = convert(bad, tmp_path / "out")
+    assert done.returncode == 1 and "which a list of words does not need: not read" in done.stderr
+    (bad / "glove/our_vab_words.pkl").write_bytes(pickle.dumps(WORDS))
+    torch.save({"movement_encoder": Path("x")}, bad / "checkpoints/t2m/text_mot_match/model/finest.tar")
+    done = convert(bad, tmp_path / "out")
+    assert done.returncode == 1 and "weights_only" in done.stderr
+
+
+RECIPE = """
+name: judged
+seed: 1
+hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
+stages:
+  data: {kind: shards, path: SHARDS}
+  stats: {kind: stats}
+  text: {kind: text}
+  guo: {kind: guo_evaluator, folder: FOLDER}
+  temos:
+    kind: tma
+    net: {latent: 8, ff: 16, layers: 1, heads: 2}
+    loss: {contrastive: 0.0}
+    train: {steps: 2, batch_size: 4, validate_every: 0}
+  evaluate:
+    {kind: evaluate, repeats: 4, size: 4, lengths: recorded, inputs: {evaluator: guo, generators: [temos]}}
+"""
+
+
+def shards(out: Path, walk: Callable[..., Any], tokens: bool) -> None:
+    def clip(number: int) -> Sample:
+        joints = walk(frames=45 + number, turn=0.2 * number)[:, :22]
+        motion = encode_h3d(joints, LAYOUT)
+        split = "test" if number % 2 else "train"
+        meta = LAYOUT.clip_meta(
+            f"{number:03d}", source="made", split=split, frames=len(motion), licence="CC0", has_hands=False
+        )
+        words = ["the/DET", "person/NOUN", "walk/VERB"] + ["left/ADV"] * number
+        text = " ".join(word.partition("/")[0] for word in words)
+        return Sample(meta, motion, texts=[Caption(text=text, tokens=words if tokens else None)])
+
+    items = [("test" if number % 2 else "train", number) for number in range(20)]
+    options = WriteOptions(clips_per_shard=8, progress=False)
+    write_dataset(out, items, clip, facts(layout=LAYOUT), options)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_a_run_is_judged_by_it(
+    folder: Path, walk: Callable[..., Any], call: Callable[..., Any], tmp_path: Path
+) -> None:
+    recipe = RECIPE.replace("FOLDER", str(folder))
+    for name, tokens in (("tagged", True), ("plain", False)):
+        shards(tmp_path / name, walk, tokens)
+        (tmp_path / f"{name}.yaml").write_text(recipe.replace("SHARDS", str(tmp_path / name)))
+    done = call("run", tmp_path / "tagged.yaml", "--out", tmp_path / "run")
+    assert done.code == 0, done.err
+    figures = json.loads((tmp_path / "run/stages/evaluate/metrics.json").read_text())
+    weights = sha256_of(folder / "model.safetensors")
+    assert figures["protocol"]["by_evaluator"] == {
+        "stage": "guo", "kind": "guo_evaluator", "sha256": weights, "untagged": "refuse",
+    }  # fmt: skip
+    found = figures["by_evaluator"]
+    assert found["matching"]["size"] == 4 and found["matching"]["clips"] == 10
+    assert set(found["matching"]["generated"]) == {"top-1", "top-2", "top-3", "matching_score"}
+    assert found["distribution"]["rows"]["generated"]["multimodality"]["mean"] > 0
+    assert "R-Precision among 4 by the evaluator, 10 clips" in done.out
+    assert "The evaluator's latents: FID to 10 recorded motions" in done.out
+    done = call("run", tmp_path / "plain.yaml", "--out", tmp_path / "plain-run")
+    assert done.code == 2 and "has no word/POS tags" in done.err
+    other = ("--set", "guo.untagged=other")
+    done = call("run", tmp_path / "plain.yaml", "--out", tmp_path / "plain-run", *other)
+    assert done.code == 0, done.err
