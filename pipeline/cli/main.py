@@ -209,7 +209,7 @@ def evaluate(
     """
     from motionloom.pipeline.runs.api import evaluate_run
 
-    evaluate_run(run_folder, clips=clips, repeats=repeats, device=device, console=make_console())
+    evaluate_run(run_folder, clips=clips, repeats=repeats, device=device, share=True, console=make_console())
 
 
 @app.command()
