@@ -68,4 +68,6 @@ def test_two_processes_make_what_one_makes(
         assert (tmp_path / "run2/evaluate/metrics.json").read_bytes() == made[0]["evaluate"]
         assert "R@1" in again
         figures = json.loads(made[0]["evaluate"])
-        assert figures["clips"] == 7 and {"t2m_r1", "matching_score"} <= set(figures["retrieval"]["generated"])
+        assert figures["clips"] == 7 and {"t2m_r1", "matching_score"} <= set(
+            figures["retrieval"]["generated"]
+        )
