@@ -52,6 +52,16 @@ def figure_rows(figures: dict[str, Any]) -> list[Rows]:
         ]
         columns = ["", "FID", "FID, length 1", "Diversity", "MModality"]
         out.append((f"TMA's latents: FID to {found['clips']} recorded motions", columns, rows))
+    if "physics" in figures:
+        found = figures["physics"]
+        titles = {"skating": "foot skating", "floating": "floating, mm", "penetration": "penetration, mm"}
+        titles["jitter"] = "jitter, 100 m/s³"
+        rows = [
+            [f"{who} motion", *(f"{row[key]:.3f}" for key in titles)] for who, row in found.items() if row
+        ]
+        out.append(
+            ("Feet, floor and jerk (the nearer to recorded motion, the better)", ["", *titles.values()], rows)
+        )
     if "agreement_with_caption" in figures:
         found = figures["agreement_with_caption"]
         names = sorted({*found["truth"], *found["generated"]})

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from motionloom.datasets.schema import PRESENT_ALL
 from motionloom.datasets.synth.measure import agrees
+from motionloom.models.metrics.physics import SHORTEST, physics
 from motionloom.models.metrics.retrieval import recall
 from motionloom.pipeline.contract.units import Row
 from motionloom.pipeline.evaluation.truth import Truth
@@ -90,6 +91,11 @@ def obeyed(truth: Truth, joints: NDArray[np.float64], face: NDArray[np.float32] 
         return {}
     found = agrees(truth.truth, joints, face, fps)
     return {name: float(value) for name, value in (found | {"everything": all(found.values())}).items()}
+
+
+def bodily(joints: NDArray[np.float64], fps: float) -> Row:
+    """Skating, floating, penetration and jitter of a motion [T, N, 3]; of one too short for them nothing."""
+    return physics(joints, fps)._asdict() if len(joints) >= SHORTEST else {}
 
 
 def shares(rows: Iterable[Row]) -> Row:

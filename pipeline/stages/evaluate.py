@@ -28,7 +28,7 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.contract.units import Arrays, as_rows, as_table, even_slices
 from motionloom.pipeline.evaluation.figure_rows import figure_rows
-from motionloom.pipeline.evaluation.figures import embed_motions, obeyed, shares
+from motionloom.pipeline.evaluation.figures import bodily, embed_motions, obeyed, shares
 from motionloom.pipeline.evaluation.nearest import NearestClip
 from motionloom.pipeline.evaluation.reconstruction import (
     clip_errors,
@@ -48,7 +48,7 @@ from motionloom.pipeline.store.networks import LoadedTma, TrainedTokenizer
 _FILE = "metrics.json"
 _RECONSTRUCTED, _GENERATED = 16, 64
 """Clips at a time, at most."""
-_JOINTS, _FACE, _OBEYED = "joints/", "face/", "obeyed/"
+_JOINTS, _FACE, _OBEYED, _PHYSICS = "joints/", "face/", "obeyed/", "physics/"
 """Begin the names of what is measured of a clip."""
 
 
@@ -187,8 +187,12 @@ class _Evaluation:
         made = list(context.units.read("generated", len(self.performances)))
         if self.tma is not None:
             figures |= self.by_tma(self.tma, [torch.from_numpy(latents) for latents in self._repeats(made)])
+        fps = dataset.layout.fps
+        figures["physics"] = {
+            "recorded": shares(bodily(t.joints, fps) for t in self.truths),
+            "generated": shares(row for table in made for row in as_rows(table, _PHYSICS)),
+        }
         if any(t.truth for t in self.truths):
-            fps = dataset.layout.fps
             figures["agreement_with_caption"] = {
                 "truth": shares(obeyed(t, t.joints, t.face, fps) for t in self.truths),
                 "generated": shares(row for table in made for row in as_rows(table, _OBEYED)),
@@ -243,7 +247,7 @@ class _Evaluation:
             sampling=self.config.sampling,
         )
         rows = [obeyed(t, m.joints, m.face, fps) for t, m in zip(truths, motions, strict=True)]
-        out = as_table(rows, _OBEYED)
+        out = as_table(rows, _OBEYED) | as_table([bodily(m.joints, fps) for m in motions], _PHYSICS)
         if self.tma is not None:
             out["latent"] = embed_motions(self.tma, [m.features for m in motions]).numpy()
         return out
