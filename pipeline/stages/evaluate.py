@@ -32,6 +32,7 @@ from motionloom.pipeline.evaluation.reconstruction import face_figures, reconstr
 from motionloom.pipeline.evaluation.tables import plain, print_tables
 from motionloom.pipeline.evaluation.text_motion import Latents, distribution, retrieval
 from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
+from motionloom.pipeline.evaluation.versions import EVALUATE
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.stages.progress import bar
@@ -65,7 +66,7 @@ class EvaluateStage(StageKind):
     summary = "figures on the test split"
     config = EvaluateConfig
     takes = ("data", "tokenizer?", "face_tokenizer?: tokenizer", "tma?", Every("generators", GENERATOR))
-    version = 5  # the papers' definitions, clips drawn as they come; TMA reads captions by its own encoder
+    version = EVALUATE
 
     def gives(self, config: Any) -> frozenset[str]:
         """Its tables."""
@@ -91,13 +92,23 @@ class _Evaluation:
         self.tokenizer: TrainedTokenizer | None = context.given.get("tokenizer")
         self.tma: LoadedTma | None = context.given.get("tma")
         makers = context.every("generators")
-        self.bundle = bundle_driven_by("text", makers, context.shelf) or Bundle(makers, context.shelf)
+        # Without generators a tokenizer alone is measured (`generators: []`).
+        self.bundle: Bundle | None = None
+        if makers:
+            self.bundle = bundle_driven_by("text", makers, context.shelf) or Bundle(makers, context.shelf)
         self.dataset = context.given["data"].held_out(prefer="test")
 
     def figures(self) -> dict[str, Any]:
         """All figures, each beside its trivial answer."""
-        dataset, context = self.dataset, self.context
-        unit = self.tokenizer.net.group_frames if self.tokenizer else self.bundle.generator.unit_frames
+        dataset, context, bundle = self.dataset, self.context, self.bundle
+        if self.tokenizer is not None:
+            unit = self.tokenizer.net.group_frames
+        elif bundle is not None:
+            unit = bundle.generator.unit_frames
+        else:
+            raise UserError(
+                f"stage '{context.name}': no tokenizer and no generator to evaluate; name one in its inputs"
+            )
         said = has_caption(dataset)
         chosen = drawn(dataset, self.config.clips) if said.any() else []
         truths = self.truths(chosen, unit)
@@ -118,10 +129,10 @@ class _Evaluation:
         if left := int((~said).sum()):
             rest = "are left out" if self.tokenizer is None else "are left out, except of the reconstruction"
             context.console.print(f"    {dataset.split}: {left} clips without a caption {rest}")
-        if not truths or "text" not in self.bundle.generator.modalities:
+        if not truths or bundle is None or "text" not in bundle.generator.modalities:
             return figures
         figures["protocol"] = self.protocol()
-        generated = self.generate(truths)
+        generated = self.generate(bundle, truths)
         if self.tma is not None:
             figures |= self.by_tma(self.tma, truths, generated)
         if any(t.truth for t in truths):
@@ -158,7 +169,7 @@ class _Evaluation:
         found = [truth_of(self.dataset, i) for i in sorted(chosen)]
         return [truth for truth in found if len(truth.features) >= unit]
 
-    def generate(self, truths: list[Truth]) -> list[list[GeneratedMotion]]:
+    def generate(self, bundle: Bundle, truths: list[Truth]) -> list[list[GeneratedMotion]]:
         """The captions of `truths` performed, once for each repeat."""
         out, config, seed = [], self.config, self.context.seed
         with bar(self.context.console) as progress:
@@ -168,7 +179,7 @@ class _Evaluation:
                 for start in range(0, len(truths), 64):
                     part = truths[start : start + 64]
                     seconds = [len(t.features) / self.dataset.layout.fps for t in part]
-                    motions += self.bundle.generate(
+                    motions += bundle.generate(
                         [t.caption for t in part],
                         face_captions=[t.face_caption for t in part],
                         seconds=seconds if config.lengths == "recorded" else None,
