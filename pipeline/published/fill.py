@@ -12,8 +12,11 @@ from motionloom.pipeline.published.filled import Cell, FilledRow, FilledTable, H
 from motionloom.pipeline.published.notes import notes_of
 from motionloom.pipeline.published.protocol import data_set_of, differences, measured_like
 from motionloom.pipeline.published.ranking import mark_best
+from motionloom.pipeline.published.repetitions import named_apart, without_repetitions
 from motionloom.pipeline.published.schema import Column, PaperTable, Row
 from motionloom.pipeline.published.stages import RunStage
+
+_MISSING, _NO_MODEL = "missing in these runs", "missing: no model of ours"
 
 _PAPERS = {"humantomato": "HumanTOMATO", "ude": "UDE"}
 
@@ -34,6 +37,7 @@ class _Filling:
         self.labels = {
             run: str(run) if names.count(short) > 1 else short for run, short in zip(runs, names, strict=True)
         }
+        self.folders = {label: run for run, label in self.labels.items()}
         self.decimals = [self._decimals(at) for at in range(len(table.columns))]
         self.used: dict[tuple[Path, str], Evaluation] = {}
         self.settings: dict[str, None] = {}
@@ -85,9 +89,17 @@ class _Filling:
         """Our rows of one of the paper's; one that says so where there are none."""
         if row.recorded or not self.evaluations:
             return []
-        found = [one for run in self.evaluations for one in self._of_run(run, row)]
-        empty = (None,) * len(self.table.columns)
-        return found or [FilledRow("missing", row.method, "missing", empty)]
+        found = [
+            one
+            for run in self.evaluations
+            for one in named_apart(without_repetitions(self._of_run(run, row)))
+        ]
+        for one in found:
+            for evaluation in self.evaluations[self.folders[one.run]]:
+                if evaluation.name in one.evaluations:
+                    self.used[evaluation.run, evaluation.name] = evaluation
+        label = _NO_MODEL if row.ours is None else _MISSING
+        return found or [FilledRow("missing", row.method, label, (None,) * len(self.table.columns))]
 
     def _of_run(self, run: Path, row: Row) -> list[FilledRow]:
         """One row for each model of a run, or for each set of models where the columns are settings."""
@@ -143,7 +155,6 @@ class _Filling:
                 alike.append(None)
                 continue
             evaluation, model = found
-            self.used[run, evaluation.name] = evaluation
             models[model.name] = None
             evaluations[evaluation.name] = None
             figure = column.figure.format(**row.values)

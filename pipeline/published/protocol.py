@@ -51,7 +51,7 @@ def measured_like(evaluation: Evaluation, figure: str) -> str:
     found, data = evaluation.figures, evaluation.data
     keys = ["split", "reconstructed_clips"]
     if evaluation.measure == "retrieval":
-        keys = [f"{figure.split('.')[0]}.size", "threshold"]
+        keys = [f"{figure.split('.')[0]}.size"]
     elif evaluation.measure == "evaluate_dances":
         keys = ["split", "clips", "songs", "feature_fps"]
     elif not figure.startswith(_RECONSTRUCTION):
@@ -61,6 +61,7 @@ def measured_like(evaluation: Evaluation, figure: str) -> str:
         if figure.startswith("retrieval"):
             keys += ["retrieval.among" if "top-" in figure else "retrieval.size"]
     facts = {key: value_at(found, key, None) for key in keys}
+    facts["threshold"] = evaluation.config.get("threshold")
     return json.dumps([evaluation.measure, data and data.fingerprint, facts], sort_keys=True)
 
 
@@ -75,7 +76,7 @@ def differences(evaluation: Evaluation, run: str, table: PaperTable) -> list[Dif
             out.append(Difference(run, evaluation.name, what, str(ours), said))
 
     data = data_of(evaluation.data)
-    if not is_named(paper.data, data):
+    if not any(is_named(name.split(" for ")[0], data) for name in paper.data.split(", ")):
         add("data", data, paper.data)
     add("split", value_at(evaluation.figures, "split", None), paper.split)
     add("clips", _clips(evaluation, columns), paper.clips)

@@ -83,7 +83,7 @@ def print_text(table: FilledTable, console: Console) -> None:
     grid.add_column("")
     for head in table.heads:
         group = f"{head.group}\n" if head.group else ""
-        grid.add_column(escape(group + heading(head)), justify="right")
+        grid.add_column(escape(group + heading(head)), justify="right", overflow="fold")
     for row in table.rows:
         indent = "" if row.source in ("paper", "reference") else "  "
         cells = [escape(_marked(cell, "*")) for cell in row.cells]
