@@ -48,14 +48,23 @@ def latex(table: FilledTable) -> str:
     if found := groups(table.heads):
         lines += _group_lines(found)
     lines += [_line(["", *(escaped(heading(head)) for head in table.heads)]), "\\midrule"]
+    answers = _last_answers(table)
     for number, row in enumerate(table.rows):
-        if row.source == "reference" and number and table.rows[number - 1].source != "reference":
+        if 0 < number == answers:
             lines.append("\\midrule")
         indent = "" if row.source in ("paper", "reference") else "\\quad "
         lines.append(_line([indent + escaped(row.label), *(_cell(cell) for cell in row.cells)]))
     lines += ["\\bottomrule", "\\end{tabular}", "\\begin{flushleft}", "\\footnotesize"]
     lines += [f"{escaped(line)}\\par" for line in lines_below(table)]
     return "\n".join([*lines, "\\end{flushleft}", "\\end{table}", ""])
+
+
+def _last_answers(table: FilledTable) -> int:
+    """Number of the first of the answers without a model that end the table; its rows where none do."""
+    at = len(table.rows)
+    while at and table.rows[at - 1].source == "reference":
+        at -= 1
+    return at
 
 
 def _group_lines(found: list[tuple[str, int]]) -> list[str]:

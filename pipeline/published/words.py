@@ -8,7 +8,8 @@ from motionloom.pipeline.published.filled import FilledRow, FilledTable, Head
 
 ARROWS = {"lower": " ↓", "higher": " ↑", None: ""}
 
-_OURS_ALONE = "not in the paper"
+_LONG = 40
+"""What the paper's measuring is called in more letters is not repeated with every difference."""
 
 
 def heading(head: Head) -> str:
@@ -37,10 +38,12 @@ def lines_below(table: FilledTable) -> Iterator[str]:
     """Notes, then what was measured otherwise, one line for each evaluation."""
     yield from table.notes
     if alone := [head.title for head in table.heads if not head.printed]:
-        yield f"{', '.join(alone)}: {_OURS_ALONE}, a figure of ours alone."
+        yield f"{', '.join(alone)}: not in the paper, a figure of ours alone."
     found: dict[tuple[str, str], list[str]] = {}
     for one in table.differences:
         theirs = "the paper does not say" if one.paper is None else f"paper: {one.paper}"
+        if one.paper is not None and len(one.paper) > _LONG and one.paper in table.measured.values():
+            theirs = "paper: see above"
         found.setdefault((one.run, one.evaluation), []).append(f"{one.what} {one.ours} ({theirs})")
     for (run, evaluation), said in found.items():
         yield f"{run} {evaluation}: {'; '.join(said)}"

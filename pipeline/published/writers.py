@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -26,13 +27,14 @@ def markdown(table: FilledTable) -> str:
     """A pipe table, the best figures bold, and what is to be known as a list below."""
     grouped = bool(groups(table.heads))
     names = [f"{head.group} {heading(head)}".strip() if grouped else heading(head) for head in table.heads]
+    names = [_plain_markdown(name) for name in names]
     rows = [["", "", *names], ["---", "---", *("---:" for _ in names)]]
     for row in table.rows:
         cells = [_marked(cell, "**") for cell in row.cells]
-        rows.append([row.label, who(row), *cells])
-    body = [f"| {' | '.join(_piped(cell) for cell in row)} |" for row in rows]
-    below = [f"- {_piped(line)}" for line in lines_below(table)]
-    return "\n".join([f"**{_piped(table.caption)}**", "", *body, "", *below, ""])
+        rows.append([_plain_markdown(row.label), who(row), *cells])
+    body = [f"| {' | '.join(row)} |" for row in rows]
+    below = [f"- {_plain_markdown(line)}" for line in lines_below(table)]
+    return "\n".join([f"**{_plain_markdown(table.caption)}**", "", *body, "", *below, ""])
 
 
 def csv_text(table: FilledTable) -> str:
@@ -80,7 +82,7 @@ def text(table: FilledTable, width: int | None = None) -> str:
 def print_text(table: FilledTable, console: Console) -> None:
     """The table on a console: the best figures with a star, ours below the paper's."""
     grid = Table(title=escape(table.caption), title_justify="left", box=SIMPLE_HEAD)
-    grid.add_column("")
+    grid.add_column("", overflow="fold")
     for head in table.heads:
         group = f"{head.group}\n" if head.group else ""
         grid.add_column(escape(group + heading(head)), justify="right", overflow="fold")
@@ -110,8 +112,9 @@ def _marked(cell: Cell | None, mark: str) -> str:
     return f"{mark}{cell.text}{mark}" if cell.best and mark != "*" else cell.text + ("*" if cell.best else "")
 
 
-def _piped(cell: str) -> str:
-    return cell.replace("|", "\\|").replace("\n", " ")
+def _plain_markdown(text: str) -> str:
+    """Text that Markdown shows as it is, also in a cell."""
+    return re.sub(r"([\\|*<`\[])", r"\\\1", text.replace("\n", " "))
 
 
 def _plain(row: FilledRow) -> dict[str, Any]:
