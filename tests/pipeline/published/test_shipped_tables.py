@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +12,7 @@ from motionloom.pipeline.published.fill import fill
 from motionloom.pipeline.published.schema import PaperTable
 from motionloom.pipeline.published.shipped import paper_table, shipped_tables
 from motionloom.pipeline.runs.shipped import shipped_recipes
+from motionloom.pipeline.store.yaml import load_yaml
 
 NAMES = list(shipped_tables())
 
@@ -225,3 +227,15 @@ def test_a_wrong_file_is_refused(case: str) -> None:
 def test_the_base_of_the_wrong_files_is_right() -> None:
     (cell,) = PaperTable.parse(BASE, "table.yaml").rows[0].printed()
     assert cell is not None and (cell.text, cell.mean, cell.decimals) == ("1.50", 1.5, 2)
+
+
+def test_the_document_names_every_table() -> None:
+    text = (Path(__file__).resolve().parents[3] / "docs" / "tables.md").read_text(encoding="utf-8")
+    listed = re.findall(r"`((?:humantomato|ude)/\d+)`", text.split("## The tables")[1].split("\n## ")[0])
+    assert sorted(listed) == sorted(NAMES)
+
+
+def test_the_example_of_the_document_parses() -> None:
+    text = (Path(__file__).resolve().parents[3] / "docs" / "tables.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(.*?)```", text, re.S)
+    assert PaperTable.parse(load_yaml(example, "example"), "example").rows[0].method == "Theirs"
