@@ -39,6 +39,7 @@ from motionloom.pipeline.evaluation.reconstruction import (
 from motionloom.pipeline.evaluation.tables import plain, print_tables
 from motionloom.pipeline.evaluation.text_motion import Latents, distribution, retrieval
 from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
+from motionloom.pipeline.evaluation.versions import EVALUATE
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.stages.progress import bar
@@ -77,7 +78,7 @@ class EvaluateStage(StageKind):
     config = EvaluateConfig
     takes = ("data", "tokenizer?", "face_tokenizer?: tokenizer", "tma?", Every("generators", GENERATOR))
     shares = True
-    version = 6  # generated in even pieces of the clips, each with its seed
+    version = EVALUATE
 
     def gives(self, config: Any) -> frozenset[str]:
         """Its tables."""
@@ -108,9 +109,19 @@ class _Evaluation:
         self.tokenizer: TrainedTokenizer | None = context.given.get("tokenizer")
         self.tma: LoadedTma | None = context.given.get("tma")
         makers = context.every("generators")
-        self.bundle = bundle_driven_by("text", makers, context.shelf) or Bundle(makers, context.shelf)
+        # Without generators a tokenizer alone is measured (`generators: []`).
+        self.bundle: Bundle | None = None
+        if makers:
+            self.bundle = bundle_driven_by("text", makers, context.shelf) or Bundle(makers, context.shelf)
         self.dataset = context.given["data"].held_out(prefer="test")
-        unit = self.tokenizer.net.group_frames if self.tokenizer else self.bundle.generator.unit_frames
+        if self.tokenizer is not None:
+            unit = self.tokenizer.net.group_frames
+        elif self.bundle is not None:
+            unit = self.bundle.generator.unit_frames
+        else:
+            raise UserError(
+                f"stage '{context.name}': no tokenizer and no generator to evaluate; name one in its inputs"
+            )
         self.said = has_caption(self.dataset)
         chosen = drawn(self.dataset, self.config.clips) if self.said.any() else []
         self.truths = self._truths(chosen, unit)
@@ -126,7 +137,8 @@ class _Evaluation:
     @property
     def performs(self) -> bool:
         """Whether motions are made for captions."""
-        return bool(self.truths) and "text" in self.bundle.generator.modalities
+        bundle = self.bundle
+        return bool(self.truths) and bundle is not None and "text" in bundle.generator.modalities
 
     @cached_property
     def slices(self) -> list[slice]:
@@ -237,6 +249,7 @@ class _Evaluation:
 
     def perform(self, repeat: int, piece: slice) -> Arrays:
         """Motions for the captions of some clips, as latents and by whether they do what is said."""
+        assert self.bundle is not None
         truths, fps = self.truths[piece], self.dataset.layout.fps
         recorded = [len(t.features) / fps for t in truths]
         motions = self.bundle.generate(

@@ -45,6 +45,7 @@ from motionloom.pipeline.evaluation.dance_figures import (
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of, require_dances
 from motionloom.pipeline.evaluation.figures import Interval
 from motionloom.pipeline.evaluation.tables import interval, plain, print_tables
+from motionloom.pipeline.evaluation.versions import EVALUATE_DANCES
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.stages.progress import bar
@@ -87,7 +88,7 @@ class EvaluateDancesStage(StageKind):
     config = EvaluateDancesConfig
     takes = ("data", Every("generators", GENERATOR))
     shares = True
-    version = 2  # generated in even pieces of the clips, each with its seed
+    version = EVALUATE_DANCES
 
     def gives(self, config: Any) -> frozenset[str]:
         """Its tables."""
