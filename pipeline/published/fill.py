@@ -82,7 +82,7 @@ class _Filling:
     def _paper(self, row: Row) -> FilledRow:
         printed = iter(row.printed())
         cells = [next(printed) if column.printed else None for column in self.table.columns]
-        shown = tuple(None if c is None else Cell(c.text, c.mean, c.spread) for c in cells)
+        shown = tuple(None if cell is None else Cell(cell.text, cell.mean, cell.spread) for cell in cells)
         return FilledRow("paper", row.method, row.method, shown)
 
     def _models(self, row: Row) -> list[FilledRow]:

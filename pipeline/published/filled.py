@@ -57,7 +57,9 @@ class FilledRow:
 
     def marked(self, best: set[int]) -> FilledRow:
         """With the cells of these columns marked as the best."""
-        cells = tuple(cell and replace(cell, best=at in best) for at, cell in enumerate(self.cells))
+        cells = tuple(
+            None if cell is None else replace(cell, best=at in best) for at, cell in enumerate(self.cells)
+        )
         return replace(self, cells=cells)
 
 

@@ -53,6 +53,8 @@ def require_all(evaluation: Evaluation) -> None:
     for key in wanted:
         assert evaluation.value(key) is not None, key
         for answer in answers(key).values():
+            if answer.startswith("rows.shuffled_music.") and evaluation.figures["songs"] == 1:
+                continue  # there is no other song to compare with
             assert (evaluation.value(answer) is None) == (answer in WITHOUT), answer
 
 
