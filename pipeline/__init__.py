@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from motionloom.pipeline.inference.bundle import GeneratedMotion
     from motionloom.pipeline.inference.outputs import write_motions
     from motionloom.pipeline.inference.pretrained import MotionModel
+    from motionloom.pipeline.published.compare import compare_with_paper
     from motionloom.pipeline.runs.api import evaluate_run, export_run, report_run, run_recipe
     from motionloom.pipeline.runs.recipe import Recipe, load_recipe
     from motionloom.pipeline.stages.trained import TrainedStage
@@ -33,6 +34,7 @@ __all__ = [
     "StageKind",
     "TrainedStage",
     "UserError",
+    "compare_with_paper",
     "evaluate_run",
     "export_run",
     "load_recipe",
@@ -52,6 +54,7 @@ _HOMES = {
     "StageKind": "pipeline.contract.stage",
     "TrainedStage": "pipeline.stages.trained",
     "UserError": "datasets.schema",
+    "compare_with_paper": "pipeline.published.compare",
     "evaluate_run": "pipeline.runs.api",
     "export_run": "pipeline.runs.api",
     "load_recipe": "pipeline.runs.recipe",

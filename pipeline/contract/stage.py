@@ -23,6 +23,7 @@ from rich.console import Console
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve, ModelCard, Showing
+from motionloom.pipeline.contract.units import WORK, Units
 from motionloom.pipeline.launch.hardware import Hardware
 
 CPU = torch.device("cpu")
@@ -199,6 +200,14 @@ class StageContext:
     console: Console
     shelf: Shelf
     """Where inputs are loaded, each once."""
+    rank: int = 0
+    world: int = 1
+    """This process among those that share the stage's work."""
+
+    @property
+    def units(self) -> Units:
+        """The work that the processes divide."""
+        return Units(self.folder / WORK, self.rank, self.world)
 
     @property
     def device(self) -> torch.device:
@@ -233,6 +242,8 @@ class StageKind(ABC):
     version: int = 1
     """Raised when the same config makes something else than before."""
     trains: bool = False
+    shares: bool = False
+    """Whether all processes of a run take part by `share` before the first of them runs the stage."""
 
     def gives(self, config: Any) -> frozenset[str]:
         """Names of what other stages may ask of this one, such as "tokenizer" or `GENERATOR`."""
@@ -250,6 +261,9 @@ class StageKind(ABC):
     def external(self, config: Any) -> Any:
         """Facts about files outside the run (names, sizes, checksums) that belong to the fingerprint."""
         return None
+
+    def share(self, context: StageContext) -> None:  # noqa: B027 (most kinds have none)
+        """Make this process's share of `context.units`, which `run` then reads and clears."""
 
     @abstractmethod
     def run(self, context: StageContext) -> None:
@@ -310,6 +324,7 @@ class FunctionStage(StageKind):
     takes: tuple[str | Every, ...] = ()
     version: int = 1
     trains: bool = False
+    shares: bool = False
     given_names: frozenset[str] = field(default_factory=frozenset)
 
     def gives(self, config: Any) -> frozenset[str]:

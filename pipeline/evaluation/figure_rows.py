@@ -38,6 +38,16 @@ def figure_rows(figures: dict[str, Any]) -> list[Rows]:
         out.append(_distribution_rows(figures["distribution"], "TMA's latents"))
     if "by_evaluator" in figures:
         out += _evaluator_rows(figures["by_evaluator"])
+    if "physics" in figures:
+        found = figures["physics"]
+        titles = {"skating": "foot skating", "floating": "floating, mm", "penetration": "penetration, mm"}
+        titles["jitter"] = "jitter, 100 m/s³"
+        rows = [
+            [f"{who} motion", *(f"{row[key]:.3f}" for key in titles)] for who, row in found.items() if row
+        ]
+        out.append(
+            ("Feet, floor and jerk (the nearer to recorded motion, the better)", ["", *titles.values()], rows)
+        )
     if "agreement_with_caption" in figures:
         found = figures["agreement_with_caption"]
         names = sorted({*found["truth"], *found["generated"]})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,7 +15,9 @@ from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import PRESENT_ALL
 from motionloom.datasets.synth.measure import agrees
+from motionloom.models.metrics.physics import SHORTEST, physics
 from motionloom.models.metrics.retrieval import recall
+from motionloom.pipeline.contract.units import Row
 from motionloom.pipeline.evaluation.truth import Truth
 
 
@@ -111,19 +113,25 @@ def chance(k: int, size: int) -> float:
     return k / size
 
 
-def truth_agreement(
-    motions: Sequence[tuple[Truth, NDArray[np.float64], NDArray[np.float32] | None]], fps: float
-) -> dict[str, float]:
-    """Share of motions that do what their clip's caption says, for each attribute that can be measured.
-
-    Only clips of the synthetic source know what they really do.
+def obeyed(truth: Truth, joints: NDArray[np.float64], face: NDArray[np.float32] | None, fps: float) -> Row:
+    """1 or 0 for each attribute of a clip's caption that can be measured: whether a motion does it; and for
+    "everything" together. Only clips of the synthetic source know what they really do; others have nothing.
     """
-    rows: dict[str, list[bool]] = {}
-    for truth, joints, face in motions:
-        if truth.truth is None:
-            continue
-        found = agrees(truth.truth, joints, face, fps)
-        for name, value in found.items():
-            rows.setdefault(name, []).append(value)
-        rows.setdefault("everything", []).append(all(found.values()))
-    return {name: float(np.mean(values)) for name, values in rows.items()}
+    if truth.truth is None:
+        return {}
+    found = agrees(truth.truth, joints, face, fps)
+    return {name: float(value) for name, value in (found | {"everything": all(found.values())}).items()}
+
+
+def bodily(joints: NDArray[np.float64], fps: float) -> Row:
+    """Skating, floating, penetration and jitter of a motion [T, N, 3]; of one too short for them nothing."""
+    return physics(joints, fps)._asdict() if len(joints) >= SHORTEST else {}
+
+
+def shares(rows: Iterable[Row]) -> Row:
+    """Mean of each figure over the rows that have it."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        for name, value in row.items():
+            values.setdefault(name, []).append(value)
+    return {name: float(np.mean(found)) for name, found in values.items()}

@@ -1,8 +1,9 @@
-"""Clips and what was made for their captions in the latents of a judge: TMA, or an evaluator."""
+"""Those by whose latents motion is judged: TMA, and an evaluator that no generator was trained with."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from torch import Tensor
@@ -10,42 +11,47 @@ from torch import Tensor
 from motionloom.pipeline.evaluation.figures import MotionJudge, embed_motions
 from motionloom.pipeline.evaluation.text_motion import Latents
 from motionloom.pipeline.evaluation.truth import Truth
-from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
 from motionloom.pipeline.store.networks import LoadedTma
 
 
-def texts_by_tma(tma: LoadedTma, truths: Sequence[Truth]) -> Tensor:
-    """Latents [n, Z] of the captions, by the text stage that the model was trained with."""
-    return tma.embed_captions([t.caption for t in truths], tma.given["text"].cache)
+@dataclass(frozen=True)
+class Judge:
+    """What embeds captions and motions in one space."""
 
+    motions: MotionJudge
+    texts: Callable[[Sequence[Truth]], Tensor]
+    """Latents [n, Z] of the captions of n clips."""
 
-def texts_by_evaluator(evaluator: LoadedEvaluator, truths: Sequence[Truth]) -> Tensor:
-    """Latents [n, Z] of the captions, which the evaluator must know."""
-    return evaluator.embed_captions([t.caption for t in truths], [t.tokens for t in truths])
+    @staticmethod
+    def tma(tma: LoadedTma) -> Judge:
+        """TMA reads captions by the text stage that it was trained with."""
+        return Judge(
+            tma, lambda truths: tma.embed_captions([t.caption for t in truths], tma.given["text"].cache)
+        )
 
+    @staticmethod
+    def evaluator(found: LoadedEvaluator) -> Judge:
+        """An evaluator reads captions, or their tags, as it was trained to, and refuses others."""
+        return Judge(
+            found,
+            lambda truths: found.embed_captions([t.caption for t in truths], [t.tokens for t in truths]),
+        )
 
-def judged(
-    judge: MotionJudge,
-    text: Tensor,
-    truths: Sequence[Truth],
-    generated: Sequence[Sequence[GeneratedMotion]],
-    others: Sequence[Truth],
-) -> Latents:
-    """Latents of n clips, of the motions made for their captions, of `others` and of the mean pose.
+    def latents(self, truths: Sequence[Truth], made: Sequence[Tensor], others: Sequence[Truth]) -> Latents:
+        """Latents of n clips, of what was made for their captions, of `others` and of the mean pose.
 
-    Args:
-        judge: What embeds motions.
-        text: Its latents of the captions of `truths`, [n, Z].
-        truths: The clips.
-        generated: Motions of their captions, once a repeat.
-        others: Training clips.
-    """
-    mean = judge.stats.mean[judge.layout.part(judge.part)].astype("float32")
-    return Latents(
-        text=text,
-        real=embed_motions(judge, [t.features for t in truths], [t.present for t in truths]),
-        made=[embed_motions(judge, [g.features for g in motions]) for motions in generated],
-        others=embed_motions(judge, [t.features for t in others], [t.present for t in others]),
-        still=embed_motions(judge, [np.tile(mean, (len(t.features), 1)) for t in truths]),
-    )
+        Args:
+            truths: The clips.
+            made: Latents [n, Z] of motions for their captions, once a repeat.
+            others: Training clips.
+        """
+        judge = self.motions
+        mean = judge.stats.mean[judge.layout.part(judge.part)].astype("float32")
+        return Latents(
+            text=self.texts(truths),
+            real=embed_motions(judge, [t.features for t in truths], [t.present for t in truths]),
+            made=made,
+            others=embed_motions(judge, [t.features for t in others], [t.present for t in others]),
+            still=embed_motions(judge, [np.tile(mean, (len(t.features), 1)) for t in truths]),
+        )

@@ -13,7 +13,7 @@ another way is no other pose, `pose_body`, `pose_hand`; and `world`, where the p
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
 from motionloom.datasets.schema import HANDS
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.reconstruction import JointErrors, joint_errors, mpjpe
+from motionloom.pipeline.contract.units import Row
 from motionloom.pipeline.evaluation.nearest import NearestClip, local_joints
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_all, reconstruct_truth
 from motionloom.pipeline.store.networks import TrainedTokenizer
@@ -32,48 +33,68 @@ from motionloom.pipeline.store.networks import TrainedTokenizer
 FINGERS = (range(22, 37), range(37, 52))
 """Joints of `smplx52`, left and right."""
 
+_SUM = "sum"
+"""Begins the names of a clip's sums over frames: "sum_hand_mean_pose/mpjpe"."""
 
-def reconstruction_figures(
-    tokenizer: TrainedTokenizer, train: ClipDataset, truths: Sequence[Truth]
-) -> dict[str, float]:
-    """Both families of errors, of the tokenizer, of the mean pose (`_mean_pose`) and of the nearest training
-    clip (`_nearest_train_clip`).
+
+def clip_errors(tokenizer: TrainedTokenizer, nearest: NearestClip, truth: Truth) -> Row:
+    """Both families of errors of one clip, through the tokenizer, as the mean pose (`_mean_pose`) and as the
+    nearest training clip (`_nearest_train_clip`): sums over frames of the papers', means of ours.
 
     Of a clip without hands the body's joints alone count, and nothing in `_hand`.
     """
     layout = tokenizer.layout
     body = tokenizer.stats.mean[layout.part("bodyhand")].astype(np.float32)
-    nearest = NearestClip(train)
-    sums: dict[str, JointErrors] = {}
-    clips: dict[str, list[float]] = defaultdict(list)
-    for truth in truths:
-        real = torch.from_numpy(local_joints(truth.features, layout))
-        target = torch.from_numpy(truth.joints)
-        found = reconstruct_truth(tokenizer, truth)
-        constant = np.broadcast_to(body, truth.features.shape)
-        compared = {
-            "": (local_joints(found, layout), joints_of(found, layout)),
-            "_mean_pose": (local_joints(constant, layout), joints_of(constant, layout)),
-            "_nearest_train_clip": nearest.motion(truth.features, truth.present),
-        }
-        joints = slice(None) if truth.present & HANDS else slice(BODY_JOINTS)
-        for suffix, motion in compared.items():
-            pose, place = (torch.from_numpy(array)[:, joints] for array in motion)
-            for part, errors in published_errors(place, target[:, joints]).items():
-                if layout.num_joints == BODY_JOINTS and part:
-                    continue  # all of its joints are the body's
-                key = f"{part}{suffix}"
-                sums[key] = sums[key] + errors if key in sums else errors
-            ours = pose_errors(pose, real[:, joints])
-            if layout.num_joints > BODY_JOINTS:
-                ours.setdefault("pose_body", ours["pose"])
-            ours["world"] = mpjpe(place, target[:, joints], root=None)
-            for name, value in ours.items():
-                clips[f"{name}{suffix}"].append(float(value.mean()))
-    out = {name: float(np.mean(values)) for name, values in clips.items()}
-    for key, errors in sums.items():
-        out |= {f"{name}{key}": value for name, value in errors.means().items()}
+    real = torch.from_numpy(local_joints(truth.features, layout))
+    target = torch.from_numpy(truth.joints)
+    found = reconstruct_truth(tokenizer, truth)
+    constant = np.broadcast_to(body, truth.features.shape)
+    compared = {
+        "": (local_joints(found, layout), joints_of(found, layout)),
+        "_mean_pose": (local_joints(constant, layout), joints_of(constant, layout)),
+        "_nearest_train_clip": nearest.motion(truth.features, truth.present),
+    }
+    joints = slice(None) if truth.present & HANDS else slice(BODY_JOINTS)
+    out: Row = {}
+    for suffix, motion in compared.items():
+        pose, place = (torch.from_numpy(array)[:, joints] for array in motion)
+        for part, errors in published_errors(place, target[:, joints]).items():
+            if layout.num_joints == BODY_JOINTS and part:
+                continue  # all of its joints are the body's
+            sums = {name: float(value) for name, value in errors._asdict().items()}
+            out |= {f"{_SUM}{part}{suffix}/{name}": value for name, value in sums.items()}
+        ours = pose_errors(pose, real[:, joints])
+        if layout.num_joints > BODY_JOINTS:
+            ours.setdefault("pose_body", ours["pose"])
+        ours["world"] = mpjpe(place, target[:, joints], root=None)
+        out |= {f"{name}{suffix}": float(value.mean()) for name, value in ours.items()}
     return out
+
+
+def mean_errors(clips: Iterable[Row]) -> dict[str, float]:
+    """Of `clip_errors`: the papers' figures over all frames, ours over all clips."""
+    sums: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+    ours: dict[str, list[float]] = defaultdict(list)
+    for clip in clips:
+        for name, value in clip.items():
+            key, _, kind = name.removeprefix(_SUM).partition("/")
+            if kind:
+                sums[key][kind] += value
+            else:
+                ours[name].append(value)
+    out = {name: float(np.mean(values)) for name, values in ours.items()}
+    for key, errors in sums.items():
+        means = JointErrors(**{name: torch.tensor(value) for name, value in errors.items()}).means()
+        out |= {f"{name}{key}": value for name, value in means.items()}
+    return out
+
+
+def reconstruction_figures(
+    tokenizer: TrainedTokenizer, train: ClipDataset, truths: Sequence[Truth]
+) -> dict[str, float]:
+    """Errors over all of the clips `truths`, millimetres."""
+    nearest = NearestClip(train)
+    return mean_errors(clip_errors(tokenizer, nearest, truth) for truth in truths)
 
 
 def published_errors(made: Tensor, real: Tensor) -> dict[str, JointErrors]:
@@ -106,19 +127,33 @@ def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
     return out
 
 
-def face_figures(tokenizer: TrainedTokenizer, truths: Sequence[Truth]) -> dict[str, float]:
-    """`expression`: length of the difference of the expressions (50 values), mean over the frames of clips
-    with a face, by a tokenizer of faces or of everything; `expression_mean`: of the mean expression.
-
-    The paper measures the vertices of a licensed head instead **[ours]**. Without such clips: nothing.
+def face_errors(tokenizer: TrainedTokenizer, truth: Truth) -> Row:
+    """Of one clip with a face, sums over its frames: length of the difference of the expressions (50 values)
+    by a tokenizer of faces or of everything (`expression`), and of the mean expression; nothing without.
     """
+    real = truth.face
+    if real is None:
+        return {}
     columns = tokenizer.layout.slice("face")
-    mean = tokenizer.stats.mean[columns]
-    found: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
-    for truth in truths:
-        if truth.face is None:
-            continue
-        made = reconstruct_all(tokenizer, truth)[:, columns]
-        for name, answer in (("expression", made), ("expression_mean", mean)):
-            found[name].append(np.linalg.norm((answer - truth.face).astype(np.float64), axis=-1))
-    return {name: float(np.concatenate(values).mean()) for name, values in found.items()}
+    made, mean = reconstruct_all(tokenizer, truth)[:, columns], tokenizer.stats.mean[columns]
+
+    def total(answer: NDArray[np.float32]) -> float:
+        return float(np.linalg.norm((answer - real).astype(np.float64), axis=-1).sum())
+
+    return {"expression": total(made), "expression_mean": total(mean), "frames": float(len(real))}
+
+
+def mean_face_errors(clips: Iterable[Row]) -> dict[str, float]:
+    """Of `face_errors`: means over the frames of all clips with a face; without such clips nothing.
+
+    The paper measures the vertices of a licensed head instead **[ours]**.
+    """
+    found = [clip for clip in clips if clip]
+    frames = sum(clip["frames"] for clip in found)
+    names = [name for name in found[0] if name != "frames"] if found else []
+    return {name: sum(clip[name] for clip in found) / frames for name in names}
+
+
+def face_figures(tokenizer: TrainedTokenizer, truths: Sequence[Truth]) -> dict[str, float]:
+    """Errors of expressions over all of the clips `truths`."""
+    return mean_face_errors(face_errors(tokenizer, truth) for truth in truths)

@@ -16,6 +16,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import preview_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Shelf, Stage, StageContext
+from motionloom.pipeline.contract.units import WORK
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.outputs import Format, write_motions
 from motionloom.pipeline.inference.pretrained import write_bundle
@@ -23,10 +24,12 @@ from motionloom.pipeline.inference.requests import caption_list, require_seed, r
 from motionloom.pipeline.inference.script import Script, read_music
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
+from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.graph import (
     Selection,
     execute,
     make_plan,
+    perform,
     plan_table,
     replaced_trainings,
     require_fit,
@@ -36,7 +39,7 @@ from motionloom.pipeline.runs.graph import (
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
-from motionloom.pipeline.store.files import require_file_place, require_folder
+from motionloom.pipeline.store.files import remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
 from motionloom.pipeline.store.yaml import read_yaml
 
@@ -193,13 +196,15 @@ def _stages_again(
     console: Console,
     changes: dict[str, Any],
     device: str = "auto",
+    share: bool = False,
 ) -> Path:
     """Run the stages of a finished run that give `what` again, into folder `target` of the run.
 
     The first one writes there, of those of kind `target` if there are some; the others into folders of their
-    names within. On `device`: auto is what the recipe's hardware says.
+    names within. On `device`: auto is what the recipe's hardware says, and with `share` in as many processes.
     """
     recipe = _recipe_of(folder)
+    team = Team.start(recipe.hardware) if share and device == "auto" else Team()
     shelf = Shelf(recipe.hardware.device() if device == "auto" else choose_device(device))
     stages = [s for s in recipe.stages if what in s.kind.gives(s.config)]
     if not stages:
@@ -207,7 +212,7 @@ def _stages_again(
     stages.sort(key=lambda s: s.kind.name != target)
     for number, stage in enumerate(stages):
         out = folder / target / stage.name if number else folder / target
-        _stage_again(folder, recipe, stage, out, target, changes, shelf, console)
+        _stage_again(folder, recipe, stage, out, target, changes, shelf, console, team)
     return folder / target
 
 
@@ -220,6 +225,7 @@ def _stage_again(
     changes: dict[str, Any],
     shelf: Shelf,
     console: Console,
+    team: Team,
 ) -> None:
     given = {name: value for name, value in changes.items() if value is not None}
     config = stage.kind.config.parse({**stage.config.dump(), **given}, target)
@@ -230,11 +236,23 @@ def _stage_again(
                 f"{folder}: stage '{source.name}' (role {role}) is not finished; run the recipe first"
             )
     require_consistent(folder, (source.name for source in inputs.values()))
-    out.mkdir(exist_ok=True)
+    if team.leads:
+        out.mkdir(exist_ok=True)
+        remove_tree(out / WORK)  # of an evaluation that was killed, maybe with other settings
     context = StageContext(
-        stage.name, recipe.name, config, out, inputs, recipe.seed, recipe.hardware, console, shelf
+        name=stage.name,
+        recipe=recipe.name,
+        config=config,
+        folder=out,
+        inputs=inputs,
+        seed=recipe.seed,
+        hardware=recipe.hardware,
+        console=console,
+        shelf=shelf,
+        rank=team.rank,
+        world=team.world,
     )
-    stage.kind.run(context)
+    perform(stage.kind, context, team)
 
 
 def evaluate_run(
@@ -243,12 +261,17 @@ def evaluate_run(
     clips: int | None = None,
     repeats: int | None = None,
     device: str = "auto",
+    share: bool = False,
     console: Console | None = None,
 ) -> Path:
-    """Figures of a finished run by all its stages that make some; returns the folder RUN/evaluate."""
+    """Figures of a finished run by all its stages that make some; returns the folder RUN/evaluate.
+
+    With `share` all processes of the recipe's hardware take part, as in `run_recipe`, which start by the
+    command that started this one; else this process alone.
+    """
     console = console or make_console()
     changes = {"clips": clips, "repeats": repeats}
-    return _stages_again(folder, "figures", "evaluate", console, changes, device)
+    return _stages_again(folder, "figures", "evaluate", console, changes, device, share)
 
 
 def report_run(

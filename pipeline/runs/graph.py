@@ -24,7 +24,15 @@ from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
-from motionloom.pipeline.contract.stage import Every, Finished, Shelf, Stage, StageContext, fingerprint_fields
+from motionloom.pipeline.contract.stage import (
+    Every,
+    Finished,
+    Shelf,
+    Stage,
+    StageContext,
+    StageKind,
+    fingerprint_fields,
+)
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
@@ -249,16 +257,16 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment.
 
     With several processes each calls this with the same plan: the lead runs and writes everything, the others
-    only take part in training stages and return after the last one.
+    only take part in trainings and in stages that share their work, and return after the last one.
     """
     todo = [row for row in plan if row.action in {"run", "resume"}]
-    trained = [row for row in todo if row.stage.kind.trains]
+    joint = [row for row in todo if row.stage.kind.trains or row.stage.kind.shares]
     require_fit(todo, recipe.hardware)
     leads = process_rank() == 0
     if not leads:
-        todo = trained
+        todo = joint
     with _lock(run, needed=leads):
-        team = Team.start(recipe.hardware) if trained else Team()
+        team = Team.start(recipe.hardware) if joint else Team()
         if leads:
             write_text(run / "recipe.yaml", recipe.to_yaml())
             for row in plan:
@@ -281,19 +289,31 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 hardware=recipe.hardware,
                 console=console,
                 shelf=Shelf(recipe.hardware.device()),
+                rank=team.rank,
+                world=team.world,
             )
-            if stage.kind.trains:
-                team.meet()
-                stage.kind.run(context)
-            else:
-                with alone():
-                    stage.kind.run(context)
+            perform(stage.kind, context, team)
             if leads:
                 seconds = time.perf_counter() - begin
                 write_json(folder / "timing.json", {"seconds": round(seconds, 2)})
                 _artifact(recipe, row, plan).finish(folder)
                 console.print(f"    finished in {seconds:.1f} s")
     return [row.stage.name for row in todo]
+
+
+def perform(kind: StageKind, context: StageContext, team: Team) -> None:
+    """One stage, by all processes that take part in its kind."""
+    if kind.trains:
+        team.meet()
+        kind.run(context)
+        return
+    with alone():
+        if kind.shares:
+            team.meet()
+            kind.share(context)
+            team.meet()
+        if team.leads:
+            kind.run(context)
 
 
 def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from pydantic import Field
 
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.dance_beats import DEFINITIONS
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import FigureTable, Showing
@@ -24,6 +26,7 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
     StageKind,
 )
+from motionloom.pipeline.contract.units import Arrays, even_slices
 from motionloom.pipeline.evaluation.dance_answers import mean_pose, nearest_dances, random_dances
 from motionloom.pipeline.evaluation.dance_figures import (
     MIN_FRAMES,
@@ -42,6 +45,7 @@ from motionloom.pipeline.evaluation.dance_figures import (
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of, require_dances
 from motionloom.pipeline.evaluation.figures import Interval
 from motionloom.pipeline.evaluation.tables import interval, plain, print_tables
+from motionloom.pipeline.evaluation.versions import EVALUATE_DANCES
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.stages.progress import bar
@@ -49,7 +53,7 @@ from motionloom.pipeline.store.files import write_json
 
 _FILE = "dances.json"
 _AT_ONCE = 16
-"""Dances generated between two steps of the progress bar."""
+"""Dances generated together, at most."""
 
 KINETIC = 3 * BODY_JOINTS
 """Kinetic features of a motion."""
@@ -83,16 +87,23 @@ class EvaluateDancesStage(StageKind):
     summary = "figures of dances to held-out music"
     config = EvaluateDancesConfig
     takes = ("data", Every("generators", GENERATOR))
+    shares = True
+    version = EVALUATE_DANCES
 
     def gives(self, config: Any) -> frozenset[str]:
         """Its tables."""
         return frozenset({"figures", SHOWING})
+
+    def share(self, context: StageContext) -> None:
+        """Generate this process's share of the dances."""
+        _DanceEvaluation(context).share()
 
     def run(self, context: StageContext) -> None:
         """Write `dances.json` and print it as tables."""
         figures = plain(_DanceEvaluation(context).figures())
         write_json(context.folder / _FILE, figures)
         print_tables(context.console, figure_rows(figures))
+        context.units.clear()
 
     def show(self, stage: Finished, given: Given) -> list[Showing]:
         """The tables."""
@@ -114,25 +125,29 @@ class _DanceEvaluation:
         require_dances(self.dataset)
         require_dances(self.train)
         self.fps = self.dataset.layout.fps
+        self.clips = self._dances(self.dataset, self.config.clips, self.bundle.generator.unit_frames)
+
+    def _dances(self, dataset: ClipDataset, count: int, unit: int = 1) -> list[DanceClip]:
+        """Dances that are long enough to be measured, cut to what the generator can make."""
+        longest = min(self.config.seconds or np.inf, self.bundle.max_seconds)
+        cut = None if np.isinf(longest) else float(longest)
+        found = dances_of(dataset, count, unit=unit, seconds=cut)
+        found = [clip for clip in found if len(clip.joints) >= MIN_FRAMES]
+        if not found:
+            raise UserError(
+                f"{self.dataset.where}: no clip with music of split '{dataset.split}' is long enough to be "
+                f"measured"
+            )
+        return found
 
     def figures(self) -> dict[str, Any]:
         """All figures, each beside its trivial answers."""
-        config, seed = self.config, self.context.seed
-        longest = min(config.seconds or np.inf, self.bundle.max_seconds)
-        unit = self.bundle.generator.unit_frames
-        cut = None if np.isinf(longest) else float(longest)
-        clips = dances_of(self.dataset, config.clips, unit=unit, seconds=cut)
-        pool = dances_of(self.train, config.pool, seconds=cut)
-        clips, pool = ([c for c in found if len(c.joints) >= MIN_FRAMES] for found in (clips, pool))
-        if not clips or not pool:
-            raise UserError(
-                f"{self.dataset.where}: no clip with music of split "
-                f"'{self.train.split if clips else self.dataset.split}' is long enough to be measured"
-            )
+        config, seed, clips = self.config, self.context.seed, self.clips
+        pool = self._dances(self.train, config.pool)
         real = [clip.joints for clip in clips]
         self.true = features_of(real, self.fps, config.feature_fps)
         apart = others(clips, config.shuffles, seed)
-        made = self.generate(clips)
+        made = self.generated()
         rng = np.random.default_rng([seed, 17])
         still = [mean_pose(pool, len(clip.joints)) for clip in clips]
         answers: dict[str, list[list[Joints]]] = {
@@ -171,26 +186,43 @@ class _DanceEvaluation:
             "rows": rows,
         }
 
-    def generate(self, clips: Sequence[DanceClip]) -> list[list[Joints]]:
-        """Dances to the clips' own music, once for each repeat."""
-        out = []
+    def share(self) -> None:
+        """This process's share of the dances."""
+        units, pieces = self.context.units, self.pieces
+        sizes = [piece.stop - piece.start for _, piece in pieces]
         with bar(self.context.console) as progress:
-            total = self.config.repeats * len(clips)
-            task = progress.add_task("generating", total=total, note="")
-            for repeat in range(self.config.repeats):
-                joints: list[Joints] = []
-                for start in range(0, len(clips), _AT_ONCE):
-                    some = clips[start : start + _AT_ONCE]
-                    motions = self.bundle.generate(
-                        sounds=[clip.sound for clip in some],
-                        music=[clip.music for clip in some],
-                        seconds=[clip.seconds for clip in some],
-                        seed=self.context.seed + 7919 * (repeat + 1) + start,
-                        sampling=self.config.sampling,
-                    )
-                    joints += [motion.joints for motion in motions]
-                    progress.update(task, advance=len(some))
-                out.append(joints)
+            task = progress.add_task("generating", total=units.mine(sizes), note="")
+            units.make(
+                "generated",
+                len(sizes),
+                lambda k: self.dance(*pieces[k]),
+                lambda k: progress.advance(task, sizes[k]),
+            )
+
+    @cached_property
+    def pieces(self) -> list[tuple[int, slice]]:
+        """Repeats and clips that are danced together."""
+        found = even_slices(len(self.clips), _AT_ONCE)
+        return [(repeat, piece) for repeat in range(self.config.repeats) for piece in found]
+
+    def dance(self, repeat: int, piece: slice) -> Arrays:
+        """Joints [T, N, 3] of dances to some clips' own music, by their numbers."""
+        some = self.clips[piece]
+        motions = self.bundle.generate(
+            sounds=[clip.sound for clip in some],
+            music=[clip.music for clip in some],
+            seconds=[clip.seconds for clip in some],
+            seed=self.context.seed + 7919 * (repeat + 1) + piece.start,
+            sampling=self.config.sampling,
+        )
+        return {f"{number:06d}": motion.joints for number, motion in enumerate(motions)}
+
+    def generated(self) -> list[list[Joints]]:
+        """Dances to all clips' own music, once for each repeat."""
+        out: list[list[Joints]] = [[] for _ in range(self.config.repeats)]
+        found = self.context.units.read("generated", len(self.pieces))
+        for (repeat, _), motions in zip(self.pieces, found, strict=True):
+            out[repeat] += [motions[name] for name in sorted(motions)]
         return out
 
     def measure(self, motions: Sequence[Joints], clips: Sequence[DanceClip]) -> Group:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.pipeline.contract.showing import Bars, Showing
 from motionloom.pipeline.contract.stage import SHOWING, Finished, Given, StageConfig, StageContext, StageKind
+from motionloom.pipeline.contract.units import Arrays
 from motionloom.pipeline.stages.progress import bar
 from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.tokens import TokenStore
@@ -51,36 +51,47 @@ class TokensStage(StageKind):
     summary = "token export"
     config = TokensConfig
     takes = ("data", "stats", "tokenizer")
+    shares = True
 
     def gives(self, config: Any) -> frozenset[str]:
         """Tokens of every clip."""
         return frozenset({"tokens", SHOWING})
 
+    def share(self, context: StageContext) -> None:
+        """Encode this process's batches of every split."""
+        for encoded in self._splits(context):
+            sizes = [len(items) for items in encoded.batches]
+            with bar(context.console) as progress:
+                total = context.units.mine(sizes)
+                task = progress.add_task(f"tokens {encoded.dataset.split}", total=total, note="")
+                context.units.make(
+                    encoded.dataset.split,
+                    len(sizes),
+                    encoded.codes,
+                    lambda k, task=task, sizes=sizes: progress.advance(task, sizes[k]),  # type: ignore[misc]
+                )
+
     def run(self, context: StageContext) -> None:
         """Write `tokens-SPLIT.safetensors` for every split."""
-        data, stats, tokenizer = (context.given[role] for role in ("data", "stats", "tokenizer"))
-        for split in data.splits:
-            dataset = data.split(split)
-            with bar(context.console) as progress:
-                task = progress.add_task(f"tokens {split}", total=len(dataset), note="")
-                store = encode_split(
-                    tokenizer.net,
-                    dataset,
-                    stats,
-                    context.config.batch_frames,
-                    partial(progress.advance, task),
-                )
+        for encoded in self._splits(context):
+            split, count = encoded.dataset.split, len(encoded.dataset)
+            store = encoded.store(context.units.read(split, len(encoded.batches)))
             store.save(context.folder / f"tokens-{split}.safetensors")
             whole = store.whole_clips()
             used = ", ".join(
                 f"{s.name} {len(torch.unique(whole.codes[s.name]))}/{s.num_codes} codes"
-                for s in tokenizer.net.streams
+                for s in encoded.tokenizer.streams
             )
-            lacking = len(dataset) - len(whole.groups)
+            lacking = count - len(whole.groups)
             note = f"; {lacking} clips lack hands or a face: no GPT learns tokens of those" if lacking else ""
-            context.console.print(
-                f"    {split}: {len(dataset)} clips, {int(store.starts[-1])} groups; {used}{note}"
-            )
+            context.console.print(f"    {split}: {count} clips, {int(store.starts[-1])} groups; {used}{note}")
+        context.units.clear()
+
+    @staticmethod
+    def _splits(context: StageContext) -> Iterator[EncodedSplit]:
+        data, stats, tokenizer = (context.given[role] for role in ("data", "stats", "tokenizer"))
+        for split in data.splits:
+            yield EncodedSplit(tokenizer.net, data.split(split), stats, context.config.batch_frames)
 
     def load(self, stage: Finished, given: Given, device: torch.device) -> Tokens:
         """The codes on disk."""
@@ -106,36 +117,50 @@ class TokensStage(StageKind):
         return out
 
 
-def encode_split(
-    tokenizer: Tokenizer,
-    dataset: ClipDataset,
-    stats: FeatureStats,
-    batch_frames: int,
-    advance: Callable[[int], None] | None = None,
-) -> TokenStore:
-    """Codes of all clips in order, encoded where the tokenizer lies.
+class EncodedSplit:
+    """The codes of all clips of a split, batch by batch, made where the tokenizer lies.
 
     Clips are cut to a multiple of the group length and batched by length.
     """
-    unit, device = tokenizer.group_frames, device_of(tokenizer)
-    groups = np.maximum(np.asarray(dataset.frames) // unit, 1)
-    starts = np.concatenate([[0], np.cumsum(groups)]).astype(np.int64)
-    per_group = {s.name: s.per_group for s in tokenizer.streams}
-    present = dataset.layout.present_columns[:, tokenizer.columns.cpu().numpy()]
-    flat = {name: torch.zeros(int(starts[-1]) * n, dtype=torch.int64) for name, n in per_group.items()}
-    for items in _by_length(groups, batch_frames // unit):
-        motion, length = padded(tokenizer, dataset, stats, items)
-        mask = torch.from_numpy(present[dataset.present[items]])
-        found = tokenizer.encode(motion.to(device), length.to(device), mask.to(device))
-        codes = {name: values.cpu() for name, values in found.items()}
-        for row, item in enumerate(items.tolist()):
-            for name, n in per_group.items():
-                begin, count = int(starts[item]) * n, int(groups[item]) * n
-                flat[name][begin : begin + count] = codes[name][row, :count]
-        if advance is not None:
-            advance(len(items))
-    whole = np.asarray(present.all(axis=1))
-    return TokenStore(flat, starts, per_group, whole[dataset.present])
+
+    def __init__(
+        self, tokenizer: Tokenizer, dataset: ClipDataset, stats: FeatureStats, batch_frames: int
+    ) -> None:
+        self.tokenizer, self.dataset, self.stats = tokenizer, dataset, stats
+        unit = tokenizer.group_frames
+        self.groups = np.maximum(np.asarray(dataset.frames) // unit, 1)
+        self.batches = _by_length(self.groups, batch_frames // unit)
+        """Clip numbers of each batch."""
+        self._present = dataset.layout.present_columns[:, tokenizer.columns.cpu().numpy()]
+
+    def codes(self, batch: int) -> Arrays:
+        """Codes int64 [B, G * per_group] of one batch, by stream."""
+        items, device = self.batches[batch], device_of(self.tokenizer)
+        motion, length = padded(self.tokenizer, self.dataset, self.stats, items)
+        mask = torch.from_numpy(self._present[self.dataset.present[items]])
+        found = self.tokenizer.encode(motion.to(device), length.to(device), mask.to(device))
+        return {name: values.cpu().numpy() for name, values in found.items()}
+
+    def store(self, codes: Iterable[Arrays]) -> TokenStore:
+        """All batches' codes, in order, as one store in the order of the clips."""
+        starts = np.concatenate([[0], np.cumsum(self.groups)]).astype(np.int64)
+        per_group = {s.name: s.per_group for s in self.tokenizer.streams}
+        flat = {name: torch.zeros(int(starts[-1]) * n, dtype=torch.int64) for name, n in per_group.items()}
+        for items, found in zip(self.batches, codes, strict=True):
+            for row, item in enumerate(items.tolist()):
+                for name, n in per_group.items():
+                    begin, count = int(starts[item]) * n, int(self.groups[item]) * n
+                    flat[name][begin : begin + count] = torch.from_numpy(found[name][row, :count])
+        whole = np.asarray(self._present.all(axis=1))
+        return TokenStore(flat, starts, per_group, whole[self.dataset.present])
+
+
+def encode_split(
+    tokenizer: Tokenizer, dataset: ClipDataset, stats: FeatureStats, batch_frames: int
+) -> TokenStore:
+    """Codes of all clips in order, in this process."""
+    encoded = EncodedSplit(tokenizer, dataset, stats, batch_frames)
+    return encoded.store(encoded.codes(batch) for batch in range(len(encoded.batches)))
 
 
 def padded(

@@ -23,7 +23,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Given, Shelf
-from motionloom.pipeline.evaluation.judges import judged, texts_by_evaluator
+from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.text_motion import matching
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.api import run_recipe
@@ -111,8 +111,7 @@ def test_it_finds_the_motion_of_a_caption(judge: Path) -> None:
     data, evaluator = loaded(judge / "run")
     test = data.split("test")
     truths = [truth_of(test, i) for i in range(len(test))]
-    text = texts_by_evaluator(evaluator, truths)
-    latents = judged(evaluator, text, truths, [], truths[:8])
+    latents = Judge.evaluator(evaluator).latents(truths, [], truths[:8])
     found = matching(replace(latents, made=[latents.real]), size=32, repeats=20, seed=0)
     assert found["chance"]["top-3"] == pytest.approx(3 / 32)
     assert found["real"]["top-3"].mean > 0.6, found["real"]

@@ -1,0 +1,204 @@
+"""Which metric notices which fault: figures of recorded motion that is made worse on purpose.
+
+    motionloom run ude-learning
+    python benchmarks/perturbation.py runs/ude-learning
+
+Recorded test clips, each with a fault of `pipeline/evaluation/faults.py`, or with another clip's motion, are
+judged as generated motion is. Distances are to as many training clips, so that recorded motion has a value
+too. Everything is measured on ten random halves of the clips. A metric has noticed a fault ("+") where it is
+worse than for the recorded motion of the same half in all ten, by more than twice the deviation that
+recorded motion has among halves; it is deceived ("!") where it is better by as much; "." is neither.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch.nn.functional import normalize
+
+from motionloom.datasets.motion.features import encode
+from motionloom.models.metrics.diversity import diversity
+from motionloom.models.metrics.frechet import fid
+from motionloom.models.metrics.retrieval import matching_score
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.evaluation.dance_figures import (
+    Matched,
+    alignment_of,
+    distribution_of,
+    features_of,
+    recognition_of,
+)
+from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
+from motionloom.pipeline.evaluation.faults import FAULTS, Joints, swapped
+from motionloom.pipeline.evaluation.figures import bodily, embed_motions, obeyed, retrieval_figures, shares
+from motionloom.pipeline.evaluation.reconstruction import published_errors
+from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
+from motionloom.pipeline.store.networks import LoadedTma
+
+HALVES = 10
+SWAPPED = "another clip's motion"
+BETTER = {
+    "R@1": 1, "Matching score": -1, "FID": -1, "FID, length 1": -1, "Diversity": 0, "obeys its caption": 1,
+    "MPJPE": -1, "PA-MPJPE": -1, "ACCEL": -1, "skating": -1, "floating": -1, "penetration": -1, "jitter": -1,
+    "Beat Align (UDE)": 1, "Beat Align (MINT)": 1, "FID_k": -1, "FID_m": -1, "genre": 1,
+}  # fmt: skip
+"""Direction in which a metric is better; 0: the nearer to recorded motion."""
+
+Figures = dict[str, float]
+
+
+@dataclass
+class Captioned:
+    """Test clips with captions, and what judges them."""
+
+    tma: LoadedTma
+    truths: list[Truth]
+    text: torch.Tensor
+    others: torch.Tensor
+
+    def figures(self, motions: Sequence[Joints], size: int) -> Callable[[NDArray[np.int64]], Figures]:
+        """Figures of any of the clips, by their numbers."""
+        layout, fps = self.tma.layout, self.tma.layout.fps
+        columns = layout.part("bodyhand")
+        latent = embed_motions(self.tma, [encode(m, layout)[:, columns] for m in motions])
+        kept = [obeyed(t, m, None, fps) for t, m in zip(self.truths, motions, strict=True)]
+        bodies = [bodily(m, fps) for m in motions]
+        errors = [
+            published_errors(torch.from_numpy(m), torch.from_numpy(t.joints))[""].means()
+            for t, m in zip(self.truths, motions, strict=True)
+        ]
+
+        def of(rows: NDArray[np.int64]) -> Figures:
+            text, motion = self.text[rows], latent[rows]
+            found = retrieval_figures(text, motion, size=size, repeats=5, seed=0)
+            obeys = shares({k: v for k, v in kept[r].items() if k != "everything"} for r in rows)
+            out = {
+                "R@1": found["t2m_r1"].mean,
+                "Matching score": float(matching_score(unit(text), unit(motion))),
+                "FID": float(fid(self.others, motion)),
+                "FID, length 1": float(fid(unit(self.others), unit(motion))),
+                "Diversity": float(diversity(motion, seed=0)),
+            }
+            out |= {"obeys its caption": float(np.mean(list(obeys.values())))} if obeys else {}
+            mean = shares(errors[r] for r in rows)
+            out |= {"MPJPE": mean["mpjpe"], "PA-MPJPE": mean["pa_mpjpe"], "ACCEL": mean["accel"]}
+            return out | shares(bodies[r] for r in rows)
+
+        return of
+
+
+@dataclass
+class Dances:
+    """Test dances, and training dances that distances are to."""
+
+    clips: list[DanceClip]
+    pool: list[Joints]
+
+    def figures(self, motions: Sequence[Joints]) -> Callable[[NDArray[np.int64]], Figures]:
+        """Figures of any of the clips, by their numbers."""
+        fps = self.clips[0].fps
+        true = features_of(self.pool, fps, 60.0)
+        found = features_of(motions, fps, 60.0)
+
+        def of(rows: NDArray[np.int64]) -> Figures:
+            matched = [Matched(motions[r], self.clips[r]) for r in rows]
+            beats = alignment_of(matched)
+            apart = distribution_of(true, {kind: values[rows] for kind, values in found.items()})
+            out = {f"Beat Align ({'UDE' if n == 'ude' else 'MINT'})": beats[n] for n in ("ude", "mint")}
+            out |= {"FID_k": apart["fid_k"], "FID_m": apart["fid_m"]}
+            return out | {k: v for k, v in recognition_of(matched).items() if k == "genre"}
+
+        return of
+
+
+def unit(latents: torch.Tensor) -> torch.Tensor:
+    """Of length 1."""
+    return normalize(latents.double(), dim=-1)
+
+
+def verdicts(clean: list[Figures], faulty: list[Figures]) -> dict[str, tuple[float, str]]:
+    """Mean of each figure with the fault, and whether it was noticed."""
+    out = {}
+    for name in faulty[0]:
+        before = np.array([row[name] for row in clean])
+        after = np.array([row[name] for row in faulty])
+        gain = (after - before) * BETTER[name] if BETTER[name] else -np.abs(after - before)
+        clear = np.abs(gain).mean() > max(2 * before.std(ddof=1), 1e-9)
+        mark = "+" if clear and (gain < 0).all() else "!" if clear and (gain > 0).all() else "."
+        out[name] = (float(after.mean()), mark)
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--clips", type=int, default=400, help="captioned test clips, and dances, at most")
+    parser.add_argument("--size", type=int, default=32, help="candidates of retrieval")
+    args = parser.parse_args()
+    stages, shelf = finished_stages(args.run), Shelf()
+    tma, data = shelf.get(stages["tma"]), shelf.get(stages["data"])
+    test, train = data.held_out(prefer="test"), data.split("train")
+    captioned = has_caption(train).nonzero()[0]
+    truths = [truth_of(test, i) for i in sorted(drawn(test, args.clips))]
+    others = [
+        truth_of(train, int(captioned[i % len(captioned)])) for i in spread_any(train, len(truths) // 2)
+    ]
+    judge = Captioned(
+        tma,
+        truths,
+        tma.embed_captions([t.caption for t in truths], tma.given["text"].cache),
+        embed_motions(tma, [t.features for t in others]),
+    )
+    sets: list[tuple[list[Joints], Callable[[Sequence[Joints]], Callable[[NDArray[np.int64]], Figures]]]] = [
+        ([t.joints for t in truths], lambda motions: judge.figures(motions, args.size))
+    ]
+    if "audio" in stages:
+        dances = Dances(dances_of(test, args.clips), [c.joints for c in dances_of(train, args.clips // 2)])
+        sets.append(([clip.joints for clip in dances.clips], dances.figures))
+    fps, results = test.layout.fps, {name: {} for name in ("recorded", *FAULTS, SWAPPED)}
+    for real, figures in sets:
+        rng = np.random.default_rng(0)
+        halves = [rng.permutation(len(real))[: len(real) // 2] for _ in range(HALVES)]
+        clean = [figures(real)(rows) for rows in halves]
+        results["recorded"] |= {name: (float(np.mean([c[name] for c in clean])), "") for name in clean[0]}
+        for name in track([*FAULTS, SWAPPED], "judging faults", transient=True):
+            if name == SWAPPED:
+                made = [real[other] for other in swapped(len(real), rng)]
+                made = [_as_long(m, len(r)) for m, r in zip(made, real, strict=True)]
+            else:
+                made = [FAULTS[name](joints, fps, rng) for joints in real]
+            of = figures(made)
+            results[name] |= verdicts(clean, [of(rows) for rows in halves])
+    show(results, len(truths))
+    (args.run / "perturbation.json").write_text(json.dumps(results, indent=1))
+
+
+def _as_long(joints: Joints, frames: int) -> Joints:
+    """Cut, or still at the end."""
+    return np.concatenate([joints[:frames], np.repeat(joints[-1:], max(0, frames - len(joints)), axis=0)])
+
+
+def show(results: dict[str, dict[str, tuple[float, str]]], clips: int) -> None:
+    """A row a metric, a column a fault: what fits a page."""
+    table = Table(title=f"{clips} captioned clips: + noticed, ! deceived, . neither", title_justify="left")
+    for column in ("", *results):
+        table.add_column(column, overflow="fold")
+    for name in results["recorded"]:
+        cells = [results[fault].get(name, (float("nan"), "")) for fault in results]
+        table.add_row(name, *(f"{value:.3g} {mark}" for value, mark in cells))
+    Console(width=170).print(table)
+
+
+if __name__ == "__main__":
+    main()

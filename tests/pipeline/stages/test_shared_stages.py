@@ -1,0 +1,73 @@
+"""Stages whose work all processes share: the same files, bit for bit, by one process and by two."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+CAPTIONS = """
+extends: small
+name: small
+stages:
+  evaluate: {clips: 7, repeats: 3, size: 4}
+"""
+DANCES = """
+extends: ude-small
+name: ude-small
+stages:
+  evaluate_dances: {kind: evaluate_dances, clips: 3, repeats: 3, shuffles: 1, pool: 4}
+"""
+
+
+def run(start: Callable[..., Any], *arguments: object) -> str:
+    process = start(*arguments)
+    output: str = process.communicate(timeout=240)[0]
+    assert process.returncode == 0, output
+    return output
+
+
+@pytest.mark.parametrize(
+    ("given", "recipe", "stages"),
+    [
+        ("small_run", CAPTIONS, {"tokens": "tokens-train.safetensors", "evaluate": "metrics.json"}),
+        ("ude_run", DANCES, {"evaluate_dances": "dances.json"}),
+    ],
+)
+def test_two_processes_make_what_one_makes(
+    given: str,
+    recipe: str,
+    stages: dict[str, str],
+    start: Callable[..., Any],
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+) -> None:
+    small: Any = request.getfixturevalue(given)
+    shutil.copy(small.recipe, tmp_path / small.recipe.name)
+    (tmp_path / "shared.yaml").write_text(recipe)
+    made: list[dict[str, bytes]] = []
+    for devices in (1, 2):
+        folder = tmp_path / f"run{devices}"
+        shutil.copytree(small.folder, folder)
+        for stage in stages:
+            run(
+                start, "run", tmp_path / "shared.yaml", "--out", folder, "--only", stage, "--force",
+                "--set", f"hardware.devices={devices}",
+            )  # fmt: skip
+        assert not list(folder.glob("stages/*/work"))
+        made.append({name: (folder / "stages" / name / file).read_bytes() for name, file in stages.items()})
+    assert made[0] == made[1]
+    if "evaluate" in stages:
+        again = run(start, "evaluate", tmp_path / "run2", "--clips", 7, "--repeats", 3)
+        assert (tmp_path / "run2/evaluate/metrics.json").read_bytes() == made[0]["evaluate"]
+        assert "R@1" in again
+        figures = json.loads(made[0]["evaluate"])
+        assert figures["clips"] == 7 and {"t2m_r1", "matching_score"} <= set(
+            figures["retrieval"]["generated"]
+        )
