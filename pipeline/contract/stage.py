@@ -24,6 +24,7 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve, ModelCard, Showing
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.store.run_state import RunState
 
 CPU = torch.device("cpu")
 
@@ -199,6 +200,9 @@ class StageContext:
     console: Console
     shelf: Shelf
     """Where inputs are loaded, each once."""
+    again: RunState | None = None
+    """How far the whole run is, where a stage is run outside of it (`motionloom report`); then inputs may be
+    missing, and times may be shown. Within a run equal stages give equal outputs."""
 
     @property
     def device(self) -> torch.device:

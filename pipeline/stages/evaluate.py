@@ -23,14 +23,23 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
     StageKind,
 )
+from motionloom.pipeline.evaluation.cases import Case, generated_cases, reconstructed_cases, write_cases
+from motionloom.pipeline.evaluation.confusions import measured_confusions, retrieval_confusions
+from motionloom.pipeline.evaluation.detail_rows import detail_showings
 from motionloom.pipeline.evaluation.figure_rows import figure_rows
 from motionloom.pipeline.evaluation.figures import (
     embed_motions,
     truth_agreement,
 )
+from motionloom.pipeline.evaluation.joint_map import joint_map
 from motionloom.pipeline.evaluation.reconstruction import face_figures, reconstruction_figures
 from motionloom.pipeline.evaluation.tables import plain, print_tables
-from motionloom.pipeline.evaluation.text_motion import Latents, distribution, retrieval
+from motionloom.pipeline.evaluation.text_motion import (
+    Latents,
+    caption_distances,
+    distribution,
+    retrieval,
+)
 from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
@@ -65,7 +74,7 @@ class EvaluateStage(StageKind):
     summary = "figures on the test split"
     config = EvaluateConfig
     takes = ("data", "tokenizer?", "face_tokenizer?: tokenizer", "tma?", Every("generators", GENERATOR))
-    version = 5  # the papers' definitions, clips drawn as they come; TMA reads captions by its own encoder
+    version = 6  # errors of each joint, confusions, worst and best cases
 
     def gives(self, config: Any) -> frozenset[str]:
         """Its tables."""
@@ -73,14 +82,17 @@ class EvaluateStage(StageKind):
 
     def run(self, context: StageContext) -> None:
         """Write `metrics.json` and print it as tables."""
-        figures = plain(_Evaluation(context).figures())
+        evaluation = _Evaluation(context)
+        figures = plain(evaluation.figures() | evaluation.details())
+        write_cases(context.folder, evaluation.cases)
         write_json(context.folder / _FILE, figures)
         print_tables(context.console, figure_rows(figures))
 
     def show(self, stage: Finished, given: Given) -> list[Showing]:
         """The tables."""
         figures = json.loads((stage.folder / _FILE).read_text())
-        return [FigureTable(title, columns, rows) for title, columns, rows in figure_rows(figures)]
+        tables = [FigureTable(title, columns, rows) for title, columns, rows in figure_rows(figures)]
+        return [*tables, *detail_showings(stage.folder, figures)]
 
 
 class _Evaluation:
@@ -93,6 +105,9 @@ class _Evaluation:
         makers = context.every("generators")
         self.bundle = bundle_driven_by("text", makers, context.shelf) or Bundle(makers, context.shelf)
         self.dataset = context.given["data"].held_out(prefer="test")
+        self.cases: list[Case] = []
+        self.confusions: list[dict[str, Any]] = []
+        self.joints: dict[str, Any] = {}
 
     def figures(self) -> dict[str, Any]:
         """All figures, each beside its trivial answer."""
@@ -110,6 +125,7 @@ class _Evaluation:
             if shown:
                 figures["reconstruction_mm"] = reconstruction_figures(self.tokenizer, train, shown)
                 figures |= self.faces(shown)
+                self.keep_reconstructions(self.tokenizer, shown)
         if not truths and "reconstruction_mm" not in figures:
             raise UserError(
                 f"{dataset.where}: no captioned clip of split '{dataset.split}' is long enough for one group "
@@ -126,7 +142,30 @@ class _Evaluation:
             figures |= self.by_tma(self.tma, truths, generated)
         if any(t.truth for t in truths):
             figures["agreement_with_caption"] = self.agreement(truths, generated)
+            first = [g.joints for g in generated[0]]
+            self.confusions += measured_confusions(truths, first, dataset.layout.fps)
         return figures
+
+    def details(self) -> dict[str, Any]:
+        """Errors of joints, confusions and cases, which are drawn, not listed; found beside the figures."""
+        layout = self.dataset.layout
+        facts = {"fps": layout.fps, "skeleton": layout.skeleton.name, **self.joints}
+        cases = [case.figures() for case in self.cases]
+        return facts | ({"cases": cases} if cases else {}) | {"confusions": self.confusions}
+
+    def keep_reconstructions(self, tokenizer: TrainedTokenizer, truths: list[Truth]) -> None:
+        """Keep each joint's error, and the worst and best clips."""
+        found = joint_map(tokenizer, truths)
+        self.joints = found.figures
+        self.cases += reconstructed_cases(tokenizer, truths, found.clips)
+
+    def keep_generated(
+        self, latents: Latents, truths: list[Truth], motions: Sequence[GeneratedMotion]
+    ) -> None:
+        """Keep what captions are taken for, and the worst and best motions of the first repeat."""
+        self.confusions += retrieval_confusions(latents, truths)
+        far = caption_distances(latents.text, latents.made[0]).tolist()
+        self.cases += generated_cases(truths, [motion.joints for motion in motions], far)
 
     def protocol(self) -> dict[str, Any]:
         """What else one has to know to get the same figures again."""
@@ -195,6 +234,7 @@ class _Evaluation:
             still=embed_motions(tma, [np.tile(mean, (len(t.features), 1)) for t in truths]),
         )
         words = [t.caption for t in truths]
+        self.keep_generated(latents, truths, generated[0])
         return {
             "retrieval": retrieval(
                 latents, words, size=config.size, among=config.among, repeats=config.repeats, seed=seed
