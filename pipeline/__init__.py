@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
     from motionloom.datasets.schema import UserError
+    from motionloom.pipeline.compare.command import compare_runs
     from motionloom.pipeline.contract.generation import Prompt
     from motionloom.pipeline.contract.registry import register
     from motionloom.pipeline.contract.sampling import SamplingConfig
@@ -33,6 +34,7 @@ __all__ = [
     "StageKind",
     "TrainedStage",
     "UserError",
+    "compare_runs",
     "evaluate_run",
     "export_run",
     "load_recipe",
@@ -52,6 +54,7 @@ _HOMES = {
     "StageKind": "pipeline.contract.stage",
     "TrainedStage": "pipeline.stages.trained",
     "UserError": "datasets.schema",
+    "compare_runs": "pipeline.compare.command",
     "evaluate_run": "pipeline.runs.api",
     "export_run": "pipeline.runs.api",
     "load_recipe": "pipeline.runs.recipe",

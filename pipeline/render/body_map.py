@@ -147,10 +147,11 @@ def _bone(a: tuple[float, ...], b: tuple[float, ...], width: float) -> str:
 def _joint(name: str, at: tuple[float, ...], error: float, scale: Scale, radius: float) -> str:
     number = f"{error:.0f}" if error >= 9.95 else f"{error:.1f}"
     tip = escape(f"{joint_label(name)}: {error:.1f} mm")
+    size = ";font-size:8px" if error >= 99.5 else ""
     return (
         f'<g><title>{tip}</title><circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="{radius:g}" '
         f'fill="{scale.colour(error)}" stroke="#5b6475" stroke-width="0.7"/>'
-        f'<text class="value" x="{at[0]:.1f}" y="{at[1] + 3.4:.1f}" style="fill:{scale.ink(error)}">'
+        f'<text class="value" x="{at[0]:.1f}" y="{at[1] + 3.4:.1f}" style="fill:{scale.ink(error)}{size}">'
         f"{number}</text></g>"
     )
 

@@ -32,7 +32,7 @@ def matrix_table(
             _cell(value, total, name == column) for column, value in zip(columns, values, strict=True)
         )
         body.append(f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>')
-    caption = f"<caption>{escape(title)}</caption>" if title else ""
+    caption = f"<caption><span>{escape(title)}</span></caption>" if title else ""
     return (
         f'<div class="scroll"><table class="matrix">{caption}<thead><tr>'
         f'<th class="corner">{escape(corner)}</th>{head}</tr></thead>'

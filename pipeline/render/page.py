@@ -38,6 +38,8 @@ class Cell:
     colour: int | None = None
     """Shows a curve's colour before the text."""
     best: bool = False
+    maybe: bool = False
+    """The best, but not for sure."""
     soft: bool = False
     """Beside the point: what a figure is compared with."""
 
@@ -263,7 +265,7 @@ def _table(
         "<tr>" + "".join(f"<td{a}>{_cell(v, digits)}</td>" for v, a in zip(row, align, strict=True)) + "</tr>"
         for row in rows
     )
-    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    title = f"<caption><span>{escape(caption)}</span></caption>" if caption else ""
     kind = ' class="pinned"' if pinned else ""
     inner = f"{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
     return f'<div class="scroll"><table{kind}>{inner}</table></div>'
@@ -283,6 +285,8 @@ def _cell(value: Value, digits: int) -> str:
     if isinstance(value, Cell):
         key = "" if value.colour is None else f'<i class="key s{value.colour % COLOURS}"></i>'
         text = escape(value.text)
+        if value.maybe:
+            return f'{key}<strong>{text}</strong> <span class="best" title="best mean, not for sure">☆</span>'
         if value.best:
             return f'{key}<strong>{text}</strong> <span class="best" title="best of those compared">★</span>'
         return f'{key}<span class="soft">{text}</span>' if value.soft else f"{key}{text}"

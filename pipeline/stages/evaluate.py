@@ -40,7 +40,7 @@ from motionloom.pipeline.evaluation.text_motion import (
     distribution,
     retrieval,
 )
-from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
+from motionloom.pipeline.evaluation.truth import Truth, digest_of, drawn, has_caption, spread_any, truth_of
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.stages.progress import bar
@@ -122,6 +122,7 @@ class _Evaluation:
             shown = truths if said.all() else self.truths(spread_any(dataset, self.config.clips), unit)
             figures["bits_per_second"] = self.tokenizer.net.bits_per_second
             figures["reconstructed_clips"] = len(shown)
+            figures["reconstructed_sha256"] = digest_of(shown)
             if shown:
                 figures["reconstruction_mm"] = reconstruction_figures(self.tokenizer, train, shown)
                 figures |= self.faces(shown)
@@ -136,7 +137,7 @@ class _Evaluation:
             context.console.print(f"    {dataset.split}: {left} clips without a caption {rest}")
         if not truths or "text" not in self.bundle.generator.modalities:
             return figures
-        figures["protocol"] = self.protocol()
+        figures["protocol"] = self.protocol() | {"clips_sha256": digest_of(truths)}
         generated = self.generate(truths)
         if self.tma is not None:
             figures |= self.by_tma(self.tma, truths, generated)
@@ -149,7 +150,12 @@ class _Evaluation:
     def details(self) -> dict[str, Any]:
         """Errors of joints, confusions and cases, which are drawn, not listed; found beside the figures."""
         layout = self.dataset.layout
-        facts = {"fps": layout.fps, "skeleton": layout.skeleton.name, **self.joints}
+        facts = {
+            "version": EvaluateStage.version,
+            "fps": layout.fps,
+            "skeleton": layout.skeleton.name,
+            **self.joints,
+        }
         cases = [case.figures() for case in self.cases]
         return facts | ({"cases": cases} if cases else {}) | {"confusions": self.confusions}
 

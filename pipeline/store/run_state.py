@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,6 +27,8 @@ class StageState:
     settings: Mapping[str, Any]
     """What made it, of a finished stage; else what its recipe says."""
     progress: Progress
+    inputs: Mapping[str, Any] = field(default_factory=dict)
+    """Roles that its recipe fills otherwise than by their names."""
     why: str = ""
     """What makes a finished stage outdated."""
     artifact: Artifact | None = None
@@ -127,6 +129,7 @@ def _stage(run: Path, name: str, entry: Mapping[str, Any], causes: dict[str, str
         folder=folder,
         settings=settings,
         progress=progress,
+        inputs=_mapping(entry.get("inputs")),
         why=why,
         artifact=artifact,
         step=int(rows[-1]["step"]) if rows else (0 if progress == "started" and steps else None),
