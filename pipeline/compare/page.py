@@ -83,26 +83,26 @@ def _settings(page: Page, runs: Sequence[ComparedRun], differences: Sequence[Sta
 
 def _figures(page: Page, runs: Sequence[ComparedRun], tables: Sequence[ComparedTable]) -> None:
     page.add_heading("Figures on held-out clips")
-    without = [run for run in runs if not run.evaluations]
+    without = [run.label for run in runs if not run.evaluations]
     if not tables:
         page.add_text("No run has figures yet: their stages that evaluate are not finished.")
         return
     page.add_text(
         "★ is the best of the runs that were measured alike, ☆ the best mean where its 95 % interval still "
-        "overlaps another's, so that the difference may be chance. Grey rows are what figures are compared "
-        "with, and are not ranked."
+        "overlaps another's, so that the difference may be chance; figures without ± were measured once. "
+        "Grey rows are what figures are compared with, and are not ranked."
     )
     sources = [f"{run.label}: {file.path}" for run in runs for file in run.evaluations.values()]
     several = len({table.stage for table in tables}) > 1
-    for table in tables:
-        _figure_table(page, table, several)
     if without:
-        page.add_text(f"Without any figures yet: {', '.join(run.label for run in without)}.")
+        page.add_text(f"Without any figures yet: {', '.join(without)}.")
+    for table in tables:
+        _figure_table(page, table, several, without)
     with page.folded("Files that the figures were read from"):
         page.add_list(sources)
 
 
-def _figure_table(page: Page, table: ComparedTable, several: bool) -> None:
+def _figure_table(page: Page, table: ComparedTable, several: bool, silent: Sequence[str]) -> None:
     lettered = len({row.protocol for row in table.rows}) > 1
     columns = ["", *(["measured"] if lettered else []), *(column.title for column in table.columns)]
     rows: list[list[Value]] = []
@@ -125,8 +125,9 @@ def _figure_table(page: Page, table: ComparedTable, several: bool) -> None:
     page.add_table(columns, rows, title, pinned=True)
     if table.difference:
         page.add_text(table.difference)
-    if table.missing:
-        page.add_text(f"No such figures of: {', '.join(table.missing)}.")
+    without = [label for label in table.missing if label not in silent]
+    if without:
+        page.add_text(f"No such figures of: {', '.join(without)}.")
 
 
 def _curves(page: Page, runs: Sequence[ComparedRun], charts: Sequence[CurveChart]) -> None:

@@ -65,7 +65,7 @@ def _table(spec: TableSpec, stage: str, runs: Sequence[ComparedRun]) -> Compared
     for run in runs:
         file = run.evaluations.get(stage)
         rows = {} if file is None or file.kind != spec.kind else spec.rows(file.figures)
-        if SUBJECT in rows:
+        if any(column.better and column.title in rows.get(SUBJECT, {}) for column in spec.columns):
             found[run.label] = rows
     if not found:
         return None

@@ -37,7 +37,7 @@ from motionloom.pipeline.evaluation.truth import (
     truth_at,
     truth_of,
 )
-from motionloom.pipeline.inference.bundle import GeneratedMotion
+from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
@@ -154,7 +154,7 @@ def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion
     if not chosen:
         return []
     truths = [truth_of(dataset, i) for i in chosen]
-    bundle = bundle_driven_by("text", context.every("generators"), context.shelf)
+    bundle = _bundle(context, "text")
     generated: Sequence[GeneratedMotion | None] = [None] * len(truths)
     if bundle is not None:
         generated = bundle.generate(
@@ -166,12 +166,21 @@ def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion
     return _motions(context, truths, generated)
 
 
+def _bundle(context: StageContext, modality: str) -> Bundle | None:
+    """What makes motion from it; of an unfinished run, None where no generator of the body is finished."""
+    makers = context.every("generators")
+    unfinished = context.again is not None and context.again.unfinished
+    if unfinished and all(context.shelf.generator(maker).part == "face" for maker in makers):
+        return None
+    return bundle_driven_by(modality, makers, context.shelf)
+
+
 def _danced(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
     """Clips with music, and dances made from it where a generator is conditioned on music."""
     config: ReportConfig = context.config
     if not config.dances or not with_music(dataset).any():
         return []
-    bundle = bundle_driven_by("audio", context.every("generators"), context.shelf)
+    bundle = _bundle(context, "audio")
     unit, longest = GROUP_FRAMES, config.dance_seconds
     if bundle is not None:
         unit, longest = math.lcm(unit, bundle.generator.unit_frames), min(longest, bundle.max_seconds)

@@ -77,7 +77,7 @@ def _stages_of_run(page: Page, state: RunState) -> None:
         }
     )
     columns = ["stage", "what it makes", "state", "steps", "time", "ran on"]
-    page.add_table(columns, rows, "The stages of the run")
+    page.add_table(columns, rows, "The stages of the run", pinned=True)
 
 
 def _data(page: Page, data: Data) -> None:
