@@ -33,7 +33,7 @@ from motionloom.pipeline.evaluation.reconstruction import published_errors
 from motionloom.pipeline.evaluation.text_motion import Latents, caption_distances
 from motionloom.pipeline.evaluation.truth import Truth, digest_of
 
-CONFIG = SynthConfig(clips=40, min_seconds=2.0, max_seconds=3.0)
+CONFIG = SynthConfig(clips=40, min_seconds=2.0, max_seconds=5.0)
 LAYOUT: MotionLayout = CONFIG.motion_layout
 
 

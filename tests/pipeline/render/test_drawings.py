@@ -69,7 +69,7 @@ def test_every_joint_is_drawn_with_its_error() -> None:
     tips = dict(re.findall(r"<title>([^:<]+): ([\d.]+) mm</title>", html))
     for joint, error in zip(WHOLE.joints, [*errors[:22], *hands], strict=True):
         assert tips[joint_label(joint)] == f"{error:.1f}"
-    assert html.count("<svg") == 2 and "60 mm" in html and "10 mm" in html
+    assert html.count("<svg") == 2 and "50 mm" in html and "10 mm" in html
     assert body_map(BODY, errors[:22], (), "t").count("<svg") == 1
     places = [float(x) for x in re.findall(r'<(?:circle|text)[^>]* (?:c?x)="([-\d.]+)"', html)]
     assert min(places) >= 0 and max(places) <= 400
@@ -111,7 +111,7 @@ def test_a_matrix_says_counts_and_shares() -> None:
         ("none", "", "·"),
         ("wrong", "100", "2"),
     ]
-    with pytest.raises(UserError, match="its counts are not 1 rows of 2"):
+    with pytest.raises(UserError, match="1 rows and 2 columns do not fit its counts"):
         matrix_table(["a"], ["a", "b"], [[1]], title="t")
 
 
