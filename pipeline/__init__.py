@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
     from motionloom.datasets.schema import UserError
+    from motionloom.pipeline.compare.command import compare_runs
     from motionloom.pipeline.contract.generation import Prompt
     from motionloom.pipeline.contract.registry import register
     from motionloom.pipeline.contract.sampling import SamplingConfig
@@ -34,6 +35,7 @@ __all__ = [
     "StageKind",
     "TrainedStage",
     "UserError",
+    "compare_runs",
     "compare_with_paper",
     "evaluate_run",
     "export_run",
@@ -54,6 +56,7 @@ _HOMES = {
     "StageKind": "pipeline.contract.stage",
     "TrainedStage": "pipeline.stages.trained",
     "UserError": "datasets.schema",
+    "compare_runs": "pipeline.compare.command",
     "compare_with_paper": "pipeline.published.compare",
     "evaluate_run": "pipeline.runs.api",
     "export_run": "pipeline.runs.api",

@@ -287,17 +287,41 @@ def retrieval(
 def report(
     run_folder: RunFolder,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The page; default RUN/report.html.")
+        Path | None, typer.Option("--out", "-o", help="The page; default RUN/report/report.html.")
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """One self-contained page: curves, codebooks, figures and motions to watch.
+    """One self-contained page: motions to watch, figures, where they err, curves, codebooks, what was run.
+
+    Of an unfinished run it shows what there is and says what is missing.
 
     Example: `motionloom report runs/humantomato-tiny`
     """
     from motionloom.pipeline.runs.api import report_run
 
     report_run(run_folder, out, device=device, console=make_console())
+
+
+@app.command()
+def compare(
+    run_folders: Annotated[
+        list[Path], typer.Argument(metavar="RUN RUN...", help="Two run folders or more, finished or not.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The page.")] = Path("compare.html"),
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the same here, for programs.")
+    ] = None,
+) -> None:
+    """Several runs on one page: settings that differ, figures side by side, training curves over each other.
+
+    The best of a figure is marked among runs that were measured alike. Nothing is computed again, and
+    unfinished runs show what they have.
+
+    Example: `motionloom compare runs/humantomato-tiny runs/second -o compare.html`
+    """
+    from motionloom.pipeline.compare.command import compare_runs
+
+    compare_runs(run_folders, out, json_file=json_file, console=make_console())
 
 
 @app.command()

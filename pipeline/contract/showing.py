@@ -9,6 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.pipeline.render.viewer import ViewerMotion
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -45,6 +47,41 @@ class FigureTable:
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """Errors drawn on a body."""
+
+    title: str
+    skeleton: str
+    errors: Sequence[float | None]
+    """mm of each joint; None of joints that no clip has."""
+    hands: Sequence[float] = ()
+    """mm of the finger joints from their wrists, left hand first."""
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """Counts [R, C] of what was taken for what."""
+
+    title: str
+    corner: str
+    """What rows and columns are."""
+    rows: Sequence[str]
+    columns: Sequence[str]
+    counts: Sequence[Sequence[int]]
+    more: bool = False
+    """Less important than the others: the page folds it away."""
+
+
+@dataclass(frozen=True)
+class Clips:
+    """Motions to watch."""
+
+    title: str
+    note: str
+    motions: Sequence[ViewerMotion]
 
 
 @dataclass(frozen=True)

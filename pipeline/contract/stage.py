@@ -25,6 +25,7 @@ from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve, ModelCard, Showing
 from motionloom.pipeline.contract.units import WORK, Units
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.store.run_state import RunState
 
 CPU = torch.device("cpu")
 
@@ -203,6 +204,9 @@ class StageContext:
     rank: int = 0
     world: int = 1
     """This process among those that share the stage's work."""
+    again: RunState | None = None
+    """How far the whole run is, where a stage is run outside of it (`motionloom report`); then inputs may be
+    missing, and times may be shown. Within a run equal stages give equal outputs."""
 
     @property
     def units(self) -> Units:

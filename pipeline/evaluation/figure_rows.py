@@ -51,7 +51,9 @@ def figure_rows(figures: dict[str, Any]) -> list[Rows]:
     if "agreement_with_caption" in figures:
         found = figures["agreement_with_caption"]
         names = sorted({*found["truth"], *found["generated"]})
-        rows = [[n, *(_percent(found[k].get(n)) for k in ("truth", "generated"))] for n in names]
+        rows = [
+            [n.replace("_", " "), *(_percent(found[k].get(n)) for k in ("truth", "generated"))] for n in names
+        ]
         out.append(
             (
                 "Does the motion do what its caption says? (measured on the joints)",

@@ -166,5 +166,11 @@ def _distances(text: Tensor, motion: Tensor) -> dict[str, Interval]:
     }
 
 
+def caption_distances(text: Tensor, motion: Tensor) -> Tensor:
+    """Of each text's latent [n, Z] from its motion's, both of length 1: [n], 0 to 2."""
+    out: Tensor = torch.linalg.vector_norm(_unit(text) - _unit(motion), dim=-1)
+    return out
+
+
 def _unit(x: Tensor) -> Tensor:
     return normalize(x.double(), dim=-1)

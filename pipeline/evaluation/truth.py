@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,6 +90,15 @@ def _main_caption(dataset: ClipDataset, index: int, frames: int, min_frames: int
 def _overlap(one: CaptionSpan, other: CaptionSpan) -> int:
     """Frames that both are about."""
     return min(one.end, other.end) - max(one.first, other.first)
+
+
+def digest_of(truths: Sequence[Truth]) -> str:
+    """What tells these clips from others, whatever their data set is called: sha256 of words and motions."""
+    found = hashlib.sha256()
+    for truth in truths:
+        found.update(f"{truth.caption}\n{truth.face_caption}\n{truth.features.shape}".encode())
+        found.update(np.ascontiguousarray(truth.features, "<f4").tobytes())
+    return found.hexdigest()
 
 
 def reconstruct_truth(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.float32]:

@@ -19,16 +19,22 @@ from numpy.typing import ArrayLike, NDArray
 WIDTH, HEIGHT = 640, 320
 LEFT, RIGHT, TOP, BOTTOM = 62, 24, 14, 46
 STRETCHES = 200
+COLOURS = 8
+"""Those of the page's style, `.s0` and so on."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One curve: x and y [K]; points that are not finite are left out; `dashed` sets validation off."""
+    """One curve: x and y [K]; points that are not finite are left out; `dashed` sets validation off.
+
+    Curves take the eight colours in turn, or the `colour` they are given.
+    """
 
     name: str
     x: ArrayLike
     y: ArrayLike
     dashed: bool = False
+    colour: int | None = None
 
 
 def line_chart(
@@ -47,6 +53,7 @@ def line_chart(
     parts = _axes(x_axis, y_axis, x_label, y_label, log_y)
     hover = []
     for index, (line, (x, y)) in enumerate(zip(lines, curves, strict=True)):
+        colour = _colour(line, index)
         x, y = _thin(x, y)
         points = [
             (round(x_axis(a), 1), round(y_axis(b), 1)) for a, b in zip(x.tolist(), y.tolist(), strict=True)
@@ -54,11 +61,9 @@ def line_chart(
         path = " ".join(f"{px:g},{py:g}" for px, py in points)
         dash = ' stroke-dasharray="6 4"' if line.dashed else ""
         if len(points) > 1:
-            parts.append(f'<polyline class="curve s{index % 8}" points="{path}"{dash}/>')
+            parts.append(f'<polyline class="curve s{colour}" points="{path}"{dash}/>')
         else:
-            parts += [
-                f'<circle class="dot s{index % 8}" cx="{px:g}" cy="{py:g}" r="4"/>' for px, py in points
-            ]
+            parts += [f'<circle class="dot s{colour}" cx="{px:g}" cy="{py:g}" r="4"/>' for px, py in points]
         raw = np.power(10, y) if log_y else y
         values = [
             [float(f"{a:.6g}"), float(f"{b:.4g}")] for a, b in zip(x.tolist(), raw.tolist(), strict=True)
@@ -130,8 +135,8 @@ def histogram(
             top, base = y_axis(below[bin_] + values[bin_]), y_axis(below[bin_])
             tip = f"<title>{escape(f'{name}, {low:.4g} to {high:.4g}: {values[bin_]:g}')}</title>"
             parts.append(
-                f'<rect class="stack s{index % 8}" x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" '
-                f'height="{base - top:.1f}">{tip}</rect>'
+                f'<rect class="stack s{index % COLOURS}" x="{left:.1f}" y="{top:.1f}" '
+                f'width="{right - left:.1f}" height="{base - top:.1f}">{tip}</rect>'
             )
         below += values
     return _svg(title, parts, None) + _legend([Line(name, (), ()) for name in stacks])
@@ -223,6 +228,10 @@ def _number(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:g}"
 
 
+def _colour(line: Line, index: int) -> int:
+    return (index if line.colour is None else line.colour) % COLOURS
+
+
 def _text(x: float, y: float, text: str, anchor: str) -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
 
@@ -231,7 +240,8 @@ def _legend(lines: Sequence[Line]) -> str:
     if len(lines) < 2:
         return ""
     marks = "".join(
-        f'<span><i class="key s{k % 8}{" dashed" if line.dashed else ""}"></i>{escape(line.name)}</span>'
+        f'<span><i class="key s{_colour(line, k)}{" dashed" if line.dashed else ""}"></i>'
+        f"{escape(line.name)}</span>"
         for k, line in enumerate(lines)
     )
     return f'<div class="legend">{marks}</div>'

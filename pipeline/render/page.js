@@ -1,4 +1,4 @@
-/* Theme switch, and the values under the pointer on line charts. */
+/* Theme switch, tables that are wider than the window, and the values under the pointer on line charts. */
 (function () {
   "use strict";
   const tip = document.getElementById("tip");
@@ -6,6 +6,21 @@
     const root = document.documentElement;
     const system = window.matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
     root.dataset.theme = (root.dataset.theme || system) === "dark" ? "light" : "dark";
+  });
+  const boxes = [...document.querySelectorAll(".scroll")];
+  const hint = (box) => {
+    const wide = box.scrollWidth > box.clientWidth + 2;
+    box.classList.toggle("wide", wide);
+    box.classList.toggle("end", wide && box.scrollLeft + box.clientWidth >= box.scrollWidth - 2);
+    if (wide) box.tabIndex = 0; else box.removeAttribute("tabindex");
+  };
+  for (const box of boxes) box.addEventListener("scroll", () => hint(box), { passive: true });
+  const hints = () => boxes.forEach(hint);
+  hints();
+  window.addEventListener("resize", hints);
+  for (const fold of document.querySelectorAll("details")) fold.addEventListener("toggle", hints);
+  window.addEventListener("beforeprint", () => {
+    for (const fold of document.querySelectorAll("details")) fold.open = true;
   });
   for (const chart of document.querySelectorAll("svg[data-hover]")) {
     const data = JSON.parse(chart.dataset.hover);

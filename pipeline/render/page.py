@@ -7,7 +7,9 @@ inlined once, and only into pages that hold a viewer.
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
@@ -15,7 +17,8 @@ from numpy.typing import ArrayLike
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.charts import Line, bar_chart, histogram, line_chart, ranking
+from motionloom.pipeline.render.charts import COLOURS, Line, bar_chart, histogram, line_chart, ranking
+from motionloom.pipeline.render.matrix import matrix_table
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
     fill,
@@ -26,7 +29,25 @@ from motionloom.pipeline.render.viewer import (
     viewer_script,
 )
 
-Value = str | float | int | None
+
+@dataclass(frozen=True)
+class Cell:
+    """A table's cell that is more than its text."""
+
+    text: str
+    colour: int | None = None
+    """Shows a curve's colour before the text."""
+    best: bool = False
+    maybe: bool = False
+    """The best, but not for sure."""
+    soft: bool = False
+    """Beside the point: what a figure is compared with."""
+
+    def __str__(self) -> str:
+        return self.text
+
+
+Value = str | float | int | Cell | None
 SHORT = 24
 """Columns whose cells have no more letters than this are not broken into lines."""
 PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}
@@ -67,11 +88,44 @@ class Page:
         return self
 
     def add_table(
-        self, columns: Sequence[str], rows: Sequence[Sequence[Value]], caption: str = "", digits: int = 3
+        self,
+        columns: Sequence[str | Cell],
+        rows: Sequence[Sequence[Value]],
+        caption: str = "",
+        digits: int = 3,
+        pinned: bool = False,
     ) -> Page:
-        """A table; numbers stand right with `digits` decimals, None is a dash."""
-        self._blocks.append(_table(columns, rows, caption, digits))
+        """A table; numbers stand right with `digits` decimals, None is a dash.
+
+        A `pinned` first column stays in sight while the others are scrolled.
+        """
+        self._blocks.append(_table(columns, rows, caption, digits, pinned))
         return self
+
+    def add_matrix(
+        self,
+        rows: Sequence[str],
+        columns: Sequence[str],
+        counts: Sequence[Sequence[int]],
+        title: str,
+        corner: str = "",
+    ) -> Page:
+        """Counts [R, C] of what was taken for what; neighbours stand side by side where there is room."""
+        return self._add_beside("matrices", matrix_table(rows, columns, counts, title=title, corner=corner))
+
+    def add_drawing(self, drawing: str, title: str) -> Page:
+        """A drawing of this package's own, as HTML that needs no more escaping, with its title."""
+        self._blocks.append(
+            f'<figure class="drawing"><figcaption>{escape(title)}</figcaption>{drawing}</figure>'
+        )
+        return self
+
+    @contextmanager
+    def folded(self, summary: str) -> Iterator[Page]:
+        """Blocks that are closed until the reader opens them."""
+        self._blocks.append(f'<details class="fold"><summary>{escape(summary)}</summary>')
+        yield self
+        self._blocks.append("</details>")
 
     def add_folded(self, summary: str, columns: Sequence[str], rows: Sequence[Sequence[Value]]) -> Page:
         """A table that is closed until the reader opens it."""
@@ -174,14 +228,24 @@ class Page:
 
     def _add_chart(self, chart: str, title: str) -> Page:
         block = f'<figure class="plot"><figcaption>{escape(title)}</figcaption>{chart}</figure>'
-        if self._blocks and self._blocks[-1].startswith('<div class="plots">'):
+        return self._add_beside("plots", block)
+
+    def _add_beside(self, kind: str, block: str) -> Page:
+        """Beside the block before, if that is of the same kind."""
+        if self._blocks and self._blocks[-1].startswith(f'<div class="{kind}">'):
             self._blocks[-1] = self._blocks[-1].removesuffix("</div>") + block + "</div>"
         else:
-            self._blocks.append(f'<div class="plots">{block}</div>')
+            self._blocks.append(f'<div class="{kind}">{block}</div>')
         return self
 
 
-def _table(columns: Sequence[str], rows: Sequence[Sequence[Value]], caption: str, digits: int) -> str:
+def _table(
+    columns: Sequence[str | Cell],
+    rows: Sequence[Sequence[Value]],
+    caption: str,
+    digits: int,
+    pinned: bool = False,
+) -> str:
     for row in rows:
         if len(row) != len(columns):
             raise UserError(f"table '{caption}': a row has {len(row)} cells for {len(columns)} columns")
@@ -194,15 +258,17 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[Value]], caption: str
         ' class="number"' if number else ' class="short"' if brief else ""
         for number, brief in zip(numeric, short, strict=True)
     ]
-    head = "".join(f'<th scope="col"{a}>{escape(name)}</th>' for name, a in zip(columns, align, strict=True))
+    head = "".join(
+        f'<th scope="col"{a}>{_cell(name, digits)}</th>' for name, a in zip(columns, align, strict=True)
+    )
     body = "".join(
         "<tr>" + "".join(f"<td{a}>{_cell(v, digits)}</td>" for v, a in zip(row, align, strict=True)) + "</tr>"
         for row in rows
     )
-    title = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return (
-        f'<div class="scroll"><table>{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-    )
+    title = f"<caption><span>{escape(caption)}</span></caption>" if caption else ""
+    kind = ' class="pinned"' if pinned else ""
+    inner = f"{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
+    return f'<div class="scroll"><table{kind}>{inner}</table></div>'
 
 
 def _is_number(value: Value) -> bool:
@@ -216,6 +282,14 @@ def _short(value: Value) -> Value:
 def _cell(value: Value, digits: int) -> str:
     if value is None:
         return "–"
+    if isinstance(value, Cell):
+        key = "" if value.colour is None else f'<i class="key s{value.colour % COLOURS}"></i>'
+        text = escape(value.text)
+        if value.maybe:
+            return f'{key}<strong>{text}</strong> <span class="best" title="best mean, not for sure">☆</span>'
+        if value.best:
+            return f'{key}<strong>{text}</strong> <span class="best" title="best of those compared">★</span>'
+        return f'{key}<span class="soft">{text}</span>' if value.soft else f"{key}{text}"
     if isinstance(value, float):
         return escape(
             f"{value:.{digits}f}" if 1e-3 <= abs(value) < 1e5 or value == 0 else f"{value:.{digits}g}"

@@ -13,9 +13,9 @@ from typing import Any, get_args
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.lookup import preview_of
+from motionloom.pipeline.contract.lookup import finished_stages, preview_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Shelf, Stage, StageContext
+from motionloom.pipeline.contract.stage import Finished, Shelf, Stage, StageContext
 from motionloom.pipeline.contract.units import WORK
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.outputs import Format, write_motions
@@ -41,6 +41,7 @@ from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
+from motionloom.pipeline.store.run_state import RunState, StageState, run_state
 from motionloom.pipeline.store.yaml import read_yaml
 
 
@@ -197,11 +198,13 @@ def _stages_again(
     changes: dict[str, Any],
     device: str = "auto",
     share: bool = False,
+    state: RunState | None = None,
 ) -> Path:
-    """Run the stages of a finished run that give `what` again, into folder `target` of the run.
+    """Run the stages of a run that give `what` again, into folder `target` of the run.
 
     The first one writes there, of those of kind `target` if there are some; the others into folders of their
     names within. On `device`: auto is what the recipe's hardware says, and with `share` in as many processes.
+    With `state` they get those of their inputs that are finished, else all must be.
     """
     recipe = _recipe_of(folder)
     team = Team.start(recipe.hardware) if share and device == "auto" else Team()
@@ -212,7 +215,7 @@ def _stages_again(
     stages.sort(key=lambda s: s.kind.name != target)
     for number, stage in enumerate(stages):
         out = folder / target / stage.name if number else folder / target
-        _stage_again(folder, recipe, stage, out, target, changes, shelf, console, team)
+        _stage_again(folder, recipe, stage, out, target, changes, shelf, console, team, state)
     return folder / target
 
 
@@ -226,10 +229,13 @@ def _stage_again(
     shelf: Shelf,
     console: Console,
     team: Team,
+    state: RunState | None,
 ) -> None:
     given = {name: value for name, value in changes.items() if value is not None}
     config = stage.kind.config.parse({**stage.config.dump(), **given}, target)
     inputs = stage_inputs(recipe, folder, stage)
+    if state is not None:
+        inputs = _finished_inputs(folder, inputs, state)
     for role, source in inputs.items():
         if not (source.folder / "artifact.json").is_file():
             raise UserError(
@@ -251,8 +257,26 @@ def _stage_again(
         shelf=shelf,
         rank=team.rank,
         world=team.world,
+        again=state,
     )
     perform(stage.kind, context, team)
+
+
+def _finished_inputs(folder: Path, inputs: dict[str, Finished], state: RunState) -> dict[str, Finished]:
+    """Those of a stage's inputs that are finished, with all that they were made from."""
+    whole = {stage.name for stage in state.stages if stage.usable and not _gone(stage)}
+    finished = finished_stages(folder) if whole else {}
+    return {
+        role: finished[source.name]
+        for role, source in inputs.items()
+        if source.name in finished
+        and whole.issuperset([source.name, *(above.name for above in finished[source.name].upstream())])
+    }
+
+
+def _gone(stage: StageState) -> bool:
+    """Whether an output of a finished stage is not there any more."""
+    return stage.artifact is not None and stage.artifact.missing(stage.folder) is not None
 
 
 def evaluate_run(
@@ -277,11 +301,14 @@ def evaluate_run(
 def report_run(
     folder: Path, out: Path | None, *, device: str = "auto", console: Console | None = None
 ) -> Path:
-    """The page of a finished run; returns its path."""
+    """The page of a run; returns its path. Of an unfinished run: what there is, and what is missing."""
     console = console or make_console()
     if out is not None:
         require_file_place(out)
-    page = _stages_again(folder, "page", "report", console, {}, device) / "report.html"
+    state = run_state(folder)
+    page = _stages_again(folder, "page", "report", console, {}, device, state=state) / "report.html"
+    if missing := [stage for stage in state.unfinished if stage.kind != "report"]:
+        console.print(f"not finished: {', '.join(f'{stage.name} ({stage.say()})' for stage in missing)}")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(page, out)

@@ -295,7 +295,8 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
             perform(stage.kind, context, team)
             if leads:
                 seconds = time.perf_counter() - begin
-                write_json(folder / "timing.json", {"seconds": round(seconds, 2)})
+                took = {"seconds": round(seconds, 2), "hardware": recipe.hardware.describe()}
+                write_json(folder / "timing.json", took)
                 _artifact(recipe, row, plan).finish(folder)
                 console.print(f"    finished in {seconds:.1f} s")
     return [row.stage.name for row in todo]

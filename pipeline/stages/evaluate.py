@@ -27,6 +27,9 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
 )
 from motionloom.pipeline.contract.units import Arrays, as_rows, as_table, even_slices
+from motionloom.pipeline.evaluation.cases import write_cases
+from motionloom.pipeline.evaluation.detail_rows import detail_showings
+from motionloom.pipeline.evaluation.details import Details
 from motionloom.pipeline.evaluation.figure_rows import figure_rows
 from motionloom.pipeline.evaluation.figures import bodily, embed_motions, obeyed, shares
 from motionloom.pipeline.evaluation.judges import Judge
@@ -39,7 +42,7 @@ from motionloom.pipeline.evaluation.reconstruction import (
 )
 from motionloom.pipeline.evaluation.tables import plain, print_tables
 from motionloom.pipeline.evaluation.text_motion import distribution, matching, retrieval
-from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
+from motionloom.pipeline.evaluation.truth import Truth, digest_of, drawn, has_caption, spread_any, truth_of
 from motionloom.pipeline.evaluation.versions import EVALUATE
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
@@ -51,8 +54,8 @@ from motionloom.pipeline.store.networks import TrainedTokenizer
 _FILE = "metrics.json"
 _RECONSTRUCTED, _GENERATED = 16, 64
 """Clips at a time, at most."""
-_JOINTS, _FACE, _OBEYED, _PHYSICS = "joints/", "face/", "obeyed/", "physics/"
-"""Begin the names of what is measured of a clip."""
+_JOINTS, _FACE, _OBEYED, _PHYSICS, _MOTION = "joints/", "face/", "obeyed/", "physics/", "motion/"
+"""Begin the names of what is measured of a clip, or made for it."""
 _LATENT = {"tma": "latent", "evaluator": "latent_evaluator"}
 """Role of a judge -> name of its latents of what was generated."""
 
@@ -97,7 +100,9 @@ class EvaluateStage(StageKind):
 
     def run(self, context: StageContext) -> None:
         """Write `metrics.json` and print it as tables."""
-        figures = plain(_Evaluation(context).figures())
+        evaluation = _Evaluation(context)
+        figures = plain(evaluation.figures() | evaluation.details.figures())
+        write_cases(context.folder, evaluation.details.cases)
         write_json(context.folder / _FILE, figures)
         print_tables(context.console, figure_rows(figures))
         context.units.clear()
@@ -105,7 +110,8 @@ class EvaluateStage(StageKind):
     def show(self, stage: Finished, given: Given) -> list[Showing]:
         """The tables."""
         figures = json.loads((stage.folder / _FILE).read_text())
-        return [FigureTable(title, columns, rows) for title, columns, rows in figure_rows(figures)]
+        tables = [FigureTable(title, columns, rows) for title, columns, rows in figure_rows(figures)]
+        return [*tables, *detail_showings(stage.folder, figures)]
 
 
 class _Evaluation:
@@ -120,6 +126,7 @@ class _Evaluation:
         if makers:
             self.bundle = bundle_driven_by("text", makers, context.shelf) or Bundle(makers, context.shelf)
         self.dataset = context.given["data"].held_out(prefer="test")
+        self.details = Details(self.dataset.layout, EVALUATE)
         self.judges = self._judges()
         if self.tokenizer is not None:
             unit = self.tokenizer.net.group_frames
@@ -200,12 +207,14 @@ class _Evaluation:
         if self.tokenizer is not None:
             figures["bits_per_second"] = self.tokenizer.net.bits_per_second
             figures["reconstructed_clips"] = len(self.shown)
+            figures["reconstructed_sha256"] = digest_of(self.shown)
             found = list(context.units.read("reconstructed", len(self.slices)))
             if found:
                 clips = [row for table in found for row in as_rows(table, _JOINTS)]
                 figures["reconstruction_mm"] = mean_errors(clips)
                 faces = mean_face_errors(row for table in found for row in as_rows(table, _FACE))
                 figures |= {"reconstruction_face": faces} if faces else {}
+                self.details.reconstructed(self.tokenizer, self.shown)
         if not self.truths and "reconstruction_mm" not in figures:
             raise UserError(
                 f"{dataset.where}: no captioned clip of split '{dataset.split}' is long enough for one group "
@@ -216,7 +225,7 @@ class _Evaluation:
             context.console.print(f"    {dataset.split}: {left} clips without a caption {rest}")
         if not self.performs:
             return figures
-        figures["protocol"] = self.protocol()
+        figures["protocol"] = self.protocol() | {"clips_sha256": digest_of(self.truths)}
         made = list(context.units.read("generated", len(self.performances)))
         figures |= self.by_judges(made)
         fps = dataset.layout.fps
@@ -225,6 +234,7 @@ class _Evaluation:
             "generated": shares(row for table in made for row in as_rows(table, _PHYSICS)),
         }
         if any(t.truth for t in self.truths):
+            self.details.performed(self.truths, self._first(made))
             figures["agreement_with_caption"] = {
                 "truth": shares(obeyed(t, t.joints, t.face, fps) for t in self.truths),
                 "generated": shares(row for table in made for row in as_rows(table, _OBEYED)),
@@ -286,9 +296,15 @@ class _Evaluation:
         )
         rows = [obeyed(t, m.joints, m.face, fps) for t, m in zip(truths, motions, strict=True)]
         out = as_table(rows, _OBEYED) | as_table([bodily(m.joints, fps) for m in motions], _PHYSICS)
+        if repeat == 0:
+            out |= {f"{_MOTION}{number:03d}": m.joints for number, m in enumerate(motions)}
         for role, judge in self.judges.items():
             out[_LATENT[role]] = embed_motions(judge.motions, [m.features for m in motions]).numpy()
         return out
+
+    def _first(self, made: Sequence[Arrays]) -> list[NDArray[np.float64]]:
+        """Joints [T, N, 3] of the first repeat."""
+        return [table[name] for table in made for name in sorted(table) if name.startswith(_MOTION)]
 
     def _repeats(self, made: Sequence[Arrays], role: str) -> list[NDArray[np.float32]]:
         """A judge's latents [n, Z] of all clips, once for each repeat."""
@@ -307,6 +323,7 @@ class _Evaluation:
             latents = judge.latents(truths, [torch.from_numpy(z) for z in self._repeats(made, role)], others)
             spread, repeats = distribution(latents, seed=seed), config.repeats
             if role == "tma":
+                self.details.judged(latents, truths, self._first(made))
                 words = [t.caption for t in truths]
                 found = retrieval(
                     latents, words, size=config.size, among=config.among, repeats=repeats, seed=seed

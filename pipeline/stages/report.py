@@ -1,4 +1,7 @@
-"""Report stage: one self-contained page with motions to watch, figures, curves and codebooks."""
+"""Report stage: one self-contained page with motions to watch, figures, where they err, curves and codebooks.
+
+Of an unfinished run it shows what there is, and says what is missing (`StageContext.again`).
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,8 @@ from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.pipeline.contract.registry import stage_kind
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
 from motionloom.pipeline.contract.stage import (
     GENERATOR,
     SHOWING,
@@ -34,14 +37,15 @@ from motionloom.pipeline.evaluation.truth import (
     truth_at,
     truth_of,
 )
-from motionloom.pipeline.inference.bundle import GeneratedMotion
+from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
-from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.viewer import ViewerMotion
-from motionloom.pipeline.stages.training import read_metrics
+from motionloom.pipeline.stages.report_drawings import draw_bars, draw_curves, draw_showings
+from motionloom.pipeline.stages.report_facts import add_run_facts, say_missing
+from motionloom.pipeline.store.run_state import RunState
 
 
 class ReportConfig(StageConfig):
@@ -76,41 +80,71 @@ class ReportStage(StageKind):
         return frozenset({"page"})
 
     def run(self, context: StageContext) -> None:
-        """Write `report.html`."""
-        dataset = context.given["data"].held_out(prefer="test")
-        said, danced = _captioned(context, dataset), _danced(context, dataset)
-        if not said and not danced:
-            raise UserError(
-                f"{dataset.where}: no clip of split '{dataset.split}' has a caption or its sound to be "
-                f"shown; raise count or dances of stage '{context.name}' if they are 0"
-            )
+        """Write `report.html`; of an unfinished run, what there is of it."""
+        state = context.again
+        partial = state is not None and bool(state.unfinished)
+        said, danced, subtitle = [], [], "of a run that has not finished its data"
+        if "data" in context.inputs:
+            dataset = context.given["data"].held_out(prefer="test")
+            subtitle = f"{len(dataset)} clips of the {dataset.split} split were never trained on"
+            said, danced = _captioned(context, dataset), _danced(context, dataset)
+            if not said and not danced and not partial:
+                raise UserError(
+                    f"{dataset.where}: no clip of split '{dataset.split}' has a caption or its sound to be "
+                    f"shown; raise count or dances of stage '{context.name}' if they are 0"
+                )
         # The recipe's name, not the folder's: equal runs write equal pages wherever they lie.
-        page = Page(
-            f"motionloom: {context.recipe}",
-            f"{len(dataset)} clips of the {dataset.split} split were never trained on",
-        )
-        page.add_heading("Watch")
-        use = "Drag to orbit, wheel to zoom, space to play."
-        if said:
-            page.add_viewer(
-                said,
-                "Each row is one caption: the recorded clip, what the tokenizer keeps of it, and a motion "
-                f"that the model made from the words alone. {use}",
-            )
-        if danced:
-            page.add_heading("Dances")
-            page.add_viewer(
-                danced,
-                "Each row is one piece of music: the recorded dance, what the tokenizer keeps of it, and a "
-                "dance that the model made from the music alone, in time with the sound; ticks are the "
-                f"music's beats. {use}",
-            )
+        page = Page(f"motionloom: {context.recipe}", subtitle)
+        if state is not None:
+            say_missing(page, state)
+        _watch(page, context, said, danced)
         stages = context.every("shown")
-        shown = [(stage, stage.kind.show(stage, context.shelf.given(stage.inputs))) for stage in stages]
-        _draw(page, "Figures on held-out clips", shown, FigureTable)
-        _curves(page, stages)
-        _draw(page, "Codebooks", shown, Bars)
+        shown = [
+            thing for stage in stages for thing in stage.kind.show(stage, context.shelf.given(stage.inputs))
+        ]
+        draw_showings(page, shown)
+        draw_curves(page, stages if state is None else _logged(stages, state))
+        draw_bars(page, shown)
+        add_run_facts(page, context)
         page.write(context.folder / "report.html")
+
+
+def _watch(page: Page, context: StageContext, said: list[ViewerMotion], danced: list[ViewerMotion]) -> None:
+    """The motions of held-out clips; the words say what each row has."""
+    use = "Drag to orbit, wheel to zoom, space to play."
+    for motions, heading, row, whole, made in (
+        (said, "Watch", "caption", "clip", "a motion that the model made from the words alone"),
+        (
+            danced,
+            "Dances",
+            "piece of music",
+            "dance",
+            "a dance that the model made from the music alone, in time with the sound; ticks are the "
+            "music's beats",
+        ),
+    ):
+        if not motions:
+            continue
+        there = {motion.label for motion in motions}
+        words = [f"the recorded {whole}"]
+        if "reconstruction" in there:
+            words.append("what the tokenizer keeps of it")
+        if "generated" in there:
+            words.append(made)
+        listed = words[0] if len(words) == 1 else ", ".join(words[:-1]) + f", and {words[-1]}"
+        page.add_heading(heading)
+        page.add_viewer(motions, f"Each row is one {row}: {listed}. {use}")
+
+
+def _logged(stages: Sequence[Finished], state: RunState) -> list[Finished]:
+    """The stages with curves: those that are finished, and trainings that are not, in the recipe's order."""
+    out = {stage.name: stage for stage in stages}
+    for stage in state.unfinished:
+        kind = stage_kind(stage.kind, f"{state.folder / 'recipe.yaml'}: stages.{stage.name}")
+        if stage.step:
+            config = kind.config.parse(dict(stage.settings), f"{stage.folder}: settings")
+            out[stage.name] = Finished(stage.name, kind, config, stage.folder, {})
+    return [out[stage.name] for stage in state.stages if stage.name in out]
 
 
 def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
@@ -120,7 +154,7 @@ def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion
     if not chosen:
         return []
     truths = [truth_of(dataset, i) for i in chosen]
-    bundle = bundle_driven_by("text", context.every("generators"), context.shelf)
+    bundle = _bundle(context, "text")
     generated: Sequence[GeneratedMotion | None] = [None] * len(truths)
     if bundle is not None:
         generated = bundle.generate(
@@ -132,12 +166,21 @@ def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion
     return _motions(context, truths, generated)
 
 
+def _bundle(context: StageContext, modality: str) -> Bundle | None:
+    """What makes motion from it; of an unfinished run, None where no generator of the body is finished."""
+    makers = context.every("generators")
+    unfinished = context.again is not None and context.again.unfinished
+    if unfinished and all(context.shelf.generator(maker).part == "face" for maker in makers):
+        return None
+    return bundle_driven_by(modality, makers, context.shelf)
+
+
 def _danced(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
     """Clips with music, and dances made from it where a generator is conditioned on music."""
     config: ReportConfig = context.config
     if not config.dances or not with_music(dataset).any():
         return []
-    bundle = bundle_driven_by("audio", context.every("generators"), context.shelf)
+    bundle = _bundle(context, "audio")
     unit, longest = GROUP_FRAMES, config.dance_seconds
     if bundle is not None:
         unit, longest = math.lcm(unit, bundle.generator.unit_frames), min(longest, bundle.max_seconds)
@@ -208,41 +251,3 @@ def _rows(
         )
         for label, joints, controls in rows
     ]
-
-
-def _draw(
-    page: Page,
-    heading: str,
-    shown: Sequence[tuple[Finished, list[Showing]]],
-    kind: type[FigureTable] | type[Bars],
-) -> None:
-    """What the stages have to show of one kind, under a heading of its own."""
-    things = [thing for _, found in shown for thing in found if isinstance(thing, kind)]
-    if things:
-        page.add_heading(heading)
-    for thing in things:
-        if isinstance(thing, FigureTable):
-            page.add_table(list(thing.columns), [list(row) for row in thing.rows], thing.title)
-        elif isinstance(thing, Bars):
-            page.add_bars(np.asarray(thing.values), thing.title, x_label=thing.x_label, y_label=thing.y_label)
-
-
-def _curves(page: Page, stages: Sequence[Finished]) -> None:
-    page.add_heading("Training")
-    for stage in stages:
-        rows = read_metrics(stage.folder)
-        keys = sorted({k.partition("/")[2] for row in rows for k in row if "/" in k})
-        for curve in stage.kind.curves(stage.config):
-            lines = [line for key in keys if key.startswith(curve.prefix) for line in _lines(rows, key)]
-            if lines:
-                page.add_plot(lines, f"{stage.name}: {curve.title or curve.prefix}")
-
-
-def _lines(rows: list[dict[str, float]], key: str) -> list[Line]:
-    out = []
-    for kind, dashed in (("train", False), ("val", True)):
-        points = [(row["step"], row[f"{kind}/{key}"]) for row in rows if f"{kind}/{key}" in row]
-        if points:
-            steps, values = zip(*points, strict=True)
-            out.append(Line(f"{key} ({kind})", steps, values, dashed))
-    return out

@@ -91,7 +91,7 @@ def require_consistent(run: Path, stages: Iterable[str]) -> None:
             continue
         for source in dict.fromkeys((i.stage, i.fingerprint) for i in artifact.inputs.values()):
             stage, fingerprint = source
-            if _fingerprint_now(run / "stages" / stage) not in (None, fingerprint):
+            if fingerprint_now(run / "stages" / stage) not in (None, fingerprint):
                 raise UserError(
                     f"{run}: stage '{name}' was made from another '{stage}', which has been made anew since; "
                     f"finish the run: motionloom run {run / 'recipe.yaml'} -o {run}"
@@ -99,10 +99,17 @@ def require_consistent(run: Path, stages: Iterable[str]) -> None:
             todo.append(stage)
 
 
-def _fingerprint_now(folder: Path) -> str | None:
+def fingerprint_now(folder: Path) -> str | None:
     """Of what a stage's folder holds, finished or not; None if nothing is there."""
     artifact = Artifact.find(folder)
     if artifact is not None:
         return artifact.fingerprint
     started = folder / "started.json"
-    return str(json.loads(started.read_text())["fingerprint"]) if started.is_file() else None
+    if not started.is_file():
+        return None
+    try:
+        return str(json.loads(started.read_text(encoding="utf-8"))["fingerprint"])
+    except (ValueError, KeyError, TypeError):
+        raise UserError(
+            f"{started}: not readable; delete the folder {folder} and run the recipe again"
+        ) from None
