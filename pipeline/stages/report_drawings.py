@@ -67,8 +67,9 @@ def _joints(page: Page, thing: JointMap) -> None:
     skeleton = Skeleton.named(thing.skeleton)
     errors = [0.0 if error is None else error for error in thing.errors]
     page.add_drawing(body_map(skeleton, errors, thing.hands, thing.title), thing.title)
-    near: list[float | None] = [*thing.hands]
-    wrists = [None] * BODY_JOINTS + (near or [None] * (len(skeleton) - BODY_JOINTS))
+    wrists: list[float | None] = [None] * len(skeleton)
+    if thing.hands:
+        wrists[BODY_JOINTS:] = thing.hands
     rows = [
         [joint_label(joint), error, wrist]
         for joint, error, wrist in zip(skeleton.joints, thing.errors, wrists, strict=True)
