@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.synth.face import read
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.gpt.drawing import sample_seeds
@@ -39,7 +39,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, Shelf
 from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
-from motionloom.pipeline.inference.bundle import Bundle, joint_layout
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.conditions import PromptEncoder
 
 matplotlib.use("Agg")
@@ -148,13 +148,13 @@ def generation(
     stages, makers, shelf = finished_stages(run), generators_of(run), Shelf()
     tokenizer, face_makers = shelf.get(stages["tokenizer"]), makers_of_faces(makers, shelf)
     captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
-    fps, joints = tokenizer.layout.fps, joint_layout(tokenizer.layout)
+    layout, fps = tokenizer.layout, tokenizer.layout.fps
     order = np.random.default_rng(0).permutation(len(truths))
     guess = ((truths[k].joints, truths[k].face) for k in order)
     rebuilt = (reconstruct_truth(tokenizer, t) for t in truths)
     out = {
         "another clip's motion": judge(truths, guess, fps, hold_out),
-        "reconstruction": judge(truths, ((decode(x, joints), None) for x in rebuilt), fps, hold_out),
+        "reconstruction": judge(truths, ((joints_of(x, layout), None) for x in rebuilt), fps, hold_out),
     }
     found = {}
     for name, title in GPTS.items():

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.layers.basis import Basis
 from motionloom.pipeline.contract.lookup import finished_stages
@@ -27,7 +27,6 @@ from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.nearest import local_joints
 from motionloom.pipeline.evaluation.reconstruction import pose_errors
 from motionloom.pipeline.evaluation.truth import truth_of
-from motionloom.pipeline.inference.bundle import joint_layout
 
 GAINS = {"the paper's features": (1.0, 0.0), "fingers in the palm's frame": (5.0, 4.0)}
 
@@ -46,7 +45,7 @@ def main() -> None:
     args = parser.parse_args()
     stages, shelf = finished_stages(args.run), Shelf()
     train, test = (shelf.get(stages["data"]).split(split) for split in ("train", "test"))
-    stats, layout = shelf.get(stages["stats"]), joint_layout(train.layout)
+    stats, layout = shelf.get(stages["stats"]), train.layout
     columns = train.layout.part("bodyhand")
     mean, std = stats.mean[columns], stats.std[columns]
     chosen = np.random.default_rng(0).permutation(len(train))[:1000]
@@ -64,7 +63,7 @@ def main() -> None:
             for truth in truths:
                 few = (seen(basis, truth.features, mean, std) - center) @ axes[:count].T @ axes[:count]
                 features = basis.decode(torch.from_numpy(few + center)).numpy() * std + mean
-                right = agrees(truth.truth or {}, decode(features, layout), None, layout.fps)
+                right = agrees(truth.truth or {}, joints_of(features, layout), None, layout.fps)
                 found["action"].append(right["action"])
                 for name in ("left_hand", "right_hand"):
                     if (truth.truth or {})[name] != "relaxed":
