@@ -11,7 +11,6 @@ motions' do not say the captions' cannot learn from them. The sentence embedding
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +68,7 @@ def main() -> None:
     parser.add_argument("--train", type=int, default=3000, help="training captions the reader learns from")
     args = parser.parse_args()
     stages, shelf = finished_stages(args.run), Shelf()
-    hold_out = json.loads((stages["data"].folder / "artifact.json").read_text())["config"]["hold_out"]
+    hold_out = [c for stage in stages.values() for c in getattr(stage.config, "hold_out", [])]
     split = shelf.get(stages["data"]).split("train")
     chosen = np.random.default_rng(1).permutation(len(split))[: args.train]
     truths = [truth_of(split, int(i)) for i in chosen], test_truths(args.run)
