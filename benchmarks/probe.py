@@ -24,7 +24,7 @@ from sklearn.linear_model import LogisticRegression
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.figures import embed_motions
-from motionloom.pipeline.evaluation.truth import Truth, truth_of
+from motionloom.pipeline.evaluation.truth import Truth, has_caption, truth_of
 
 ATTRIBUTES = ("action", "direction", "side", "count", "speed", "left_hand", "right_hand")
 
@@ -70,8 +70,10 @@ def main() -> None:
     stages, shelf = finished_stages(args.run), Shelf()
     hold_out = [c for stage in stages.values() for c in getattr(stage.config, "hold_out", [])]
     split = shelf.get(stages["data"]).split("train")
-    chosen = np.random.default_rng(1).permutation(len(split))[: args.train]
-    truths = [truth_of(split, int(i)) for i in chosen], test_truths(args.run)
+    captioned = has_caption(split).nonzero()[0]
+    chosen = np.random.default_rng(1).permutation(captioned)[: args.train]
+    asked = [t for t in test_truths(args.run) if t.caption and t.truth and t.truth["action"] != "dance"]
+    truths = [truth_of(split, int(i)) for i in chosen], asked
     tma, cache = shelf.get(stages["tma"]), shelf.get(stages["text"]).cache
     readers: dict[str, list[NDArray[np.float32]]] = {
         "TMA, captions": [], "TMA, motions": [], "sentence encoder": []

@@ -169,17 +169,24 @@ def caption_figures(
     apart: Sequence[Mapping[str, Any]],
 ) -> dict[str, float]:
     """Shares of right attributes, "every" all together, "whole" of clips with all right, and both of these of
-    held-out combinations and of the other clips; faces play no part."""
+    held-out combinations and of the other clips; faces play no part.
+
+    A combination with a hand's shape holds out a hand beside a motion that is known ("new hand"); one without
+    holds out the motion itself ("new motion"), which training has never seen.
+    """
     found: dict[str, list[bool]] = {}
     for truth, joints in zip(truths, motions, strict=True):
         right = agrees(dict(truth), joints, None, fps)
-        new = any(all(truth.get(k) == v for k, v in combination.items()) for combination in apart)
+        new = [c for c in apart if all(truth.get(k) == v for k, v in c.items())]
+        groups = ["held out" if new else "other"]
+        if new:
+            hands = all("left_hand" in c or "right_hand" in c for c in new)
+            groups.append("new hand" if hands else "new motion")
         for name, value in right.items():
-            found.setdefault(name, []).append(value)
-            found.setdefault("every", []).append(value)
-            found.setdefault(f"{'held out' if new else 'other'} every", []).append(value)
-        found.setdefault("whole", []).append(all(right.values()))
-        found.setdefault(f"{'held out' if new else 'other'} whole", []).append(all(right.values()))
+            for title in (name, "every", *(f"{group} every" for group in groups)):
+                found.setdefault(title, []).append(value)
+        for title in ("whole", *(f"{group} whole" for group in groups)):
+            found.setdefault(title, []).append(all(right.values()))
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
