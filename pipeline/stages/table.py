@@ -23,6 +23,7 @@ from motionloom.pipeline.stages.gpt import GptStage
 from motionloom.pipeline.stages.mix import MixStage
 from motionloom.pipeline.stages.prepare import StatsStage, TextStage
 from motionloom.pipeline.stages.report import ReportStage
+from motionloom.pipeline.stages.rewordings import RewordingsStage
 from motionloom.pipeline.stages.tma import TmaStage
 from motionloom.pipeline.stages.tokenizer import TOKENIZERS, TokenizerStage
 from motionloom.pipeline.stages.tokens import TokensStage
@@ -36,6 +37,7 @@ register(ShardsStage("shards", "existing shards", ShardsStageConfig, run_shards)
 register(MixStage())
 register(StatsStage())
 register(TextStage())
+register(RewordingsStage())
 register(AlignedTextStage())
 register(AudioStage())
 for name, summary, config in TOKENIZERS:
