@@ -25,12 +25,13 @@ from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.text.cache import TextCache
+from motionloom.datasets.text.reword import Rewordings
 
 ENDLESS = 2**62
 """`len` of training batches: they go on for as many epochs as the sampler asks for."""
 
 # Counters that keep the draws for different purposes apart (arguments of `uniform`).
-_WINDOW, _CAPTION, _CROP = 1, 2, 3
+_WINDOW, _CAPTION, _CROP, _REWORD = 1, 2, 3, 4
 
 
 class MotionBatch(TypedDict):
@@ -168,9 +169,17 @@ class _CaptionedClips:
         return caption_spans(found, self.dataset.layout.fps, frames, self.min_frames)
 
     def make(
-        self, clips: NDArray[np.int64], spans: list[CaptionSpan], crop: NDArray[np.float64]
+        self,
+        clips: NDArray[np.int64],
+        spans: list[CaptionSpan],
+        crop: NDArray[np.float64],
+        reworded: tuple[Rewordings, NDArray[np.float64]] | None = None,
     ) -> CaptionBatch:
-        """The batch of `clips` [B] and their spans; `crop` in [0, 1) places the crop of too long a span."""
+        """The batch of `clips` [B] and their spans; `crop` in [0, 1) places the crop of too long a span.
+
+        `reworded` may put other words in a caption's place, by draws in [0, 1) [B]; `caption` and
+        `similarity` stay the caption's.
+        """
         cut = self.crops.cut(clips, spans, crop, self.max_frames)
         captions = [span.text for span in spans]
         batch = {
@@ -183,9 +192,11 @@ class _CaptionedClips:
             "conditions": {},
         }
         if self.text is not None:
-            tokens, mask = map(torch.from_numpy, self.text.tokens(captions))
-            sentence = torch.from_numpy(self.text.sentence(captions))
-            batch["conditions"] = {"text": Condition(tokens, mask, sentence)}
+            if reworded is None:
+                words = (*self.text.tokens(captions), self.text.sentence(captions))
+            else:
+                words = reworded[0].read(captions, reworded[1], self.text)
+            batch["conditions"] = {"text": Condition(*map(torch.from_numpy, words))}
             batch["similarity"] = torch.from_numpy(self.text.similarity(captions))
         return batch  # type: ignore[return-value]
 
@@ -195,7 +206,8 @@ class CaptionBatches(Dataset[CaptionBatch]):
 
     Caption and crop are drawn by (seed, epoch, clip). A caption with start and end seconds gives that stretch
     of the clip; a stretch longer than `max_frames` is cropped at random. `face` takes face captions and,
-    unless `columns` says otherwise, the face columns.
+    unless `columns` says otherwise, the face columns. `rewordings` stand in for captions now and then, drawn
+    likewise.
     """
 
     def __init__(
@@ -212,10 +224,17 @@ class CaptionBatches(Dataset[CaptionBatch]):
         world: int = 1,
         face: bool = False,
         columns: NDArray[np.int64] | None = None,
+        rewordings: Rewordings | None = None,
     ) -> None:
         self.source = _CaptionedClips(
             dataset, stats, text, max_frames=max_frames, min_frames=min_frames, face=face, columns=columns
         )
+        if rewordings is not None and rewordings.cache.encoder != text.encoder:
+            raise UserError(
+                f"{rewordings.folder}: rewordings by the encoder {rewordings.cache.encoder}, captions by "
+                f"{text.encoder}; give both stages the same text stage"
+            )
+        self.rewordings = rewordings
         self.seed, self.rank, self.world = seed, rank, world
         clips = self.source.clips
         self.plan = BatchPlan(len(clips), batch_size, seed, sources=dataset.sources(clips))
@@ -233,7 +252,10 @@ class CaptionBatches(Dataset[CaptionBatch]):
         for clip, draw in zip(clips.tolist(), which, strict=True):
             choices = self.source.captions(clip)
             spans.append(choices[int(draw * len(choices))])
-        return self.source.make(clips, spans, uniform(self.seed, _CROP, turns, clips))
+        reworded = None
+        if self.rewordings is not None:
+            reworded = self.rewordings, uniform(self.seed, _REWORD, turns, clips)
+        return self.source.make(clips, spans, uniform(self.seed, _CROP, turns, clips), reworded)
 
 
 class EvalBatches(Dataset[CaptionBatch]):

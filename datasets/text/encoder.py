@@ -64,6 +64,10 @@ class SentenceEncoder:
         out = self._model(features)
         return _pack(out["sentence_embedding"], out["token_embeddings"], out["attention_mask"])
 
+    def vocabulary(self) -> list[str]:
+        """The pieces its tokenizer knows."""
+        return list(self._model.tokenizer.get_vocab())
+
 
 class ClipEncoder:
     """CLIP's text tower: last hidden states after the final norm, and the projected end-of-text embedding.
@@ -91,6 +95,10 @@ class ClipEncoder:
         last = features["attention_mask"].sum(dim=1) - 1
         sentence = out.text_embeds if same else out.last_hidden_state[rows, last]
         return _pack(sentence, out.last_hidden_state, features["attention_mask"])
+
+    def vocabulary(self) -> list[str]:
+        """The pieces its tokenizer knows."""
+        return list(self._tokenizer.get_vocab())
 
 
 def load_text_encoder(spec: str, *, device: str = "cpu") -> SentenceEncoder | ClipEncoder:

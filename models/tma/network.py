@@ -10,6 +10,8 @@ Notable choices:
 - `frame_stride` n feeds and reconstructs every n-th frame. 1 is the paper; small CPU runs take 2 to 4.
 - Gains [ours] let it read and reconstruct motion in the coordinates of `Basis`, where a hand's shape is the
   same numbers wherever the hand is; in the paper's features small networks do not see it.
+- `text_noise` and `text_dropout` [ours] keep the text encoder from learning a few wordings by heart: small
+  sets say the same in the same words again and again, and users say it in others.
 
 Legend: B batch, T frames, D motion features, S text tokens, E text width, Z latent width.
 """
@@ -45,6 +47,11 @@ class TmaConfig(Config):
     """How much more the root's columns count than others [ours]; see `layers/basis.py`."""
     finger_gain: float = Field(default=0.0, ge=0)
     """Above 0, fingers count by how they bend, in bone lengths times this [ours]; see `layers/basis.py`."""
+    text_dropout: float | None = Field(default=None, ge=0, lt=1)
+    """Dropout of the text encoder; null is `dropout`, as for the others [ours]."""
+    text_noise: float = Field(default=0.0, ge=0)
+    """Width of Gaussian noise on the text features in training, in root mean squares of each caption's own
+    features [ours]."""
 
     @model_validator(mode="after")
     def _heads_divide(self) -> Self:
@@ -91,6 +98,16 @@ class MotionDecoder(nn.Module):
         return out * mask[..., None]
 
 
+def noisy(tokens: Tensor, mask: Tensor, scale: float) -> Tensor:
+    """tokens [B, S, E] with Gaussian noise, `scale` root mean squares of each caption's own features wide.
+
+    The features of different encoders differ in size, so an absolute width would mean nothing. What is masked
+    (bool [B, S], True = real) plays no part in the size.
+    """
+    squares = tokens.square().mean(-1).masked_fill(~mask, 0.0).sum(1) / mask.sum(1).clamp(min=1)
+    return tokens + scale * squares.sqrt()[:, None, None] * torch.randn_like(tokens)
+
+
 def _stack(config: TmaConfig) -> Transformer:
     return Transformer(
         config.layers,
@@ -122,7 +139,8 @@ class Tma(nn.Module):
         self.text_dim = text_dim
         self.basis = basis
         self.motion_encoder = GaussianEncoder(config, motion_dim)
-        self.text_encoder = GaussianEncoder(config, text_dim)
+        words = config.dropout if config.text_dropout is None else config.text_dropout
+        self.text_encoder = GaussianEncoder(config.model_copy(update={"dropout": words}), text_dim)
         self.motion_decoder = MotionDecoder(config, motion_dim)
 
     @classmethod
@@ -162,6 +180,8 @@ class Tma(nn.Module):
         """tokens [B, S, E] text features, mask bool [B, S] -> (mu, logvar), float32 [B, Z]."""
         if tokens.shape[-1] != self.text_dim:
             raise ValueError(f"TMA was built for {self.text_dim} text features, got {tokens.shape[-1]}")
+        if self.training and self.config.text_noise:
+            tokens = noisy(tokens, mask, self.config.text_noise)
         mu, logvar = self.text_encoder(tokens, mask)
         return mu, logvar
 

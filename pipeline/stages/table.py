@@ -25,6 +25,7 @@ from motionloom.pipeline.stages.guo_evaluator import GuoEvaluatorStage
 from motionloom.pipeline.stages.mix import MixStage
 from motionloom.pipeline.stages.prepare import StatsStage, TextStage
 from motionloom.pipeline.stages.report import ReportStage
+from motionloom.pipeline.stages.rewordings import RewordingsStage
 from motionloom.pipeline.stages.tma import TmaStage
 from motionloom.pipeline.stages.tokenizer import TOKENIZERS, TokenizerStage
 from motionloom.pipeline.stages.tokens import TokensStage
@@ -38,6 +39,7 @@ register(ShardsStage("shards", "existing shards", ShardsStageConfig, run_shards)
 register(MixStage())
 register(StatsStage())
 register(TextStage())
+register(RewordingsStage())
 register(AlignedTextStage())
 register(AudioStage())
 for name, summary, config in TOKENIZERS:

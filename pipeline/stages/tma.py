@@ -64,7 +64,7 @@ class TmaStage(TrainedStage):
     name = "tma"
     summary = "text-motion alignment"
     config = TmaStageConfig
-    takes = ("data", "stats", "text")
+    takes = ("data", "stats", "text", "rewordings?")
     version = 2  # the filter of negatives is sBERT's
 
     def gives(self, config: TmaStageConfig) -> frozenset[str]:
@@ -140,7 +140,7 @@ def caption_batches(config: Any, given: Given, seed: int) -> Batches:
     def train(batch: int, rank: int, world: int) -> Dataset[Any]:
         return CaptionBatches(
             dataset, stats, text, batch_size=batch, seed=seed, rank=rank, world=world, face=face,
-            columns=columns, **frames,
+            columns=columns, rewordings=given.get("rewordings"), **frames,
         )  # fmt: skip
 
     def validation() -> Dataset[Any]:

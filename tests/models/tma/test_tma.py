@@ -7,7 +7,7 @@ import torch
 
 from motionloom.datasets.conditions import Condition
 from motionloom.models.tma.module import TmaModule
-from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.tma.network import Tma, TmaConfig, noisy
 from motionloom.models.training.stage_module import OptimConfig
 
 TINY = TmaConfig(latent=32, ff=64, layers=2, heads=2, dropout=0.0, attention_dropout=0.0)
@@ -132,3 +132,54 @@ def test_learns_to_retrieve() -> None:
     top1 = (similar.argmax(1) == torch.arange(32)).float().mean().item()
     assert top1 > 0.6, values
     assert values["rec_motion"] < 0.15, values  # a mean pose gives 0.4
+
+
+def test_text_noise_is_as_wide_as_asked_and_of_each_caption() -> None:
+    """Measured on many words: the width is a share of the caption's own size, whatever is masked."""
+    torch.manual_seed(0)
+    tokens = torch.randn(2, 400, 64) * torch.tensor([1.0, 5.0])[:, None, None]
+    mask = torch.arange(400)[None] < torch.tensor([400, 200])[:, None]
+    tokens[1, 200:] = 1e6  # masked: plays no part in the size
+    added = noisy(tokens, mask, 0.5)[mask] - tokens[mask]
+    first, second = added[:400], added[400:]
+    # 25,600 and 12,800 draws: the deviation is within 4 standard errors, 4 / sqrt(2 * 12,800) = 2.5 %.
+    assert first.std().item() == pytest.approx(0.5, rel=0.03)
+    assert second.std().item() == pytest.approx(2.5, rel=0.03)
+    assert abs(first.mean().item()) < 4 * 0.5 / 160
+
+
+def test_text_noise_is_for_training_alone_and_off_draws_nothing() -> None:
+    tokens, mask = torch.randn(3, 7, 5), torch.ones(3, 7, dtype=torch.bool)
+    torch.manual_seed(0)
+    net, plain = Tma(TINY.model_copy(update={"text_noise": 0.5}), 6, 5), Tma(TINY, 6, 5)
+    plain.load_state_dict(net.state_dict())
+    with torch.no_grad():
+        assert torch.equal(net.eval().encode_text(tokens, mask)[0], plain.eval().encode_text(tokens, mask)[0])
+        before = torch.get_rng_state()
+        off = plain.train().encode_text(tokens, mask)[0]
+        assert torch.equal(before, torch.get_rng_state())
+        net.train()
+        torch.manual_seed(1)
+        once = net.encode_text(tokens, mask)[0]
+        torch.manual_seed(1)
+        again = net.encode_text(tokens, mask)[0]
+    assert torch.equal(once, again)
+    assert not torch.allclose(once, off)
+
+
+def test_text_dropout_is_the_text_encoders_alone() -> None:
+    """Nothing else of the network changes, also not the draws it is made with."""
+    config = TINY.model_copy(update={"dropout": 0.1})
+    torch.manual_seed(0)
+    plain = Tma(config, 6, 5)
+    torch.manual_seed(0)
+    more = Tma(config.model_copy(update={"text_dropout": 0.4}), 6, 5)
+    for (name, one), (_, other) in zip(plain.state_dict().items(), more.state_dict().items(), strict=True):
+        assert torch.equal(one, other), name
+
+    def rates(part: torch.nn.Module) -> set[float]:
+        return {m.p for m in part.modules() if isinstance(m, torch.nn.Dropout)}
+
+    assert rates(plain.text_encoder) == rates(plain.motion_encoder) == {0.1}
+    assert rates(more.text_encoder) == {0.4}
+    assert rates(more.motion_encoder) == rates(more.motion_decoder) == {0.1}
