@@ -108,7 +108,10 @@ def read_cases(folder: Path, figures: Mapping[str, Any]) -> list[Case]:
         arrays = load_file(path)
         return [
             Case(
-                *(str(case[key]) for key in ("of", "place", "id", "caption")),
+                of=str(case["of"]),
+                place=str(case["place"]),
+                id=str(case["id"]),
+                caption=str(case["caption"]),
                 error=float(case["error"]),
                 recorded=arrays[f"{number}.recorded"],
                 made=arrays[f"{number}.made"],

@@ -67,7 +67,8 @@ def _joints(page: Page, thing: JointMap) -> None:
     skeleton = Skeleton.named(thing.skeleton)
     errors = [0.0 if error is None else error for error in thing.errors]
     page.add_drawing(body_map(skeleton, errors, thing.hands, thing.title), thing.title)
-    wrists = [None] * BODY_JOINTS + ([*thing.hands] or [None] * (len(skeleton) - BODY_JOINTS))
+    fingers: list[float | None] = [*thing.hands] or [None] * (len(skeleton) - BODY_JOINTS)
+    wrists = [*[None] * BODY_JOINTS, *fingers]
     rows = [
         [joint_label(joint), error, near]
         for joint, error, near in zip(skeleton.joints, thing.errors, wrists, strict=True)
