@@ -95,7 +95,7 @@ def _number(value: float, form: Form) -> str:
 
 def _reconstruction(title: str, names: Mapping[str, str]) -> TableSpec:
     references = {"nearest_train_clip": "nearest training clip", "mean_pose": "mean pose"}
-    paths: dict[str, dict[str, tuple[str, ...]]] = {
+    paths: dict[str, dict[str, Sequence[str]]] = {
         row: {title: ("reconstruction_mm", f"{key}_{row}" if row else key) for key, title in names.items()}
         for row in (SUBJECT, *references)
     }

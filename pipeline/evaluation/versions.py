@@ -7,7 +7,7 @@ from __future__ import annotations
 
 EVALUATE = 6
 """5: the papers' definitions, clips drawn as they come; TMA reads captions by its own encoder.
-6: generated in even pieces of the clips, each with its seed; physics."""
+6: generated in even pieces of the clips, each with its seed; physics, joints' errors, confusions, cases."""
 
 EVALUATE_DANCES = 2
 """2: generated in even pieces of the clips, each with its seed."""
