@@ -50,6 +50,10 @@ def answers(figure: str) -> dict[str, str]:
         return {title: f"rows.{row}.{key}" for title, row in _DANCES.items()}
     if first == "agreement_with_caption":
         return {RECORDED: figure.replace(".generated.", ".truth.")}
+    if figure.startswith("by_evaluator.matching.generated."):
+        key = figure.removeprefix("by_evaluator.matching.generated.")
+        rows = {RECORDED: "real", "mean pose, still": "mean_pose", "chance": "chance"}
+        return {title: f"by_evaluator.matching.{row}.{key}" for title, row in rows.items()}
     if first == "retrieval":
         found = re.fullmatch(r"(.*)\.generated\.(?:[tm]2[mt]_)?(.+)", figure)
         real = {RECORDED: figure.replace(".generated.", ".real.")}

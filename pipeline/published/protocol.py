@@ -56,7 +56,9 @@ def measured_like(evaluation: Evaluation, figure: str) -> str:
         keys = ["split", "clips", "songs", "feature_fps"]
     elif not figure.startswith(_RECONSTRUCTION):
         keys = ["split", "clips", "protocol.lengths"]
-        if not figure.startswith("agreement_with_caption"):
+        if figure.startswith("by_evaluator"):
+            keys += ["protocol.by_evaluator.sha256", "by_evaluator.matching.size"]
+        elif not figure.startswith("agreement_with_caption"):
             keys += ["protocol.evaluator.sha256"]
         if figure.startswith("retrieval"):
             keys += ["retrieval.among" if "top-" in figure else "retrieval.size"]
@@ -122,6 +124,8 @@ def _candidates(evaluation: Evaluation, columns: list[Column]) -> list[tuple[str
         if column.candidates is None or column.figure is None:
             continue
         key = "retrieval.among" if "top-" in column.figure else "retrieval.size"
+        if column.figure.startswith("by_evaluator"):
+            key = "by_evaluator.matching.size"
         ours = value_at(evaluation.figures, key, None)
         if isinstance(ours, int):
             out[(f"candidates of {column.group or column.name}", ours, column.candidates)] = None
