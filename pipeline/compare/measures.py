@@ -149,6 +149,8 @@ def _grouped(
 
 
 _GENERATED = ("captioned", "lengths", "caption", "repeats", "evaluator")
+_JOINTLY = tuple(name for name in _GENERATED if name != "evaluator")
+"""Of what is measured without TMA."""
 _DANCED = ("danced", "repeats")
 _ASPECTS = (
     "everything", "action", "direction", "side", "count", "speed", "left_hand", "right_hand", "face", "style",
@@ -207,13 +209,39 @@ TABLES: tuple[TableSpec, ...] = (
         _GENERATED,
     ),
     _grouped(
+        "R-Precision by the evaluator (higher is better; the score: lower)",
+        "evaluate",
+        ("by_evaluator", "matching"),
+        "generated",
+        {"real": "recorded motion", "chance": "chance", "mean_pose": "mean pose, still"},
+        {
+            **{(f"top-{k}",): Measure(f"R-Precision top-{k}", "higher") for k in (1, 2, 3)},
+            ("matching_score",): Measure("Matching score", "lower"),
+        },
+        (*_JOINTLY, "by_evaluator"),
+    ),
+    _grouped(
+        "Feet, floor and jerk (the nearer to recorded motion, the better)",
+        "evaluate",
+        ("physics",),
+        "generated",
+        {"recorded": "recorded motion"},
+        {
+            ("skating",): Measure("foot skating"),
+            ("floating",): Measure("floating, mm", "", "mm"),
+            ("penetration",): Measure("penetration, mm", "", "mm"),
+            ("jitter",): Measure("jitter, 100 m/s³"),
+        },
+        _JOINTLY,
+    ),
+    _grouped(
         "Does the motion do what its caption says? Measured on the joints (higher is better)",
         "evaluate",
         ("agreement_with_caption",),
         "generated",
         {"truth": "recorded motion"},
         {(name,): Measure(name.replace("_", " "), "higher", "percent") for name in _ASPECTS},
-        tuple(name for name in _GENERATED if name != "evaluator"),
+        _JOINTLY,
     ),
     _dance(
         "Beat Align of dances (higher is better)",

@@ -24,6 +24,7 @@ _WORDS = {
     "size": "among different numbers of candidates ({values})",
     "among": "with the own caption among different numbers ({values})",
     "evaluator": "by different TMA models",
+    "by_evaluator": "by different evaluators",
     "feature_fps": "at different frame rates ({values})",
     "seconds": "with dances cut to different lengths ({values})",
     "shuffles": "with different numbers of other songs ({values})",
@@ -56,6 +57,9 @@ def protocol_of(file: FigureFile, names: Sequence[str]) -> dict[str, str]:
         facts |= {name: retrieval.get(name) for name in ("size", "among")}
     if "evaluator" in names:
         facts["evaluator"] = (said.get("evaluator") or {}).get("sha256")
+    if "by_evaluator" in names:
+        facts["by_evaluator"] = (said.get("by_evaluator") or {}).get("sha256")
+        facts["size"] = ((figures.get("by_evaluator") or {}).get("matching") or {}).get("size")
     return {name: _text(value) for name, value in facts.items()}
 
 
@@ -85,7 +89,12 @@ def groups(protocols: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
 
 
 def _noun(name: str) -> str:
-    return {"data": "clips", "number": "number of clips", "evaluator": "TMA model"}.get(name, name)
+    return {
+        "data": "clips",
+        "number": "number of clips",
+        "evaluator": "TMA model",
+        "by_evaluator": "evaluator",
+    }.get(name, name)
 
 
 def _text(value: Any) -> str:

@@ -62,10 +62,12 @@ def compared_tables(runs: Sequence[ComparedRun]) -> list[ComparedTable]:
 
 def _table(spec: TableSpec, stage: str, runs: Sequence[ComparedRun]) -> ComparedTable | None:
     found: dict[str, dict[str, Row]] = {}
+    # What is not ranked, such as bits a second, makes no table beside figures that are.
+    telling = [column for column in spec.columns if column.better] or spec.columns
     for run in runs:
         file = run.evaluations.get(stage)
         rows = {} if file is None or file.kind != spec.kind else spec.rows(file.figures)
-        if any(column.better and column.title in rows.get(SUBJECT, {}) for column in spec.columns):
+        if any(column.title in rows.get(SUBJECT, {}) for column in telling):
             found[run.label] = rows
     if not found:
         return None
