@@ -198,7 +198,7 @@ def generate(
 def evaluate(
     run_folders: Annotated[
         list[Path] | None,
-        typer.Argument(help="A run folder (runs/NAME); with --table several, or none.", show_default=False),
+        typer.Argument(help="A run folder (runs/NAME). With --table several, or none.", show_default=False),
     ] = None,
     clips: Annotated[int | None, typer.Option(help="At most this many test clips.")] = None,
     repeats: Annotated[

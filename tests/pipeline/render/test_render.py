@@ -157,11 +157,13 @@ def test_outlines_hold_their_circles(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     centres, radii = rng.uniform(0, 100, (1, count, 2)), rng.uniform(1, 30, (1, count))
     ring = outlines(centres, radii)[0]
+    # Between two of 40 tangents the hull lies in a triangle over the chord of the points where they touch: no
+    # higher than half the chord times the tangent of half the angle between them, 0.04 of the chord.
+    slack = 0.04 * np.linalg.norm(np.ptp(centres[0], axis=0) + 2 * radii.max())
     for direction in rng.normal(size=(20, 2)):
         direction /= np.linalg.norm(direction)
         exact = (centres[0] @ direction + radii[0]).max()
-        # A hull sampled in 40 directions lies inside the exact one, by less than a percent of its size.
-        assert exact - 1.0 < (ring @ direction).max() <= exact + 1e-9
+        assert exact - slack < (ring @ direction).max() <= exact + 1e-9
 
 
 # ---- viewer file
@@ -371,7 +373,7 @@ def test_page_is_whole_and_escapes(tmp_path: Path, walk: Walk) -> None:
     assert all(a["src"].startswith("data:image/png;base64,") for t, a in tags.seen if t == "img")
     assert '<td class="number">1.500</td>' in text and '<td class="number">–</td>' in text
     plain = Page("t").add_text("x").html()
-    assert "mountViewer" not in plain and len(plain) < 12_000
+    assert "mountViewer" not in plain and len(plain) < 16_000
 
 
 def test_page_refuses_uneven_rows_and_unknown_pictures() -> None:

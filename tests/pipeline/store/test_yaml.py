@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,8 @@ def test_shipped_recipes_mean_the_same_in_both_versions_but_for_numbers(name: st
             return {key: numbers(item) for key, item in value.items()}
         if isinstance(value, list):
             return [numbers(item) for item in value]
-        return float(value) if isinstance(value, str) and value[:1].isdigit() and "e" in value else value
+        exponent = isinstance(value, str) and re.fullmatch(r"[\d.]+e[-+]?\d+", value)
+        return float(value) if exponent else value
 
     path = shipped_recipes()[name]
     assert read_yaml(path) == numbers(yaml.safe_load(path.read_text()))
