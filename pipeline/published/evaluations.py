@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from motionloom.pipeline.published.schema import Measure
 from motionloom.pipeline.published.stages import RunStage, run_stages
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.run_folder import stage_folder
+from motionloom.pipeline.store.run_state import read_record
 
 _FILES = {"evaluate": ("metrics.json", EVALUATE), "evaluate_dances": ("dances.json", EVALUATE_DANCES)}
 _METHODS = {"gpt": "gpt", "tma": "vae", "diffusion": "diffusion"}
@@ -85,7 +85,7 @@ def _staged(run: Path, stage: RunStage, order: list[str]) -> Evaluation:
             f"motionloom run {run / 'recipe.yaml'} -o {run}"
         )
     require_consistent(run, [stage.name])
-    figures = _read(path)
+    figures = read_record(path)
     about = {role: stage.inputs[role] for role in ("tokenizer", "face_tokenizer") if role in stage.inputs}
     about |= _generators(stage, figures, order)
     measure: Measure = "evaluate" if stage.kind == "evaluate" else "evaluate_dances"
@@ -111,7 +111,7 @@ def _generators(stage: RunStage, figures: Mapping[str, Any], order: list[str]) -
 
 def _retrieval(path: Path, run: Path, stages: Mapping[str, RunStage]) -> Evaluation:
     """What the command `retrieval` wrote: figures by protocol, `A.t2m/R@1`."""
-    data = _read(path)
+    data = read_record(path)
     protocols, stage = data.get("protocols"), stages.get(str(data.get("stage")))
     if not isinstance(protocols, list) or stage is None:
         raise UserError(f"{path}: not a record of motionloom retrieval on this run; run it again")
@@ -148,15 +148,3 @@ def _with_body(figures: dict[str, Any]) -> dict[str, Any]:
             if key == metric or key.startswith(f"{metric}_"):
                 body[f"{metric}_body{key.removeprefix(metric)}"] = value
     return {**figures, "reconstruction_mm": {**found, **body}}
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); run its stage again") from None
-    except ValueError as error:
-        raise UserError(f"{path}: not valid JSON ({error}); run its stage again") from None
-    if not isinstance(data, dict):
-        raise UserError(f"{path}: holds no figures; run its stage again")
-    return data

@@ -328,7 +328,7 @@ def test_what_a_run_lacks_is_one_sentence(baselines: Make, tmp_path: Path, recor
     ("content", "message"),
     [
         ("{", r"metrics\.json: not valid JSON"),
-        ("[]", r"metrics\.json: holds no figures"),
+        ("[]", r"metrics\.json: holds no JSON object"),
         (None, r"metrics\.json: cannot be read \(No such file or directory\)"),
     ],
 )
