@@ -25,6 +25,7 @@ _WORDS = {
     "among": "with the own caption among different numbers ({values})",
     "evaluator": "by different TMA models",
     "by_evaluator": "by different evaluators",
+    "by_face_evaluator": "by different evaluators of faces",
     "feature_fps": "at different frame rates ({values})",
     "seconds": "with dances cut to different lengths ({values})",
     "shuffles": "with different numbers of other songs ({values})",
@@ -57,9 +58,10 @@ def protocol_of(file: FigureFile, names: Sequence[str]) -> dict[str, str]:
         facts |= {name: retrieval.get(name) for name in ("size", "among")}
     if "evaluator" in names:
         facts["evaluator"] = (said.get("evaluator") or {}).get("sha256")
-    if "by_evaluator" in names:
-        facts["by_evaluator"] = (said.get("by_evaluator") or {}).get("sha256")
-        facts["size"] = ((figures.get("by_evaluator") or {}).get("matching") or {}).get("size")
+    for judge in ("by_evaluator", "by_face_evaluator"):
+        if judge in names:
+            facts[judge] = (said.get(judge) or {}).get("sha256")
+            facts["size"] = ((figures.get(judge) or {}).get("matching") or {}).get("size")
     return {name: _text(value) for name, value in facts.items()}
 
 
@@ -94,6 +96,7 @@ def _noun(name: str) -> str:
         "number": "number of clips",
         "evaluator": "TMA model",
         "by_evaluator": "evaluator",
+        "by_face_evaluator": "evaluator of faces",
     }.get(name, name)
 
 

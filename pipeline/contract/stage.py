@@ -38,6 +38,9 @@ GENERATOR = "generator"
 ALIGNMENT = "alignment"
 """What a stage gives that embeds text and motion in one space: it loads as a `LoadedTma`."""
 
+FACE_ALIGNMENT = "face_alignment"
+"""The same of captions of faces and of expressions."""
+
 SHOWING = "showing"
 """What a stage gives that has curves or figures for the report."""
 

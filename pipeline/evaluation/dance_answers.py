@@ -1,8 +1,8 @@
-"""Trivial answers to music: the dances that need no model, to stand beside a model's."""
+"""Trivial answers: motions that need no model, to stand beside a model's."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,15 @@ from motionloom.pipeline.evaluation.dances import DanceClip
 Joints = NDArray[np.float64]
 
 
-def mean_pose(pool: Sequence[DanceClip], frames: int) -> Joints:
-    """The mean pose of training dances, standing still, [frames, N, 3]."""
+def mean_poses(pool: Sequence[Joints], fps: float, lengths: Iterable[int]) -> list[Joints]:
+    """The mean pose of training motions [T, N, 3], standing still for so many frames each."""
     poses, heights = [], []
-    for clip in pool:
-        poses.append(local_joints_of(clip.joints, clip.fps).mean(0))
-        heights.append(clip.joints[:, 0, 1].mean())
+    for joints in pool:
+        poses.append(local_joints_of(joints, fps).mean(0))
+        heights.append(joints[:, 0, 1].mean())
     pose = np.mean(poses, axis=0)
     pose[:, 1] += np.mean(heights)
-    return np.tile(pose, (frames, 1, 1))
+    return [np.tile(pose, (frames, 1, 1)) for frames in lengths]
 
 
 def random_dances(

@@ -32,6 +32,9 @@ from motionloom.pipeline.evaluation.dances import DanceClip
 Joints = NDArray[np.float64]
 Features = dict[str, NDArray[np.float64]]
 
+KINETIC = 3 * BODY_JOINTS
+"""Kinetic features of a motion."""
+
 MIN_FRAMES = 4
 """Shortest motion whose figures are taken."""
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from motionloom.pipeline.evaluation.dance_figures import KINETIC
 from motionloom.pipeline.evaluation.figures import chance
+from motionloom.pipeline.evaluation.paired import POSITION_TITLES
 
 Rows = tuple[str, list[str], list[list[str]]]
 """Title, columns, rows."""
@@ -18,11 +20,15 @@ def figure_rows(figures: dict[str, Any]) -> list[Rows]:
         out += _reconstruction_rows(figures)
     if "reconstruction_face" in figures:
         found = figures["reconstruction_face"]
+        titles = {"expression": "expression error", "vertex": "vertices, mm"}
+        titles = {key: title for key, title in titles.items() if key in found}
         rows = [
-            [title, f"{found[key]:.3f}"]
-            for title, key in (("tokenizer", "expression"), ("mean expression", "expression_mean"))
+            [title, *(f"{found[key + suffix]:.3f}" for key in titles)]
+            for title, suffix in (("tokenizer", ""), ("mean expression", "_mean"))
         ]
-        out.append(("Reconstruction of faces (lower is better)", ["", "expression error"], rows))
+        out.append(("Reconstruction of faces (lower is better)", ["", *titles.values()], rows))
+    if "reconstruction_latents" in figures:
+        out.append(_rebuilt_rows(figures["reconstruction_latents"]))
     if "retrieval" in figures:
         found = figures["retrieval"]
         out.append(_retrieval_rows(found))
@@ -36,8 +42,11 @@ def figure_rows(figures: dict[str, Any]) -> list[Rows]:
             out.append((f"Own caption among {found['among']}, by TMA", columns, [guess, *tops]))
     if figures.get("distribution", {}).get("rows"):
         out.append(_distribution_rows(figures["distribution"], "TMA's latents"))
-    if "by_evaluator" in figures:
-        out += _evaluator_rows(figures["by_evaluator"])
+    for key, whose in (("by_evaluator", "the evaluator"), ("by_face_evaluator", "the face evaluator")):
+        if key in figures:
+            out += _evaluator_rows(figures[key], whose)
+    if "positions" in figures:
+        out += _paired_rows(figures)
     if "physics" in figures:
         found = figures["physics"]
         titles = {"skating": "foot skating", "floating": "floating, mm", "penetration": "penetration, mm"}
@@ -99,7 +108,48 @@ def _distribution_rows(found: dict[str, Any], whose: str) -> Rows:
     return f"{whose}: FID to {found['clips']} recorded motions", columns, rows
 
 
-def _evaluator_rows(figures: dict[str, Any]) -> list[Rows]:
+_JUDGES = {"tma": "TMA", "evaluator": "the evaluator", "face_evaluator": "the face evaluator"}
+
+
+def _rebuilt_rows(figures: dict[str, Any]) -> Rows:
+    rows = []
+    for role, found in figures.items():
+        cells = [found.get(key) for key in ("fid", "training_fid", "top-3", "recorded_top-3")]
+        texts = ["" if c is None else _interval(c) if isinstance(c, dict) else f"{c:.3f}" for c in cells]
+        rows.append([f"{_JUDGES.get(role, role)}, {found['clips']} clips", *texts])
+    columns = ["latents of", "FID", "as many training clips", "R-Precision top-3", "of recorded motion"]
+    return "Reconstructed motion by its latents", columns, rows
+
+
+def _paired_rows(figures: dict[str, Any]) -> list[Rows]:
+    names = {
+        "recorded": "recorded motion", "generated": "generated motion", "training": "training clips",
+        "mean_pose": "mean pose, still",
+    }  # fmt: skip
+    out: list[Rows] = []
+    found = figures["positions"]
+    rows = [
+        [title, *(_interval(found[name][key]) for key in POSITION_TITLES)]
+        for name, title in names.items()
+        if found.get(name)
+    ]
+    title = "Distance to the motion recorded for the same caption (lower is better)"
+    out.append((title, ["", *POSITION_TITLES.values()], rows))
+    moves = figures["movement"]
+    keys = {f"{name.lower()}_{kind}": f"{name}_{kind}" for name in ("FID", "Div", "MM") for kind in "km"}
+    rows = [
+        [title, *(_interval(row[key]) if key in row else "" for key in keys)]
+        for name, title in names.items()
+        if (row := moves["rows"].get(name))
+    ]
+    title = f"Kinetic (k) and geometric (m) features of {moves['clips']} motions"
+    if moves["clips"] < KINETIC:
+        title += f"; few for FID, whose features are up to {KINETIC}"
+    out.append((title, ["", *keys.values()], rows))
+    return out
+
+
+def _evaluator_rows(figures: dict[str, Any], whose: str) -> list[Rows]:
     found = figures["matching"]
     keys = ("top-1", "top-2", "top-3", "matching_score")
     rows = [["chance", *(f"{found['chance'][key]:.3f}" for key in keys[:3]), ""]]
@@ -107,10 +157,10 @@ def _evaluator_rows(figures: dict[str, Any]) -> list[Rows]:
         ("real", "real motion"), ("generated", "generated motion"), ("mean_pose", "mean pose, still"),
     ):  # fmt: skip
         rows.append([title, *(_interval(found[name][key]) for key in keys)])
-    title = f"R-Precision among {found['size']} by the evaluator, {found['clips']} clips as they are drawn"
+    title = f"R-Precision among {found['size']} by {whose}, {found['clips']} clips as they are drawn"
     out: list[Rows] = [(title, ["", "top-1", "top-2", "top-3", "Matching score"], rows)]
     if figures["distribution"]["rows"]:
-        out.append(_distribution_rows(figures["distribution"], "The evaluator's latents"))
+        out.append(_distribution_rows(figures["distribution"], f"{whose[:1].upper()}{whose[1:]}'s latents"))
     return out
 
 

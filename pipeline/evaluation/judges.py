@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from motionloom.pipeline.evaluation.figures import MotionJudge, embed_motions
@@ -17,7 +18,7 @@ from motionloom.pipeline.store.networks import LoadedTma
 
 @dataclass(frozen=True)
 class Judge:
-    """What embeds captions and motions in one space."""
+    """What embeds captions and motions in one space; that of faces: captions of faces and expressions."""
 
     motions: MotionJudge
     texts: Callable[[Sequence[Truth]], Tensor]
@@ -38,6 +39,25 @@ class Judge:
             lambda truths: found.embed_captions([t.caption for t in truths], [t.tokens for t in truths]),
         )
 
+    @staticmethod
+    def faces(tma: LoadedTma) -> Judge:
+        """TMA of faces."""
+        return Judge(
+            tma, lambda truths: tma.embed_captions([t.face_caption for t in truths], tma.given["text"].cache)
+        )
+
+    def read(self, truth: Truth) -> NDArray[np.float32]:
+        """The features of a clip that are judged: of body and hands, or its expression."""
+        if self.motions.part != "face":
+            return truth.features
+        if truth.face is None:
+            raise ValueError(f"clip '{truth.id}' has no face to be judged")
+        return truth.face
+
+    def recorded(self, truths: Sequence[Truth]) -> Tensor:
+        """Latents [n, Z] of what was recorded."""
+        return embed_motions(self.motions, [self.read(t) for t in truths], [t.present for t in truths])
+
     def latents(self, truths: Sequence[Truth], made: Sequence[Tensor], others: Sequence[Truth]) -> Latents:
         """Latents of n clips, of what was made for their captions, of `others` and of the mean pose.
 
@@ -50,8 +70,8 @@ class Judge:
         mean = judge.stats.mean[judge.layout.part(judge.part)].astype("float32")
         return Latents(
             text=self.texts(truths),
-            real=embed_motions(judge, [t.features for t in truths], [t.present for t in truths]),
+            real=self.recorded(truths),
             made=made,
-            others=embed_motions(judge, [t.features for t in others], [t.present for t in others]),
+            others=self.recorded(others),
             still=embed_motions(judge, [np.tile(mean, (len(t.features), 1)) for t in truths]),
         )

@@ -137,6 +137,36 @@ def distribution(latents: Latents, *, seed: int) -> dict[str, Any]:
     return {"clips": count, "training_clips": len(latents.others), "rows": rows}
 
 
+def reconstructed(
+    real: Tensor, made: Tensor, others: Tensor, text: Tensor | None, *, size: int, repeats: int, seed: int
+) -> dict[str, Any]:
+    """FID of reconstructed motions to the recorded ones, beside as many training clips' (Tables 2 and 6).
+
+    Args:
+        real: Latents [n, Z] of the recorded clips.
+        made: Of the same clips through a tokenizer.
+        others: Of training clips, [m, Z].
+        text: Of their captions, for R-Precision (Table 2); None where some have none.
+        size: Captions and motions of a batch of R-Precision.
+        repeats: Draws of batches.
+        seed: Of the draws.
+    """
+    out: dict[str, Any] = {"clips": len(real)}
+    if len(real) > 1:
+        out["fid"] = float(fid(real, made))
+        out |= {"training_fid": float(fid(real, others))} if len(others) > 1 else {}
+    if text is not None:
+        size = min(size, len(text))
+        draws = range(seed, seed + max(repeats, 5))
+        for name, motions in (("", made), ("recorded_", real)):
+            rows = [r_precision(text, motions, batch=size, seed=draw).tolist() for draw in draws]
+            columns = zip(*rows, strict=True)
+            out |= {f"{name}top-{k}": Interval.of(values) for k, values in enumerate(columns, start=1)}
+        out |= {f"chance_top-{k}": min(1.0, chance(k, size)) for k in (1, 2, 3)}
+        out["size"] = size
+    return out
+
+
 def _recalls(
     text: Tensor, real: Tensor, made: Sequence[Tensor], size: int, repeats: int, seed: int
 ) -> dict[str, Any]:

@@ -22,6 +22,7 @@ TITLES = (
 )
 """In the order in which they are shown."""
 
+_JUDGES = ("by_evaluator", "by_face_evaluator")
 _LATENTS = {RECORDED: "recorded", "training clips, as many": "training", "mean pose, still": "mean_pose"}
 _DANCES = {
     RECORDED: "ground_truth",
@@ -42,18 +43,28 @@ def answers(figure: str) -> dict[str, str]:
         }
     if first == "reconstruction_face":
         return {"mean expression": f"{figure}_mean"}
-    if figure.startswith("distribution.rows.generated."):
-        key = figure.removeprefix("distribution.rows.generated.")
-        return {title: f"distribution.rows.{row}.{key}" for title, row in _LATENTS.items()}
+    if first == "reconstruction_latents":
+        where, _, name = figure.rpartition(".")
+        if name == "fid":
+            return {"training clips, as many": f"{where}.training_fid"}
+        return {RECORDED: f"{where}.recorded_{name}", "chance": f"{where}.chance_{name}"}
+    if first == "positions":
+        key = rest.removeprefix("generated.")
+        rows = {"training clips, as many": "training", "mean pose, still": "mean_pose"}
+        return {title: f"positions.{row}.{key}" for title, row in rows.items()}
+    for where in ("distribution", "movement", *(f"{judge}.distribution" for judge in _JUDGES)):
+        if figure.startswith(f"{where}.rows.generated."):
+            key = figure.removeprefix(f"{where}.rows.generated.")
+            return {title: f"{where}.rows.{row}.{key}" for title, row in _LATENTS.items()}
     if first == "rows" and rest.startswith("generated."):
         key = rest.removeprefix("generated.")
         return {title: f"rows.{row}.{key}" for title, row in _DANCES.items()}
     if first == "agreement_with_caption":
         return {RECORDED: figure.replace(".generated.", ".truth.")}
-    if figure.startswith("by_evaluator.matching.generated."):
-        key = figure.removeprefix("by_evaluator.matching.generated.")
+    if first in _JUDGES and rest.startswith("matching.generated."):
+        key = rest.removeprefix("matching.generated.")
         rows = {RECORDED: "real", "mean pose, still": "mean_pose", "chance": "chance"}
-        return {title: f"by_evaluator.matching.{row}.{key}" for title, row in rows.items()}
+        return {title: f"{first}.matching.{row}.{key}" for title, row in rows.items()}
     if first == "retrieval":
         found = re.fullmatch(r"(.*)\.generated\.(?:[tm]2[mt]_)?(.+)", figure)
         real = {RECORDED: figure.replace(".generated.", ".real.")}

@@ -13,7 +13,10 @@ from motionloom.pipeline.published.filled import Difference
 from motionloom.pipeline.published.schema import Column, DataSet, PaperTable
 from motionloom.pipeline.published.stages import RunStage
 
-_RECONSTRUCTION = ("reconstruction_mm", "reconstruction_face")
+_RECONSTRUCTION = ("reconstruction_mm", "reconstruction_face", "reconstruction_latents")
+_WITHOUT_JUDGE = ("agreement_with_caption", "positions", "movement")
+_JUDGES = ("by_evaluator", "by_face_evaluator")
+"""Groups of figures whose judge stands under the same name in the protocol."""
 
 
 def data_of(stage: RunStage | None) -> str:
@@ -54,11 +57,15 @@ def measured_like(evaluation: Evaluation, figure: str) -> str:
         keys = [f"{figure.split('.')[0]}.size"]
     elif evaluation.measure == "evaluate_dances":
         keys = ["split", "clips", "songs", "feature_fps"]
+    elif figure.startswith("reconstruction_latents"):
+        judge = figure.split(".")[1]
+        keys += [f"protocol.{'evaluator' if judge == 'tma' else f'by_{judge}'}.sha256"]
     elif not figure.startswith(_RECONSTRUCTION):
         keys = ["split", "clips", "protocol.lengths"]
-        if figure.startswith("by_evaluator"):
-            keys += ["protocol.by_evaluator.sha256", "by_evaluator.matching.size"]
-        elif not figure.startswith("agreement_with_caption"):
+        first = figure.split(".")[0]
+        if first in _JUDGES:
+            keys += [f"protocol.{first}.sha256", f"{first}.matching.size"]
+        elif first not in _WITHOUT_JUDGE:
             keys += ["protocol.evaluator.sha256"]
         if figure.startswith("retrieval"):
             keys += ["retrieval.among" if "top-" in figure else "retrieval.size"]
@@ -124,8 +131,8 @@ def _candidates(evaluation: Evaluation, columns: list[Column]) -> list[tuple[str
         if column.candidates is None or column.figure is None:
             continue
         key = "retrieval.among" if "top-" in column.figure else "retrieval.size"
-        if column.figure.startswith("by_evaluator"):
-            key = "by_evaluator.matching.size"
+        if (first := column.figure.split(".")[0]) in _JUDGES:
+            key = f"{first}.matching.size"
         ours = value_at(evaluation.figures, key, None)
         if isinstance(ours, int):
             out[(f"candidates of {column.group or column.name}", ours, column.candidates)] = None

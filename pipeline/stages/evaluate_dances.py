@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.dance_beats import DEFINITIONS
@@ -27,8 +26,9 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
 )
 from motionloom.pipeline.contract.units import Arrays, even_slices
-from motionloom.pipeline.evaluation.dance_answers import mean_pose, nearest_dances, random_dances
+from motionloom.pipeline.evaluation.dance_answers import mean_poses, nearest_dances, random_dances
 from motionloom.pipeline.evaluation.dance_figures import (
+    KINETIC,
     MIN_FRAMES,
     Joints,
     Matched,
@@ -44,6 +44,7 @@ from motionloom.pipeline.evaluation.dance_figures import (
 )
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of, require_dances
 from motionloom.pipeline.evaluation.figures import Interval
+from motionloom.pipeline.evaluation.paired import POSITION_TITLES, position_means, position_row
 from motionloom.pipeline.evaluation.tables import interval, plain, print_tables
 from motionloom.pipeline.evaluation.versions import EVALUATE_DANCES
 from motionloom.pipeline.inference.bundle import Bundle
@@ -55,11 +56,8 @@ _FILE = "dances.json"
 _AT_ONCE = 16
 """Dances generated together, at most."""
 
-KINETIC = 3 * BODY_JOINTS
-"""Kinetic features of a motion."""
-
 Group = dict[str, dict[str, float]]
-"""Figures of one set of motions, by group: "beat_align", "recognition", "feet", "distribution"."""
+"""Figures of one set of motions, by group: "beat_align", "recognition", "feet" and so on."""
 
 
 class EvaluateDancesConfig(StageConfig):
@@ -149,7 +147,7 @@ class _DanceEvaluation:
         apart = others(clips, config.shuffles, seed)
         made = self.generated()
         rng = np.random.default_rng([seed, 17])
-        still = [mean_pose(pool, len(clip.joints)) for clip in clips]
+        still = mean_poses([clip.joints for clip in pool], self.fps, [len(joints) for joints in real])
         answers: dict[str, list[list[Joints]]] = {
             "ground_truth": [real],
             "generated": made,
@@ -234,6 +232,9 @@ class _DanceEvaluation:
             "recognition": recognition_of(matched),
             "feet": feet_of(motions, self.fps),
             "distribution": distribution_of(self.true, found),
+            "positions": position_means(
+                position_row(motion, clip.joints) for motion, clip in zip(motions, clips, strict=True)
+            ),
         }
 
     def shuffled(
@@ -296,6 +297,7 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
         ("multimodality", "mm_k"): "MM_k",
         ("multimodality", "mm_m"): "MM_m",
     }
+    errors = {("positions", key): title for key, title in POSITION_TITLES.items()}
     feet = {
         ("feet", "foot_skating"): "foot skating",
         ("feet", "foot_contact"): "foot contact score",
@@ -310,6 +312,7 @@ def figure_rows(figures: dict[str, Any]) -> list[tuple[str, list[str], list[list
         # Covariances of fewer rows than columns are not of full rank.
         title += f"; {figures['clips']} clips are few for FID, whose features are up to {KINETIC}"
     out.append(_rows(title, spread, figures))
+    out.append(_rows("Distance to the recorded dance (lower is better)", errors, figures))
     out.append(_rows("Feet (lower is better)", feet, figures))
     return out
 

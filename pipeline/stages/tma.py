@@ -21,7 +21,7 @@ from motionloom.models.tma.module import TmaLossConfig, TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import ALIGNMENT, GENERATOR, Finished, Given
+from motionloom.pipeline.contract.stage import ALIGNMENT, FACE_ALIGNMENT, GENERATOR, Finished, Given
 from motionloom.pipeline.stages.examples import caption_example
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
@@ -68,12 +68,15 @@ class TmaStage(TrainedStage):
     version = 2  # the filter of negatives is sBERT's
 
     def gives(self, config: TmaStageConfig) -> frozenset[str]:
-        """One space for text and motion, but for faces; motion of text where that is what it is for: the
-        facial cVAE (B.5.1), and TEMOS, which is TMA without InfoNCE (4.1.2).
+        """One space for text and motion, or for text and faces; without InfoNCE motion of text: the facial
+        cVAE (B.5.1), and TEMOS (4.1.2), whose latents are compared with TMA's.
         """
-        makes = config.part == "face" or config.loss.contrastive == 0
-        aligns = config.part != "face"
-        return super().gives(config) | ({GENERATOR} if makes else set()) | ({ALIGNMENT} if aligns else set())
+        names = super().gives(config)
+        if config.loss.contrastive == 0:
+            names |= {GENERATOR}
+        if config.part != "face":
+            return names | {ALIGNMENT}
+        return names if config.loss.contrastive == 0 else names | {FACE_ALIGNMENT}
 
     def facts(self, config: TmaStageConfig, given: Given) -> ModelFacts:
         """Config, layout and the widths of both sides."""

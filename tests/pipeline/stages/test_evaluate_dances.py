@@ -17,7 +17,7 @@ from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.dance_plan import DanceConditions, DanceConfig, beats_of
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, synthesize
-from motionloom.pipeline.evaluation.dance_answers import mean_pose, nearest_dances, random_dances
+from motionloom.pipeline.evaluation.dance_answers import mean_poses, nearest_dances, random_dances
 from motionloom.pipeline.evaluation.dance_figures import (
     Matched,
     alignment_of,
@@ -107,7 +107,7 @@ def test_figures_tell_the_truth_from_trivial_answers(data: Splits, clips: list[D
     true = alignment_of(matched(real, clips))
     crossed = alignment_of([Matched(m, clips[k]) for m, row in zip(real, apart, strict=True) for k in row])
     pool = dances_of(data[0], 50)
-    still = [mean_pose(pool, len(joints)) for joints in real]
+    still = mean_poses([c.joints for c in pool], pool[0].fps, map(len, real))
     frozen = alignment_of(matched(still, clips))
     late = [np.concatenate([np.tile(j[:1], (4, 1, 1)), j[:-4]]) for j in real]  # a fifth of a second
     delayed = alignment_of(matched(late, clips))
@@ -222,7 +222,10 @@ def test_dances_of_a_run_are_evaluated(run: tuple[Path, str]) -> None:
         "ground_truth", "generated", "shuffled_music", "nearest_music", "random_training_dance", "mean_pose"
     }  # fmt: skip
     made, true = rows["generated"], rows["ground_truth"]
-    assert set(made) == {"beat_align", "recognition", "feet", "distribution", "multimodality", "way"}
+    assert set(made) == {
+        "beat_align", "recognition", "feet", "distribution", "multimodality", "positions", "way"
+    }  # fmt: skip
+    assert true["positions"]["ape_joints"]["mean"] == 0 < made["positions"]["ape_joints"]["mean"]
     assert true["distribution"]["fid_k"]["mean"] == 0 and true["recognition"]["genre"]["mean"] == 1
     for name in ("bailando", "mint", "ude", "edge"):
         worse = (rows[other]["beat_align"][name]["mean"] for other in set(rows) - {"ground_truth"})

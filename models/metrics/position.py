@@ -1,0 +1,102 @@
+"""APE and AVE: errors of positions and of their variance over time, of motions made for a caption or a song.
+
+Average Position Error and Average Variance Error of TEMOS (Ghosh et al., Petrovich et al.), which UDE's
+Tables 1 and 2 print. Motions are put on the floor, begin above the origin and face one way at first; then
+joints, the root, its path on the floor and the pose, seen from the root and the heading of its frame, are
+compared. Metres, and square metres for AVE.
+
+UDE does not say which code its figures come from; TEMOS' measures are the ones of these names. Public code
+(`PUBLIC_SIDES`) reads the heading from other joints than it means to, and divides positions that are metres
+already by 1000 (Motion-X) or 1.5625 (HumanML3D).
+
+Legend: T frames, N joints, the first 22 of them the body's.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+_FEET = (7, 10, 8, 11)
+"""Ankles and toes."""
+_SIDES = ((1, 2), (16, 17))
+"""Left and right hip, left and right shoulder."""
+PUBLIC_SIDES = ((3, 2), (18, 17))
+"""What public code reads in their place: it removes the root, and then looks hips and shoulders up by the
+numbers they had with it. The heading is that of the lowest spine joint and the right hip, and so on."""
+_SOFTNESS = 0.5
+KINDS = ("joints", "pose", "root", "path")
+
+
+class PositionErrors(NamedTuple):
+    """Sums, so that clips can be added up; `means()` divides."""
+
+    ape: Tensor
+    """[4] over frames, of `KINDS`; means over joints."""
+    ave: Tensor
+    """[4] over clips."""
+    frames: Tensor
+    clips: Tensor
+
+    def __add__(self, other: object) -> PositionErrors:  # type: ignore[override]
+        if not isinstance(other, PositionErrors):
+            return NotImplemented
+        return PositionErrors(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def means(self) -> dict[str, float]:
+        """`ape_joints`, … in m, a mean over frames; `ave_joints`, … in m², a mean over clips."""
+        ape, ave = self.ape / self.frames.clamp(min=1), self.ave / self.clips.clamp(min=1)
+        each = {"ape": ape.tolist(), "ave": ave.tolist()}
+        return {f"{name}_{kind}": v for name, row in each.items() for kind, v in zip(KINDS, row, strict=True)}
+
+
+def position_errors(
+    made: Tensor, real: Tensor, *, sides: tuple[tuple[int, int], ...] = _SIDES
+) -> PositionErrors:
+    """Of one motion against what was recorded for the same caption or song: [T, N, 3] each, metres, Y up.
+
+    Args:
+        made: The motion that is judged.
+        real: The recorded one.
+        sides: (left, right) joints that say where the body faces; `PUBLIC_SIDES` for public code's figures.
+
+    Raises:
+        ValueError: The two have other shapes, or less than two frames, which have no variance.
+    """
+    if made.shape != real.shape:
+        raise ValueError(f"motions [T, N, 3] of one shape, not {list(made.shape)} and {list(real.shape)}")
+    if len(made) < 2:
+        raise ValueError("APE and AVE need two frames or more")
+    ape, ave = [], []
+    for one, other in zip(_views(made, sides), _views(real, sides), strict=True):
+        ape.append(torch.linalg.vector_norm(one - other, dim=-1).sum(0).mean())
+        ave.append(torch.linalg.vector_norm(one.var(0) - other.var(0), dim=-1).mean())
+    return PositionErrors(torch.stack(ape), torch.stack(ave), torch.tensor(len(made)), torch.tensor(1))
+
+
+def _views(joints: Tensor, sides: tuple[tuple[int, int], ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Joints [T, N, 3], the pose without the root [T, N - 1, 3], the root [T, 3] and its path [T, 2]."""
+    joints = joints.double()
+    height = joints[:, _FEET, 1].amin(-1)
+    low, high = height.min(), height.max()
+    # A soft minimum, so that one bad frame does not decide.
+    floor = low - torch.log(_SOFTNESS + torch.exp(low - high))
+    across = sum(joints[:, left] - joints[:, right] for left, right in sides)
+    assert isinstance(across, Tensor)
+    forward = torch.stack([-across[:, 2], across[:, 0]], dim=-1)
+    forward = forward / torch.linalg.vector_norm(forward, dim=-1, keepdim=True).clamp(min=1e-12)
+    root = joints[:, 0]
+    begin = torch.stack([root[0, 0], floor, root[0, 2]])
+    placed = _turned(joints - begin, forward[:1])
+    around = torch.stack([root[:, 0], floor.expand(len(root)), root[:, 2]], dim=-1)
+    pose = _turned(joints - around[:, None], forward)[:, 1:]
+    return placed, pose, placed[:, 0], placed[:, 0, [0, 2]]
+
+
+def _turned(joints: Tensor, forward: Tensor) -> Tensor:
+    """Joints [T, N, 3] seen from one who faces `forward` [T or 1, 2], (x, z) of length 1."""
+    sin, cos = forward[:, None, 0], forward[:, None, 1]
+    x, y, z = joints.unbind(-1)
+    return torch.stack([cos * x - sin * z, y, sin * x + cos * z], dim=-1)

@@ -1,0 +1,71 @@
+"""APE and AVE equal public code's figures, wherever a motion begins and whichever way it faces."""
+
+from __future__ import annotations
+
+from functools import reduce
+from operator import add
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.models.metrics.position import KINDS, PUBLIC_SIDES, PositionErrors, position_errors
+
+
+@pytest.fixture(scope="module")
+def golden(shared: Path) -> dict[str, np.ndarray]:
+    with np.load(shared / "golden" / "t6_metrics_A.npz", allow_pickle=False) as data:
+        return {name: data[name] for name in data.files if name.startswith(("mr_", "apeave"))}
+
+
+def clip(golden: dict[str, np.ndarray], name: str, row: int) -> torch.Tensor:
+    return torch.from_numpy(golden[name][row, : int(golden["mr_lengths"][row])])
+
+
+@pytest.mark.parametrize(
+    ("case", "scale"), [("humanml3d_raw", 1.0), ("humanml3d_m", 1.5625), ("motionx_m", 1000.0)]
+)
+def test_public_code(golden: dict[str, np.ndarray], case: str, scale: float) -> None:
+    """In the public order: joints, pose, root, path; of APE, then of AVE. The reference is in float32."""
+    found = reduce(
+        add,
+        (
+            position_errors(clip(golden, "mr_rst", k), clip(golden, "mr_ref", k), sides=PUBLIC_SIDES)
+            for k in (0, 1)
+        ),
+    ).means()
+    expected = golden[f"apeave_{case}"]
+    values = [found[f"ape_{kind}"] / scale for kind in KINDS]
+    values += [found[f"ave_{kind}"] / scale**2 for kind in KINDS]
+    assert values == pytest.approx(expected.tolist(), rel=1e-5)
+
+
+def test_place_and_heading_of_the_start_do_not_count(golden: dict[str, np.ndarray]) -> None:
+    real = clip(golden, "mr_ref", 0).double()
+    turn = torch.tensor([[np.cos(1.0), 0, np.sin(1.0)], [0, 1, 0], [-np.sin(1.0), 0, np.cos(1.0)]])
+    moved = real @ turn.T + torch.tensor([3.0, 0.4, -2.0])
+    assert max(abs(v) for v in position_errors(moved, real).means().values()) < 1e-9
+
+
+def test_by_hand() -> None:
+    """A body that shifts by 1 m a frame to its side, beside one that stands: its path is wrong by 0, 1 and
+    2 m, the variance by 1 m²; the pose, seen from the root, is right."""
+    still = torch.zeros(3, 22, 3, dtype=torch.float64)
+    still[:, [1, 16], 0], still[:, [2, 17], 0] = 0.1, -0.1
+    still[:, :, 1] = torch.linspace(1.0, 0.0, 22)
+    moving = still.clone()
+    moving[..., 0] += torch.arange(3.0)[:, None]
+    found = position_errors(moving, still).means()
+    assert [found[f"ape_{kind}"] for kind in KINDS] == pytest.approx([1.0, 0.0, 1.0, 1.0])
+    assert [found[f"ave_{kind}"] for kind in KINDS] == pytest.approx([1.0, 0.0, 1.0, 1.0])
+
+
+def test_sums_add_up_and_shapes_are_refused(golden: dict[str, np.ndarray]) -> None:
+    one = position_errors(clip(golden, "mr_rst", 0), clip(golden, "mr_ref", 0))
+    twice: PositionErrors = one + one
+    assert twice.means() == pytest.approx(one.means())
+    with pytest.raises(ValueError, match="one shape"):
+        position_errors(torch.zeros(4, 22, 3), torch.zeros(5, 22, 3))
+    with pytest.raises(ValueError, match="two frames"):
+        position_errors(torch.zeros(1, 22, 3), torch.zeros(1, 22, 3))

@@ -1,0 +1,127 @@
+"""Faces judged by a TMA of faces, vertices of a head, motion beside what was recorded for its caption."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.evaluation.face_basis import read_basis
+from motionloom.pipeline.evaluation.figure_rows import figure_rows
+from motionloom.pipeline.evaluation.reconstruction import face_errors
+from motionloom.pipeline.evaluation.truth import reconstruct_all, spread_any, truth_of
+from motionloom.pipeline.published.compare import compare_with_paper
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.graph import Selection
+
+RECIPE = """
+extends: small
+name: small
+stages:
+  face_evaluator:
+    kind: tma
+    part: face
+    net: {latent: 8, ff: 16, layers: 1, frame_stride: 1}
+    loss: {contrastive: 0.1}
+    train: {steps: 4, batch_size: 8, checkpoint_every: 4, validate_every: 4}
+  evaluate: {clips: 9, repeats: 2, size: 4, face_basis: BASIS}
+"""
+
+
+@pytest.fixture(scope="module")
+def judged(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with an evaluator of faces, evaluated by it."""
+    root = tmp_path_factory.mktemp("faces")
+    shutil.copy(small_run.recipe, root / small_run.recipe.name)
+    np.save(root / "head.npy", np.random.default_rng(0).normal(size=(5, 3, 50)) * 0.01)
+    (root / "faces.yaml").write_text(RECIPE.replace("BASIS", str(root / "head.npy")))
+    shutil.copytree(small_run.folder, root / "run")
+    run_recipe(
+        root / "faces.yaml", root / "run", select=Selection(until="evaluate"), console=Console(quiet=True)
+    )
+    return root
+
+
+@pytest.mark.slow
+def test_faces_have_a_judge_and_vertices(judged: Path) -> None:
+    figures = json.loads((judged / "run/stages/evaluate/metrics.json").read_text())
+    by_face = figures["by_face_evaluator"]
+    assert set(by_face["matching"]["generated"]) == {"top-1", "top-2", "top-3", "matching_score"}
+    rows = by_face["distribution"]["rows"]
+    assert rows["generated"]["fid"]["mean"] > 0 and rows["mean_pose"]["fid"]["mean"] > 0
+    assert figures["protocol"]["by_face_evaluator"]["stage"] == "face_evaluator"
+    rebuilt = figures["reconstruction_latents"]
+    assert set(rebuilt) == {"tma", "face_evaluator"}
+    assert rebuilt["face_evaluator"]["fid"] > 0 and rebuilt["face_evaluator"]["training_fid"] > 0
+    assert 0 <= rebuilt["face_evaluator"]["top-3"]["mean"] <= 1
+    titles = [title for title, _, _ in figure_rows(figures)]
+    assert "R-Precision among 4 by the face evaluator, 7 clips as they are drawn" in titles
+    # By hand: one clip's vertices.
+    stages, shelf = finished_stages(judged / "run"), Shelf()
+    data, tokenizer = shelf.get(stages["data"]).split("test"), shelf.get(stages["face_tokenizer"])
+    basis = read_basis(judged / "head.npy")
+    errors, frames = 0.0, 0
+    for index in spread_any(data, 9):
+        truth = truth_of(data, index)
+        if truth.face is None:
+            continue
+        off = reconstruct_all(tokenizer, truth)[:, data.layout.slice("face")].astype(np.float64) - truth.face
+        moved = np.stack([(basis @ row) for row in off])
+        errors += 1000 * np.sqrt(np.square(moved).sum(-1)).mean(-1).sum()
+        frames += len(off)
+        assert "vertex" not in face_errors(tokenizer, truth)
+    assert figures["reconstruction_face"]["vertex"] == pytest.approx(errors / frames, abs=2e-5)
+
+
+@pytest.mark.slow
+def test_motion_stands_beside_what_was_recorded(judged: Path) -> None:
+    figures = json.loads((judged / "run/stages/evaluate/metrics.json").read_text())
+    positions = figures["positions"]
+    assert set(positions) == {"generated", "training", "mean_pose"}
+    for row in positions.values():
+        assert 0 < row["ape_pose"]["mean"] < 1 and 0 < row["ape_joints"]["mean"] < 20
+    moves = figures["movement"]["rows"]
+    assert moves["recorded"]["div_k"]["mean"] > 0 and moves["generated"]["mm_k"]["mean"] > 0
+    assert moves["mean_pose"]["fid_k"]["mean"] > 0
+    columns, rows = next(
+        (columns, rows) for title, columns, rows in figure_rows(figures) if "recorded for the same" in title
+    )
+    assert columns[1:3] == ["APE, m", "AVE, m²"] and len(rows) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("table", "filled"), [("humantomato/2", 4), ("humantomato/4", 7), ("humantomato/6", 3)]
+)
+def test_tables_of_faces_are_filled(judged: Path, table: str, filled: int) -> None:
+    found = compare_with_paper(table, [judged / "run"])
+    ours = [row for row in found.rows if row.source == "ours"]
+    assert ours and max(sum(cell is not None for cell in row.cells) for row in ours) >= filled
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (np.zeros((5, 50)), "shape"),
+        (np.full((5, 3, 50), np.nan), "finite"),
+        (np.zeros((5, 3, 50), int), "floats"),
+    ],
+)
+def test_a_wrong_basis_is_refused(values: np.ndarray, said: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "head.npy", values)
+    with pytest.raises(UserError, match=said):
+        read_basis(tmp_path / "head.npy")
+
+
+def test_what_is_no_array_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "head.npy").write_bytes(b"\x80\x04not an array")
+    with pytest.raises(UserError, match="cannot be read"):
+        read_basis(tmp_path / "head.npy")
