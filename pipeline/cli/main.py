@@ -83,13 +83,18 @@ def run(
     only: Annotated[str | None, typer.Option(help="Only this stage; its inputs must be finished.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Run the selected stages even if finished.")] = False,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Go on in the folder of another recipe's run.")
+        bool,
+        typer.Option(
+            "--replace",
+            help="Go on in this folder even where that replaces finished trainings, or another recipe's run.",
+        ),
     ] = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
 
-    Finished stages are skipped, changed ones and those below them run again. Kill it at any moment and start
-    it again: it goes on where it was.
+    Finished stages are skipped, changed ones and those below them run again; before a finished training is
+    replaced it asks for --replace, or for another folder. Kill it at any moment and start it again: it goes
+    on where it was.
 
     Example: `motionloom run humantomato-tiny --dry-run`
 

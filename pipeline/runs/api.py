@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from rich.console import Console
+from rich.markup import escape
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages, preview_of
@@ -31,18 +32,17 @@ from motionloom.pipeline.runs.graph import (
     make_plan,
     perform,
     plan_table,
-    replaced_trainings,
     require_fit,
     selected,
     stage_inputs,
 )
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.runs.replace import replaced_stages, require_asked, say_replaced, started_trainings
 from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, StageState, run_state
-from motionloom.pipeline.store.yaml import read_yaml
 
 
 def run_recipe(
@@ -57,7 +57,8 @@ def run_recipe(
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
 
-    A folder of another recipe is refused without `replace`.
+    Without `replace` a run is refused that would make anew what is finished and took long (`replace.py`), or
+    that goes on in the folder of another recipe's run.
     """
     console = console or make_console()
     loaded = load_recipe(recipe, overrides)
@@ -69,12 +70,17 @@ def run_recipe(
     if dry_run:
         console.print(plan_table(loaded, plan))
         require_fit(todo, loaded.hardware)
-    if not replace:
-        _require_same_recipe(run, loaded.name)
-    finished, started = replaced_trainings(run, plan)
-    for what, names in (("finished", finished), ("unfinished", started)):
-        if names:
-            console.print(f"[yellow]replaces {what} trainings: {', '.join(names)}[/]")
+    replaced = replaced_stages(run, plan)
+    if not replace and dry_run:
+        said = say_replaced(run, loaded.name, replaced)
+        if said is not None:
+            console.print(f"[yellow]without --replace this is refused. {escape(said)}[/]", soft_wrap=True)
+    elif not replace:
+        require_asked(run, loaded.name, replaced)
+    elif replaced:
+        console.print(f"[yellow]replaces finished stages: {', '.join(stage.stage for stage in replaced)}[/]")
+    if started := started_trainings(run, plan):
+        console.print(f"[yellow]replaces unfinished trainings: {', '.join(started)}[/]")
     if dry_run:
         console.print(f"{len(todo)} of {len(plan)} stages would run in {run}")
         return run
@@ -97,20 +103,6 @@ def run_recipe(
         if "page" in row.stage.kind.gives(row.stage.config) and row.action != "leave" and page.is_file():
             console.print(f"watch it: {page.resolve()}", soft_wrap=True)
     return run
-
-
-def _require_same_recipe(run: Path, name: str) -> None:
-    """Never replace the stages of another recipe's run unasked."""
-    path = run / "recipe.yaml"
-    try:
-        found = read_yaml(path) if path.is_file() else None
-    except UserError:
-        return  # it is about to be written anew
-    if isinstance(found, dict) and found.get("name", name) != name:
-        raise UserError(
-            f"{run}: holds a run of recipe '{found['name']}', not '{name}'; choose another folder with "
-            f"--out, or give --replace to go on here: what fits is kept, the rest is made anew"
-        )
 
 
 def _say_estimate(recipe: Recipe, console: Console) -> None:

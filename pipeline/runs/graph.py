@@ -127,20 +127,6 @@ def selected(recipe: Recipe, select: Selection) -> set[str]:
     return _ancestors(recipe, until) if until else {stage.name for stage in recipe.stages}
 
 
-def replaced_trainings(run: Path, plan: Sequence[PlannedStage]) -> tuple[list[str], list[str]]:
-    """Trainings that the plan deletes though nobody asked for it by name: finished ones, and started ones."""
-    finished, started = [], []
-    for row in plan:
-        folder = stage_folder(run, row.stage.name)
-        if not row.stage.kind.trains or row.action != "run" or row.asked:
-            continue
-        if Artifact.find(folder) is not None:
-            finished.append(row.stage.name)
-        elif (folder / "checkpoints").is_dir():
-            started.append(row.stage.name)
-    return finished, started
-
-
 def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> dict[str, Any]:
     """What a stage's fingerprint is the digest of."""
     facts = {
