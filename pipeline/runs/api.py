@@ -41,6 +41,7 @@ from motionloom.pipeline.runs.replace import replaced_stages, require_asked, say
 from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import remove_tree, require_file_place, require_folder
+from motionloom.pipeline.store.outside import owner_of
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, StageState, run_state
 
@@ -116,7 +117,7 @@ def _say_estimate(recipe: Recipe, console: Console) -> None:
         if "data" not in stage.kind.gives(stage.config):
             continue
         try:
-            preview_of(stage, stages)
+            preview_of(stage, {**stages, **recipe.outside})
         except UserError as error:
             console.print(str(error))
             return
@@ -226,6 +227,9 @@ def _stage_again(
     given = {name: value for name, value in changes.items() if value is not None}
     config = stage.kind.config.parse({**stage.config.dump(), **given}, target)
     inputs = stage_inputs(recipe, folder, stage)
+    for (name, _), said in recipe.gone.items():
+        if name == stage.name and state is None:
+            raise UserError(said)
     if state is not None:
         inputs = _finished_inputs(folder, inputs, state)
     for role, source in inputs.items():
@@ -233,7 +237,8 @@ def _stage_again(
             raise UserError(
                 f"{folder}: stage '{source.name}' (role {role}) is not finished; run the recipe first"
             )
-    require_consistent(folder, (source.name for source in inputs.values()))
+    for source in inputs.values():
+        require_consistent(owner_of(source.folder), [source.folder.name])
     if team.leads:
         out.mkdir(exist_ok=True)
         remove_tree(out / WORK)  # of an evaluation that was killed, maybe with other settings
@@ -243,7 +248,7 @@ def _stage_again(
         config=config,
         folder=out,
         inputs=inputs,
-        seed=recipe.seed,
+        seed=recipe.seed_of(stage),
         hardware=recipe.hardware,
         console=console,
         shelf=shelf,
@@ -258,12 +263,13 @@ def _finished_inputs(folder: Path, inputs: dict[str, Finished], state: RunState)
     """Those of a stage's inputs that are finished, with all that they were made from."""
     whole = {stage.name for stage in state.stages if stage.usable and not _gone(stage)}
     finished = finished_stages(folder) if whole else {}
-    return {
-        role: finished[source.name]
-        for role, source in inputs.items()
-        if source.name in finished
-        and whole.issuperset([source.name, *(above.name for above in finished[source.name].upstream())])
-    }
+
+    def there(stage: Finished) -> bool:
+        own = [one.name for one in (stage, *stage.upstream()) if not one.outside]
+        return whole.issuperset(own)
+
+    now = {role: source if source.outside else finished.get(source.name) for role, source in inputs.items()}
+    return {role: source for role, source in now.items() if source is not None and there(source)}
 
 
 def _gone(stage: StageState) -> bool:
@@ -325,4 +331,4 @@ def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Pa
 
 def _recipe_of(folder: Path) -> Recipe:
     require_run(folder)
-    return load_recipe(folder / "recipe.yaml")
+    return load_recipe(folder / "recipe.yaml", strict=False)

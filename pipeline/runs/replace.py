@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from motionloom.datasets.base.progress import duration
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.runs.graph import PlannedStage
 from motionloom.pipeline.store.artifact import Artifact
-from motionloom.pipeline.store.flatten import duration
 from motionloom.pipeline.store.run_folder import stage_folder
 from motionloom.pipeline.store.run_state import read_record
 from motionloom.pipeline.store.yaml import read_yaml

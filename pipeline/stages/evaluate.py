@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import FigureTable, Showing
@@ -46,7 +47,6 @@ from motionloom.pipeline.evaluation.truth import Truth, digest_of, drawn, has_ca
 from motionloom.pipeline.evaluation.versions import EVALUATE
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
-from motionloom.pipeline.stages.progress import bar
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.networks import TrainedTokenizer
@@ -182,22 +182,20 @@ class _Evaluation:
             for judge in self.judges.values():
                 judge.texts(self.truths)  # captions that it cannot read are refused before anything is made
         units, sizes = self.context.units, [piece.stop - piece.start for piece in self.slices]
-        with bar(self.context.console) as progress:
-            task = progress.add_task("reconstructing", total=units.mine(sizes), note="")
+        with Meter("reconstructing", units.mine(sizes), console=self.context.console) as done:
             units.make(
                 "reconstructed",
                 len(sizes),
                 lambda k: self.reconstruct(self.shown[self.slices[k]]),
-                lambda k: progress.advance(task, sizes[k]),
+                lambda k: done.advance(sizes[k]),
             )
         made = [piece.stop - piece.start for _, piece in self.performances]
-        with bar(self.context.console) as progress:
-            another = progress.add_task("generating", total=units.mine(made), note="")
+        with Meter("generating", units.mine(made), console=self.context.console) as another:
             units.make(
                 "generated",
                 len(made),
                 lambda k: self.perform(*self.performances[k]),
-                lambda k: progress.advance(another, made[k]),
+                lambda k: another.advance(made[k]),
             )
 
     def figures(self) -> dict[str, Any]:

@@ -156,7 +156,7 @@ def took(run: Path, **seconds: float) -> None:
 def test_another_recipe_is_refused_in_the_folder(go: Go, tmp_path: Path) -> None:
     go()
     before = files(tmp_path / "run")
-    with pytest.raises(UserError, match=r"(?s)holds a run of recipe 'toy', not 'other'; to go on .*gpt.* --replace"):
+    with pytest.raises(UserError, match=r"(?s)of recipe 'toy', not 'other'; to go on .*gpt.* --replace"):
         go("gpt.add=2", recipe="other")
     with pytest.raises(UserError, match=r"'toy', not 'other'; -o .*run-2 keeps both, --replace goes on here"):
         go("report.add=2", recipe="other")
