@@ -16,6 +16,7 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.data import data_app
+from motionloom.pipeline.cli.sweep import sweep
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
 from motionloom.pipeline.launch.process import TeamError, leave, process_rank
 
@@ -99,6 +100,8 @@ def run(
     Example: `motionloom run humantomato-tiny --dry-run`
 
     Example: `motionloom run humantomato-tiny -o runs/second --set tma.optim.lr=2e-4 --until tma`
+
+    Example: `motionloom run humantomato-tiny --set face_gpt.train.steps=900 --replace`
     """
     from motionloom.pipeline.runs.api import run_recipe
     from motionloom.pipeline.runs.graph import Selection
@@ -112,6 +115,9 @@ def run(
         replace=replace,
         console=make_console(),
     )
+
+
+app.command()(sweep)
 
 
 @app.command()

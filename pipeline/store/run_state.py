@@ -65,6 +65,7 @@ class RunState:
     folder: Path
     recipe: str
     seed: int | None
+    data_seed: int | None
     hardware: Mapping[str, Any]
     stages: tuple[StageState, ...]
 
@@ -87,12 +88,13 @@ def run_state(run: Path) -> RunState:
     require_run(run)
     entries = stages_of(run)
     recipe = read_yaml(run / "recipe.yaml")
-    seed = recipe.get("seed")
+    seed, data_seed = recipe.get("seed"), recipe.get("data_seed")
     causes: dict[str, str] = {}
     return RunState(
         folder=run,
         recipe=str(recipe.get("name", run.name)),
         seed=seed if isinstance(seed, int) else None,
+        data_seed=data_seed if isinstance(data_seed, int) else None,
         hardware=_mapping(recipe.get("hardware")),
         stages=tuple(_stage(run, name, entry, causes) for name, entry in entries.items()),
     )
