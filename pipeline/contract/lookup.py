@@ -80,6 +80,7 @@ class _Reader:
     def __init__(self, home: Path | None) -> None:
         self._home = None if home is None else home.resolve()
         self._made: dict[Path, Finished | None] = {}
+        self._places: dict[Path, dict[Path, int]] = {}
 
     def find(self, folder: Path) -> Finished | None:
         """The stage in a folder; None where it has not finished."""
@@ -113,7 +114,15 @@ class _Reader:
         config = kind.config.parse(artifact.config, f"{where}: config")
         outside = run.resolve() != self._home
         name = label_of(folder) if outside else folder.name
-        return Finished(name, kind, config, folder, _in_order(inputs, run), outside=outside, gone=gone)
+        return Finished(name, kind, config, folder, self._in_order(inputs, run), outside=outside, gone=gone)
+
+    def _in_order(self, inputs: Mapping[str, Finished], run: Path) -> dict[str, Finished]:
+        """Inputs as the run's recipe has their stages, then others; an artifact lists them by role."""
+        if run not in self._places:
+            names = enumerate(stages_of(run))
+            self._places[run] = {stage_folder(run, name).resolve(): number for number, name in names}
+        own = self._places[run]
+        return dict(sorted(inputs.items(), key=lambda item: own.get(item[1].folder.resolve(), len(own))))
 
 
 def say_gone(run: Path, stage: str, place: Path) -> str:
@@ -130,13 +139,6 @@ def _gives(kind: StageKind, artifact: Artifact) -> frozenset[str]:
         return kind.gives(kind.config.parse(artifact.config, "config"))
     except UserError:
         return frozenset()
-
-
-def _in_order(inputs: Mapping[str, Finished], run: Path) -> dict[str, Finished]:
-    """Inputs as the run's recipe has their stages, then others; an artifact lists them by role."""
-    names = list(stages_of(run))
-    own = {stage_folder(run, name).resolve(): number for number, name in enumerate(names)}
-    return dict(sorted(inputs.items(), key=lambda item: own.get(item[1].folder.resolve(), len(own))))
 
 
 def generators_of(run: Path) -> list[Finished]:

@@ -233,7 +233,7 @@ def _stage_again(
     if state is not None:
         inputs = _finished_inputs(folder, inputs, state)
     for role, source in inputs.items():
-        if not (source.folder / "artifact.json").is_file():
+        if not source.outside and not (source.folder / "artifact.json").is_file():
             raise UserError(
                 f"{folder}: stage '{source.name}' (role {role}) is not finished; run the recipe first"
             )
