@@ -150,7 +150,8 @@ def _short(keys: Sequence[str]) -> list[str]:
 
 def _plain(value: str) -> str:
     """A value as it may stand in the name of a folder."""
-    return re.sub(r"[^A-Za-z0-9.+-]+", "-", value).strip("-") or "empty"
+    sign = "-" if value.startswith("-") else ""
+    return sign + (re.sub(r"[^A-Za-z0-9.+-]+", "-", value).strip("-") or "empty")
 
 
 def _divided(text: str) -> list[str]:
