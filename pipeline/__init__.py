@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from motionloom.pipeline.published.compare import compare_with_paper
     from motionloom.pipeline.runs.api import evaluate_run, export_run, report_run, run_recipe
     from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+    from motionloom.pipeline.runs.sweep import run_sweep
     from motionloom.pipeline.stages.trained import TrainedStage
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "register",
     "report_run",
     "run_recipe",
+    "run_sweep",
     "write_motions",
 ]
 
@@ -64,6 +66,7 @@ _HOMES = {
     "register": "pipeline.contract.registry",
     "report_run": "pipeline.runs.api",
     "run_recipe": "pipeline.runs.api",
+    "run_sweep": "pipeline.runs.sweep",
     "write_motions": "pipeline.inference.outputs",
 }
 

@@ -22,11 +22,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from rich.progress import Progress
-
 from motionloom.datasets.base.files import remove_temporaries, sync_folder, write_json
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.pool import Workers
+from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, ShardInfo, Split, UserError
 from motionloom.datasets.shards.index import (
@@ -164,13 +163,12 @@ class DatasetWriter(Generic[T]):
 
     def _shards(self, convert: Convert[T]) -> list[Result]:
         """Results of all tasks, in their order."""
-        with Progress(disable=not self._how.progress) as bar:
-            done = len(self._tasks) - len(self._todo)
-            shown = bar.add_task("writing shards", total=len(self._tasks), completed=done)
+        done = len(self._tasks) - len(self._todo)
+        with Meter("writing shards", len(self._tasks), done=done, shown=self._how.progress) as meter:
             tasks = [self._tasks[at] for at in self._todo]
             for position, result in self.pool.run(partial(write_shard, convert=convert), tasks):
                 self._results[self._todo[position]] = result
-                bar.advance(shown)
+                meter.advance()
         return [result for result in self._results if result is not None]
 
 

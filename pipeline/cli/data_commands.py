@@ -66,7 +66,7 @@ def convert_command(
     """Plan a conversion, run it here, or hand it to SLURM."""
     converter = converter_named(kind)
     config = converter.config().parse(fields, f"data convert {kind}")
-    shown = console.is_terminal
+    shown = not console.quiet
     if plan:
         conversion = converter.prepare(config, workers=workers, progress=shown)
         say_plan(conversion.estimated(workers), console)

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.data import data_app
+from motionloom.pipeline.cli.sweep import sweep
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
 from motionloom.pipeline.launch.process import TeamError, leave, process_rank
 
@@ -83,17 +84,24 @@ def run(
     only: Annotated[str | None, typer.Option(help="Only this stage; its inputs must be finished.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Run the selected stages even if finished.")] = False,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Go on in the folder of another recipe's run.")
+        bool,
+        typer.Option(
+            "--replace",
+            help="Go on in this folder even where that replaces finished trainings, or another recipe's run.",
+        ),
     ] = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
 
-    Finished stages are skipped, changed ones and those below them run again. Kill it at any moment and start
-    it again: it goes on where it was.
+    Finished stages are skipped, changed ones and those below them run again; before a finished training is
+    replaced it asks for --replace, or for another folder. Kill it at any moment and start it again: it goes
+    on where it was.
 
     Example: `motionloom run humantomato-tiny --dry-run`
 
     Example: `motionloom run humantomato-tiny -o runs/second --set tma.optim.lr=2e-4 --until tma`
+
+    Example: `motionloom run humantomato-tiny --set face_gpt.train.steps=900 --replace`
     """
     from motionloom.pipeline.runs.api import run_recipe
     from motionloom.pipeline.runs.graph import Selection
@@ -107,6 +115,9 @@ def run(
         replace=replace,
         console=make_console(),
     )
+
+
+app.command()(sweep)
 
 
 @app.command()

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from motionloom.datasets.base.progress import duration
 from motionloom.pipeline.compare.curves import CurveChart, curve_charts
 from motionloom.pipeline.compare.runs import ComparedRun
 from motionloom.pipeline.compare.settings import ABSENT, StageDifferences, setting_differences
 from motionloom.pipeline.compare.tables import ComparedTable, compared_tables
 from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.page import Cell, Page, Value
-from motionloom.pipeline.store.flatten import duration, setting_text
+from motionloom.pipeline.store.flatten import setting_text
 
 NO_PAGES = ("report",)
 """Kinds of stages that nothing compared here comes from."""

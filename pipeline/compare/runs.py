@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.outside import owner_of
+from motionloom.pipeline.store.run_folder import stage_folder
 from motionloom.pipeline.store.run_state import RunState, StageState, read_record, run_state
 from motionloom.pipeline.store.training_log import read_training_log
 
@@ -80,9 +83,9 @@ class ComparedRun:
         return max((path.stat().st_mtime_ns for path in made if path.is_file()), default=0)
 
     def _data(self, stage: StageState) -> str:
+        run = self.state.folder
         source = stage.artifact.inputs.get("data") if stage.artifact else None
-        name = "data" if source is None else source.stage
-        return _identity(self.state, name, set())
+        return _identity(stage_folder(run, "data") if source is None else source.place(run), set())
 
 
 def open_runs(folders: Sequence[Path]) -> list[ComparedRun]:
@@ -111,16 +114,16 @@ def _labels(places: Sequence[Path]) -> list[str]:
     return [str(place) for place in places]
 
 
-def _identity(state: RunState, name: str, seen: set[str]) -> str:
+def _identity(folder: Path, seen: set[Path]) -> str:
     """A digest of the shards that a data stage wrote and of the stages it mixes; else its fingerprint.
 
     Two recipes that make the same clips have other fingerprints, by their seed or by unused settings.
     """
-    stage = state.stage(name)
-    if stage is None or stage.artifact is None or name in seen:
-        return f"unknown data of {state.folder}"
-    artifact = stage.artifact
-    above = [_identity(state, source.stage, seen | {name}) for source in artifact.inputs.values()]
+    artifact = None if folder in seen else Artifact.find(folder)
+    if artifact is None:
+        return f"unknown data of {folder}"
+    run = owner_of(folder)
+    above = [_identity(source.place(run), seen | {folder}) for source in artifact.inputs.values()]
     if not above and not any(output.endswith(".tar") for output in artifact.outputs):
         return artifact.fingerprint
     facts = [sorted((name, output.sha256) for name, output in artifact.outputs.items()), above]

@@ -50,7 +50,12 @@ def setting_differences(runs: Sequence[ComparedRun]) -> list[StageDifferences]:
     A finished stage has the settings that made it, which its recipe may have changed since.
     """
     recipes = [
-        {"recipe": run.state.recipe, "seed": run.state.seed, **flatten({"hardware": run.state.hardware})}
+        {
+            "recipe": run.state.recipe,
+            "seed": run.state.seed,
+            "data_seed": run.state.data_seed,
+            **flatten({"hardware": run.state.hardware}),
+        }
         for run in runs
     ]
     out = [StageDifferences("", (), _differences(recipes))]

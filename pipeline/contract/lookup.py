@@ -2,29 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.exported import exported_stage
 from motionloom.pipeline.contract.registry import stage_kind
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage, StageKind
 from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.outside import in_export, is_place, label_of, owner_of
 from motionloom.pipeline.store.run_folder import stage_folder, stages_of
 
 
-def preview_of(stage: Stage, others: Mapping[str, Stage]) -> Any:
+def preview_of(stage: Stage, others: Mapping[str, Stage | Finished]) -> Any:
     """What a stage of a recipe will give, as far as it is known before it has run."""
     return stage.kind.preview(stage.config, previews(stage, others))
 
 
-def previews(stage: Stage, others: Mapping[str, Stage]) -> Given:
-    """Previews of a stage's inputs, by role."""
+def previews(stage: Stage, others: Mapping[str, Stage | Finished]) -> Given:
+    """Previews of a stage's inputs, by role; `others` are those of its recipe, and finished ones outside."""
 
     def maker(name: str) -> Callable[[], Any]:
-        return lambda: preview_of(others[name], others)
+        found = others[name]
+        if isinstance(found, Finished):
+            return partial(preview_of_finished, found)
+        return partial(preview_of, found, others)
 
     return Given({role: maker(name) for role, name in stage.inputs.items()})
+
+
+def preview_of_finished(stage: Finished) -> Any:
+    """What a finished stage gives, without what only running it needs."""
+    makers: dict[str, Callable[[], Any]] = {}
+    for role, source in stage.inputs.items():
+        makers[role] = partial(preview_of_finished, source)
+    return stage.kind.preview_of_finished(stage, Given(makers))
 
 
 def stages_giving(run: Path, what: str) -> list[str]:
@@ -41,31 +56,82 @@ def stages_giving(run: Path, what: str) -> list[str]:
 
 def finished_stages(run: Path) -> dict[str, Finished]:
     """The finished stages of a run by name, in the recipe's order."""
-    out: dict[str, Finished] = {}
+    reader = _Reader(run)
+    found = {name: reader.find(stage_folder(run, name)) for name in stages_of(run)}
+    return {name: stage for name, stage in found.items() if stage is not None}
 
-    def find(name: str) -> Finished | None:
-        if name not in out:
-            folder = stage_folder(run, name)
-            artifact = Artifact.find(folder)
-            if artifact is None:
-                return None
-            where = str(folder / "artifact.json")
-            kind = stage_kind(artifact.kind, where)
-            if artifact.version != kind.version and GENERATOR in _gives(kind, artifact):
-                raise UserError(
-                    f"{where}: made by version {artifact.version} of stage kind {kind.name}, which is now "
-                    f"version {kind.version}; run the recipe again"
-                )
-            inputs = {role: find(source.stage) for role, source in artifact.inputs.items()}
-            config = kind.config.parse(artifact.config, f"{where}: config")
-            found = {role: stage for role, stage in inputs.items() if stage is not None}
-            out[name] = Finished(name, kind, config, folder, _in_order(found, names))
-        return out[name]
 
-    names = list(stages_of(run))
-    for name in names:
-        find(name)
-    return {name: out[name] for name in names if name in out}
+def outside_stage(folder: Path) -> Finished | None:
+    """A finished stage of a run or of an export, by its folder, for another run; None where there is none."""
+    place = folder.resolve()
+    if not in_export(place):
+        return _Reader(None).find(place)
+    return _as_outside(exported_stage(place)) if place.is_dir() else None
+
+
+def _as_outside(stage: Finished) -> Finished:
+    inputs = {role: _as_outside(source) for role, source in stage.inputs.items()}
+    return replace(stage, name=label_of(stage.folder), inputs=inputs, outside=True)
+
+
+class _Reader:
+    """Reads finished stages and those that fed them, each once, into other runs too."""
+
+    def __init__(self, home: Path | None) -> None:
+        self._home = None if home is None else home.resolve()
+        self._made: dict[Path, Finished | None] = {}
+        self._places: dict[Path, dict[Path, int]] = {}
+
+    def find(self, folder: Path) -> Finished | None:
+        """The stage in a folder; None where it has not finished."""
+        key = folder.resolve()
+        if key not in self._made:
+            self._made[key] = None  # a damaged folder may name itself
+            self._made[key] = self._read(folder)
+        return self._made[key]
+
+    def _read(self, folder: Path) -> Finished | None:
+        if in_export(folder):
+            return outside_stage(folder)
+        artifact = Artifact.find(folder)
+        if artifact is None:
+            return None
+        where = str(folder / "artifact.json")
+        kind = stage_kind(artifact.kind, where)
+        if artifact.version != kind.version and GENERATOR in _gives(kind, artifact):
+            raise UserError(
+                f"{where}: made by version {artifact.version} of stage kind {kind.name}, which is now "
+                f"version {kind.version}; run the recipe again"
+            )
+        run = owner_of(folder)
+        inputs, gone = dict[str, Finished](), dict[str, str]()
+        for role, source in artifact.inputs.items():
+            stage = self.find(source.place(run))
+            if stage is not None:
+                inputs[role] = stage
+            elif source.folder is not None:
+                gone[role] = say_gone(run, folder.name, source.place(run))
+        config = kind.config.parse(artifact.config, f"{where}: config")
+        outside = run.resolve() != self._home
+        name = label_of(folder) if outside else folder.name
+        return Finished(name, kind, config, folder, self._in_order(inputs, run), outside=outside, gone=gone)
+
+    def _in_order(self, inputs: Mapping[str, Finished], run: Path) -> dict[str, Finished]:
+        """Inputs as the run's recipe has their stages, then others; an artifact lists them by role."""
+        if run not in self._places:
+            names = enumerate(stages_of(run))
+            self._places[run] = {stage_folder(run, name).resolve(): number for number, name in names}
+        own = self._places[run]
+        return dict(sorted(inputs.items(), key=lambda item: own.get(item[1].folder.resolve(), len(own))))
+
+
+def say_gone(run: Path, stage: str, place: Path) -> str:
+    """What to say where a stage outside a run is not there any more, and one of the run was made from it."""
+    return (
+        f"{run}: stage '{stage}' was made from {place}, where no finished stage is any more; put it back "
+        f"there (a run finds it by the way from its own folder: move both together), or run the recipe again "
+        f"with another one in inputs"
+    )
 
 
 def _gives(kind: StageKind, artifact: Artifact) -> frozenset[str]:
@@ -75,28 +141,36 @@ def _gives(kind: StageKind, artifact: Artifact) -> frozenset[str]:
         return frozenset()
 
 
-def _in_order(inputs: Mapping[str, Finished], names: Sequence[str]) -> dict[str, Finished]:
-    """Inputs as the recipe has their stages; an artifact lists them by role."""
-    place = {name: number for number, name in enumerate(names)}
-    return dict(sorted(inputs.items(), key=lambda item: place.get(item[1].name, len(place))))
-
-
 def generators_of(run: Path) -> list[Finished]:
     """The finished stages of a run that generate, its default first.
 
     Those that the recipe lists as a stage's inputs come first, in that order, then those that a finished
-    stage such as `generate` has read: a recipe with several says so which it means.
+    stage such as `generate` has read: a recipe with several says so which it means. Those of other runs are
+    among them where one of these stages reads them.
     """
     stages = finished_stages(run)
-    makers = {name: stage for name, stage in stages.items() if stage.gives(GENERATOR)}
+    makers = {stage.folder.resolve(): stage for stage in stages.values() if stage.gives(GENERATOR)}
     read = [
-        source.name
+        source
         for stage in stages.values()
         if not stage.gives(GENERATOR)
         for source in stage.inputs.values()
+        if source.gives(GENERATOR)
     ]
-    names = dict.fromkeys((*_listed(run), *read, *makers))
-    return [makers[name] for name in names if name in makers]
+    listed = [_place(run, name) for name in _listed(run)]
+    for place in listed:
+        if place not in makers and owner_of(place) != run.resolve():
+            found = outside_stage(place)
+            if found is not None and found.gives(GENERATOR):
+                makers[place] = found
+    makers |= {source.folder.resolve(): source for source in read if source.outside}
+    order = dict.fromkeys((*listed, *(source.folder.resolve() for source in read), *makers))
+    return [makers[place] for place in order if place in makers]
+
+
+def _place(run: Path, name: str) -> Path:
+    """The folder of a stage as a run's recipe names it."""
+    return (run / name if is_place(name) else stage_folder(run, name)).resolve()
 
 
 def _listed(run: Path) -> list[str]:

@@ -100,7 +100,7 @@ class Every:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a resolved recipe. `inputs` maps roles to stage names."""
+    """One stage of a resolved recipe. `inputs` maps roles to stage names, or to places outside the run."""
 
     name: str
     kind: StageKind
@@ -150,6 +150,10 @@ class Finished:
     inputs: Mapping[str, Finished]
     exported: bool = False
     """In an exported folder, which may come from anywhere: nothing outside `folder` is followed."""
+    outside: bool = False
+    """Of another run than the one in which it is looked up, or of an export; then `name` names both."""
+    gone: Mapping[str, str] = field(default_factory=dict)
+    """Roles whose stages have gone since, and what to say where one of them is needed."""
 
     def gives(self, what: str) -> bool:
         """Whether other stages may ask this one for `what`."""
@@ -157,12 +161,12 @@ class Finished:
 
     def upstream(self) -> Iterator[Finished]:
         """All stages above this one, each once, those it reads first."""
-        seen: set[str] = set()
+        seen: set[Path] = set()
         todo = list(self.inputs.values())
         while todo:
             stage = todo.pop(0)
-            if stage.name not in seen:
-                seen.add(stage.name)
+            if stage.folder not in seen:
+                seen.add(stage.folder)
                 yield stage
                 todo += stage.inputs.values()
 
@@ -177,16 +181,25 @@ class Shelf:
     def get(self, stage: Finished) -> Any:
         """What `stage` gives."""
         if stage.folder not in self._loaded:
-            self._loaded[stage.folder] = stage.kind.load(stage, self.given(stage.inputs), self.device)
+            self._loaded[stage.folder] = stage.kind.load(stage, self.given_to(stage), self.device)
         return self._loaded[stage.folder]
 
     def given(self, inputs: Mapping[str, Finished]) -> Given:
         """What `inputs` give, by role."""
         return Given({role: partial(self.get, stage) for role, stage in inputs.items()})
 
+    def given_to(self, stage: Finished) -> Given:
+        """What the inputs of a finished stage give; one that is gone says so where it is asked for."""
+        makers = {role: partial(self.get, source) for role, source in stage.inputs.items()}
+        return Given({**{role: partial(_refuse, said) for role, said in stage.gone.items()}, **makers})
+
     def generator(self, stage: Finished) -> MotionGenerator:
         """The generator that a stage is."""
-        return stage.kind.generator(stage, self.given(stage.inputs), self.device)
+        return stage.kind.generator(stage, self.given_to(stage), self.device)
+
+
+def _refuse(said: str) -> Any:
+    raise UserError(said)
 
 
 @dataclass(frozen=True)
@@ -288,6 +301,10 @@ class StageKind(ABC):
     def load(self, stage: Finished, given: Given, device: torch.device) -> Any:
         """What the finished stage gives to those that take it."""
         return stage.folder
+
+    def preview_of_finished(self, stage: Finished, given: Given) -> Any:
+        """What `load` gives, for a dry run; a kind whose weights take long to read may leave them out."""
+        return self.load(stage, given, CPU)
 
     def generator(self, stage: Finished, given: Given, device: torch.device) -> MotionGenerator:
         """A generator of motion, of a kind that gives `GENERATOR`."""

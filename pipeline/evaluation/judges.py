@@ -26,10 +26,10 @@ class Judge:
 
     @staticmethod
     def tma(tma: LoadedTma) -> Judge:
-        """TMA reads captions by the text stage that it was trained with."""
-        return Judge(
-            tma, lambda truths: tma.embed_captions([t.caption for t in truths], tma.given["text"].cache)
-        )
+        """TMA reads captions by the text stage that it was trained with; that of another run encodes anew
+        what its own data did not say.
+        """
+        return Judge(tma, lambda truths: tma.embed_captions([t.caption for t in truths], tma.given["text"]))
 
     @staticmethod
     def evaluator(found: LoadedEvaluator) -> Judge:

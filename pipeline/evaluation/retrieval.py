@@ -46,7 +46,7 @@ def retrieve(
     """
     found = alignment_stage(run, stage)
     shelf = Shelf(choose_device(device))
-    tma, given = shelf.get(found), shelf.given(found.inputs)
+    tma, given = shelf.get(found), shelf.given_to(found)
     data, cache = given["data"], given["text"].cache
     dataset = data.split(split) if split else data.held_out(prefer="test")
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
@@ -85,8 +85,9 @@ def alignment_stage(run: Path, name: str | None = None) -> Finished:
         raise UserError(f"{run}: no finished '{name}' stage; run the recipe up to it first")
     missing = [role for role in ("data", "stats", "text") if role not in found.inputs]
     if missing:
-        raise UserError(f"{run}: no finished '{missing[0]}' stage; run the recipe up to it first")
-    require_consistent(run, (name, *(stage.name for stage in found.inputs.values())))
+        said = f"{run}: no finished '{missing[0]}' stage; run the recipe up to it first"
+        raise UserError(found.gone.get(missing[0], said))
+    require_consistent(run, [name])
     return found
 
 

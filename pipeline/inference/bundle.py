@@ -22,6 +22,7 @@ from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import sample_seeds
+from motionloom.pipeline.contract.exported import open_exported
 from motionloom.pipeline.contract.generation import (
     DrivenGenerator,
     GenerationRequest,
@@ -33,7 +34,6 @@ from motionloom.pipeline.contract.lookup import generators_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CPU, Finished, Shelf
 from motionloom.pipeline.inference.conditions import PromptEncoder
-from motionloom.pipeline.inference.exported import BUNDLE_FILE, open_exported
 from motionloom.pipeline.inference.requests import (
     caption_list,
     prompts_of,
@@ -46,6 +46,7 @@ from motionloom.pipeline.inference.requests import (
 from motionloom.pipeline.inference.script import DrivenSegment, sound_of
 from motionloom.pipeline.render.score import Segment
 from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.outside import BUNDLE_FILE, owner_of
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -90,8 +91,8 @@ class Bundle:
         self.stages = tuple(stages)
         """The stages that generate, the default of each kind first."""
         self.shelf = shelf
-        self._generators: dict[str, MotionGenerator] = {}
-        self._encoders: dict[str, PromptEncoder] = {}
+        self._generators: dict[Path, MotionGenerator] = {}
+        self._encoders: dict[Path, PromptEncoder] = {}
         for stage in self.stages:
             self._open(stage)
         parts = [self.of(stage).part for stage in self.stages]
@@ -113,7 +114,8 @@ class Bundle:
     def from_run(run: Path, device: torch.device = CPU) -> Bundle:
         """Open the finished stages of a run."""
         makers = generators_of(run)
-        require_consistent(run, (stage.name for stage in makers))
+        for stage in makers:
+            require_consistent(owner_of(stage.folder), [stage.folder.name])
         return Bundle._of(run, makers, device)
 
     @staticmethod
@@ -127,7 +129,7 @@ class Bundle:
 
     def _open(self, stage: Finished) -> None:
         """Load a stage's inputs, and theirs, as far as generation needs them."""
-        needed, given = stage.kind.exported(stage.config), self.shelf.given(stage.inputs)
+        needed, given = stage.kind.exported(stage.config), self.shelf.given_to(stage)
         for role in stage.kind.roles():
             if role.name in needed and (role.name in given or not role.optional):
                 given[role.name]
@@ -135,14 +137,14 @@ class Bundle:
 
     def of(self, stage: Finished) -> MotionGenerator:
         """The generator that a stage is."""
-        if stage.name not in self._generators:
-            self._generators[stage.name] = self.shelf.generator(stage)
-        return self._generators[stage.name]
+        if stage.folder not in self._generators:
+            self._generators[stage.folder] = self.shelf.generator(stage)
+        return self._generators[stage.folder]
 
     def _encoder(self, stage: Finished) -> PromptEncoder:
-        if stage.name not in self._encoders:
-            self._encoders[stage.name] = PromptEncoder(self.of(stage).text, self.shelf.device)
-        return self._encoders[stage.name]
+        if stage.folder not in self._encoders:
+            self._encoders[stage.folder] = PromptEncoder(self.of(stage).text, self.shelf.device)
+        return self._encoders[stage.folder]
 
     @cached_property
     def main(self) -> Finished:

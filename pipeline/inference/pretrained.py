@@ -22,10 +22,11 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntry
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
-from motionloom.pipeline.inference.exported import BUNDLE_FILE, write_exported
+from motionloom.pipeline.inference.exported import write_exported
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.outside import BUNDLE_FILE
 from motionloom.pipeline.store.weights import LayoutFacts
 
 if TYPE_CHECKING:

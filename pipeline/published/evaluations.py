@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,7 @@ def _staged(run: Path, stage: RunStage, order: list[str]) -> Evaluation:
 def _generators(stage: RunStage, figures: Mapping[str, Any], order: list[str]) -> dict[str, RunStage]:
     """The generator that made the motions, and the face's, as `Bundle` chooses them."""
     inputs = {one.name: one for role, one in stage.inputs.items() if role.startswith("generators.")}
-    listed = value_at(figures, "protocol.generators", None) or sorted(inputs, key=order.index)
+    listed = value_at(figures, "protocol.generators", None) or sorted(inputs, key=_place(order))
     makers = [inputs[name] for name in listed if name in inputs]
     bodies = [maker for maker in makers if not maker.of_faces]
     if stage.kind == "evaluate_dances":
@@ -107,6 +107,12 @@ def _generators(stage: RunStage, figures: Mapping[str, Any], order: list[str]) -
     faces = [face for face in faces if chosen in (face.name, _METHODS.get(face.kind))] or faces
     out = {"generator": bodies[:1], "face_generator": faces[:1]}
     return {role: found[0] for role, found in out.items() if found}
+
+
+def _place(order: list[str]) -> Callable[[str], int]:
+    """Where a stage stands in the recipe; those of other runs come last."""
+    places = {name: number for number, name in enumerate(order)}
+    return lambda name: places.get(name, len(places))
 
 
 def _retrieval(path: Path, run: Path, stages: Mapping[str, RunStage]) -> Evaluation:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from rich.console import Console
+from rich.markup import escape
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages, preview_of
@@ -31,18 +32,18 @@ from motionloom.pipeline.runs.graph import (
     make_plan,
     perform,
     plan_table,
-    replaced_trainings,
     require_fit,
     selected,
     stage_inputs,
 )
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.runs.replace import replaced_stages, require_asked, say_replaced, started_trainings
 from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import remove_tree, require_file_place, require_folder
+from motionloom.pipeline.store.outside import owner_of
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, StageState, run_state
-from motionloom.pipeline.store.yaml import read_yaml
 
 
 def run_recipe(
@@ -57,7 +58,8 @@ def run_recipe(
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
 
-    A folder of another recipe is refused without `replace`.
+    Without `replace` a run is refused that would make anew what is finished and took long (`replace.py`), or
+    that goes on in the folder of another recipe's run.
     """
     console = console or make_console()
     loaded = load_recipe(recipe, overrides)
@@ -69,12 +71,17 @@ def run_recipe(
     if dry_run:
         console.print(plan_table(loaded, plan))
         require_fit(todo, loaded.hardware)
-    if not replace:
-        _require_same_recipe(run, loaded.name)
-    finished, started = replaced_trainings(run, plan)
-    for what, names in (("finished", finished), ("unfinished", started)):
-        if names:
-            console.print(f"[yellow]replaces {what} trainings: {', '.join(names)}[/]")
+    replaced = replaced_stages(run, plan)
+    if not replace and dry_run:
+        said = say_replaced(run, loaded.name, replaced)
+        if said is not None:
+            console.print(f"[yellow]without --replace this is refused. {escape(said)}[/]", soft_wrap=True)
+    elif not replace:
+        require_asked(run, loaded.name, replaced)
+    elif replaced:
+        console.print(f"[yellow]replaces finished stages: {', '.join(stage.stage for stage in replaced)}[/]")
+    if started := started_trainings(run, plan):
+        console.print(f"[yellow]replaces unfinished trainings: {', '.join(started)}[/]")
     if dry_run:
         console.print(f"{len(todo)} of {len(plan)} stages would run in {run}")
         return run
@@ -99,20 +106,6 @@ def run_recipe(
     return run
 
 
-def _require_same_recipe(run: Path, name: str) -> None:
-    """Never replace the stages of another recipe's run unasked."""
-    path = run / "recipe.yaml"
-    try:
-        found = read_yaml(path) if path.is_file() else None
-    except UserError:
-        return  # it is about to be written anew
-    if isinstance(found, dict) and found.get("name", name) != name:
-        raise UserError(
-            f"{run}: holds a run of recipe '{found['name']}', not '{name}'; choose another folder with "
-            f"--out, or give --replace to go on here: what fits is kept, the rest is made anew"
-        )
-
-
 def _say_estimate(recipe: Recipe, console: Console) -> None:
     """What the trainings would take, where the recipe says enough."""
     from motionloom.pipeline.runs.estimate import estimate, estimate_table
@@ -124,7 +117,7 @@ def _say_estimate(recipe: Recipe, console: Console) -> None:
         if "data" not in stage.kind.gives(stage.config):
             continue
         try:
-            preview_of(stage, stages)
+            preview_of(stage, {**stages, **recipe.outside})
         except UserError as error:
             console.print(str(error))
             return
@@ -234,14 +227,18 @@ def _stage_again(
     given = {name: value for name, value in changes.items() if value is not None}
     config = stage.kind.config.parse({**stage.config.dump(), **given}, target)
     inputs = stage_inputs(recipe, folder, stage)
+    for (name, _), said in recipe.gone.items():
+        if name == stage.name and state is None:
+            raise UserError(said)
     if state is not None:
         inputs = _finished_inputs(folder, inputs, state)
     for role, source in inputs.items():
-        if not (source.folder / "artifact.json").is_file():
+        if not source.outside and not (source.folder / "artifact.json").is_file():
             raise UserError(
                 f"{folder}: stage '{source.name}' (role {role}) is not finished; run the recipe first"
             )
-    require_consistent(folder, (source.name for source in inputs.values()))
+    for source in inputs.values():
+        require_consistent(owner_of(source.folder), [source.folder.name])
     if team.leads:
         out.mkdir(exist_ok=True)
         remove_tree(out / WORK)  # of an evaluation that was killed, maybe with other settings
@@ -251,7 +248,7 @@ def _stage_again(
         config=config,
         folder=out,
         inputs=inputs,
-        seed=recipe.seed,
+        seed=recipe.seed_of(stage),
         hardware=recipe.hardware,
         console=console,
         shelf=shelf,
@@ -266,12 +263,13 @@ def _finished_inputs(folder: Path, inputs: dict[str, Finished], state: RunState)
     """Those of a stage's inputs that are finished, with all that they were made from."""
     whole = {stage.name for stage in state.stages if stage.usable and not _gone(stage)}
     finished = finished_stages(folder) if whole else {}
-    return {
-        role: finished[source.name]
-        for role, source in inputs.items()
-        if source.name in finished
-        and whole.issuperset([source.name, *(above.name for above in finished[source.name].upstream())])
-    }
+
+    def there(stage: Finished) -> bool:
+        own = [one.name for one in (stage, *stage.upstream()) if not one.outside]
+        return whole.issuperset(own)
+
+    now = {role: source if source.outside else finished.get(source.name) for role, source in inputs.items()}
+    return {role: source for role, source in now.items() if source is not None and there(source)}
 
 
 def _gone(stage: StageState) -> bool:
@@ -333,4 +331,4 @@ def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Pa
 
 def _recipe_of(folder: Path) -> Recipe:
     require_run(folder)
-    return load_recipe(folder / "recipe.yaml")
+    return load_recipe(folder / "recipe.yaml", strict=False)

@@ -12,7 +12,7 @@ from motionloom.pipeline.runs.recipe import Recipe
 
 def estimate(recipe: Recipe) -> dict[str, ModelCard]:
     """A card for each stage that trains, by name; `UserError` when the layout of the data is not known."""
-    stages = {stage.name: stage for stage in recipe.stages}
+    stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
     cards = {}
     for stage in recipe.stages:
         try:

@@ -11,9 +11,9 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,9 +37,11 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.extend import extendable, extension
+from motionloom.pipeline.runs.outside import require_elsewhere
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import fingerprint_of, remove_tree, write_json
+from motionloom.pipeline.store.outside import identity_of, place_from
 from motionloom.pipeline.store.run_folder import stage_folder
 
 Action = Literal["skip", "run", "resume", "leave"]
@@ -71,6 +73,8 @@ class PlannedStage:
     """The selection names it to run again (`--from`, `--force`)."""
     extendable: dict[str, Any] | None = None
     """What a longer training would be compared with."""
+    identities: Mapping[str, str] = field(default_factory=dict)
+    """What its inputs from outside were when the plan was made."""
 
 
 def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
@@ -83,20 +87,24 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
     plan: list[PlannedStage] = []
     rows: dict[str, PlannedStage] = {}
     for stage in recipe.stages:
+        require_elsewhere(run, stage, recipe.outside)
         facts = _facts(recipe, stage, rows)
         fingerprint, others = fingerprint_of(facts), extendable(stage, facts)
-        action, reason = _decide(stage, fingerprint, run, rows, forced, select)
+        action, reason = _decide(recipe, stage, fingerprint, run, rows, forced, select)
         if action == "run" and stage.name not in forced:
             longer = extension(stage, others, stage_folder(run, stage.name))
             if longer is not None:
                 action, reason = ("resume" if longer[0] else "run"), longer[1]
         if stage.name not in wanted and action != "skip":
             action, reason = "leave", "not selected"
-        rows[stage.name] = PlannedStage(stage, fingerprint, action, reason, stage.name in forced, others)
+        identities = {n: _fingerprint(recipe, n, rows) for n in stage.inputs.values() if n in recipe.outside}
+        rows[stage.name] = PlannedStage(
+            stage, fingerprint, action, reason, stage.name in forced, others, identities
+        )
         plan.append(rows[stage.name])
     if select.only:
         for role, name in recipe.stage(select.only).inputs.items():
-            if rows[name].action != "skip":
+            if name in rows and rows[name].action != "skip":
                 raise UserError(
                     f"--only {select.only}: its input '{role}' ({name}) is not finished; run it first"
                 )
@@ -106,9 +114,9 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
 def selected(recipe: Recipe, select: Selection) -> set[str]:
     """Names of the stages that may run; refuses selections that contradict each other."""
     first, until, only = select.first, select.until, select.only
-    for name in (first, until, only):
+    for option, name in (("--from", first), ("--until", until), ("--only", only)):
         if name is not None:
-            recipe.stage(name)
+            recipe.stage(name, option)
     for option, name in (("--from", first), ("--until", until)):
         if only and name and name != only:
             raise UserError(f"--only {only} runs that stage alone: leave {option} {name} out")
@@ -127,36 +135,30 @@ def selected(recipe: Recipe, select: Selection) -> set[str]:
     return _ancestors(recipe, until) if until else {stage.name for stage in recipe.stages}
 
 
-def replaced_trainings(run: Path, plan: Sequence[PlannedStage]) -> tuple[list[str], list[str]]:
-    """Trainings that the plan deletes though nobody asked for it by name: finished ones, and started ones."""
-    finished, started = [], []
-    for row in plan:
-        folder = stage_folder(run, row.stage.name)
-        if not row.stage.kind.trains or row.action != "run" or row.asked:
-            continue
-        if Artifact.find(folder) is not None:
-            finished.append(row.stage.name)
-        elif (folder / "checkpoints").is_dir():
-            started.append(row.stage.name)
-    return finished, started
-
-
 def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> dict[str, Any]:
     """What a stage's fingerprint is the digest of."""
     facts = {
         "kind": stage.kind.name,
         "version": stage.kind.version,
-        "seed": recipe.seed,
+        "seed": recipe.seed_of(stage),
         "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
         "external": stage.kind.external(stage.config),
-        "inputs": {role: rows[name].fingerprint for role, name in stage.inputs.items()},
+        "inputs": {role: _fingerprint(recipe, name, rows) for role, name in stage.inputs.items()},
     }
     if any(isinstance(role, Every) for role in stage.kind.roles()):
         facts["order"] = list(stage.inputs)  # the first of several generators is the default
     return facts
 
 
+def _fingerprint(recipe: Recipe, name: str, rows: Mapping[str, PlannedStage]) -> str:
+    """Of an input: the fingerprint of a stage of the recipe, the identity of one outside."""
+    if name in rows:
+        return rows[name].fingerprint
+    return str(identity_of(recipe.outside[name].folder))
+
+
 def _decide(
+    recipe: Recipe,
     stage: Stage,
     fingerprint: str,
     run: Path,
@@ -176,11 +178,11 @@ def _decide(
     if artifact.fingerprint != fingerprint:
         if _started(folder) == fingerprint:
             return "resume", "started earlier, not finished"
-        return "run", _difference(artifact, stage, rows)
+        return "run", _difference(recipe, artifact, stage, rows)
     gone = artifact.missing(folder)
     if gone:
         return "run", f"output {gone} is gone or has another size"
-    above = [name for name in stage.inputs.values() if rows[name].action == "run" and name in forced]
+    above = [name for name in stage.inputs.values() if name in forced and rows[name].action == "run"]
     if above:
         return "run", f"below {above[0]}"
     return "skip", "finished"
@@ -192,7 +194,7 @@ def _started(folder: Path) -> str | None:
     return str(json.loads(started.read_text())["fingerprint"]) if started.is_file() else None
 
 
-def _difference(artifact: Artifact, stage: Stage, rows: dict[str, PlannedStage]) -> str:
+def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[str, PlannedStage]) -> str:
     if artifact.kind != stage.kind.name or artifact.version != stage.kind.version:
         return f"{artifact.kind} v{artifact.version} is now {stage.kind.name} v{stage.kind.version}"
     changes = list(_changed_fields(artifact.config, stage.config.dump()))
@@ -201,7 +203,7 @@ def _difference(artifact: Artifact, stage: Stage, rows: dict[str, PlannedStage])
         return f"changed: {changes[0]}{more}"
     for role, name in stage.inputs.items():
         old = artifact.inputs.get(role)
-        if old is None or old.fingerprint != rows[name].fingerprint:
+        if old is None or old.fingerprint != _fingerprint(recipe, name, rows):
             return f"input {name} changed"
     return "seed, source files or the order of inputs changed"
 
@@ -219,7 +221,7 @@ def _ancestors(recipe: Recipe, name: str) -> set[str]:
     while todo:
         current = todo.pop()
         out.add(current)
-        todo += list(recipe.stage(current).inputs.values())
+        todo += [stage.name for stage in recipe.above(recipe.stage(current))]
     return out
 
 
@@ -268,7 +270,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     with _lock(run, needed=leads):
         team = Team.start(recipe.hardware) if joint else Team()
         if leads:
-            write_text(run / "recipe.yaml", recipe.to_yaml())
+            write_text(run / "recipe.yaml", recipe.to_yaml(run))
             for row in plan:
                 if row.action == "skip":
                     row.stage.kind.settle(row.stage.config, stage_folder(run, row.stage.name))
@@ -285,7 +287,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 config=stage.config,
                 folder=folder,
                 inputs=stage_inputs(recipe, run, stage),
-                seed=recipe.seed,
+                seed=recipe.seed_of(stage),
                 hardware=recipe.hardware,
                 console=console,
                 shelf=Shelf(recipe.hardware.device()),
@@ -297,7 +299,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 seconds = time.perf_counter() - begin
                 took = {"seconds": round(seconds, 2), "hardware": recipe.hardware.describe()}
                 write_json(folder / "timing.json", took)
-                _artifact(recipe, row, plan).finish(folder)
+                _artifact(recipe, run, row, plan).finish(folder)
                 console.print(f"    finished in {seconds:.1f} s")
     return [row.stage.name for row in todo]
 
@@ -319,13 +321,15 @@ def perform(kind: StageKind, context: StageContext, team: Team) -> None:
 
 def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]:
     """The stages that feed one of a recipe, by role."""
-    made: dict[str, Finished] = {}
+    made: dict[str, Finished] = dict(recipe.outside)
 
     def finished(name: str) -> Finished:
         if name not in made:
             source = recipe.stage(name)
             inputs = {role: finished(above) for role, above in source.inputs.items()}
-            made[name] = Finished(name, source.kind, source.config, stage_folder(run, name), inputs)
+            gone = {role: said for (needing, role), said in recipe.gone.items() if needing == name}
+            folder = stage_folder(run, name)
+            made[name] = Finished(name, source.kind, source.config, folder, inputs, gone=gone)
         return made[name]
 
     return {role: finished(name) for role, name in stage.inputs.items()}
@@ -341,18 +345,32 @@ def _prepare(folder: Path, row: PlannedStage) -> None:
     (folder / "artifact.json").unlink(missing_ok=True)
 
 
-def _artifact(recipe: Recipe, row: PlannedStage, plan: Sequence[PlannedStage]) -> Artifact:
-    stage = row.stage
-    fingerprints = {p.stage.name: p.fingerprint for p in plan}
+def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[PlannedStage]) -> Artifact:
+    stage, rows = row.stage, {planned.stage.name: planned for planned in plan}
     return Artifact(
         stage=stage.name,
         kind=stage.kind.name,
         version=stage.kind.version,
         fingerprint=row.fingerprint,
-        seed=recipe.seed,
+        seed=recipe.seed_of(stage),
         config=stage.config.dump(),
-        inputs={r: InputStage(stage=n, fingerprint=fingerprints[n]) for r, n in stage.inputs.items()},
+        inputs={role: _input(recipe, run, row, rows, name) for role, name in stage.inputs.items()},
     )
+
+
+def _input(
+    recipe: Recipe, run: Path, row: PlannedStage, rows: Mapping[str, PlannedStage], name: str
+) -> InputStage:
+    """What an artifact says of an input; refuses one from outside that has changed since the plan."""
+    if name in rows:
+        return InputStage(stage=name, fingerprint=rows[name].fingerprint)
+    folder = recipe.outside[name].folder
+    now = identity_of(folder)
+    if now != row.identities[name]:
+        raise UserError(
+            f"stage '{row.stage.name}': {folder} was made anew while this stage ran; run the recipe again"
+        )
+    return InputStage(stage=folder.name, fingerprint=now, folder=place_from(run, folder))
 
 
 @contextmanager

@@ -62,7 +62,10 @@ def _inputs(kind: StageKind) -> dict[str, Any]:
     several: dict[str, Any] = {"type": "array", "items": {"type": "string"}}
     return {
         "type": "object",
-        "description": "Which stage feeds a role; without it the stage of the role's own name.",
+        "description": (
+            "Which stage feeds a role; without it the stage of the role's own name. A path is a stage of "
+            "another run or of an export: runs/other/stages/gpt."
+        ),
         "properties": {role.name: several if isinstance(role, Every) else one for role in kind.roles()},
         "additionalProperties": False,
     }

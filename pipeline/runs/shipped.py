@@ -32,7 +32,8 @@ def find_recipe(name_or_path: str) -> Path:
     return shipped[name]
 
 
-def nearest(name: str, valid: Sequence[str]) -> str:
-    """A hint to append: did you mean 'x'?, or the list of valid names."""
+def nearest(name: str, valid: Sequence[str], shown: Sequence[str] | None = None) -> str:
+    """A hint to append: did you mean 'x'?, or the list of valid names, or else of those `shown`."""
     near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
-    return f"; did you mean '{near[0]}'?" if near else f"; valid names: {', '.join(valid)}"
+    names = valid if shown is None else shown
+    return f"; did you mean '{near[0]}'?" if near else f"; valid names: {', '.join(names)}"

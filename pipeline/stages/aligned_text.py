@@ -18,7 +18,9 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
     StageKind,
 )
+from motionloom.pipeline.stages.same_text import same_encoder
 from motionloom.pipeline.store.aligned_text import AlignedText, build_aligned_cache
+from motionloom.pipeline.store.outside import is_place
 from motionloom.pipeline.store.text import TextPreview
 
 
@@ -41,7 +43,8 @@ class AlignedTextStage(StageKind):
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """The TMA must be given captions as the encoder made them that it was trained on."""
         own, tma = stage.inputs["text"], others[stage.inputs["tma"]]
-        if tma.inputs.get("text", own) != own:
+        theirs = tma.inputs.get("text", own)
+        if theirs != own and not (is_place(theirs) and same_encoder(theirs, own, others)):
             raise UserError(
                 f"stage '{stage.name}' reads captions of '{own}' and its TMA '{tma.name}' was trained on "
                 f"those of '{tma.inputs['text']}'; name that one: inputs: {{text: {tma.inputs['text']}}}"

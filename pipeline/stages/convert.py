@@ -63,8 +63,9 @@ def run_convert(context: StageContext) -> None:
     out = context.folder / SHARDS
     workers = context.hardware.convert_workers
     kind = next(name for name, (_, config) in CONVERTED.items() if isinstance(context.config, config))
-    conversion = converter_named(kind).prepare(context.config, out=out, workers=workers)
-    manifest = run_conversion(conversion, out, workers=workers, progress=context.console.is_terminal)
+    shown = not context.console.quiet
+    conversion = converter_named(kind).prepare(context.config, out=out, workers=workers, progress=shown)
+    manifest = run_conversion(conversion, out, workers=workers, progress=shown)
     say_shards(context, manifest)
 
 

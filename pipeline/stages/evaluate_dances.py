@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.dance_beats import DEFINITIONS
@@ -49,7 +50,6 @@ from motionloom.pipeline.evaluation.tables import interval, plain, print_tables
 from motionloom.pipeline.evaluation.versions import EVALUATE_DANCES
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
-from motionloom.pipeline.stages.progress import bar
 from motionloom.pipeline.store.files import write_json
 
 _FILE = "dances.json"
@@ -188,13 +188,12 @@ class _DanceEvaluation:
         """This process's share of the dances."""
         units, pieces = self.context.units, self.pieces
         sizes = [piece.stop - piece.start for _, piece in pieces]
-        with bar(self.context.console) as progress:
-            task = progress.add_task("generating", total=units.mine(sizes), note="")
+        with Meter("generating", units.mine(sizes), console=self.context.console) as meter:
             units.make(
                 "generated",
                 len(sizes),
                 lambda k: self.dance(*pieces[k]),
-                lambda k: progress.advance(task, sizes[k]),
+                lambda k: meter.advance(sizes[k]),
             )
 
     @cached_property

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import (
@@ -40,7 +41,6 @@ from motionloom.pipeline.evaluation.truth import (
 from motionloom.pipeline.evaluation.versions import EVALUATE
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
-from motionloom.pipeline.stages.progress import bar
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
@@ -167,22 +167,20 @@ class EvaluationUnits:
                     self.judged(judge, self.truths)
                 )  # captions that it cannot read are refused before anything is made
         units, sizes = self.context.units, [piece.stop - piece.start for piece in self.slices]
-        with bar(self.context.console) as progress:
-            task = progress.add_task("reconstructing", total=units.mine(sizes), note="")
+        with Meter("reconstructing", units.mine(sizes), console=self.context.console) as done:
             units.make(
                 "reconstructed",
                 len(sizes),
                 lambda k: self.reconstruct(self.shown[self.slices[k]]),
-                lambda k: progress.advance(task, sizes[k]),
+                lambda k: done.advance(sizes[k]),
             )
         made = [piece.stop - piece.start for _, piece in self.performances]
-        with bar(self.context.console) as progress:
-            another = progress.add_task("generating", total=units.mine(made), note="")
+        with Meter("generating", units.mine(made), console=self.context.console) as another:
             units.make(
                 "generated",
                 len(made),
                 lambda k: self.perform(*self.performances[k]),
-                lambda k: progress.advance(another, made[k]),
+                lambda k: another.advance(made[k]),
             )
 
     def _truths(self, chosen: Sequence[int], unit: int) -> list[Truth]:

@@ -24,10 +24,12 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
+from motionloom.pipeline.stages.same_text import same_encoder
 from motionloom.pipeline.stages.streams import require_streams, stream_facts
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer, device_of
+from motionloom.pipeline.store.outside import is_place
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import TokenBatches
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
@@ -305,12 +307,19 @@ def _check_text(stage: Stage, others: Mapping[str, Stage]) -> None:
     """A TMA must be given captions by the encoder that it was trained on."""
     tma, own = others.get(stage.inputs.get("tma", "")), stage.inputs.get("text", "")
     other = tma.inputs.get("text", "") if tma is not None else own
-    if own in others and other in others and others[own].config != others[other].config:
+    if not same_encoder(own, other, others):
         raise UserError(
             f"stage '{stage.name}' reads captions as '{own}' encodes them, but its TMA "
             f"'{stage.inputs['tma']}' was trained on those of '{other}'; name one text stage for both, "
             f"or leave the TMA out (inputs: {{tma: null}})"
         )
+
+
+def _its_own(start: Stage, wrong: list[str]) -> str:
+    """Where the inputs of a GPT outside the run lie, for the message."""
+    roles = [name.removeprefix("inputs.") for name in wrong if name.startswith("inputs.")]
+    there = [f"{role}: {start.inputs[role]}" for role in roles if is_place(start.inputs.get(role, ""))]
+    return f", like inputs: {{{', '.join(there)}}}" if there else ""
 
 
 def _check_start(stage: Stage, others: Mapping[str, Stage]) -> None:
@@ -322,10 +331,12 @@ def _check_start(stage: Stage, others: Mapping[str, Stage]) -> None:
     theirs: Any = start.config
     wrong = [f"net.{size}" for size in _SIZES if getattr(ours.net, size) != getattr(theirs.net, size)]
     wrong += ["prior"] if ours.prior != theirs.prior else []
-    roles = ("text", "tokenizer") + (("tma",) if ours.prior == "tma" else ())
+    roles = ("tokenizer",) + (("tma",) if ours.prior == "tma" else ())
+    if not same_encoder(start.inputs.get("text", ""), stage.inputs.get("text", ""), others):
+        wrong.append("inputs.text")
     wrong += [f"inputs.{role}" for role in roles if start.inputs.get(role) != stage.inputs.get(role)]
     if wrong:
         raise UserError(
             f"stage '{stage.name}' starts from '{start.name}', which differs in {', '.join(wrong)}; give "
-            f"both the same"
+            f"both the same{_its_own(start, wrong)}"
         )

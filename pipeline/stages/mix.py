@@ -1,7 +1,7 @@
 """Several data stages of a recipe as one: captioned clips beside dances, say.
 
-Nothing is copied. The stage writes down which stages of its run it mixes, so a run that is moved still works;
-data sets outside a run are mixed by `shards` (`mix:`).
+Nothing is copied. The stage writes down which stages it mixes, of its run or of others, so a run that is
+moved still works; data sets that no run has made are mixed by `shards` (`mix:`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.store.data import MIX, Data, DataPreview, Mix, MixedStage
 from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.outside import place_from
 
 _INPUTS = Every("data", gives="data")
 
@@ -34,7 +35,8 @@ class MixStageConfig(StageConfig):
     """How often each data stage is drawn."""
 
     weights: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = Field(default_factory=dict)
-    """Share of the batches of a stage, by its name, relative to the others; 1 for a stage not named."""
+    """Share of the batches of a stage, by its name, relative to the others; 1 for a stage not named. One of
+    another run is called after both: `other:data`."""
 
 
 class MixStage(StageKind):
@@ -51,10 +53,11 @@ class MixStage(StageKind):
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """There must be something to mix, no mixes among it, and weights for nothing else."""
-        sources = [name for key, name in stage.inputs.items() if key == _INPUTS.key(name)]
+        mixed = {key.removeprefix(f"{_INPUTS.name}."): name for key, name in stage.inputs.items()}
+        sources = list(mixed)
         if not sources:
             raise UserError(f"stage '{stage.name}' mixes data stages and the recipe has no other one")
-        for name in sources:
+        for name in mixed.values():
             if name in others and others[name].kind.name == self.name:
                 raise UserError(
                     f"stage '{stage.name}' mixes '{name}', a mix itself; list all data stages in one mix: "
@@ -72,13 +75,13 @@ class MixStage(StageKind):
         sources = context.every(_INPUTS.name)
         _one_layout({stage.name: context.shelf.get(stage).layout for stage in sources})
         weights = context.config.weights
-        parts = [MixedStage(stage=stage.name, weight=weights.get(stage.name, 1.0)) for stage in sources]
-        write_json(context.folder / MIX, Mix(parts=parts).dump())
+        parts = [_part(context, stage, weights.get(stage.name, 1.0)) for stage in sources]
+        write_json(context.folder / MIX, Mix(parts=parts).model_dump(mode="json", exclude_none=True))
         total = sum(part.weight for part in parts)
         for stage, part in zip(sources, parts, strict=True):
             clips = len(context.shelf.get(stage).split("train"))
             context.console.print(
-                f"    {part.stage}: {clips} training clips, {100 * part.weight / total:.0f} % of the draws"
+                f"    {stage.name}: {clips} training clips, {100 * part.weight / total:.0f} % of the draws"
             )
 
     def preview(self, config: MixStageConfig, given: Given) -> DataPreview:
@@ -88,6 +91,12 @@ class MixStage(StageKind):
     def load(self, stage: Finished, given: Given, device: torch.device) -> Data:
         """The splits of all."""
         return Data(stage.folder)
+
+
+def _part(context: StageContext, stage: Finished, weight: float) -> MixedStage:
+    """A stage of the mix; one of another run by the way to it, so that runs can be moved together."""
+    folder = place_from(context.folder, stage.folder) if stage.outside else None
+    return MixedStage(stage=stage.folder.name, folder=folder, weight=weight)
 
 
 def _one_layout(layouts: Mapping[str, MotionLayout]) -> MotionLayout:

@@ -11,41 +11,26 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 
+from motionloom.datasets.base.progress import Pace, bar
 from motionloom.models.training.stage_module import LOG_EVERY, StageModule
 from motionloom.pipeline.stages.loggers import Loggers
 
-_LINE_EVERY_SECONDS = 15.0
-
-
-def bar(console: Console) -> Progress:
-    """A progress bar on a terminal; silent elsewhere (callers print lines there)."""
-    return Progress(
-        TextColumn("    {task.description:<18}"),
-        BarColumn(bar_width=36),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-        console=console,
-        disable=not console.is_terminal,
-        transient=False,
-    )
-
 
 class StepProgress(Callback):
-    """Steps done of all steps, loss and speed: a bar on a terminal, a line every 15 s elsewhere."""
+    """Steps done, loss, speed and time left: a bar on a terminal, a line every 15 s elsewhere."""
 
     def __init__(self, name: str, steps: int, console: Console, *, longer: bool = False) -> None:
         self.name, self.steps, self.console, self.longer = name, steps, console, longer
         self.progress: Progress | None = None
-        self.began = self.printed = time.monotonic()
+        self.pace = Pace(steps)
         self.first = 0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Open the bar at the resumed step."""
-        self.began = self.printed = time.monotonic()
         self.first = trainer.global_step
+        self.pace = Pace(self.steps, self.first)
         if not trainer.is_global_zero:
             return
         if self.first and self.longer:
@@ -62,17 +47,16 @@ class StepProgress(Callback):
         """Move the bar, or print a line now and then."""
         if self.progress is None:
             return
-        step, now = trainer.global_step, time.monotonic()
-        shown = self.console.is_terminal
-        if not shown and now - self.printed < _LINE_EVERY_SECONDS and step < self.steps:
+        step, shown = trainer.global_step, self.console.is_terminal
+        if not shown and not self.pace.due(step) and step < self.steps:
             return
-        speed = (step - self.first) / max(1e-9, now - self.began)
-        note = f"loss {float(trainer.callback_metrics.get('loss', 0.0)):.4f}  {speed:.1f} steps/s"
+        loss = float(trainer.callback_metrics.get("loss", 0.0))
+        note = f"loss {loss:.4f}  {self.pace.speed(step):.1f} steps/s"
         if shown:
             self.progress.update(self.task, completed=step, note=note)
         else:
-            self.printed = now
-            self.console.print(f"    {self.name}: step {step}/{self.steps}  {note}")
+            left = self.pace.left(step)
+            self.console.print(f"    {self.name}: step {step}/{self.steps}  {note}{left and f'  {left}'}")
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Close the bar."""

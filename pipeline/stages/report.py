@@ -99,9 +99,7 @@ class ReportStage(StageKind):
             say_missing(page, state)
         _watch(page, context, said, danced)
         stages = context.every("shown")
-        shown = [
-            thing for stage in stages for thing in stage.kind.show(stage, context.shelf.given(stage.inputs))
-        ]
+        shown = [thing for stage in stages for thing in stage.kind.show(stage, context.shelf.given_to(stage))]
         draw_showings(page, shown)
         draw_curves(page, stages if state is None else _logged(stages, state))
         draw_bars(page, shown)
@@ -138,13 +136,13 @@ def _watch(page: Page, context: StageContext, said: list[ViewerMotion], danced: 
 
 def _logged(stages: Sequence[Finished], state: RunState) -> list[Finished]:
     """The stages with curves: those that are finished, and trainings that are not, in the recipe's order."""
-    out = {stage.name: stage for stage in stages}
+    out = {stage.name: stage for stage in stages if not stage.outside}
     for stage in state.unfinished:
         kind = stage_kind(stage.kind, f"{state.folder / 'recipe.yaml'}: stages.{stage.name}")
         if stage.step:
             config = kind.config.parse(dict(stage.settings), f"{stage.folder}: settings")
             out[stage.name] = Finished(stage.name, kind, config, stage.folder, {})
-    return [out[stage.name] for stage in state.stages if stage.name in out]
+    return [out[stage.name] for stage in state.stages if stage.name in out] + [s for s in stages if s.outside]
 
 
 def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:

@@ -7,12 +7,14 @@ A page made within a run names no times and no machine, since equal runs write e
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
+from motionloom.datasets.base.progress import duration
 from motionloom.pipeline.contract.registry import stage_kind
 from motionloom.pipeline.contract.stage import Finished, StageContext
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.store.data import Data
-from motionloom.pipeline.store.flatten import duration, flatten, setting_text
+from motionloom.pipeline.store.flatten import flatten, setting_text
 from motionloom.pipeline.store.run_state import RunState
 
 SPLITS = ("train", "val", "test")
@@ -108,13 +110,13 @@ def _settings(context: StageContext) -> Iterator[tuple[str, str, dict[str, objec
 
 def _upstream(context: StageContext) -> list[Finished]:
     """The stages that the page is made from, those that others read first."""
-    out: dict[str, Finished] = {}
+    out: dict[Path, Finished] = {}
 
     def take(stage: Finished) -> None:
-        if stage.name not in out:
+        if stage.folder not in out:
             for above in stage.inputs.values():
                 take(above)
-            out.setdefault(stage.name, stage)
+            out.setdefault(stage.folder, stage)
 
     for stage in context.inputs.values():
         take(stage)

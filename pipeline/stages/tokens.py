@@ -12,13 +12,13 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
+from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.pipeline.contract.showing import Bars, Showing
 from motionloom.pipeline.contract.stage import SHOWING, Finished, Given, StageConfig, StageContext, StageKind
 from motionloom.pipeline.contract.units import Arrays
-from motionloom.pipeline.stages.progress import bar
 from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.tokens import TokenStore
 
@@ -61,14 +61,13 @@ class TokensStage(StageKind):
         """Encode this process's batches of every split."""
         for encoded in self._splits(context):
             sizes = [len(items) for items in encoded.batches]
-            with bar(context.console) as progress:
-                total = context.units.mine(sizes)
-                task = progress.add_task(f"tokens {encoded.dataset.split}", total=total, note="")
+            split, total = encoded.dataset.split, context.units.mine(sizes)
+            with Meter(f"tokens {split}", total, console=context.console) as meter:
                 context.units.make(
-                    encoded.dataset.split,
+                    split,
                     len(sizes),
                     encoded.codes,
-                    lambda k, task=task, sizes=sizes: progress.advance(task, sizes[k]),  # type: ignore[misc]
+                    lambda k, meter=meter, sizes=sizes: meter.advance(sizes[k]),  # type: ignore[misc]
                 )
 
     def run(self, context: StageContext) -> None:

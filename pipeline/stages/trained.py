@@ -106,6 +106,11 @@ class TrainedStage(StageKind):
         net = self.network(facts, given)
         return self.loaded(_frozen(net), facts, given)
 
+    def preview_of_finished(self, stage: Finished, given: Given) -> Any:
+        """The network of a stage outside the recipe's run, without its weights."""
+        facts = load_facts(stage.folder)
+        return self.loaded(_frozen(self.network(facts, given)), facts, given)
+
     def load(self, stage: Finished, given: Given, device: torch.device) -> Any:
         """The trained network on `device`, frozen."""
         facts = load_facts(stage.folder)

@@ -11,11 +11,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.outside import identity_of, in_export, owner_of
+from motionloom.pipeline.store.run_folder import stage_folder
 
 FILE_NAME = "artifact.json"
 
@@ -31,10 +33,31 @@ class OutputFile(Config):
 
 
 class InputStage(Config):
-    """The stage that fed a role, and its fingerprint then."""
+    """The stage that fed a role, and its fingerprint then; of one outside the run its identity."""
 
     stage: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
     fingerprint: str
+    folder: str | None = None
+    """Of a stage outside the run: its folder, seen from that of the run. None: a stage of the run."""
+
+    @model_serializer(mode="wrap")
+    def _only_what_is(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Stages of the run itself are written without the folder that they do not have."""
+        return {name: value for name, value in handler(self).items() if value is not None}
+
+    def place(self, run: Path) -> Path:
+        """The stage's folder."""
+        return stage_folder(run, self.stage) if self.folder is None else (run / self.folder).resolve()
+
+    def now(self, run: Path) -> str | None:
+        """What `fingerprint` would be of what is there now; None if nothing is."""
+        if self.folder is None:
+            return fingerprint_now(self.place(run))
+        return identity_of(self.place(run))
+
+    def say(self, run: Path) -> str:
+        """Its name, for people; with the place of one outside the run."""
+        return f"'{self.stage}'" if self.folder is None else f"'{self.stage}' of {owner_of(self.place(run))}"
 
 
 class Artifact(Config):
@@ -78,25 +101,26 @@ class Artifact(Config):
 def require_consistent(run: Path, stages: Iterable[str]) -> None:
     """Refuse stages of a run that were made from something else than what their inputs hold now.
 
-    Goes up to the first stage of all. What is gone without a trace cannot be compared and is let through.
+    Goes up to the first stage of all, into other runs too; an export is whole in itself. What is gone without
+    a trace cannot be compared and is let through.
     """
-    todo, seen = list(stages), set[str]()
+    todo, seen = [stage_folder(run, name) for name in stages], set[Path]()
     while todo:
-        name = todo.pop()
-        if name in seen:
+        folder = todo.pop()
+        if folder.resolve() in seen:
             continue
-        seen.add(name)
-        artifact = Artifact.find(run / "stages" / name)
+        seen.add(folder.resolve())
+        artifact = None if in_export(folder) else Artifact.find(folder)
         if artifact is None:
             continue
-        for source in dict.fromkeys((i.stage, i.fingerprint) for i in artifact.inputs.values()):
-            stage, fingerprint = source
-            if fingerprint_now(run / "stages" / stage) not in (None, fingerprint):
+        own = folder.parent.parent
+        for source in artifact.inputs.values():
+            if source.now(own) not in (None, source.fingerprint):
                 raise UserError(
-                    f"{run}: stage '{name}' was made from another '{stage}', which has been made anew since; "
-                    f"finish the run: motionloom run {run / 'recipe.yaml'} -o {run}"
+                    f"{own}: stage '{folder.name}' was made from another {source.say(own)}, which has been "
+                    f"made anew since; finish the run: motionloom run {own / 'recipe.yaml'} -o {own}"
                 )
-            todo.append(stage)
+            todo.append(source.place(own))
 
 
 def fingerprint_now(folder: Path) -> str | None:

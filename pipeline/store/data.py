@@ -52,13 +52,19 @@ class MixedStage(Config):
 
     stage: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
     """Its name, which is its folder beside that of the mix."""
+    folder: str | None = None
+    """Of a stage outside the run: its folder, seen from that of the mix."""
     weight: float = Field(gt=0, allow_inf_nan=False)
 
 
 class Mix(Config):
-    """`mix.json` of a stage that mixes data stages of its own run."""
+    """`mix.json` of a stage that mixes data stages of its own run, or of others."""
 
     parts: list[MixedStage] = Field(min_length=1)
+
+    def folders(self, mix: Path) -> list[Path]:
+        """The folders of the stages; `mix` is that of the mix."""
+        return [mix.parent / part.stage if part.folder is None else mix / part.folder for part in self.parts]
 
 
 def open_split(folder: Path, split: str, *, training: bool = False) -> ClipDataset:
@@ -76,9 +82,9 @@ def open_split(folder: Path, split: str, *, training: bool = False) -> ClipDatas
 def _opened(folder: Path, split: str, training: bool) -> list[tuple[ClipDataset, float]]:
     """The data sets of a data stage that hold clips of a split, and their weights."""
     if (folder / MIX).is_file():
-        opened = []
-        for mixed in Mix.load_json(folder / MIX).parts:
-            inner = _opened(folder.parent / mixed.stage, split, training)
+        opened, mix = [], Mix.load_json(folder / MIX)
+        for mixed, place in zip(mix.parts, mix.folders(folder), strict=True):
+            inner = _opened(place, split, training)
             # Whatever weights a stage has for its own data sets, they share the stage's.
             whole = sum(weight for _, weight in inner)
             opened += [(dataset, mixed.weight * weight / whole) for dataset, weight in inner]
@@ -121,8 +127,8 @@ def held_out(folder: Path, *, prefer: str = "val") -> str:
 
 def _manifests(folder: Path) -> list[Manifest]:
     if (folder / MIX).is_file():
-        mixed = Mix.load_json(folder / MIX).parts
-        return [manifest for part in mixed for manifest in _manifests(folder.parent / part.stage)]
+        places = Mix.load_json(folder / MIX).folders(folder)
+        return [manifest for place in places for manifest in _manifests(place)]
     if _is_plain(folder):
         return [read_manifest(open_store(folder / SHARDS))[0]]
     parts = Reference.load_json(folder / REFERENCE).parts

@@ -51,7 +51,7 @@ def copy_encoder(spec: str, stage: Path, target: Path) -> None:
     problem = ""
     for find in _sources(spec):
         try:
-            _copy(find(), target)
+            copy_encoder_files(find(), target)
             if load_text_encoder(str(target)).name.endswith(f":{digest}"):
                 return
             problem = "its weights are not those that encoded this run's captions"
@@ -74,7 +74,8 @@ def _sources(spec: str) -> list[Callable[[], Path]]:
     return [lambda: Path(fetch(local_files_only=True)), lambda: Path(fetch())]
 
 
-def _copy(source: Path, target: Path) -> None:
+def copy_encoder_files(source: Path, target: Path) -> None:
+    """Copy the files of an encoder that may be exported: no pickled weights, no code."""
     if not source.is_dir():
         raise UserError(f"{source}: no such folder")
     for path in sorted(source.rglob("*")):

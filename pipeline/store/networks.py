@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from torch import Tensor
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import PRESENT_ALL
-from motionloom.datasets.text.cache import TextCache
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tma.network import Tma
@@ -101,6 +100,14 @@ class TrainedTokenizer:
         return np.asarray(out * std + mean, dtype=np.float32)
 
 
+class TokensOfCaptions(Protocol):
+    """A cache of encoded captions, or a text stage."""
+
+    def tokens(self, captions: Sequence[str]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Token features [n, S, E] and the mask [n, S]."""
+        ...
+
+
 @dataclass(frozen=True)
 class LoadedTma:
     """A trained alignment model, the columns it reads and their statistics.
@@ -134,8 +141,8 @@ class LoadedTma:
         near = [(tokens[span].to(self.device), mask[span].to(self.device)) for span in spans]
         return torch.cat([self.net.encode_text(*given)[0] for given in near])
 
-    def embed_captions(self, texts: list[str], cache: TextCache) -> Tensor:
-        """Text latents of captions in the cache, on the CPU."""
+    def embed_captions(self, texts: list[str], cache: TokensOfCaptions) -> Tensor:
+        """Text latents of captions, on the CPU, by a cache that has them all or by a text stage."""
         out = []
         for start in range(0, len(texts), 256):
             tokens, mask = cache.tokens(texts[start : start + 256])

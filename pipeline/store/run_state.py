@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.store.artifact import Artifact, fingerprint_now
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.outside import in_export
 from motionloom.pipeline.store.run_folder import require_run, stage_folder, stages_of
 from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.store.yaml import read_yaml
@@ -64,6 +65,7 @@ class RunState:
     folder: Path
     recipe: str
     seed: int | None
+    data_seed: int | None
     hardware: Mapping[str, Any]
     stages: tuple[StageState, ...]
 
@@ -86,12 +88,13 @@ def run_state(run: Path) -> RunState:
     require_run(run)
     entries = stages_of(run)
     recipe = read_yaml(run / "recipe.yaml")
-    seed = recipe.get("seed")
+    seed, data_seed = recipe.get("seed"), recipe.get("data_seed")
     causes: dict[str, str] = {}
     return RunState(
         folder=run,
         recipe=str(recipe.get("name", run.name)),
         seed=seed if isinstance(seed, int) else None,
+        data_seed=data_seed if isinstance(data_seed, int) else None,
         hardware=_mapping(recipe.get("hardware")),
         stages=tuple(_stage(run, name, entry, causes) for name, entry in entries.items()),
     )
@@ -141,18 +144,26 @@ def _stage(run: Path, name: str, entry: Mapping[str, Any], causes: dict[str, str
 
 def _why_outdated(run: Path, name: str, causes: dict[str, str]) -> str:
     """The first stage above a finished one that is another now than it was made from."""
-    if name not in causes:
-        causes[name] = ""  # a damaged folder may name itself
-        artifact = Artifact.find(stage_folder(run, name))
+    return _cause(stage_folder(run, name), run.resolve(), causes)
+
+
+def _cause(folder: Path, home: Path, causes: dict[str, str]) -> str:
+    key = str(folder.resolve())
+    if key not in causes:
+        causes[key] = ""  # a damaged folder may name itself
+        artifact = None if in_export(folder) else Artifact.find(folder)
+        own = folder.parent.parent
         for source in () if artifact is None else artifact.inputs.values():
-            now = fingerprint_now(stage_folder(run, source.stage))
-            if now not in (None, source.fingerprint):
-                causes[name] = f"'{source.stage}' has been made anew since"
-            elif cause := _why_outdated(run, source.stage, causes):
-                causes[name] = cause
-            if causes[name]:
+            if source.now(own) not in (None, source.fingerprint):
+                there = "" if own.resolve() == home else f" of {own}"
+                causes[key] = (
+                    f"{source.say(own)}{there if source.folder is None else ''} has been made anew since"
+                )
+            elif cause := _cause(source.place(own), home, causes):
+                causes[key] = cause
+            if causes[key]:
                 break
-    return causes[name]
+    return causes[key]
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

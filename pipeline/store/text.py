@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.datasets.text.cache import TextCache
+from motionloom.datasets.text.cache import TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
-from motionloom.pipeline.store.encoder_files import BUILT_IN, copy_encoder, place_of
+from motionloom.pipeline.store.encoder_files import BUILT_IN, copy_encoder, copy_encoder_files, place_of
 from motionloom.pipeline.store.files import write_json
 
 _EXPORTED = "text.json"
@@ -84,13 +87,23 @@ class TextSource:
         """Loaded on first use; it is the slow part of starting."""
         return load_text_encoder(self.encoder_name, device=str(self.device))
 
+    def tokens(self, captions: Sequence[str]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Token features [n, S, E] and the mask [n, S] of captions: as the cache has them, or, where one is
+        missing there (captions of another run's data, an export), by the encoder.
+        """
+        if not self.exported and all(self.cache.row(key_of(text)) is not None for text in captions):
+            return self.cache.tokens(captions)
+        encoded = self.encoder.encode(captions)
+        return encoded.tokens, encoded.mask
+
     def export(self, target: Path) -> None:
         """What encoding new words needs; an encoder that comes with the installation is not copied."""
         target.mkdir(parents=True, exist_ok=True)
         name = self.encoder_name
         if name != BUILT_IN:
             if self.exported:
-                raise UserError(f"{self.folder}: an export with its own encoder; copy the folder instead")
-            copy_encoder(name, self.folder, target / _COPY)
+                copy_encoder_files(Path(name), target / _COPY)
+            else:
+                copy_encoder(name, self.folder, target / _COPY)
             name = _COPY
         write_json(target / _EXPORTED, ExportedText(encoder=name, dim=self.dim).dump())

@@ -12,9 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
-from rich.progress import Progress
-
 from motionloom.datasets.base.pool import Workers
+from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.options import WriteOptions
 from motionloom.datasets.shards.sample import Sample
@@ -72,10 +71,10 @@ class FeatureStep(Generic[T]):
             )
         if todo:
             folder.mkdir(parents=True, exist_ok=True)
-        with Progress(disable=not how.progress or not items) as bar:
-            shown = bar.add_task("converting clips", total=sum(batch.size for batch in todo))
+        clips = sum(batch.size for batch in todo)
+        with Meter("converting clips", clips, shown=how.progress and bool(items)) as meter:
             for position, _ in pool.run(partial(_make, folder), todo):
-                bar.advance(shown, todo[position].size)
+                meter.advance(todo[position].size)
         return partial(_take, self.take, folder)
 
 

@@ -7,8 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
-from rich.progress import Progress
-
+from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.convert.common.splits import check_id
 from motionloom.datasets.schema import UserError
 
@@ -78,8 +77,8 @@ def read_in_threads(
     Threads are enough: opening many files waits for the disk, unpacking and hashing run outside the
     interpreter's lock.
     """
-    with Progress(disable=not progress) as bar, ThreadPoolExecutor(max(workers, 1)) as pool:
-        shown = bar.add_task("reading the source", total=before + len(items), completed=before)
+    meter = Meter("reading the source", before + len(items), done=before, shown=progress)
+    with meter, ThreadPoolExecutor(max(workers, 1)) as pool:
         for made in pool.map(read, items):
             yield made
-            bar.advance(shown)
+            meter.advance()

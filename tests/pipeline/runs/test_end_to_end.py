@@ -298,12 +298,14 @@ def test_alignment_works_with_the_sentence_prior_too(
     copy: Path, small_run: Any, call: Callable[..., Any]
 ) -> None:
     change = ("--set", "gpt.prior=sentence", "--until", "gpt")
-    done = call("run", small_run.recipe, "--out", copy, *change)
+    refused = call("run", small_run.recipe, "--out", copy, *change)
+    assert refused.code == 2 and "  gpt: changed: prior tma -> sentence (" in refused.err
+    done = call("run", small_run.recipe, "--out", copy, *change, "--replace")
     assert done.code == 0, done.out
     log = [json.loads(line) for line in (copy / "stages/gpt/metrics.jsonl").read_text().splitlines()]
     assert all(row["val/align"] > 0 for row in log if "val/align" in row) and log
     assert any("val/align" in row for row in log)
-    assert call("run", small_run.recipe, "--out", copy, "--until", "gpt").code == 0
+    assert call("run", small_run.recipe, "--out", copy, "--until", "gpt", "--replace").code == 0
 
 
 @pytest.mark.browser

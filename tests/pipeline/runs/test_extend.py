@@ -16,8 +16,9 @@ from toy_stages import register_toys
 
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import FunctionStage, StageConfig, StageContext
-from motionloom.pipeline.runs.graph import execute, make_plan, replaced_trainings
+from motionloom.pipeline.runs.graph import execute, make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.runs.replace import replaced_stages, started_trainings
 from motionloom.pipeline.stages.training import TrainedStageConfig, fit
 from motionloom.pipeline.store.artifact import Artifact
 
@@ -79,7 +80,7 @@ def go(folder: Path, *overrides: str) -> tuple[str, str, str]:
     plan = make_plan(loaded, folder / "run")
     row = plan[1]
     if row.action != "run" or row.reason == "never run":
-        assert replaced_trainings(folder / "run", plan) == ([], [])
+        assert replaced_stages(folder / "run", plan) == started_trainings(folder / "run", plan) == []
     console = Console(record=True, quiet=False, width=140, file=(folder / "out.txt").open("w"))
     execute(loaded, folder / "run", plan, console)
     return row.action, row.reason, console.export_text()

@@ -236,3 +236,46 @@ def test_two_processes_do_not_share_a_run(tmp_path: Path) -> None:
 def lock_file(tmp_path: Path) -> Path:
     (tmp_path / "run").mkdir()
     return tmp_path / "run/.lock"
+
+
+def test_a_seed_of_the_data_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With `data_seed` another `seed` keeps all that comes before the first training, byte for byte."""
+
+    def draw(context: StageContext) -> None:
+        write_json(context.folder / "value.json", context.seed)
+
+    takes = ("left: number", "right?: number")
+    register_toys(
+        monkeypatch,
+        FunctionStage("root", "a seed", AddConfig, draw, given_names=NUMBER),
+        FunctionStage("sum", "a seed", AddConfig, draw, takes, given_names=NUMBER),
+        FunctionStage("fit", "a seed", AddConfig, draw, takes, trains=True, given_names=NUMBER),
+    )
+    assert go(tmp_path, "both.kind=fit", "data_seed=3", "seed=5") == ["left", "right", "both", "one", "top"]
+    seeds = {name: value(tmp_path, name) for name in ("left", "right", "one", "both", "top")}
+    assert seeds == {"left": 3, "right": 3, "one": 3, "both": 5, "top": 5}, "top is made from a training"
+    assert go(tmp_path, "both.kind=fit", "data_seed=3", "seed=6") == ["both", "top"]
+    assert go(tmp_path, "both.kind=fit", "data_seed=6", "seed=6") == ["left", "right", "both", "one", "top"]
+    assert go(tmp_path, "both.kind=fit", "seed=6") == [], "it is `seed` where it is not given"
+    again = load_recipe(tmp_path / "run/recipe.yaml")
+    assert again.data_seed is None and "data_seed" not in again.to_yaml()
+    seeded = recipe(tmp_path, "data_seed=3")
+    (tmp_path / "seeded.yaml").write_text(seeded.to_yaml())
+    assert load_recipe(tmp_path / "seeded.yaml") == seeded
+    with pytest.raises(UserError, match="data_seed"):
+        recipe(tmp_path, "data_seed=-1")
+
+
+@pytest.mark.parametrize(
+    ("select", "says"),
+    [
+        (Selection(first="lefft"), "--from lefft: recipe toy has no stage 'lefft'; did you mean 'left'"),
+        (Selection(until="bot"), "--until bot: .* did you mean 'both'"),
+        (Selection(only="x"), "--only x: .* valid names: left, right, both, one, top"),
+    ],
+)
+def test_a_misspelt_stage_names_the_option_and_the_stage_meant(
+    select: Selection, says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match=says):
+        go(tmp_path, select=select)

@@ -236,3 +236,69 @@ def test_shards_that_are_not_there_or_of_another_layout(tmp_path: Path) -> None:
     other = [f"data.path={tmp_path / 'shards'}", "data.layout=body133"]
     with pytest.raises(UserError, match="layout wholebody363, but the recipe wants body133"):
         run_recipe(path, tmp_path / "run", overrides=other, dry_run=True, console=Console(quiet=True))
+
+
+LISTED = """
+name: two-faces
+stages:
+  data: {kind: synth, clips: 8}
+  stats: {kind: stats}
+  text: {kind: text}
+  face_vae: {kind: tma, part: face, net: {frame_stride: 1}, loss: {contrastive: 0}}
+  diffusion: {kind: diffusion}
+  tma: {kind: tma}
+  latents: {kind: aligned_text}
+  generate: {kind: generate, inputs: {generators: [face_vae, diffusion]}}
+"""
+
+
+def test_a_stage_of_the_base_can_be_left_out(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(LISTED)
+    child = (
+        "extends: base\nname: child\nstages: {face_vae: null, generate: {inputs: {generators: [diffusion]}}}"
+    )
+    names = [stage.name for stage in load_recipe(write(tmp_path, child)).stages]
+    assert names == ["data", "stats", "text", "diffusion", "tma", "latents", "generate"]
+    sets = ["face_vae=null", "generate.inputs.generators=[diffusion]"]
+    assert [stage.name for stage in load_recipe(tmp_path / "base.yaml", sets).stages] == names
+
+
+@pytest.mark.parametrize(
+    ("child", "says"),
+    [
+        (
+            "{face_vae: null}",
+            r"generate.inputs.generators: 'face_vae' is no stage that gives a generator, as "
+            r"stages.face_vae: null in .*recipe.yaml leaves it out; valid names: diffusion",
+        ),
+        (
+            "{tma: null}",
+            r"stage 'latents' needs a stage 'tma' \(role 'tma'\), which stages.tma: null in .* leaves",
+        ),
+        ("{face_vea: null}", "there is no such stage to remove; did you mean 'face_vae'"),
+    ],
+)
+def test_what_names_a_stage_that_is_left_out(child: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(LISTED)
+    with pytest.raises(UserError, match=says):
+        load_recipe(write(tmp_path, f"extends: base\nname: child\nstages: {child}"))
+
+
+@pytest.mark.parametrize(
+    ("sets", "says"),
+    [
+        (["tma=null"], r"needs a stage 'tma' \(role 'tma'\), which --set tma=null leaves out"),
+        (["face_vea=null"], "--set face_vea=null: no stage 'face_vea'; did you mean 'face_vae'"),
+        (
+            ["stages.tmaa=null"],
+            "--set stages.tmaa=null: there is no such stage to remove; did you mean 'tma'",
+        ),
+        (["diffusion=null", "diffusion.net.dim=8"], "no stage 'diffusion'; --set diffusion=null"),
+        (["sead=3"], "no stage 'sead'; did you mean 'seed'"),
+        (["diffusion.inputs.text=txt"], "needs a stage 'txt' .*; did you mean 'text'"),
+        (["generate.inputs.generators=[difusion]"], "'difusion' is no stage .*; did you mean 'diffusion'"),
+    ],
+)
+def test_names_on_the_command_line_that_are_no_stage(sets: list[str], says: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=says):
+        load_recipe(write(tmp_path, LISTED), sets)

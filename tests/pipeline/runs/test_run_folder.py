@@ -73,7 +73,7 @@ Go = Callable[..., str]
 
 @pytest.fixture
 def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
-    """`go("tma.add=2", until="tma")`: run into `tmp_path / "run"`; what was printed."""
+    """`go("tma.add=2", until="tma", replace=True)`: run into `tmp_path / "run"`; what was printed."""
     for name, inputs in INPUTS.items():
         given = frozenset({GIVES[name]} if name in GIVES else ())
         kind = FunctionStage(
@@ -100,22 +100,22 @@ def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
 def test_a_folder_with_mixed_stages_is_not_used(go: Go, tmp_path: Path) -> None:
     run = tmp_path / "run"
     go()
-    go("tma.add=2", until="tma")
+    go("tma.add=2", until="tma", replace=True)
     for use in (lambda: Bundle.from_run(run), lambda: evaluate_run(run, console=Console(quiet=True))):
         with pytest.raises(UserError, match="stage 'gpt' was made from another 'tma'") as error:
             use()
         assert f"motionloom run {run / 'recipe.yaml'} -o {run}" in str(error.value)
-    run_recipe(run / "recipe.yaml", run, console=Console(quiet=True))  # the fix
+    run_recipe(run / "recipe.yaml", run, replace=True, console=Console(quiet=True))  # the fix
     evaluate_run(run, console=Console(quiet=True))
     require_consistent(run, finished_stages(run))
 
 
 def test_it_goes_up_to_the_first_stage(go: Go, tmp_path: Path) -> None:
     go()
-    go("tokenizer.add=2", until="tokenizer")
+    go("tokenizer.add=2", until="tokenizer", replace=True)
     with pytest.raises(UserError, match="stage 'tokens' was made from another 'tokenizer'"):
         evaluate_run(tmp_path / "run", console=Console(quiet=True))
-    go()
+    go(replace=True)
     go("data.add=2", until="data")
     with pytest.raises(UserError, match="was made from another 'data'"):
         retrieve(tmp_path / "run")
@@ -124,7 +124,7 @@ def test_it_goes_up_to_the_first_stage(go: Go, tmp_path: Path) -> None:
 def test_a_stage_that_is_being_made_anew_is_another_one_too(go: Go, tmp_path: Path) -> None:
     go()
     with pytest.raises(KeyboardInterrupt):
-        go("tma.add=-1", until="tma")
+        go("tma.add=-1", until="tma", replace=True)
     with pytest.raises(UserError, match="stage 'gpt' was made from another 'tma'"):
         Bundle.from_run(tmp_path / "run")
 
@@ -139,32 +139,81 @@ def test_the_page_of_other_settings_is_not_shown(go: Go) -> None:
     assert "watch it:" in go()
     assert "watch it:" in go()
     assert "watch it:" in go(until="tma")
-    assert "watch it:" not in go("tma.add=2", until="tma")
-    assert "watch it:" in go("tma.add=2")
+    assert "watch it:" not in go("tma.add=2", until="tma", replace=True)
+    assert "watch it:" in go("tma.add=2", replace=True)
+
+
+def files(run: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+def took(run: Path, **seconds: float) -> None:
+    """As if finished stages had taken so long."""
+    for name, time in seconds.items():
+        write_json(run / "stages" / name / "timing.json", {"seconds": time, "hardware": "a GPU"})
 
 
 def test_another_recipe_is_refused_in_the_folder(go: Go, tmp_path: Path) -> None:
     go()
-    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
-    for dry_run in (False, True):
-        with pytest.raises(UserError, match=r"holds a run of recipe 'toy', not 'other'.*--replace"):
-            go("gpt.add=2", recipe="other", dry_run=dry_run)
-    assert before == {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    before = files(tmp_path / "run")
+    with pytest.raises(UserError, match=r"(?s)of recipe 'toy', not 'other'; to go on .*gpt.* --replace"):
+        go("gpt.add=2", recipe="other")
+    with pytest.raises(UserError, match=r"'toy', not 'other'; -o .*run-2 keeps both, --replace goes on here"):
+        go("report.add=2", recipe="other")
+    said = go("gpt.add=2", recipe="other", dry_run=True)
+    assert "without --replace this is refused" in said and "holds a run of recipe 'toy', not 'other'" in said
+    assert before == files(tmp_path / "run")
     assert "2 of 9" not in go("gpt.add=2", recipe="other", replace=True, until="gpt")
     assert json.loads((tmp_path / "run/stages/gpt/value.json").read_text()) == 2
 
 
-def test_trainings_that_go_are_named_first(go: Go) -> None:
-    assert "replaces" not in go()
-    for dry_run in (True, False):
-        said = go("tokenizer.add=2", dry_run=dry_run)
-        assert "replaces finished trainings: tokenizer, gpt\n" in said
+def test_finished_trainings_are_not_replaced_unasked(go: Go, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    go()
+    took(run, tokenizer=7500.0, gpt=30000.0, evaluate=600.0)
+    before = files(run)
+    with pytest.raises(UserError) as error:
+        go("tokenizer.add=2", "evaluate.add=3")
+    assert str(error.value).splitlines() == [
+        f"{run}: this would replace 2 finished stages, 10 h 25 min of work:",
+        "  tokenizer: changed: add 1 -> 2 (2 h 05 min of training)",
+        "  gpt: input tokens changed (8 h 20 min of training)",
+        f"-o {run}-2 keeps both, --replace goes on here: what fits is kept, the rest is made anew",
+    ]
+    said = go("tokenizer.add=2", "evaluate.add=3", dry_run=True)
+    assert "without --replace this is refused." in said
+    assert all(line in said for line in str(error.value).splitlines())
+    assert files(run) == before
+    said = go("tokenizer.add=2", "evaluate.add=3", replace=True)
+    assert "replaces finished stages: tokenizer, gpt\n" in said
     assert said.index("replaces") < said.index("] tokenizer")
-    assert "replaces" not in go("tokenizer.add=2", "evaluate.add=3"), "not a training"
-    assert "replaces" not in go("tokenizer.add=2", first="gpt"), "asked for"
+
+
+def test_what_is_cheap_is_made_anew_without_asking(go: Go, tmp_path: Path) -> None:
+    go()
+    assert "replaces" not in go("evaluate.add=3")
+    assert json.loads((tmp_path / "run/stages/evaluate/value.json").read_text()) == 3
+    took(tmp_path / "run", evaluate=3601.0)
+    with pytest.raises(UserError, match=r"  evaluate: changed: add 3 -> 1 \(1 h 00 min of work\)"):
+        go()
+    (tmp_path / "run/stages/gpt/timing.json").unlink()
+    with pytest.raises(UserError, match=r"  gpt: changed: add 1 -> 2 \(training of unknown time\)"):
+        go("gpt.add=2", until="gpt")
+
+
+def test_a_stage_that_is_asked_for_by_name_is_made_anew(go: Go) -> None:
+    go()
+    assert "3 of 9 stages to run" in go("gpt.add=2", first="gpt")
+    assert "9 of 9 stages to run" in go("tokenizer.add=2", force=True)
+    with pytest.raises(UserError, match="  tokenizer: changed: add 2 -> 3"):
+        go("tokenizer.add=3", first="gpt")
+
+
+def test_trainings_that_were_only_begun_are_named(go: Go) -> None:
+    go()
     with pytest.raises(KeyboardInterrupt):
-        go("tokenizer.add=2", "gpt.add=-1")
-    assert "replaces unfinished trainings: gpt\n" in go("tokenizer.add=2", "gpt.add=5")
+        go("gpt.add=-1", replace=True)
+    assert "replaces unfinished trainings: gpt\n" in go("gpt.add=5")
 
 
 def test_nothing_to_do_says_of_how_much(go: Go) -> None:

@@ -53,7 +53,7 @@ def single(small_run: Any, recipe: Path, tmp_path_factory: pytest.TempPathFactor
     """The run by one process; data, statistics and text are there already."""
     run = tmp_path_factory.mktemp("single") / "run"
     shutil.copytree(small_run.folder, run)
-    return run_recipe(recipe, run, select=Selection(until="gpt"), console=Console(quiet=True))
+    return run_recipe(recipe, run, select=Selection(until="gpt"), replace=True, console=Console(quiet=True))
 
 
 @pytest.fixture
@@ -118,7 +118,7 @@ def test_two_processes_equal_one(
 ) -> None:
     run = tmp_path / "run"
     shutil.copytree(small_run.folder, run)
-    output = finish(running("run", recipe, "--out", run, "--until", "gpt", *PAIR))
+    output = finish(running("run", recipe, "--out", run, "--until", "gpt", "--replace", *PAIR))
     assert output.count("[4/15] tokenizer") == output.count("[7/15] tokens") == 1, "only one process speaks"
     assert files(run) == files(single)
     for stage in ("tokenizer", "tma"):
