@@ -9,8 +9,8 @@ from torch import nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.evaluator.losses import EvaluatorLossConfig
-from motionloom.models.evaluator.module import MATCHING, MOVEMENT, EvaluatorModule
+from motionloom.models.evaluator.losses import MATCHING, MOVEMENT, EvaluatorLossConfig
+from motionloom.models.evaluator.module import EvaluatorModule
 from motionloom.models.evaluator.network import PART, UNIT, Evaluator, EvaluatorConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve

@@ -16,7 +16,8 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.sampling import generate
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator

@@ -17,7 +17,8 @@ from torch.utils.data import Dataset
 from motionloom.datasets.loading.batches import CaptionBatches, EvalBatches
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.tma.module import TmaLossConfig, TmaModule
+from motionloom.models.tma.losses import TmaLossConfig
+from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve

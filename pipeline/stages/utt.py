@@ -19,7 +19,8 @@ from motionloom.models.condition.mate import MateConfig
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.utt.conditioned import ConditionedUtt
-from motionloom.models.utt.module import UttLossConfig, UttModule
+from motionloom.models.utt.losses import UttLossConfig
+from motionloom.models.utt.module import UttModule
 from motionloom.models.utt.network import UttConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Given, Stage

@@ -29,7 +29,8 @@ from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule
 from motionloom.models.utt.conditioned import ConditionedUtt
-from motionloom.models.utt.module import UttLossConfig, UttModule
+from motionloom.models.utt.losses import UttLossConfig
+from motionloom.models.utt.module import UttModule
 from motionloom.models.utt.network import UttConfig
 from motionloom.pipeline.contract.stage import CPU, Shelf, StageContext
 from motionloom.pipeline.launch.hardware import Hardware

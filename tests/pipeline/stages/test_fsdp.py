@@ -24,7 +24,8 @@ from two_ranks import run_two_ranks
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.network import Tma, TmaConfig
