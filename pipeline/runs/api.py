@@ -17,11 +17,8 @@ from motionloom.pipeline.contract.lookup import finished_stages, preview_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, Shelf, Stage, StageContext
 from motionloom.pipeline.contract.units import WORK
-from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.outputs import Format, write_motions
-from motionloom.pipeline.inference.pretrained import write_bundle
+from motionloom.pipeline.inference.formats import Format
 from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
-from motionloom.pipeline.inference.script import Script, read_music
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.launch.team import Team
@@ -152,6 +149,10 @@ def generate_motions(
     From captions, sound files, or both side by side (the first caption with the first file, and so on), or
     from one script. `samples` motions of each.
     """
+    from motionloom.pipeline.inference.bundle import Bundle
+    from motionloom.pipeline.inference.outputs import write_motions
+    from motionloom.pipeline.inference.script import Script, read_music
+
     if not captions and not audio and script is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
     if script is not None and (captions or audio or seconds is not None or face_captions):
@@ -319,6 +320,8 @@ def report_run(
 
 def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Path:
     """Copy what generation needs into one folder."""
+    from motionloom.pipeline.inference.pretrained import write_bundle
+
     console = console or make_console()
     require_folder(out)
     if out.exists() and any(out.iterdir()):

@@ -46,7 +46,7 @@ from motionloom.pipeline.evaluation.truth import Truth, digest_of, drawn, has_ca
 from motionloom.pipeline.evaluation.versions import EVALUATE
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
-from motionloom.pipeline.stages.progress import bar
+from motionloom.pipeline.stages.bar import bar
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.networks import TrainedTokenizer

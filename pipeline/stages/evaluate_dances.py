@@ -48,7 +48,7 @@ from motionloom.pipeline.evaluation.tables import interval, plain, print_tables
 from motionloom.pipeline.evaluation.versions import EVALUATE_DANCES
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
-from motionloom.pipeline.stages.progress import bar
+from motionloom.pipeline.stages.bar import bar
 from motionloom.pipeline.store.files import write_json
 
 _FILE = "dances.json"

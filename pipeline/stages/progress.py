@@ -11,26 +11,13 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from motionloom.models.training.stage_module import LOG_EVERY, StageModule
+from motionloom.pipeline.stages.bar import bar
 from motionloom.pipeline.stages.loggers import Loggers
 
 _LINE_EVERY_SECONDS = 15.0
-
-
-def bar(console: Console) -> Progress:
-    """A progress bar on a terminal; silent elsewhere (callers print lines there)."""
-    return Progress(
-        TextColumn("    {task.description:<18}"),
-        BarColumn(bar_width=36),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-        console=console,
-        disable=not console.is_terminal,
-        transient=False,
-    )
 
 
 class StepProgress(Callback):

@@ -18,7 +18,7 @@ from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.pipeline.contract.showing import Bars, Showing
 from motionloom.pipeline.contract.stage import SHOWING, Finished, Given, StageConfig, StageContext, StageKind
 from motionloom.pipeline.contract.units import Arrays
-from motionloom.pipeline.stages.progress import bar
+from motionloom.pipeline.stages.bar import bar
 from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.tokens import TokenStore
 

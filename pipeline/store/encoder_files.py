@@ -7,11 +7,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from huggingface_hub import snapshot_download
-
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo
-from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.store.files import remove_tree, write_json
 
 BUILT_IN = "minilm"
@@ -47,6 +44,8 @@ def copy_encoder(spec: str, stage: Path, target: Path) -> None:
 
     The copy is loaded once: it must have the weights that encoded the run's captions.
     """
+    from motionloom.datasets.text.encoder import load_text_encoder
+
     digest = CacheInfo.load_json(stage / "cache" / "cache.json").encoder.rpartition(":")[2]
     problem = ""
     for find in _sources(spec):
@@ -66,6 +65,8 @@ def copy_encoder(spec: str, stage: Path, target: Path) -> None:
 
 def _sources(spec: str) -> list[Callable[[], Path]]:
     """Ways to a folder that holds the encoder, in the order to be tried."""
+    from huggingface_hub import snapshot_download
+
     folder = Path(spec).expanduser()
     if folder.is_dir() or folder.is_absolute():
         return [lambda: folder]

@@ -18,7 +18,8 @@ from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.runs.graph import execute, make_plan, replaced_trainings
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
-from motionloom.pipeline.stages.training import TrainedStageConfig, fit
+from motionloom.pipeline.stages.train_config import TrainedStageConfig
+from motionloom.pipeline.stages.training import fit
 from motionloom.pipeline.store.artifact import Artifact
 
 
