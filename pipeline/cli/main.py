@@ -1,12 +1,14 @@
 """The command line: a thin layer on the Python API.
 
 Exit codes: 0 done; 1 the check found problems; 2 a mistake in the call, the recipe or the data (one sentence
-on standard error says which and how to fix it); 130 interrupted. A bug shows
-its traceback and gives 1.
+on standard error says which and how to fix it), or what the system refuses: a full disk, no permission; 130
+interrupted; 141 nobody reads the output any more. A bug shows its traceback and gives 1.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import traceback
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +16,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.data import data_app
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
@@ -40,6 +43,7 @@ Device = Annotated[
     str, typer.Option(help="auto (a GPU if there is one; stages go by the recipe), cpu, cuda or cuda:N.")
 ]
 _INTERRUPTED = 130
+_CLOSED_PIPE = 141
 
 
 @app.command()
@@ -349,6 +353,7 @@ def _exit_code() -> int:
     errors = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
         code = app(prog_name="motionloom", standalone_mode=False) or 0
+        sys.stdout.flush()  # here a full disk can still be answered
     except UserError as error:
         errors.print(f"error: {error}", style="red", markup=False)
         return 2
@@ -356,11 +361,18 @@ def _exit_code() -> int:
         where = f"process {process_rank()}: another process of this run has stopped"
         errors.print(f"{where} ({error})", style="red", markup=False)
         return 1
+    except BrokenPipeError:  # `motionloom info | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return _CLOSED_PIPE
     except (typer.Abort, KeyboardInterrupt):
         code = _INTERRUPTED
     except Exception as error:
         if type(error).__module__.startswith(("click", "typer")) and hasattr(error, "show"):
             error.show()
+            return 2
+        words = sentence_of(error)
+        if words is not None:
+            errors.print(f"error: {words}", style="red", markup=False)
             return 2
         traceback.print_exc()
         return 1

@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 from rich.console import Console
 
+from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages, preview_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
@@ -36,7 +37,7 @@ from motionloom.pipeline.runs.graph import (
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
-from motionloom.pipeline.store.files import remove_tree, require_file_place, require_folder
+from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, StageState, run_state
 from motionloom.pipeline.store.yaml import read_yaml
@@ -311,8 +312,8 @@ def report_run(
     if missing := [stage for stage in state.unfinished if stage.kind != "report"]:
         console.print(f"not finished: {', '.join(f'{stage.name} ({stage.say()})' for stage in missing)}")
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(page, out)
+        with atomic_path(out) as whole:
+            shutil.copyfile(page, whole)
         page = out
     console.print(str(page.resolve()), soft_wrap=True)
     return page
@@ -326,7 +327,8 @@ def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Pa
     require_folder(out)
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
-    write_bundle(folder, out)
+    with new_folder(out.absolute()) as whole:
+        write_bundle(folder, whole)
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     console.print(
         f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"', soft_wrap=True
