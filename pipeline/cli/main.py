@@ -143,10 +143,12 @@ def generate(
     top_p: Annotated[
         float, typer.Option(help="Draw from the likeliest tokens of this total probability.")
     ] = 0.95,
-    cfg: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
-    face_cfg: Annotated[float | None, typer.Option(help="Guidance of the face; default: as --cfg.")] = None,
-    music_cfg: Annotated[
-        float | None, typer.Option(help="Guidance where there is music; default: as --cfg.")
+    cfg_scale: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
+    face_cfg_scale: Annotated[
+        float | None, typer.Option(help="Guidance of the face; default: as --cfg-scale.")
+    ] = None,
+    music_cfg_scale: Annotated[
+        float | None, typer.Option(help="Guidance where there is music; default: as --cfg-scale.")
     ] = None,
     face_model: Annotated[
         str | None, typer.Option(help="gpt, vae or diffusion; default: the first the run has.")
@@ -154,7 +156,7 @@ def generate(
     sampler: Annotated[
         str | None, typer.Option(help="Of diffusion models: ddpm (default), ddim or dpm++.")
     ] = None,
-    steps: Annotated[
+    denoising_steps: Annotated[
         int | None,
         typer.Option(help="Denoising steps of diffusion models, default 50, at most those trained (1000)."),
     ] = None,
@@ -169,15 +171,15 @@ def generate(
     from motionloom.pipeline.runs.api import generate_motions
 
     of_models = {
-        "face_cfg_scale": face_cfg,
-        "music_cfg_scale": music_cfg,
+        "face_cfg_scale": face_cfg_scale,
+        "music_cfg_scale": music_cfg_scale,
         "sampler": sampler,
-        "denoising_steps": steps,
+        "denoising_steps": denoising_steps,
     }
     generate_motions(
         run_folder,
         captions or [],
-        face_captions=face,
+        face=face,
         audio=audio or [],
         script=script,
         samples=samples,
@@ -189,7 +191,7 @@ def generate(
             "temperature": temperature,
             "top_k": top_k,
             "top_p": top_p,
-            "cfg_scale": cfg,
+            "cfg_scale": cfg_scale,
             "face_model": face_model,
             **{name: value for name, value in of_models.items() if value is not None},
         },

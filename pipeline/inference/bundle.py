@@ -196,7 +196,7 @@ class Bundle:
         self,
         captions: Sequence[str] | None = None,
         *,
-        face_captions: Sequence[str] | None = None,
+        face: Sequence[str] | None = None,
         sounds: Sequence[Sound | None] | None = None,
         music: Sequence[NDArray[np.float32] | None] | None = None,
         seconds: float | Sequence[float] | None = None,
@@ -215,9 +215,9 @@ class Bundle:
         sampling = sampling_of(sampling)
         require_seed(seed)
         texts = None if captions is None else caption_list(captions)
-        faces = None if face_captions is None else caption_list(face_captions, "face_captions")
+        faces = None if face is None else caption_list(face, "face")
         if strict:
-            require_words(faces or [], "face_captions")
+            require_words(faces or [], "face")
             require_used(self, faces, sampling)
         prompts = prompts_of(texts, faces, sounds, music)
         require_driven(self.generator, prompts)

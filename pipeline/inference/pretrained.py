@@ -69,7 +69,7 @@ class MotionModel(
         self,
         captions: Sequence[str] | None = None,
         *,
-        face_captions: Sequence[str] | None = None,
+        face: Sequence[str] | None = None,
         sounds: Sequence[Sound | None] | None = None,
         seconds: float | Sequence[float] | None = None,
         seed: int = 0,
@@ -82,7 +82,7 @@ class MotionModel(
         mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused.
         """
         return self.bundle.generate(
-            captions, face_captions=face_captions, sounds=sounds, seconds=seconds, seed=seed,
+            captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
             sampling=sampling, strict=True,
         )  # fmt: skip
 

@@ -133,7 +133,7 @@ def generate_motions(
     folder: Path,
     captions: Sequence[str] = (),
     *,
-    face_captions: Sequence[str] | None = None,
+    face: Sequence[str] | None = None,
     audio: Sequence[Path] = (),
     script: Path | None = None,
     samples: int = 1,
@@ -156,7 +156,7 @@ def generate_motions(
 
     if not captions and not audio and script is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
-    if script is not None and (captions or audio or seconds is not None or face_captions):
+    if script is not None and (captions or audio or seconds is not None or face):
         raise UserError("--script says everything: leave captions, --face, --audio and --seconds out")
     if samples < 1:
         raise UserError(f"--samples {samples}: take 1 or more")
@@ -179,7 +179,7 @@ def generate_motions(
     else:
         motions = bundle.generate(
             [text for text in captions for _ in range(samples)] or None,
-            face_captions=face_captions and [text for text in face_captions for _ in range(samples)],
+            face=face and [text for text in face for _ in range(samples)],
             sounds=[sound for sound in sounds for _ in range(samples)] or None,
             seconds=seconds,
             seed=seed,

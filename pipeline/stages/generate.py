@@ -86,7 +86,7 @@ def _performed(context: StageContext) -> list[GeneratedMotion]:
         raise UserError(f"stage '{context.name}': captions are given and no generator is conditioned on text")
     if not captions:
         return []
-    return bundle.generate(captions, face_captions=faces, seed=context.seed, sampling=config.sampling)
+    return bundle.generate(captions, face=faces, seed=context.seed, sampling=config.sampling)
 
 
 def _danced(context: StageContext) -> list[tuple[GeneratedMotion, DanceClip]]:
