@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.places import no_such_folder
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
@@ -104,6 +105,8 @@ class Bundle:
         if (folder / BUNDLE_FILE).is_file():
             return Bundle._of(folder, open_exported(folder), device)
         if not (folder / "recipe.yaml").is_file():
+            if not folder.exists():
+                raise UserError(no_such_folder(folder))
             raise UserError(
                 f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no {BUNDLE_FILE})"
             )

@@ -19,6 +19,7 @@ import torch
 from huggingface_hub import ModelHubMixin, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
+from motionloom.datasets.base.places import hub_is_away, no_such_folder, require_hub_name
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
@@ -51,7 +52,7 @@ class MotionModel(
 
     @classmethod
     def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> MotionModel:
-        """A folder, or a name on the hub.
+        """A folder, or a name on the hub (`owner/name`).
 
         `options` are `device` (auto: a GPU if there is one; cpu, cuda, cuda:N) and the hub's (revision,
         token, local_files_only).
@@ -59,10 +60,18 @@ class MotionModel(
         name = pretrained_model_name_or_path
         if Path(name).is_dir():  # the hub's own way in warns of a run folder, which has no config.json
             return cls(name, options.get("device", "auto"))
+        if isinstance(name, Path) or "/" not in name:
+            raise UserError(no_such_folder(Path(name)))
+        require_hub_name(name)
+        away = hub_is_away()
+        if away:
+            options["local_files_only"] = True
         try:
             return super().from_pretrained(name, **options)
         except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            if away:
+                reason = "it cannot be reached from here, and its cache does not hold it"
             raise UserError(f"{name}: no such folder, and the hub does not give it ({reason})") from None
 
     def generate(

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from motionloom.datasets.base.places import hub_is_away
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo
 from motionloom.pipeline.store.files import remove_tree, write_json
@@ -71,8 +72,11 @@ def _sources(spec: str) -> list[Callable[[], Path]]:
     if folder.is_dir() or folder.is_absolute():
         return [lambda: folder]
     patterns = [f"*{suffix}" for suffix in _SUFFIXES]
-    fetch = partial(snapshot_download, spec, allow_patterns=patterns)
-    return [lambda: Path(fetch(local_files_only=True)), lambda: Path(fetch())]
+
+    def fetched(only_cached: bool) -> Path:
+        return Path(snapshot_download(spec, allow_patterns=patterns, local_files_only=only_cached))
+
+    return [partial(fetched, only_cached) for only_cached in ((True,) if hub_is_away() else (True, False))]
 
 
 def _copy(source: Path, target: Path) -> None:

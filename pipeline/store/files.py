@@ -54,7 +54,7 @@ def remove_tree(folder: Path) -> None:
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """A folder to fill, which takes its place as `folder`, absent or empty before, when the block ends whole."""
+    """A folder to fill; it becomes `folder`, which is absent or empty before, when the block ends whole."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.tmp")
     try:

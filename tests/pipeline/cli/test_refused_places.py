@@ -27,8 +27,8 @@ def places(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(small_run.recipe, root / "small.yaml")
     shutil.copytree(small_run.folder / "stages" / "data" / "shards", root / "shards")
     (root / "mocap").mkdir()
-    for name in ("a", "b"):
-        write_clip(root / "mocap" / f"{name}.bvh")
+    for seed, name in enumerate("ab"):
+        write_clip(root / "mocap" / f"{name}.bvh", seed)
     write_map(root / "map.json")
     return root
 
