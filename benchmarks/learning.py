@@ -160,7 +160,7 @@ def generation(
     for name, title in GPTS.items():
         if finished(run, name):
             bundle = Bundle([stages[name], *face_makers], shelf)
-            made = bundle.generate(captions, face_captions=faces, sampling=sampling)
+            made = bundle.generate(captions, face=faces, sampling=sampling)
             out[title] = judge(truths, ((m.joints, m.face) for m in made), fps, hold_out)
             found[title] = retrieval(run, "tma", truths, draws, [m.features for m in made])
     return out, found

@@ -8,7 +8,7 @@ import os
 import re
 import secrets
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -38,7 +38,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """A path to write to; the file moves to `path`, synced, only when the block ends without error.
 
     Parent folders are made. The temporary name starts with a dot and ends in a random number, so no worker,
-    of an earlier run or on another machine, can rename another's half-written file into place.
+    of an earlier run or on another machine, can rename another's half-written file into place. An error of
+    the system names `path`, never the temporary file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
@@ -48,8 +49,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
         sync_folder(path.parent)
+    except OSError as error:
+        if error.errno is not None and error.filename in (None, str(temporary), temporary):
+            error.filename, error.filename2 = str(path), None
+        raise
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # the error that ended the block says more
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import multiprocessing
 import os
 import sys
@@ -17,6 +16,7 @@ from typing import Self, TypeVar
 
 import threadpoolctl  # type: ignore[import-untyped]
 
+from motionloom.datasets.base.os_errors import of_the_machine, sentence_of
 from motionloom.datasets.schema import UserError
 
 T = TypeVar("T")
@@ -70,8 +70,8 @@ class Workers:
                 "finished work is kept"
             ) from None
         except OSError as error:
-            if error.errno == errno.ENOSPC:
-                raise UserError("the disk is full; free space and run again: finished work is kept") from None
+            if of_the_machine(error):
+                raise UserError(str(sentence_of(error))) from None
             raise
 
 

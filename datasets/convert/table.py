@@ -5,11 +5,13 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion
 from motionloom.datasets.schema import UserError
+
+if TYPE_CHECKING:
+    from motionloom.datasets.convert.common.config import ConvertConfig
+    from motionloom.datasets.convert.common.conversion import Conversion
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class Converter:
         With `out`, the folder of the shards, a source whose listing must read every file (archives) is read
         once and not again by the next run or by the other parts of a conversion.
         """
+        from motionloom.datasets.convert.common.conversion import SCAN_FILE
+
         prepare = getattr(importlib.import_module(self.module), self.prepare_name)
         more = {"scan": out / SCAN_FILE} if self.keeps_scan and out is not None else {}
         made: Conversion[Any] = prepare(config, workers=workers, progress=progress, **more)

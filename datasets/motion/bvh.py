@@ -17,8 +17,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import roma
-import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import write_text
@@ -79,6 +77,9 @@ class BvhMotion:
 
     def _rotations(self, wanted: Sequence[int]) -> Floats:
         """Local rotations of some joints, joint first [M, T, 3, 3]."""
+        import roma
+        import torch
+
         out = np.broadcast_to(np.eye(3), (len(wanted), self.frames, 3, 3)).copy()
         turns = _channel_columns(self.channels).rotations
         groups: dict[str, list[int]] = {}
@@ -231,6 +232,9 @@ def _hierarchy_lines(skeleton: Skeleton, joint: int, depth: int) -> list[str]:
 
 def _euler_degrees(rotations: Floats) -> Floats:
     """Euler angles [T, N, 3] in degrees, without jumps of whole turns between frames."""
+    import roma
+    import torch
+
     angles = roma.rotmat_to_euler(
         WRITTEN_ORDER, torch.from_numpy(np.ascontiguousarray(rotations)), degrees=True
     )

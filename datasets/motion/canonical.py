@@ -18,10 +18,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import roma
-import torch
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
@@ -73,6 +70,8 @@ def heading(joints: NDArray[Any], fps: float) -> NDArray[np.float64]:
     Gaussian of `SMOOTH_SECONDS`, extended by point reflection at both ends, so that the first and the last
     frame keep their raw heading and a steady turn is reproduced without lag.
     """
+    from scipy.ndimage import gaussian_filter1d
+
     angle = facing(joints)
     last = angle.shape[-1] - 1
     if last < 1:
@@ -130,6 +129,9 @@ def resample(values: NDArray[Any], fps_in: float, fps_out: float) -> NDArray[Any
 
 def resample_quaternions(quaternions: NDArray[Any], fps_in: float, fps_out: float) -> NDArray[np.float64]:
     """Spherical resampling in time of unit quaternions [T, ..., 4] (x, y, z, w), along the shorter arc."""
+    import roma
+    import torch
+
     left, weight = _source_frames(len(quaternions), fps_in, fps_out)
     right = np.minimum(left + 1, len(quaternions) - 1)
     unit = roma.quat_normalize(torch.from_numpy(np.asarray(quaternions, dtype=np.float64)))

@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from motionloom.datasets.motion.canonical import (
     LEFT_HIP,
@@ -112,6 +111,8 @@ def uniform_joints(
 
 def _published_heading(joints: NDArray[np.float64]) -> NDArray[np.float64]:
     """Heading [..., T] in (-pi, pi] with quirks 1 to 3; the published root quaternion is its inverse."""
+    from scipy.ndimage import gaussian_filter1d
+
     across = joints[..., LEFT_HIP, :] - joints[..., RIGHT_HIP, :]
     across = across + joints[..., RIGHT_SHOULDER, :] - joints[..., LEFT_SHOULDER, :]
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)

@@ -18,7 +18,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import BODY_JOINTS
@@ -128,6 +127,8 @@ def smpl_joints(
     [..., T, 3] in metres is what the model adds to every vertex, so the root stands at rest pelvis + trans.
     `betas` [B] is one shape for all frames. The joints are those of the model itself, to rounding.
     """
+    from scipy.spatial.transform import Rotation
+
     count = len(body.skeleton)
     if rotvecs.shape[-2:] != (count, 3) or trans.shape != (*rotvecs.shape[:-2], 3):
         raise UserError(

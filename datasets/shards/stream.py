@@ -18,8 +18,6 @@ from collections import OrderedDict
 from collections.abc import Collection, Sequence
 from typing import BinaryIO
 
-from webdataset.tariterators import group_by_keys, tar_file_expander
-
 from motionloom.datasets.schema import ShardInfo, UserError
 from motionloom.datasets.shards.index import SplitIndex
 from motionloom.datasets.shards.sample import MEMBERS
@@ -77,6 +75,9 @@ def read_shard(
 
     `rows` are the shard's rows of the index.
     """
+    # Brings in torch.
+    from webdataset.tariterators import group_by_keys, tar_file_expander
+
     where = store.where(shard.name)
     number = shard.name.removesuffix(".tar").rpartition("-")[2]
     clips: list[dict[str, bytes]] = []

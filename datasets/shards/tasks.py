@@ -7,13 +7,13 @@ finished.
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of, sha256_of_json, write_json
+from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Dropped, ShardInfo, Split, UserError
@@ -124,7 +124,7 @@ def _convert_item(
     except MemoryError:
         raise
     except Exception as error:  # a converter meets whatever a bad file makes of its libraries
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        if of_the_machine(error):
             raise
         reason = f"{type(error).__name__}: {error}" if not isinstance(error, UserError) else str(error)
         if task.strict:

@@ -8,8 +8,6 @@ three joints each.
 from __future__ import annotations
 
 import numpy as np
-import roma
-import torch
 
 from motionloom.datasets.synth.maths import Array, ease, rot_y, rot_z, wander
 
@@ -57,6 +55,9 @@ def _turned(
     relaxed: tuple[Array, Array, Array], shape: str, t: Array, on: Array, rng: np.random.Generator
 ) -> Array:
     """Rotations [T, 15, 3, 3] on the way `on` [T] from a relaxed hand's angles to a shape."""
+    import roma
+    import torch
+
     flex, fan, thumb = relaxed
     n = len(t)
     to_flex, to_fan, to_thumb = _angles(shape, rng)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy import signal
 
 from motionloom.datasets.synth.genres import Wave
 from motionloom.datasets.synth.maths import Array
@@ -88,6 +87,8 @@ def note(rate: int, wave: Wave, hertz: float, seconds: float) -> Array:
 
 def equalize(sound: Array, rate: int, decibels: tuple[float, float, float]) -> Array:
     """Low, middle and high bands (edges at 250 Hz and 2.5 kHz) of samples made louder by `decibels`."""
+    from scipy import signal
+
     edges = [signal.butter(1, hertz, fs=rate, output="sos") for hertz in (250.0, 2500.0)]
     low, below = (np.asarray(signal.sosfilt(edge, sound)) for edge in edges)
     bands = (low, below - low, sound - below)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 Array = NDArray[np.float64]
 
@@ -74,11 +73,15 @@ def keys(t: Array, times: Sequence[float] | Array, values: ArrayLike) -> Array:
 
 def smooth(x: Array, seconds: float, fps: float) -> Array:
     """Gaussian smoothing over time, ends held."""
+    from scipy.ndimage import gaussian_filter1d
+
     return np.asarray(gaussian_filter1d(x, max(seconds * fps, 1e-3), axis=0, mode="nearest"))
 
 
 def lower_envelope(x: Array, seconds: float, fps: float) -> Array:
     """A smooth curve [T] never above x [T]: running minimum, then an average over the same window."""
+    from scipy.ndimage import minimum_filter1d
+
     half = max(1, round(seconds * fps))
     size = 2 * half + 1
     low = minimum_filter1d(x, size, mode="nearest")

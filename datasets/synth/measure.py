@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import find_peaks
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth import face as faces
@@ -199,6 +198,8 @@ def _reach(s: Signals) -> tuple[int, str]:
 
 def _waves(s: Signals, side: int) -> int:
     """How often a raised hand turns back between left and right."""
+    from scipy.signal import find_peaks
+
     raised = s.wrists[side, :, 1] > 0.12
     if not raised.any():
         return 0

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks
 
 from motionloom.datasets.synth.genres import Style
 from motionloom.datasets.synth.maths import Array
@@ -52,6 +50,9 @@ def measure_dance(joints: NDArray[Any], fps: float) -> MeasuredDance:
 
 def kinetic_beats(joints: NDArray[Any], fps: float) -> Array:
     """Seconds at which the mean speed of the body joints [T, N >= 22, 3] is at a minimum."""
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.signal import find_peaks
+
     body = np.asarray(joints, dtype=np.float64)[:, :22]
     speed = np.linalg.norm(np.diff(body, axis=0), axis=-1).mean(1)
     speed = gaussian_filter1d(speed, max(0.04 * fps, 0.3), mode="nearest")

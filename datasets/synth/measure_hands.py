@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from motionloom.datasets.synth.maths import Array
 
@@ -23,6 +22,8 @@ def curls(joints: NDArray[Any], side: int) -> Array:
 
 def hand_shape(joints: NDArray[Any], side: int, fps: float) -> str:
     """Shape of the left (0) or right (1) hand over a clip of joints [T, 52, 3]; a name of `truth.HANDS`."""
+    from scipy.ndimage import gaussian_filter1d
+
     x = gaussian_filter1d(np.asarray(joints, dtype=np.float64), max(0.03 * fps, 0.3), axis=0, mode="nearest")
     curl = curls(x, side)
     start = min(int(0.5 * fps), len(curl) // 4)

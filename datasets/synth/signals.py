@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.maths import Array
@@ -53,6 +51,8 @@ class Signals:
 
     def peaks(self, signal: Array, prominence: float, height: float | None = None) -> int:
         """Number of peaks of a signal [T]; the ends count as low."""
+        from scipy.signal import find_peaks
+
         low = float(signal.min()) - 1e-6
         padded = np.concatenate([[low], signal, [low]])
         return len(find_peaks(padded, prominence=prominence, height=height)[0])
@@ -70,6 +70,8 @@ def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def signals_of(joints: NDArray[Any], fps: float) -> Signals:
     """Signals of joints [T, N >= 22, 3] in metres, Y up."""
+    from scipy.ndimage import gaussian_filter1d
+
     if joints.ndim != 3 or joints.shape[0] < 4 or joints.shape[1] < 22 or joints.shape[2] != 3:
         raise UserError(f"joints of shape {list(joints.shape)}: expected [T >= 4, N >= 22, 3]")
     x = gaussian_filter1d(np.asarray(joints, dtype=np.float64), max(0.025 * fps, 0.3), axis=0, mode="nearest")
@@ -148,4 +150,6 @@ def _length(x: Array, a: int, b: int) -> float:
 
 
 def _smooth(x: Array, seconds: float, fps: float) -> Array:
+    from scipy.ndimage import gaussian_filter1d
+
     return np.asarray(gaussian_filter1d(x, seconds * fps, axis=0, mode="nearest"))

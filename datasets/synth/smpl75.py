@@ -8,8 +8,6 @@ differ. Its last two joints, the hands, stay at rest **[ours]**.
 from __future__ import annotations
 
 import numpy as np
-import roma
-import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.canonical import canonicalize, facing
@@ -26,6 +24,9 @@ def smpl75_of(rotations: Array, joints: Array) -> NDArray[np.float32]:
 
     Canonical: floor at 0, the first root above the origin, the first heading +Z, as for joints.
     """
+    import roma
+    import torch
+
     body = joints[:, :BODY_JOINTS]
     local = rotations[:, :BODY_JOINTS].copy()
     local[:, 0] = rot_y(-float(facing(body[:1])[0])) @ local[:, 0]

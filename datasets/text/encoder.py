@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.schema import UserError
 
 
@@ -113,6 +114,7 @@ def load_text_encoder(spec: str, *, device: str = "cpu") -> SentenceEncoder | Cl
         if kind in ("clip", "clip_text_model"):
             return ClipEncoder(folder.name, *_clip_model(folder, device=device, local=True))
         return SentenceEncoder(folder.name, _sentence_model(folder, device=device, local=True))
+    require_hub_name(spec)
     if "clip" in spec.lower() and not spec.startswith("sentence-transformers/"):
         return ClipEncoder(spec, *_clip_model(spec, device=device, local=False))
     return SentenceEncoder(spec, _sentence_model(spec, device=device, local=False))
@@ -147,7 +149,7 @@ def _sentence_model(where: Path | str, *, device: str, local: bool) -> Any:
             return SentenceTransformer(
                 str(where),
                 device=device,
-                local_files_only=local,
+                local_files_only=local or hub_is_away(),
                 trust_remote_code=False,
                 model_kwargs={"use_safetensors": True},
             )
@@ -158,12 +160,13 @@ def _sentence_model(where: Path | str, *, device: str, local: bool) -> Any:
 def _clip_model(where: Path | str, *, device: str, local: bool) -> tuple[Any, Any]:
     from transformers import AutoTokenizer, CLIPTextModelWithProjection
 
+    here = local or hub_is_away()
     try:
         with _no_progress_bars():
             model = CLIPTextModelWithProjection.from_pretrained(
-                str(where), local_files_only=local, use_safetensors=True
+                str(where), local_files_only=here, use_safetensors=True
             )
-        tokenizer = AutoTokenizer.from_pretrained(str(where), local_files_only=local, trust_remote_code=False)
+        tokenizer = AutoTokenizer.from_pretrained(str(where), local_files_only=here, trust_remote_code=False)
     except Exception as error:  # as above
         raise _not_loadable(where, local, error) from error
     nn.Module.to(model, device)

@@ -13,6 +13,9 @@ from motionloom.datasets.schema import Config
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.distributed import gather_rows_with_grad, masked_mean
 
+MOVEMENT, MATCHING = "movement", "matching"
+"""The players, in the order in which they are trained."""
+
 
 class EvaluatorLossConfig(Config):
     """Weights and margin; the defaults are the published ones."""

@@ -7,13 +7,16 @@ from typing import Any
 
 from torch import Tensor
 
-from motionloom.models.evaluator.losses import EvaluatorLossConfig, matching_loss, movement_loss
+from motionloom.models.evaluator.losses import (
+    MATCHING,
+    MOVEMENT,
+    EvaluatorLossConfig,
+    matching_loss,
+    movement_loss,
+)
 from motionloom.models.evaluator.network import UNIT, Evaluator
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
-
-MOVEMENT, MATCHING = "movement", "matching"
-"""The players, in the order in which they are trained."""
 
 
 class EvaluatorModule(PlayersModule):

@@ -8,10 +8,14 @@ the frozen TMA motion encoder, then InfoNCE against the TMA text latents of the 
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import Tensor
 
+from motionloom.datasets.schema import Config
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import PAD
@@ -19,6 +23,24 @@ from motionloom.models.tma.losses import info_nce
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.training.distributed import masked_mean
+
+
+class GptLossConfig(Config):
+    """Weight and temperatures of the alignment term."""
+
+    align_weight: float = Field(default=0.1, ge=0)
+    """eta [ours]; 0 turns L_align off, and the tokenizer and TMA are then not needed."""
+    align_on: Literal["predictions", "samples"] = "predictions"
+    """What L_align judges [ours]: tokens predicted after the true ones, or motions that the model samples
+    itself. Those take several times longer; start such a stage from a trained GPT
+    (`inputs: {start: gpt}`)."""
+    samples: int = Field(default=2, ge=2)
+    """Motions sampled for each caption, for `align_on: samples`."""
+    gumbel_temperature: float = Field(default=1.0, gt=0)
+    """Of the codes, for `align_on: predictions`."""
+    temperature: float = Field(default=0.1, gt=0)
+    threshold: float | None = Field(default=0.85, ge=-1, le=1)
+    """Captions with a higher sBERT cosine are not negatives of each other; null keeps all negatives."""
 
 
 def predicted(tokens: Tensor, logits: Tensor, known: Tensor | None = None) -> Tensor:

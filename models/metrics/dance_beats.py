@@ -20,8 +20,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import argrelextrema
 
 from motionloom.datasets.schema import UserError
 
@@ -56,6 +54,9 @@ def motion_beats(
     joints: NDArray[np.floating], fps: float, definition: str = "bailando"
 ) -> NDArray[np.float64]:
     """Seconds of the beats of a motion, joints [T, N, 3]: minima of the body's speed, ascending."""
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.signal import argrelextrema
+
     how = _definition(definition)
     steps = np.linalg.norm(np.diff(np.asarray(joints, dtype=np.float64), axis=0), axis=-1).mean(1)
     if how.late:

@@ -12,9 +12,23 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import Tensor
 
+from motionloom.datasets.schema import Config
 from motionloom.models.training.distributed import gather_rows, gather_rows_with_grad, masked_mean
+
+
+class TmaLossConfig(Config):
+    """Weights of the loss terms and the negative filter; the defaults are the paper's."""
+
+    reconstruction: float = Field(default=1.0, ge=0)
+    kl: float = Field(default=1e-5, ge=0)
+    latent: float = Field(default=1e-5, ge=0)
+    contrastive: float = Field(default=0.1, ge=0)
+    temperature: float = Field(default=0.1, gt=0)
+    threshold: float | None = Field(default=0.85, ge=-1, le=1)
+    """Captions with a higher sBERT cosine are not negatives of each other; null keeps all negatives."""
 
 
 def reconstruction_loss(pred: Tensor, target: Tensor, mask: Tensor, present: Tensor | None = None) -> Tensor:

@@ -5,26 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
-from motionloom.datasets.schema import Config
 from motionloom.models.layers.transformer import length_mask
-from motionloom.models.tma.losses import info_nce, kl_four, latent_loss, reconstruction_loss
+from motionloom.models.tma.losses import TmaLossConfig, info_nce, kl_four, latent_loss, reconstruction_loss
 from motionloom.models.tma.network import Tma
 from motionloom.models.training.stage_module import OptimConfig, StageModule
-
-
-class TmaLossConfig(Config):
-    """Weights of the loss terms and the negative filter; the defaults are the paper's."""
-
-    reconstruction: float = Field(default=1.0, ge=0)
-    kl: float = Field(default=1e-5, ge=0)
-    latent: float = Field(default=1e-5, ge=0)
-    contrastive: float = Field(default=0.1, ge=0)
-    temperature: float = Field(default=0.1, gt=0)
-    threshold: float | None = Field(default=0.85, ge=-1, le=1)
-    """Captions with a higher sBERT cosine are not negatives of each other; null keeps all negatives."""
 
 
 class TmaModule(StageModule):

@@ -9,11 +9,36 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from pydantic import Field
 from torch import Tensor
 
+from motionloom.datasets.schema import Config
+from motionloom.models.discriminator.losses import AdversarialConfig
+from motionloom.models.discriminator.patch import DiscriminatorConfig
 from motionloom.models.gpt.losses import group_counts, soft_codes
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.training.optim import OptimConfig
+
+
+class UttLossConfig(Config):
+    """The loss of MATE and UTT."""
+
+    adversarial: AdversarialConfig = AdversarialConfig()
+    adversarial_start: int = Field(0, ge=0)
+    """First step with the adversarial term, and the discriminator's first step."""
+    adversarial_ramp: int = Field(0, ge=0)
+    """Steps over which its weight rises from 0."""
+    discriminator: DiscriminatorConfig = DiscriminatorConfig()
+    discriminator_optim: OptimConfig = OptimConfig(optimizer="adam", betas=(0.5, 0.99))
+
+    def weight(self, step: int) -> float:
+        """Weight of the adversarial term in a step."""
+        since = step - self.adversarial_start
+        if since < 0:
+            return 0.0
+        rise = 1.0 if self.adversarial_ramp == 0 else min(1.0, (since + 1) / self.adversarial_ramp)
+        return self.adversarial.weight * rise
 
 
 class SoftMotion(NamedTuple):

@@ -16,18 +16,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
-from motionloom.datasets.schema import Config
 from motionloom.models.condition.mate import Encoded, drop_conditions
 from motionloom.models.discriminator.losses import (
-    AdversarialConfig,
     discriminator_loss,
     generator_loss,
     gradient_penalty,
 )
-from motionloom.models.discriminator.patch import DiscriminatorConfig, PatchDiscriminator
+from motionloom.models.discriminator.patch import PatchDiscriminator
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy
 from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave, stream_names
@@ -35,27 +32,7 @@ from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
 from motionloom.models.utt.conditioned import ConditionedUtt
-from motionloom.models.utt.losses import SoftMotion, soft_motion
-
-
-class UttLossConfig(Config):
-    """The loss of MATE and UTT."""
-
-    adversarial: AdversarialConfig = AdversarialConfig()
-    adversarial_start: int = Field(0, ge=0)
-    """First step with the adversarial term, and the discriminator's first step."""
-    adversarial_ramp: int = Field(0, ge=0)
-    """Steps over which its weight rises from 0."""
-    discriminator: DiscriminatorConfig = DiscriminatorConfig()
-    discriminator_optim: OptimConfig = OptimConfig(optimizer="adam", betas=(0.5, 0.99))
-
-    def weight(self, step: int) -> float:
-        """Weight of the adversarial term in a step."""
-        since = step - self.adversarial_start
-        if since < 0:
-            return 0.0
-        rise = 1.0 if self.adversarial_ramp == 0 else min(1.0, (since + 1) / self.adversarial_ramp)
-        return self.adversarial.weight * rise
+from motionloom.models.utt.losses import SoftMotion, UttLossConfig, soft_motion
 
 
 def closed_sequences(

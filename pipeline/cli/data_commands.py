@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.check.dataset import examine
-from motionloom.datasets.check.files import FILE_SUFFIXES, FileRules, check_file, check_folder
-from motionloom.datasets.convert.common.conversion import run_conversion
-from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.table import converter_named
-from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.schema import Manifest, UserError
-from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.store.files import require_file_place, require_folder
+
+if TYPE_CHECKING:
+    from motionloom.datasets.convert.common.plan import ConversionPlan
 
 
 def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
@@ -45,6 +39,8 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
 
 def synth_command(fields: dict[str, Any], out: Path, *, workers: int, console: Console) -> None:
     """Write synthetic clips."""
+    from motionloom.datasets.synth.generate import SynthConfig, synthesize
+
     config = SynthConfig.parse(fields, "data synth")
     require_folder(out)
     say_manifest(synthesize(config, out, workers=workers), out, console)
@@ -64,6 +60,9 @@ def convert_command(
     console: Console,
 ) -> None:
     """Plan a conversion, run it here, or hand it to SLURM."""
+    from motionloom.datasets.convert.common.conversion import run_conversion
+    from motionloom.datasets.convert.table import converter_named
+
     converter = converter_named(kind)
     config = converter.config().parse(fields, f"data convert {kind}")
     shown = not console.quiet
@@ -122,12 +121,16 @@ def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: C
 
 def _holds_files(folder: Path) -> bool:
     """Whether a folder is no dataset, finished or not, but holds files that can be checked one by one."""
+    from motionloom.datasets.check.files import FILE_SUFFIXES
+
     if (folder / "manifest.json").exists() or any(folder.glob("*.index.json")):
         return False
     return any(path.suffix.lower() in FILE_SUFFIXES for path in folder.rglob("*"))
 
 
 def _check_dataset(root: Path, console: Console) -> tuple[int, int]:
+    from motionloom.datasets.check.dataset import examine
+
     report = examine(root, progress=console.is_terminal)
     for warning in report.warnings:
         _say(console, f"warning: {warning}")
@@ -140,6 +143,8 @@ def _check_dataset(root: Path, console: Console) -> tuple[int, int]:
 
 
 def _check_files(path: Path, given: dict[str, Any], console: Console) -> tuple[int, int]:
+    from motionloom.datasets.check.files import FileRules, check_file, check_folder
+
     rules = FileRules(**given)
     bad = warned = 0
     for verdict in [check_file(path, rules)] if path.is_file() else check_folder(path, rules):
@@ -169,6 +174,11 @@ def report_command(root: Path, out: Path | None, *, check: bool, clips: int, con
 
 def stats_command(root: Path, *, group: bool, out: Path | None, console: Console) -> None:
     """Describe a data set."""
+    import numpy as np
+
+    from motionloom.datasets.loading.statistics import compute
+    from motionloom.datasets.shards.reader import ShardDataset
+
     manifest = Manifest.load_json(root / "manifest.json")
     if out is not None:
         require_file_place(out)

@@ -1,12 +1,14 @@
 """The command line: a thin layer on the Python API.
 
 Exit codes: 0 done; 1 the check found problems; 2 a mistake in the call, the recipe or the data (one sentence
-on standard error says which and how to fix it); 130 interrupted. A bug shows
-its traceback and gives 1.
+on standard error says which and how to fix it), or what the system refuses: a full disk, no permission; 130
+interrupted; 141 nobody reads the output any more. A bug shows its traceback and gives 1.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import traceback
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +16,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.data import data_app
 from motionloom.pipeline.cli.sweep import sweep
@@ -41,6 +44,7 @@ Device = Annotated[
     str, typer.Option(help="auto (a GPU if there is one; stages go by the recipe), cpu, cuda or cuda:N.")
 ]
 _INTERRUPTED = 130
+_CLOSED_PIPE = 141
 
 
 @app.command()
@@ -150,10 +154,12 @@ def generate(
     top_p: Annotated[
         float, typer.Option(help="Draw from the likeliest tokens of this total probability.")
     ] = 0.95,
-    cfg: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
-    face_cfg: Annotated[float | None, typer.Option(help="Guidance of the face; default: as --cfg.")] = None,
-    music_cfg: Annotated[
-        float | None, typer.Option(help="Guidance where there is music; default: as --cfg.")
+    cfg_scale: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
+    face_cfg_scale: Annotated[
+        float | None, typer.Option(help="Guidance of the face; default: as --cfg-scale.")
+    ] = None,
+    music_cfg_scale: Annotated[
+        float | None, typer.Option(help="Guidance where there is music; default: as --cfg-scale.")
     ] = None,
     face_model: Annotated[
         str | None, typer.Option(help="gpt, vae or diffusion; default: the first the run has.")
@@ -161,7 +167,7 @@ def generate(
     sampler: Annotated[
         str | None, typer.Option(help="Of diffusion models: ddpm (default), ddim or dpm++.")
     ] = None,
-    steps: Annotated[
+    denoising_steps: Annotated[
         int | None,
         typer.Option(help="Denoising steps of diffusion models, default 50, at most those trained (1000)."),
     ] = None,
@@ -176,15 +182,15 @@ def generate(
     from motionloom.pipeline.runs.api import generate_motions
 
     of_models = {
-        "face_cfg_scale": face_cfg,
-        "music_cfg_scale": music_cfg,
+        "face_cfg_scale": face_cfg_scale,
+        "music_cfg_scale": music_cfg_scale,
         "sampler": sampler,
-        "denoising_steps": steps,
+        "denoising_steps": denoising_steps,
     }
     generate_motions(
         run_folder,
         captions or [],
-        face_captions=face,
+        face=face,
         audio=audio or [],
         script=script,
         samples=samples,
@@ -196,7 +202,7 @@ def generate(
             "temperature": temperature,
             "top_k": top_k,
             "top_p": top_p,
-            "cfg_scale": cfg,
+            "cfg_scale": cfg_scale,
             "face_model": face_model,
             **{name: value for name, value in of_models.items() if value is not None},
         },
@@ -360,6 +366,7 @@ def _exit_code() -> int:
     errors = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
         code = app(prog_name="motionloom", standalone_mode=False) or 0
+        sys.stdout.flush()  # here a full disk can still be answered
     except UserError as error:
         errors.print(f"error: {error}", style="red", markup=False)
         return 2
@@ -367,11 +374,18 @@ def _exit_code() -> int:
         where = f"process {process_rank()}: another process of this run has stopped"
         errors.print(f"{where} ({error})", style="red", markup=False)
         return 1
+    except BrokenPipeError:  # `motionloom info | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return _CLOSED_PIPE
     except (typer.Abort, KeyboardInterrupt):
         code = _INTERRUPTED
     except Exception as error:
         if type(error).__module__.startswith(("click", "typer")) and hasattr(error, "show"):
             error.show()
+            return 2
+        words = sentence_of(error)
+        if words is not None:
+            errors.print(f"error: {words}", style="red", markup=False)
             return 2
         traceback.print_exc()
         return 1

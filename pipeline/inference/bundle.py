@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.places import no_such_folder
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
@@ -105,6 +106,8 @@ class Bundle:
         if (folder / BUNDLE_FILE).is_file():
             return Bundle._of(folder, open_exported(folder), device)
         if not (folder / "recipe.yaml").is_file():
+            if not folder.exists():
+                raise UserError(no_such_folder(folder))
             raise UserError(
                 f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no {BUNDLE_FILE})"
             )
@@ -198,7 +201,7 @@ class Bundle:
         self,
         captions: Sequence[str] | None = None,
         *,
-        face_captions: Sequence[str] | None = None,
+        face: Sequence[str] | None = None,
         sounds: Sequence[Sound | None] | None = None,
         music: Sequence[NDArray[np.float32] | None] | None = None,
         seconds: float | Sequence[float] | None = None,
@@ -217,9 +220,9 @@ class Bundle:
         sampling = sampling_of(sampling)
         require_seed(seed)
         texts = None if captions is None else caption_list(captions)
-        faces = None if face_captions is None else caption_list(face_captions, "face_captions")
+        faces = None if face is None else caption_list(face, "face")
         if strict:
-            require_words(faces or [], "face_captions")
+            require_words(faces or [], "face")
             require_used(self, faces, sampling)
         prompts = prompts_of(texts, faces, sounds, music)
         require_driven(self.generator, prompts)

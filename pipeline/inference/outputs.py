@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -16,14 +16,12 @@ from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.kinematics import joints_to_rotations
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.bundle import GeneratedMotion
+from motionloom.pipeline.inference.formats import Format
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 from motionloom.pipeline.store.files import require_folder
-
-Format = Literal["npz", "bvh", "mp4", "html"]
-FORMATS: tuple[Format, ...] = ("npz", "bvh", "mp4", "html")
 
 
 def file_stem(number: int, caption: str) -> str:

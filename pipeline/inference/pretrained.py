@@ -19,6 +19,7 @@ import torch
 from huggingface_hub import ModelHubMixin, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
+from motionloom.datasets.base.places import hub_is_away, no_such_folder, require_hub_name
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
@@ -52,7 +53,7 @@ class MotionModel(
 
     @classmethod
     def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> MotionModel:
-        """A folder, or a name on the hub.
+        """A folder, or a name on the hub (`owner/name`).
 
         `options` are `device` (auto: a GPU if there is one; cpu, cuda, cuda:N) and the hub's (revision,
         token, local_files_only).
@@ -60,17 +61,25 @@ class MotionModel(
         name = pretrained_model_name_or_path
         if Path(name).is_dir():  # the hub's own way in warns of a run folder, which has no config.json
             return cls(name, options.get("device", "auto"))
+        if isinstance(name, Path) or "/" not in name:
+            raise UserError(no_such_folder(Path(name)))
+        require_hub_name(name)
+        away = hub_is_away()
+        if away:
+            options["local_files_only"] = True
         try:
             return super().from_pretrained(name, **options)
         except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            if away:
+                reason = "it cannot be reached from here, and its cache does not hold it"
             raise UserError(f"{name}: no such folder, and the hub does not give it ({reason})") from None
 
     def generate(
         self,
         captions: Sequence[str] | None = None,
         *,
-        face_captions: Sequence[str] | None = None,
+        face: Sequence[str] | None = None,
         sounds: Sequence[Sound | None] | None = None,
         seconds: float | Sequence[float] | None = None,
         seed: int = 0,
@@ -83,7 +92,7 @@ class MotionModel(
         mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused.
         """
         return self.bundle.generate(
-            captions, face_captions=face_captions, sounds=sounds, seconds=seconds, seed=seed,
+            captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
             sampling=sampling, strict=True,
         )  # fmt: skip
 

@@ -16,13 +16,8 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
 
-_OPTIONS = {
-    "face_cfg_scale": "--face-cfg",
-    "music_cfg_scale": "--music-cfg",
-    "sampler": "--sampler",
-    "denoising_steps": "--steps",
-}
-"""Settings that some generators take, and how the command line calls them."""
+_OPTIONS = ("face_cfg_scale", "music_cfg_scale", "sampler", "denoising_steps")
+"""Settings that some generators take; the command line calls them by the same words."""
 
 
 def caption_list(given: Iterable[str], name: str = "captions") -> list[str]:
@@ -111,7 +106,7 @@ def require_used(model: _Chooses, face_captions: Iterable[str] | None, sampling:
         if face_captions is not None:
             raise UserError("this model makes no face: leave the face captions (--face) out")
         if sampling.face_cfg_scale is not None:
-            raise UserError("this model makes no face: leave face_cfg_scale (--face-cfg) out")
+            raise UserError("this model makes no face: leave face_cfg_scale (--face-cfg-scale) out")
     used = model.generator.settings | (model.of(face).settings if face is not None else frozenset())
     unused = [
         name
@@ -119,7 +114,7 @@ def require_used(model: _Chooses, face_captions: Iterable[str] | None, sampling:
         if name in sampling.model_fields_set and getattr(sampling, name) is not None and name not in used
     ]
     if unused:
-        named = " and ".join(f"{name} ({_OPTIONS[name]})" for name in unused)
+        named = " and ".join(f"{name} (--{name.replace('_', '-')})" for name in unused)
         takers = [m for m, s in model.faces.items() if set(unused) <= model.of(s).settings]
         fix = f"choose --face-model {takers[0]}, or leave it out" if takers else "leave it out"
         raise UserError(f"{named}: no generator that is used here takes it; {fix}")

@@ -21,6 +21,7 @@ from typing import Any, Literal, cast
 from pydantic import Field
 
 from motionloom.datasets.base.files import write_json
+from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.schema import Config, Manifest, UserError
@@ -87,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
     except UserError as error:
         message = str(error)
     except Exception as error:  # the one who waits sees the result, not this process's output
-        message = f"{type(error).__name__}: {error}"
+        message = sentence_of(error) or f"{type(error).__name__}: {error}"
         traceback.print_exc()
     print(f"{step} {index + 1} of {count}: {message}", flush=True)
     result = JobResult(ok=ok, message=message, seconds=time.monotonic() - start, host=platform.node())

@@ -5,8 +5,10 @@ The global batch belongs to the stage's config, so one process, eight GPUs or tw
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -16,6 +18,10 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.launch.process import local_rank
 
 LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow", "trackio"]
+
+
+EXTRA_LOGGERS: dict[str, str] = {"wandb": "wandb", "mlflow": "mlflow", "trackio": "trackio"}
+"""Loggers that need a package of their own, and that package."""
 
 
 class Hardware(Config):
@@ -96,6 +102,16 @@ class Hardware(Config):
                 f" x {threads} thread{'s' if threads > 1 else ''}"
             )
         return where + (f", {nodes} nodes" if nodes > 1 else "")
+
+
+def require_loggers(names: Sequence[LoggerName]) -> None:
+    """Refuse, before anything runs, loggers whose package is not installed."""
+    for name in names:
+        package = EXTRA_LOGGERS.get(name)
+        if package is not None and importlib.util.find_spec(package) is None:
+            raise UserError(
+                f"hardware.loggers names {name}, which is not installed: pip install 'motionloom[{name}]'"
+            )
 
 
 def usable_cores() -> int:

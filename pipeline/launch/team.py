@@ -10,17 +10,16 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from datetime import timedelta
+from typing import TYPE_CHECKING
 
 import torch.distributed as dist
-from lightning.fabric import Fabric
-from lightning.fabric.plugins.environments.cluster_environment import ClusterEnvironment
-from lightning.fabric.plugins.environments.lightning import LightningEnvironment
-from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
-from lightning.fabric.strategies.ddp import DDPStrategy
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError, srun_tasks
+
+if TYPE_CHECKING:
+    from lightning.fabric.plugins.environments.cluster_environment import ClusterEnvironment
 
 _PATIENCE = timedelta(days=30)
 """How long the others wait for a stage that only the lead runs; a dead lead ends the wait at once."""
@@ -38,6 +37,9 @@ class Team:
     @staticmethod
     def start(hardware: Hardware) -> Team:
         """Launch the other processes, or join them where a launcher has; returns when all are here."""
+        from lightning.fabric import Fabric
+        from lightning.fabric.strategies.ddp import DDPStrategy
+
         _require_match(hardware)
         if hardware.world() == 1:
             return Team()
@@ -75,6 +77,9 @@ def environment() -> ClusterEnvironment | None:
     requeueing is off: its checkpoint in the current folder would be taken up by any stage that trains there
     next. Runs resume by themselves.
     """
+    from lightning.fabric.plugins.environments.lightning import LightningEnvironment
+    from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+
     if "RANK" in os.environ or "SLURM_NTASKS" not in os.environ:
         return None
     return SLURMEnvironment(auto_requeue=False) if srun_tasks() > 1 else LightningEnvironment()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -72,8 +73,37 @@ def write_mp4(
                     writer.send(frame.tobytes())
                     if progress is not None:
                         progress(done, len(joints))
+        except OSError as error:
+            if error.errno is not None:
+                raise
+            raise UserError(_unfinished(path, str(error))) from None  # ffmpeg has ended before us
         finally:
             wav.unlink(missing_ok=True)
+        if not _is_whole(temporary):
+            raise UserError(_unfinished(path, "its file is cut short"))
+
+
+def _unfinished(path: Path, why: str) -> str:
+    reason = (why.strip().splitlines() or ["no reason given"])[0]
+    return f"{path}: ffmpeg could not write the film ({reason}); is the disk full? No film is left there"
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether the boxes of an MP4 file, its index among them, fill it to the end; ffmpeg's own exit code is
+    not passed on to us.
+    """
+    names, at, size = set(), 0, path.stat().st_size
+    with path.open("rb") as file:
+        while at + 8 <= size:
+            file.seek(at)
+            length, name = struct.unpack(">I4s", file.read(8))
+            if length == 1:
+                length = struct.unpack(">Q", file.read(8))[0]
+            if length < 8:
+                return False
+            names.add(name)
+            at += length
+    return at == size and {b"moov", b"mdat"} <= names
 
 
 def render_frames(

@@ -13,16 +13,14 @@ from typing import Any, get_args
 from rich.console import Console
 from rich.markup import escape
 
+from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages, preview_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, Shelf, Stage, StageContext
 from motionloom.pipeline.contract.units import WORK
-from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.outputs import Format, write_motions
-from motionloom.pipeline.inference.pretrained import write_bundle
+from motionloom.pipeline.inference.formats import Format
 from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
-from motionloom.pipeline.inference.script import Script, read_music
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.launch.team import Team
@@ -40,7 +38,7 @@ from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.replace import replaced_stages, require_asked, say_replaced, started_trainings
 from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
-from motionloom.pipeline.store.files import remove_tree, require_file_place, require_folder
+from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.outside import owner_of
 from motionloom.pipeline.store.run_folder import require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, StageState, run_state
@@ -128,7 +126,7 @@ def generate_motions(
     folder: Path,
     captions: Sequence[str] = (),
     *,
-    face_captions: Sequence[str] | None = None,
+    face: Sequence[str] | None = None,
     audio: Sequence[Path] = (),
     script: Path | None = None,
     samples: int = 1,
@@ -145,9 +143,13 @@ def generate_motions(
     From captions, sound files, or both side by side (the first caption with the first file, and so on), or
     from one script. `samples` motions of each.
     """
+    from motionloom.pipeline.inference.bundle import Bundle
+    from motionloom.pipeline.inference.outputs import write_motions
+    from motionloom.pipeline.inference.script import Script, read_music
+
     if not captions and not audio and script is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
-    if script is not None and (captions or audio or seconds is not None or face_captions):
+    if script is not None and (captions or audio or seconds is not None or face):
         raise UserError("--script says everything: leave captions, --face, --audio and --seconds out")
     if samples < 1:
         raise UserError(f"--samples {samples}: take 1 or more")
@@ -170,7 +172,7 @@ def generate_motions(
     else:
         motions = bundle.generate(
             [text for text in captions for _ in range(samples)] or None,
-            face_captions=face_captions and [text for text in face_captions for _ in range(samples)],
+            face=face and [text for text in face for _ in range(samples)],
             sounds=[sound for sound in sounds for _ in range(samples)] or None,
             seconds=seconds,
             seed=seed,
@@ -308,8 +310,8 @@ def report_run(
     if missing := [stage for stage in state.unfinished if stage.kind != "report"]:
         console.print(f"not finished: {', '.join(f'{stage.name} ({stage.say()})' for stage in missing)}")
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(page, out)
+        with atomic_path(out) as whole:
+            shutil.copyfile(page, whole)
         page = out
     console.print(str(page.resolve()), soft_wrap=True)
     return page
@@ -317,11 +319,14 @@ def report_run(
 
 def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Path:
     """Copy what generation needs into one folder."""
+    from motionloom.pipeline.inference.pretrained import write_bundle
+
     console = console or make_console()
     require_folder(out)
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
-    write_bundle(folder, out)
+    with new_folder(out.absolute()) as whole:
+        write_bundle(folder, whole)
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     console.print(
         f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"', soft_wrap=True

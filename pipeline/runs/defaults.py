@@ -19,7 +19,7 @@ from motionloom.pipeline.contract.registry import stage_kinds
 from motionloom.pipeline.contract.stage import StageConfig
 from motionloom.pipeline.runs.layers import merge
 from motionloom.pipeline.runs.shipped import nearest
-from motionloom.pipeline.stages.training import TrainedStageConfig
+from motionloom.pipeline.stages.train_config import TrainedStageConfig
 
 TRAINED = "trained"
 """The defaults of every stage that trains."""

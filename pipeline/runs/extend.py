@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from motionloom.pipeline.contract.stage import Stage
-from motionloom.pipeline.stages.training import TrainedStageConfig
+from motionloom.pipeline.stages.train_config import TrainedStageConfig
 from motionloom.pipeline.store.files import fingerprint_of
 
 

@@ -12,7 +12,7 @@ from motionloom.pipeline.contract.registry import stage_kinds
 from motionloom.pipeline.contract.stage import Every, StageConfig, StageKind
 from motionloom.pipeline.runs.defaults import TRAINED
 from motionloom.pipeline.runs.recipe import RecipeFile
-from motionloom.pipeline.stages.training import TrainedStageConfig
+from motionloom.pipeline.stages.train_config import TrainedStageConfig
 
 
 def recipe_schema() -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from torch import nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
@@ -22,11 +21,14 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given
 from motionloom.pipeline.stages.examples import caption_example
 from motionloom.pipeline.stages.tma import caption_batches, part_columns
+from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+
+if TYPE_CHECKING:
+    from motionloom.models.diffusion.module import DiffusionModule
 
 
 class DiffusionStageConfig(TrainedStageConfig):
@@ -78,6 +80,8 @@ class DiffusionStage(TrainedStage):
 
     def module(self, config: DiffusionStageConfig, net: Any, given: Given, seed: int) -> DiffusionModule:
         """Squared error at a random time step."""
+        from motionloom.models.diffusion.module import DiffusionModule
+
         return DiffusionModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
     def batches(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from pydantic import Field
@@ -12,16 +12,18 @@ from torch import nn
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
-from motionloom.models.diffusion.dmd_module import DmdModule
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Given
 from motionloom.pipeline.stages.streams import require_streams, stream_facts
+from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.windows import window_batches
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+
+if TYPE_CHECKING:
+    from motionloom.models.diffusion.dmd_module import DmdModule
 
 
 class DmdStageConfig(TrainedStageConfig):
@@ -81,6 +83,8 @@ class DmdStage(TrainedStage):
 
     def module(self, config: DmdStageConfig, net: Any, given: Given, seed: int) -> DmdModule:
         """Squared error of the noise."""
+        from motionloom.models.diffusion.dmd_module import DmdModule
+
         return DmdModule(
             net, config.optim, seed=seed, max_steps=config.train.steps, tokenizer=given["tokenizer"].net
         )

@@ -221,7 +221,7 @@ class EvaluationUnits:
         recorded = [len(t.features) / fps for t in truths]
         motions = self.bundle.generate(
             [t.caption for t in truths],
-            face_captions=[t.face_caption for t in truths],
+            face=[t.face_caption for t in truths],
             seconds=recorded if self.config.lengths == "recorded" else None,
             seed=self.context.seed + 7919 * (repeat + 1) + piece.start,
             sampling=self.config.sampling,

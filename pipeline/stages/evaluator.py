@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from pydantic import Field, model_validator
 from torch import nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.evaluator.losses import EvaluatorLossConfig
-from motionloom.models.evaluator.module import MATCHING, MOVEMENT, EvaluatorModule
+from motionloom.models.evaluator.losses import MATCHING, MOVEMENT, EvaluatorLossConfig
 from motionloom.models.evaluator.network import PART, UNIT, Evaluator, EvaluatorConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Given
 from motionloom.pipeline.stages.examples import caption_example
 from motionloom.pipeline.stages.tma import caption_batches
+from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.evaluator import LoadedEvaluator, StageWords
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+
+if TYPE_CHECKING:
+    from motionloom.models.evaluator.module import EvaluatorModule
 
 
 class EvaluatorStageConfig(TrainedStageConfig):
@@ -89,6 +91,8 @@ class EvaluatorStage(TrainedStage):
 
     def module(self, config: EvaluatorStageConfig, net: Any, given: Given, seed: int) -> EvaluatorModule:
         """The autoencoder, then the pairs."""
+        from motionloom.models.evaluator.module import EvaluatorModule
+
         return EvaluatorModule(
             net,
             config.optim,

@@ -13,7 +13,7 @@ from motionloom.pipeline.evaluation.dances import DanceClip, dances_of, with_mus
 from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
 from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
-from motionloom.pipeline.inference.outputs import FORMATS, Format, write_motions
+from motionloom.pipeline.inference.formats import FORMATS, Format
 from motionloom.pipeline.render.score import Score
 
 
@@ -47,6 +47,8 @@ class GenerateStage(StageKind):
 
     def run(self, context: StageContext) -> None:
         """Generate, decode and write."""
+        from motionloom.pipeline.inference.outputs import write_motions
+
         config: GenerateConfig = context.config
         said, danced = _performed(context), _danced(context)
         if not said and not danced:
@@ -84,7 +86,7 @@ def _performed(context: StageContext) -> list[GeneratedMotion]:
         raise UserError(f"stage '{context.name}': captions are given and no generator is conditioned on text")
     if not captions:
         return []
-    return bundle.generate(captions, face_captions=faces, seed=context.seed, sampling=config.sampling)
+    return bundle.generate(captions, face=faces, seed=context.seed, sampling=config.sampling)
 
 
 def _danced(context: StageContext) -> list[tuple[GeneratedMotion, DanceClip]]:

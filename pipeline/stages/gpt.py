@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.sampling import generate
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
@@ -26,13 +26,16 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
 from motionloom.pipeline.stages.same_text import same_encoder
 from motionloom.pipeline.stages.streams import require_streams, stream_facts
+from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer, device_of
 from motionloom.pipeline.store.outside import is_place
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import TokenBatches
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+
+if TYPE_CHECKING:
+    from motionloom.models.gpt.module import GptModule
 
 Prior = Literal["tma", "sentence"]
 
@@ -121,6 +124,8 @@ class GptStage(TrainedStage):
 
     def module(self, config: GptStageConfig, net: Any, given: Given, seed: int) -> GptModule:
         """Cross-entropy, and L_align on what the frozen tokenizer and TMA make of its tokens."""
+        from motionloom.models.gpt.module import GptModule
+
         return GptModule(
             net,
             config.optim,

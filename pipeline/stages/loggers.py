@@ -7,7 +7,6 @@ drop what lies behind it. Those with a server cannot take rows back, so they get
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import uuid
 from collections.abc import Callable, Sequence
@@ -18,24 +17,11 @@ from lightning.fabric.loggers.logger import rank_zero_experiment
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers.logger import Logger
 
-from motionloom.datasets.schema import UserError
-from motionloom.pipeline.launch.hardware import LoggerName
+from motionloom.pipeline.launch.hardware import EXTRA_LOGGERS, LoggerName
 from motionloom.pipeline.store.files import write_json
 
 FOLDER = "logs"
 """Of a stage's folder; no result depends on it."""
-_EXTRAS: dict[str, str] = {"wandb": "wandb", "mlflow": "mlflow", "trackio": "trackio"}
-"""Loggers that need a package of their own, and that package."""
-
-
-def require_loggers(names: Sequence[LoggerName]) -> None:
-    """Refuse, before anything runs, loggers whose package is not installed."""
-    for name in names:
-        package = _EXTRAS.get(name)
-        if package is not None and importlib.util.find_spec(package) is None:
-            raise UserError(
-                f"hardware.loggers names {name}, which is not installed: pip install 'motionloom[{name}]'"
-            )
 
 
 class Loggers:
@@ -52,7 +38,7 @@ class Loggers:
         """Begin behind step `step`, with the rows up to it."""
         for name in self.names:
             logger = _MAKERS[name](self, step)
-            (self._servers if name in _EXTRAS else self._files).append(logger)
+            (self._servers if name in EXTRA_LOGGERS else self._files).append(logger)
             if name == "csv":
                 for row in rows:
                     _log(logger, row)

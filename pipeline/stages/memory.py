@@ -22,7 +22,8 @@ from motionloom.models.training.players import PlayersModule
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.training import TrainConfig, prepare_module
+from motionloom.pipeline.stages.train_config import TrainConfig
+from motionloom.pipeline.stages.training import prepare_module
 
 _BYTES_A_PARAMETER = 16
 """Weight, gradient and two moments in float32."""

@@ -157,7 +157,7 @@ def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion
     if bundle is not None:
         generated = bundle.generate(
             [t.caption for t in truths],
-            face_captions=[t.face_caption for t in truths],
+            face=[t.face_caption for t in truths],
             seed=context.seed,
             sampling=config.sampling,
         )

@@ -5,7 +5,7 @@ B.5.1, D).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -17,17 +17,20 @@ from torch.utils.data import Dataset
 from motionloom.datasets.loading.batches import CaptionBatches, EvalBatches
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.tma.module import TmaLossConfig, TmaModule
+from motionloom.models.tma.losses import TmaLossConfig
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import ALIGNMENT, FACE_ALIGNMENT, GENERATOR, Finished, Given
 from motionloom.pipeline.stages.examples import caption_example
+from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.networks import LoadedTma
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+
+if TYPE_CHECKING:
+    from motionloom.models.tma.module import TmaModule
 
 
 class TmaStageConfig(TrainedStageConfig):
@@ -104,6 +107,8 @@ class TmaStage(TrainedStage):
 
     def module(self, config: TmaStageConfig, net: Any, given: Given, seed: int) -> TmaModule:
         """Reconstruction, KL, latents and InfoNCE."""
+        from motionloom.models.tma.module import TmaModule
+
         return TmaModule(net, config.optim, seed=seed, max_steps=config.train.steps, loss=config.loss)
 
     def batches(self, config: TmaStageConfig, net: nn.Module, given: Given, seed: int, say: Say) -> Batches:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from pydantic import Field
@@ -22,15 +22,17 @@ from motionloom.models.tokenizer.config import (
     VqConfig,
     parse_tokenizer,
 )
-from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Given
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.windows import window_batches
 from motionloom.pipeline.store.networks import TrainedTokenizer
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+
+if TYPE_CHECKING:
+    from motionloom.models.tokenizer.module import TokenizerModule
 
 
 class TokenizerStageConfig(TrainedStageConfig):
@@ -128,6 +130,8 @@ class TokenizerStage(TrainedStage):
 
     def module(self, config: TokenizerStageConfig, net: Any, given: Given, seed: int) -> TokenizerModule:
         """Reconstruction and commitment."""
+        from motionloom.models.tokenizer.module import TokenizerModule
+
         steps = config.train.steps
         return TokenizerModule(net, config.optim, seed=seed, max_steps=steps, **config.net.loss_terms())
 

@@ -10,19 +10,20 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
 
-from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.contract.stage import SHOWING, Finished, Given, StageContext, StageKind
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.memory import model_card
-from motionloom.pipeline.stages.training import BatchSource, EvalSource, TrainedStageConfig, fit
+from motionloom.pipeline.stages.train_config import BatchSource, EvalSource, TrainedStageConfig
 from motionloom.pipeline.store.files import copy_files
 from motionloom.pipeline.store.weights import MODEL_FILES, ModelFacts, load_facts, load_weights, save_model
+
+if TYPE_CHECKING:
+    from motionloom.models.training.stage_module import StageModule
 
 Say = Callable[[str], None]
 """Tells the person at the terminal one line."""
@@ -88,6 +89,8 @@ class TrainedStage(StageKind):
 
     def run(self, context: StageContext) -> None:
         """Train, and write weights and facts."""
+        from motionloom.pipeline.stages.training import fit
+
         config, given = context.config, context.given
         facts = self.facts(config, given)
         seed = context.seed if config.train.seed is None else config.train.seed
@@ -124,6 +127,8 @@ class TrainedStage(StageKind):
 
     def estimate(self, config: Any, given: Given, hardware: Hardware) -> ModelCard:
         """Parameters and memory of one training process, from the code that will run, on fake tensors."""
+        from motionloom.pipeline.stages.memory import model_card
+
         size = config.train.local_batch(hardware.world())
 
         def make() -> tuple[StageModule, Example]:

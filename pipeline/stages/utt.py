@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from pydantic import Field
@@ -19,15 +19,18 @@ from motionloom.models.condition.mate import MateConfig
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.utt.conditioned import ConditionedUtt
-from motionloom.models.utt.module import UttLossConfig, UttModule
+from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.network import UttConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Given, Stage
 from motionloom.pipeline.stages.examples import text_example
 from motionloom.pipeline.stages.streams import require_streams, stream_facts
+from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+
+if TYPE_CHECKING:
+    from motionloom.models.utt.module import UttModule
 
 ModalityName = Literal["text", "audio"]
 
@@ -114,6 +117,8 @@ class UttStage(TrainedStage):
 
     def module(self, config: UttStageConfig, net: Any, given: Given, seed: int) -> UttModule:
         """Cross-entropy, and what the discriminator says of the decoded motion."""
+        from motionloom.models.utt.module import UttModule
+
         groups = config.max_frames // GROUP_FRAMES
         if groups > net.utt.max_groups:
             raise UserError(

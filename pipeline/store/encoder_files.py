@@ -7,11 +7,9 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from huggingface_hub import snapshot_download
-
+from motionloom.datasets.base.places import hub_is_away
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo
-from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.store.files import remove_tree, write_json
 
 BUILT_IN = "minilm"
@@ -47,6 +45,8 @@ def copy_encoder(spec: str, stage: Path, target: Path) -> None:
 
     The copy is loaded once: it must have the weights that encoded the run's captions.
     """
+    from motionloom.datasets.text.encoder import load_text_encoder
+
     digest = CacheInfo.load_json(stage / "cache" / "cache.json").encoder.rpartition(":")[2]
     problem = ""
     for find in _sources(spec):
@@ -66,12 +66,17 @@ def copy_encoder(spec: str, stage: Path, target: Path) -> None:
 
 def _sources(spec: str) -> list[Callable[[], Path]]:
     """Ways to a folder that holds the encoder, in the order to be tried."""
+    from huggingface_hub import snapshot_download
+
     folder = Path(spec).expanduser()
     if folder.is_dir() or folder.is_absolute():
         return [lambda: folder]
     patterns = [f"*{suffix}" for suffix in _SUFFIXES]
-    fetch = partial(snapshot_download, spec, allow_patterns=patterns)
-    return [lambda: Path(fetch(local_files_only=True)), lambda: Path(fetch())]
+
+    def fetched(only_cached: bool) -> Path:
+        return Path(snapshot_download(spec, allow_patterns=patterns, local_files_only=only_cached))
+
+    return [partial(fetched, only_cached) for only_cached in ((True,) if hub_is_away() else (True, False))]
 
 
 def copy_encoder_files(source: Path, target: Path) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import secrets
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +50,23 @@ def remove_tree(folder: Path) -> None:
     if folder.exists():
         folder.rename(doomed)
         shutil.rmtree(doomed)
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """A folder to fill; it becomes `folder`, which is absent or empty before, when the block ends whole."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.tmp")
+    try:
+        temporary.mkdir()
+        yield temporary
+        temporary.rename(folder)
+    except OSError as error:
+        if str(error.filename).startswith(str(temporary)):
+            error.filename = str(error.filename).replace(str(temporary), str(folder), 1)
+        raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def copy_files(source: Path, target: Path, names: Iterable[str]) -> None:

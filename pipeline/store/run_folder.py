@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.base.places import no_such_folder
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.yaml import read_yaml
 
@@ -34,4 +35,6 @@ def require_run(folder: Path) -> None:
             f"{folder}: an exported folder, which generates and holds nothing else; name the run folder "
             f"(runs/NAME) that it was made from"
         )
+    if not folder.exists():
+        raise UserError(no_such_folder(folder))
     raise UserError(f"{folder}: not a run folder (no recipe.yaml)")

@@ -30,8 +30,8 @@ from motionloom.pipeline.contract.generation import GenerationRequest, MotionGen
 from motionloom.pipeline.contract.registry import register
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given
+from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
-from motionloom.pipeline.stages.training import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
 PART: Part = "bodyhand"

@@ -16,7 +16,8 @@ from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
 from motionloom.pipeline.contract.stage import Shelf, StageContext
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.training import TrainConfig, fit
+from motionloom.pipeline.stages.train_config import TrainConfig
+from motionloom.pipeline.stages.training import fit
 
 DIM = 6
 GENERATOR = OptimConfig(optimizer="adam", lr=1e-2, grad_clip=0.3, warmup_steps=3)

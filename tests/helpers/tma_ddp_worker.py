@@ -14,9 +14,11 @@ from torch.nn.parallel import DistributedDataParallel
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.tma.module import TmaLossConfig, TmaModule
+from motionloom.models.tma.losses import TmaLossConfig
+from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig

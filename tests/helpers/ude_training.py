@@ -29,11 +29,13 @@ from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule
 from motionloom.models.utt.conditioned import ConditionedUtt
-from motionloom.models.utt.module import UttLossConfig, UttModule
+from motionloom.models.utt.losses import UttLossConfig
+from motionloom.models.utt.module import UttModule
 from motionloom.models.utt.network import UttConfig
 from motionloom.pipeline.contract.stage import CPU, Shelf, StageContext
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.training import TrainConfig, fit
+from motionloom.pipeline.stages.train_config import TrainConfig
+from motionloom.pipeline.stages.training import fit
 
 LAYOUT = MotionLayout.named("smpl75")
 MQ = MqConfig(width=8, depth=1, code_dim=8, num_codes=9, quantizer="gradient", start="data")

@@ -17,11 +17,9 @@ from __future__ import annotations
 
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import roma
-import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_features
@@ -46,6 +44,9 @@ from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.sample import Sample
+
+if TYPE_CHECKING:
+    import torch
 
 __all__ = ["AistppConfig", "canonical_smpl75", "convert_clip", "plan_aistpp", "prepare_aistpp"]
 
@@ -139,6 +140,9 @@ def canonical_smpl75(
     `poses` [T, 24, 3] radians and `trans` [T, 3] metres at `fps_in`. `smpl_joints` of the result with the
     same body gives joints with the floor at 0, the first root above the origin and the first heading +Z.
     """
+    import roma
+    import torch
+
     turns = roma.rotvec_to_unitquat(torch.from_numpy(np.asarray(poses, dtype=np.float64))).numpy()
     turns = torch.from_numpy(resample_quaternions(turns, fps_in, fps_out))
     trans = resample(np.asarray(trans, dtype=np.float64), fps_in, fps_out)
@@ -153,6 +157,8 @@ def canonical_smpl75(
 
 def _rotvecs(turns: torch.Tensor) -> NDArray[np.float64]:
     """Unit quaternions [..., 4] -> axis-angle [..., 3] of at most pi."""
+    import roma
+
     return np.asarray(roma.unitquat_to_rotvec(turns, shortest_arc=True).numpy(), dtype=np.float64)
 
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-import roma
-import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.canonical import resample, resample_quaternions
@@ -68,6 +66,9 @@ def scale_aist(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def z_up_to_y_up(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """The same motion with Y up, as Motion-X's scripts turn their Z-up sources: (x, y, z) -> (x, z, -y)."""
+    import roma
+    import torch
+
     turn = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
     out = values.copy()
     root = roma.rotvec_to_rotmat(torch.from_numpy(np.ascontiguousarray(values[:, ROOT])))
@@ -106,6 +107,9 @@ def stretch(values: NDArray[Any], frames: int) -> NDArray[np.float64]:
 
 def resample_parameters(values: NDArray[np.float64], fps_in: float, fps_out: float) -> NDArray[np.float64]:
     """[T, 322] at another rate: rotations along the shorter arc, everything else linearly."""
+    import roma
+    import torch
+
     if fps_in == fps_out:
         return values
     out = resample(values, fps_in, fps_out)

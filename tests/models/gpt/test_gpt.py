@@ -7,8 +7,8 @@ import torch
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.losses import corrupt, cross_entropy, soft_codes
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig, corrupt, cross_entropy, soft_codes
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave
 from motionloom.models.tma.network import Tma, TmaConfig

@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.samples import Samples, log_likelihood, policy_loss, rewards, sample
 from motionloom.models.gpt.tokens import interleave

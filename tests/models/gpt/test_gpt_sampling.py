@@ -7,7 +7,8 @@ import torch
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import draw, filter_logits, sample_seeds
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.tokens import interleave

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
 from motionloom.datasets.conditions import Condition
-from motionloom.models.gpt.module import GptLossConfig
+from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.losses import (
+    TmaLossConfig,
     false_negatives,
     info_nce,
     kl_divergence,
@@ -26,7 +27,7 @@ from motionloom.models.tma.losses import (
     latent_loss,
     reconstruction_loss,
 )
-from motionloom.models.tma.module import TmaLossConfig, TmaModule
+from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.training.stage_module import OptimConfig
 

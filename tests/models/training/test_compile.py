@@ -12,7 +12,8 @@ from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.module import TmaModule

@@ -36,10 +36,12 @@ from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.tokens import interleave
-from motionloom.models.tma.module import TmaLossConfig, TmaModule
+from motionloom.models.tma.losses import TmaLossConfig
+from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import (

@@ -19,7 +19,8 @@ from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, MqConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.utt.conditioned import ConditionedUtt
-from motionloom.models.utt.module import UttLossConfig, UttModule, closed_sequences
+from motionloom.models.utt.losses import UttLossConfig
+from motionloom.models.utt.module import UttModule, closed_sequences
 from motionloom.models.utt.network import UttConfig
 
 # ---- sequences

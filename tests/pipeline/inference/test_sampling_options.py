@@ -164,19 +164,19 @@ def test_more_steps_than_were_trained_are_refused(sampler: Any) -> None:
 
 WRONG_ASKS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
     "one text": ((), {"captions": "wave"}, r"captions is one text; give a list, also of one: .*\['wave'\]"),
-    "one face text": ((), {"face_captions": "abc"}, r"face_captions is one text; .*\['abc'\]"),
+    "one face text": ((), {"face": "abc"}, r"face is one text; .*\['abc'\]"),
     "no text": ((), {"captions": ["a", 3, "b"]}, r"captions\[1\] = 3: not a text"),
     "empty": ((), {"captions": ["a", " ", "b"]}, r"captions\[1\] is empty"),
     "negative seed": ((), {"seed": -1}, "seed -1: a seed is a whole number"),
     "broken seed": ((), {"seed": 0.5}, "seed 0.5: a seed is a whole number"),
     "misspelt sampling": ((), {"sampling": {"topp": 0.9}}, "unknown key 'topp'; did you mean 'top_p'"),
     "no sampling": ((), {"sampling": 3}, "sampling: "),
-    "face of no face": ((), {"face_captions": CAPTIONS}, "this model makes no face"),
+    "face of no face": ((), {"face": CAPTIONS}, "this model makes no face"),
     "guidance of no face": ((), {"sampling": {"face_cfg_scale": 3.0}}, "this model makes no face"),
     "steps of no face": (
         (),
         {"sampling": {"denoising_steps": 9}},
-        r"\(--steps\): no generator that is used here takes it; leave it out",
+        r"\(--denoising-steps\): no generator that is used here takes it; leave it out",
     ),
     "sampler of a GPT": (("gpt",), {"sampling": {"sampler": "ddim"}}, r"\(--sampler\): .*; leave it out"),
     "steps beside a diffusion model": (
@@ -197,11 +197,13 @@ def test_what_has_no_sense_or_no_effect_is_refused(name: str) -> None:
 def test_a_face_by_a_vae_takes_no_guidance() -> None:
     model = bundle(faces=("vae",))
     require_used(model, CAPTIONS, SamplingConfig(cfg_scale=2.0))
-    with pytest.raises(UserError, match=r"\(--face-cfg\): no generator .* takes it; leave it out"):
+    with pytest.raises(UserError, match=r"\(--face-cfg-scale\): no generator .* takes it; leave it out"):
         require_used(model, CAPTIONS, SamplingConfig(face_cfg_scale=2.0))
     both = bundle(faces=("vae", "gpt"))
     assert list(both.faces) == ["gpt", "vae"]
-    with pytest.raises(UserError, match=r"\(--face-cfg\): .*; choose --face-model gpt, or leave it out"):
+    with pytest.raises(
+        UserError, match=r"\(--face-cfg-scale\): .*; choose --face-model gpt, or leave it out"
+    ):
         require_used(both, CAPTIONS, SamplingConfig(face_cfg_scale=2.0, face_model="vae"))
 
 
@@ -239,8 +241,19 @@ def test_the_commands_options_reach_the_sampling(
 ) -> None:
     seen: dict[str, Any] = {}
     monkeypatch.setattr("motionloom.pipeline.runs.api.Bundle.open", lambda *_: _Watching(seen))
-    words = ("--sampler", "dpm++", "--steps", "7", "--cfg", "3", "--face-cfg", "1.5", "--temperature", "0")
-    words += ("--music-cfg", "1.2")
+    words = (
+        "--sampler",
+        "dpm++",
+        "--denoising-steps",
+        "7",
+        "--cfg-scale",
+        "3",
+        "--face-cfg-scale",
+        "1.5",
+        "--temperature",
+        "0",
+    )
+    words += ("--music-cfg-scale", "1.2")
     assert call("generate", "somewhere", "a person walks", *words, "-o", tmp_path, "-f", "npz").code == 0
     assert seen["sampling"] == SamplingConfig(
         sampler="dpm++", denoising_steps=7, cfg_scale=3, face_cfg_scale=1.5, music_cfg_scale=1.2,

@@ -180,7 +180,7 @@ def test_a_script_says_everything(write: Write, tmp_path: Path) -> None:
         {"captions": ["a person bows"]},
         {"audio": [tmp_path / "song.wav"]},
         {"seconds": 3.0},
-        {"face_captions": ["a happy face"]},
+        {"face": ["a happy face"]},
     ]
     for given in options:
         with pytest.raises(UserError, match="--script says everything: leave captions"):

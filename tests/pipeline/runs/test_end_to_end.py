@@ -217,7 +217,7 @@ def test_from_pretrained_needs_the_saved_folder_alone(
     text = "".join(p.read_text() for p in (tmp_path / "saved").rglob("*") if p.suffix in (".json", ".md"))
     assert str(copy) not in text
     model = MotionModel.from_pretrained(tmp_path / "saved")
-    made = model.generate([WAVE[0]], face_captions=[WAVE[2]], seconds=2.0, seed=5)[0]
+    made = model.generate([WAVE[0]], face=[WAVE[2]], seconds=2.0, seed=5)[0]
     first = arrays(only(motions, ".npz"))
     np.testing.assert_array_equal(made.joints.astype(np.float32), first["joints"].astype(np.float32))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")

@@ -19,7 +19,8 @@ from motionloom.pipeline.contract.stage import FunctionStage, StageConfig, Stage
 from motionloom.pipeline.runs.graph import execute, make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.replace import replaced_stages, started_trainings
-from motionloom.pipeline.stages.training import TrainedStageConfig, fit
+from motionloom.pipeline.stages.train_config import TrainedStageConfig
+from motionloom.pipeline.stages.training import fit
 from motionloom.pipeline.store.artifact import Artifact
 
 

@@ -24,7 +24,8 @@ from two_ranks import run_two_ranks
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.module import GptLossConfig, GptModule
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.network import Tma, TmaConfig
@@ -36,7 +37,8 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt import GptStageConfig
 from motionloom.pipeline.stages.tma import TmaStageConfig
 from motionloom.pipeline.stages.tokenizer import H2VQStageConfig
-from motionloom.pipeline.stages.training import TrainConfig, fit, read_metrics
+from motionloom.pipeline.stages.train_config import TrainConfig
+from motionloom.pipeline.stages.training import fit, read_metrics
 
 STEPS, BATCH = 8, 8
 CLIP = 0.5  # below the norms met here

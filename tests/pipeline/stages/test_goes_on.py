@@ -21,7 +21,8 @@ from two_ranks import run_two_ranks
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt import GptStageConfig
-from motionloom.pipeline.stages.training import TrainConfig, read_metrics, start_of
+from motionloom.pipeline.stages.train_config import TrainConfig
+from motionloom.pipeline.stages.training import read_metrics, start_of
 
 # A constant schedule for both: a cosine would depend on the number of steps.
 CONSTANT: dict[str, Any] = {"critic": Duel(seed=0, max_steps=1).optim_config}

@@ -1,0 +1,99 @@
+"""What the system refuses, in words: a full disk, no permission, a file in the way.
+
+Libraries pass such an error on in their own ways; `sentence_of` knows those of torch, safetensors and numpy.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+from collections.abc import Iterator
+
+_AGAIN = "what was finished is kept, and nothing half-written is left under a final name"
+
+_WORDS: dict[int, str] = {
+    errno.ENOSPC: f"the disk is full; free space and give the same command again: {_AGAIN}",
+    errno.EDQUOT: f"the disk quota is used up; free space and give the same command again: {_AGAIN}",
+    errno.EROFS: "lies on a read-only file system; choose another place",
+    errno.EACCES: "no permission; change the rights of the file or its folder, or choose another place",
+    errno.EPERM: "not permitted; change the rights of the file or its folder, or choose another place",
+    errno.ENOTDIR: "a file stands where a folder is needed; choose another name",
+    errno.EISDIR: "is a folder, and a file is needed; choose another name",
+    errno.EEXIST: "exists already; choose another name, or move it away",
+    errno.ENOTEMPTY: "is not empty; choose another name, or move it away",
+    errno.ENAMETOOLONG: "the name is too long for the file system; choose a shorter one",
+    errno.ENOENT: "no such file or folder",
+    errno.ELOOP: "its symbolic links go in a circle; name the file itself",
+    errno.EMFILE: f"too many open files; raise the limit (ulimit -n) or take fewer workers: {_AGAIN}",
+    errno.ENFILE: f"too many open files on this machine; close programs and try again: {_AGAIN}",
+    errno.EIO: f"the disk could not be read or written (input/output error); check it: {_AGAIN}",
+    errno.EFBIG: f"the file is larger than its file system or a limit (ulimit -f) allows: {_AGAIN}",
+    errno.ENOMEM: f"the machine is out of memory: {_AGAIN}",
+    errno.ENODEV: "there is no such device; choose another place",
+    errno.ENXIO: "there is no such device; choose another place",
+    errno.EBUSY: "is in use by another program; end that, or choose another place",
+    errno.ESTALE: f"its network file system has gone away; mount that again: {_AGAIN}",
+    errno.EINVAL: "the file system does not take this name or operation; choose another place",
+}
+
+_OF_THE_MACHINE = {
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.EIO,
+    errno.ENOMEM,
+    errno.EFBIG,
+}
+
+_RUST = re.compile(r"\(os error (\d+)\)")
+_NUMPY_SHORT = re.compile(r"\d+ requested and \d+ written")
+_TORCH = ("PytorchStreamWriter", "PytorchStreamReader", "inline_container")
+
+
+def of_the_machine(error: BaseException) -> bool:
+    """Whether an error says that the machine is at its limits, whatever file was read or written."""
+    return isinstance(error, OSError) and error.errno in _OF_THE_MACHINE
+
+
+def sentence_of(error: BaseException) -> str | None:
+    """One sentence for an error of the system: the file, what happened and what to do.
+
+    None for all others, which are mistakes in a program. An error that a library has wrapped is found through
+    what it was raised from.
+    """
+    if isinstance(error, OSError):
+        if error.errno in _WORDS:
+            return _named(error, _WORDS[error.errno])
+        if error.errno is not None and error.filename is not None:
+            return _named(error, (error.strerror or os.strerror(error.errno)).lower())
+    text = str(error)
+    rust = _RUST.search(text)
+    if rust is not None and int(rust[1]) in _WORDS:  # safetensors
+        return _WORDS[int(rust[1])]
+    if isinstance(error, OSError) and _NUMPY_SHORT.search(text):
+        return _named(error, f"could not be written to its end, most likely {_WORDS[errno.ENOSPC]}")
+    if isinstance(error, RuntimeError) and any(name in text for name in _TORCH):
+        found = next((words for cause in _causes(error) if (words := sentence_of(cause))), None)
+        what = text.strip().splitlines()[0]
+        return found or f"torch could not read or write a file ({what}); is the disk full? {_AGAIN}"
+    return None
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """What an error was raised from or while handling, nearest first."""
+    seen = {id(error)}
+    cause = error.__cause__ or error.__context__
+    while cause is not None and id(cause) not in seen:
+        seen.add(id(cause))
+        yield cause
+        cause = cause.__cause__ or cause.__context__
+
+
+def _named(error: OSError, words: str) -> str:
+    """`words` behind the name of the file, where the error has one."""
+    name = error.filename
+    if name is None or isinstance(name, int):
+        return words
+    return f"{os.fsdecode(name) if isinstance(name, bytes) else name}: {words}"

@@ -1,0 +1,8 @@
+"""The files that a motion can be written as."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Format = Literal["npz", "bvh", "mp4", "html"]
+FORMATS: tuple[Format, ...] = ("npz", "bvh", "mp4", "html")

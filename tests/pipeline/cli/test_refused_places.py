@@ -1,0 +1,118 @@
+"""Every command that writes, where it cannot: a file in the way, and a disk that takes no more.
+
+The second is real: with a limit on the size of files the system refuses what goes beyond, in the middle of a
+write and for root too.
+"""
+
+from __future__ import annotations
+
+import resource
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bvh_clips import write_clip, write_map
+
+Call = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def places(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished run, its shards and a BVH source, all free to change."""
+    root = tmp_path_factory.mktemp("places")
+    shutil.copytree(small_run.folder, root / "run")
+    shutil.copy(small_run.recipe, root / "small.yaml")
+    shutil.copytree(small_run.folder / "stages" / "data" / "shards", root / "shards")
+    (root / "mocap").mkdir()
+    for seed, name in enumerate("ab"):
+        write_clip(root / "mocap" / f"{name}.bvh", seed)
+    write_map(root / "map.json")
+    return root
+
+
+@contextmanager
+def no_room(size: int) -> Iterator[None]:
+    """Files may grow to `size` bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+WRITING: dict[str, Sequence[str]] = {
+    "run": ("run", "{root}/small.yaml", "--out", "{out}", "--until", "data"),
+    "generate": ("generate", "{root}/run", "a person waves", "--seconds", "2", "--out", "{out}"),
+    "generate-mp4": (
+        "generate", "{root}/run", "a person waves", "--seconds", "2", "--format", "mp4", "--out", "{out}",
+    ),
+    "evaluate": ("evaluate", "{root}/run", "--clips", "4"),
+    "report": ("report", "{root}/run", "--out", "{out}/page.html"),
+    "compare": ("compare", "{root}/run", "{root}/run/../run", "--out", "{out}/page.html"),
+    "table": ("evaluate", "--table", "humantomato/7", "{root}/run", "--out", "{out}/seven.md"),
+    "export": ("export", "{root}/run", "--out", "{out}"),
+    "data synth": ("data", "synth", "{out}", "--clips", "3", "--workers", "1"),
+    "data convert": (
+        "data", "convert", "bvh", "{root}/mocap", "{out}", "--joint-map", "{root}/map.json", "--licence", "x",
+        "--workers", "1",
+    ),
+    "data report": ("data", "report", "{root}/shards", "--out", "{out}/page.html"),
+    "data stats": ("data", "stats", "{root}/shards", "--out", "{out}/stats.safetensors"),
+}  # fmt: skip
+
+
+def words_of(name: str, root: Path, out: Path) -> list[str]:
+    return [word.format(root=root, out=out) for word in WRITING[name]]
+
+
+def files_of(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if path.is_file() and path.name != ".lock"}
+
+
+def require_sentence(answer: Any) -> str:
+    assert answer.code == 2, answer.out + answer.err
+    assert answer.err.startswith("error: ") and "Traceback" not in answer.err
+    assert "Errno" not in answer.err and ".tmp" not in answer.err
+    return str(answer.err)
+
+
+@pytest.mark.parametrize("name", sorted(set(WRITING) - {"evaluate"}))
+def test_a_file_in_the_way(name: str, places: Path, tmp_path: Path, call: Call) -> None:
+    (tmp_path / "file").write_text("here")
+    error = require_sentence(call(*words_of(name, places, tmp_path / "file" / "below")))
+    assert str(tmp_path / "file") in error
+    assert files_of(tmp_path) == {tmp_path / "file"}
+
+
+@pytest.mark.parametrize("name", sorted(set(WRITING) - {"table"}))
+def test_a_disk_that_takes_no_more(name: str, places: Path, tmp_path: Path, call: Call) -> None:
+    out = tmp_path / "out"
+    with no_room(2000):
+        answer = call(*words_of(name, places, out))
+    error = require_sentence(answer)
+    assert "larger than its file system" in error or "disk is full" in error
+    assert str(out if name != "evaluate" else places) in error
+    # What has got its own name is whole, and nothing else is there.
+    assert all(path.stat().st_size < 2000 for path in files_of(out))
+    assert not [path for path in files_of(tmp_path) if path.suffix in (".tmp", ".wav", ".html", ".mp4")]
+    if name == "export":
+        assert not out.exists() and not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_that_finds_no_room(places: Path, tmp_path: Path, call: Call) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(places / "run", run)
+    with no_room(30_000):
+        answer = call(
+            "run", places / "small.yaml", "--out", run, "--from", "tokenizer", "--until", "tokenizer"
+        )
+    assert str(run) in require_sentence(answer)
+    assert not list((run / "stages" / "tokenizer").rglob("*.ckpt"))
+    assert not (run / "stages" / "tokenizer" / "artifact.json").exists()
+    # Nothing is in the way of the same command once there is room.
+    again = call("run", places / "small.yaml", "--out", run, "--until", "tokenizer")
+    assert again.code == 0, again.err
