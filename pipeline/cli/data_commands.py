@@ -91,6 +91,8 @@ def convert_command(
         conversion, out, workers=workers, strict=strict, clips_per_shard=clips_per_shard, progress=shown
     )
     say_manifest(manifest, out, console)
+    if conversion.plan.captions:
+        _say(console, conversion.plan.captions)
 
 
 def say_plan(plan: ConversionPlan[Any], console: Console) -> None:

@@ -141,6 +141,7 @@ def submit_conversion(
     )
     if strict:
         conversion.plan.require_whole()
+    conversion.plan.require_settled()
     steps = _steps(conversion, cluster.tasks, clips_per_shard)
     record = ConvertJob(
         kind=kind,

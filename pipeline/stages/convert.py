@@ -9,6 +9,7 @@ from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.convert.aistpp.convert import AistppConfig
 from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.bvh.convert import BvhConfig
+from motionloom.datasets.convert.common.caption_options import digest_of
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.humanml3d.convert import HumanMl3dConfig
@@ -67,10 +68,15 @@ def run_convert(context: StageContext) -> None:
     conversion = converter_named(kind).prepare(context.config, out=out, workers=workers, progress=shown)
     manifest = run_conversion(conversion, out, workers=workers, progress=shown)
     say_shards(context, manifest)
+    if conversion.plan.captions:
+        context.console.print(
+            f"    {conversion.plan.captions}", markup=False, highlight=False, soft_wrap=True
+        )
 
 
 def source_facts(config: ConvertConfig) -> dict[str, Any]:
-    """Names and sizes of the source's files; checksums of the files that options name."""
+    """Names and sizes of the source's files; checksums of the files, and folders of text files, that options
+    name."""
     source = Path(config.source).expanduser()
     if not source.exists():
         raise UserError(f"{source}: no such folder (the source; set it with --set data.source=FOLDER)")
@@ -79,6 +85,11 @@ def source_facts(config: ConvertConfig) -> dict[str, Any]:
     steering = {}
     for name in type(config).model_fields:
         path = getattr(config, name)
-        if name != "source" and isinstance(path, Path) and path.expanduser().is_file():
-            steering[name] = sha256_of(path.expanduser())
+        if name == "source" or not isinstance(path, Path):
+            continue
+        path = path.expanduser()
+        if path.is_file():
+            steering[name] = sha256_of(path)
+        elif path.is_dir() and any(path.rglob("*.txt")):  # captions and split files
+            steering[name] = digest_of(path)["sha256"]
     return {"files": files, "steering": steering}

@@ -19,7 +19,8 @@ from motionloom.datasets.convert.amass.source import (
     list_files,
     read_headers,
 )
-from motionloom.datasets.convert.common.captions import CaptionTable, read_captions
+from motionloom.datasets.convert.common.caption_match import CaptionMatch
+from motionloom.datasets.convert.common.caption_options import settle_captions
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset
@@ -28,7 +29,6 @@ from motionloom.datasets.convert.common.splits import (
     hash_split,
     keep_mirrors_together,
     original_of,
-    read_split_files,
 )
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, Split, UserError
@@ -66,6 +66,8 @@ class AmassClip:
 class _Draft(PlanDraft[AmassClip]):
     missing_in: Counter[str] = field(default_factory=Counter)
     """Missing clips a subset."""
+    match: CaptionMatch = field(default_factory=CaptionMatch)
+    """Captions of whole files."""
 
 
 def plan_amass(
@@ -74,18 +76,18 @@ def plan_amass(
     """Find every clip and decide what becomes of it. `models` is the kind of the body model by gender."""
     layout = config.motion_layout()
     files, others, broken = list_files(config.source)
-    listed, notes = read_split_files(config.splits) if config.splits else ({}, [])
+    listed, notes = config.listed_splits()
     draft = _Draft(config, broken=broken, notes=notes)
     if config.humanml_index is not None:
         clips = _index_clips(config, config.humanml_index, files, listed, draft, workers, progress)
     else:
         clips = _whole_clips(config, files, listed, draft, workers, progress)
-    captioned = config.captions is not None or config.humanml_texts is not None
+    with_texts = config.captions is not None or config.humanml_texts is not None
+    bare_clips: list[str] = []
+    captioned = 0
     for clip, reason in clips:
-        if captioned and not clip.texts:
+        if with_texts and not clip.texts:
             draft.uncaptioned.append(clip.label())
-            if config.uncaptioned == "drop":
-                reason = reason or "no captions"
         if config.splits is not None and clip.id not in listed:
             reason = reason or "in no split file"
         reason = (
@@ -94,10 +96,15 @@ def plan_amass(
             or config.licence_problem(config.licence or LICENCE)
             or config.length_problem(clip.seconds)
         )
+        captioned += bool(clip.texts) and not reason
+        if with_texts and not clip.texts and not reason:
+            bare_clips.append(clip.label())
+            reason = "" if config.uncaptioned == "keep" else "no captions"
         if reason:
             draft.leave_out(clip.label(), reason)
         else:
             draft.take(clip)
+    settle_captions(config, draft, draft.match, bare_clips, captioned)
     draft.limit(AmassClip.label)
     return draft.finish(
         found=len(files),
@@ -119,21 +126,23 @@ def _whole_clips(
     """Every file as one clip, with the reason against it if there is one already."""
     headers, broken = read_headers(files, workers, progress)
     draft.broken += broken
-    table = read_captions(config.captions) if config.captions else CaptionTable({}, {})
+    draft.match = config.matched([file.label for file in files] + [drop.source for drop in draft.broken])
     clips: list[tuple[AmassClip, str]] = []
     seen: dict[str, str] = {}
     for file, header in headers:
         fps = _rate(config, file, header, draft)
         if not fps:
             continue
-        row = table.find(file.label)
+        row = draft.match.rows.get(file.label)
         clip_id = row.id if row else file.id
-        texts = row.texts(source="captions") if row else ()
+        texts = row.texts if row else ()
         split = listed.get(clip_id) or (row.split if row else None) or hash_split(clip_id)
         first = seen.setdefault(clip_id, file.label)
         reason = "" if first == file.label else f"second file for clip id '{clip_id}'; the first is {first}"
+        if row and row.left_out:
+            reason = reason or "in a split that is left out (splits_map)"
         clips.append((AmassClip(file, clip_id, split, header, fps, 0, header.frames, texts), reason))
-    wanted = {row.id: row.file or f"{row.id}{SUFFIX}" for row in table.rows.values()}
+    wanted = {row.id: row.file or f"{row.id}{SUFFIX}" for row in draft.match.unused}
     wanted |= {clip_id: f"{clip_id}{SUFFIX}" for clip_id in listed if clip_id not in wanted}
     here = {file.label for file in files} | {drop.source for drop in draft.broken}
     for clip_id, name in wanted.items():

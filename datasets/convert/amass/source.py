@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.caption_options import CaptionConfig
 from motionloom.datasets.convert.common.files import inside, read_in_threads
 from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.convert.common.smpl_npz import MotionHeader, read_motion_header
@@ -25,7 +25,7 @@ freer, but the fits are AMASS's: non-commercial research only, and not to be pas
 """
 
 
-class AmassConfig(ConvertConfig):
+class AmassConfig(CaptionConfig):
     """AMASS, or any folder tree of SMPL, SMPL-H or SMPL-X clips in .npz files (`SUBSET/subject/clip.npz`)."""
 
     name: str = "amass"
@@ -42,18 +42,12 @@ class AmassConfig(ConvertConfig):
     """The same, for female clips."""
     body_model_male: Path | None = None
     """The same, for male clips."""
-    captions: Path | None = None
-    """`captions.jsonl`, by path or id of the clips."""
     humanml_index: Path | None = None
     """HumanML3D's `index.csv`: convert its clips (cut, and named by its numbers) instead of whole files."""
     humanml_texts: Path | None = None
     """HumanML3D's folder of texts, for the clips of `humanml_index`."""
     mirror: bool = False
     """With `humanml_index`: also the mirrored clips (`M...`), which have texts of their own there."""
-    splits: Path | None = None
-    """Folder of train.txt, val.txt, test.txt; else the captions' `split`, else 80/5/15 by a hash."""
-    uncaptioned: Literal["drop", "keep"] = "drop"
-    """What to do with clips that the given captions or texts do not describe."""
     up: Literal["z", "y"] = "z"
     """The axis that points up in the files; AMASS's is z."""
     source_fps: float | None = Field(default=None, gt=0)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.convert.common.archives import Batch, list_batches
-from motionloom.datasets.convert.common.captions import CaptionTable, read_captions
-from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.caption_options import CaptionConfig, digest_of, settle_captions
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft
 from motionloom.datasets.convert.common.scan import BatchScan, FoundFile, scan_batches
-from motionloom.datasets.convert.common.splits import check_id, hash_split, read_split_files
+from motionloom.datasets.convert.common.splits import check_id, hash_split
 from motionloom.datasets.motion.bvh_text import read_header
 from motionloom.datasets.motion.joint_map import Unit, Up
 from motionloom.datasets.motion.layout import MotionLayout
@@ -24,17 +22,13 @@ from motionloom.datasets.schema import Caption, Split, UserError
 SUFFIX = ".bvh"
 
 
-class BvhConfig(ConvertConfig):
+class BvhConfig(CaptionConfig):
     """Options of the BVH converter."""
 
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""
     joint_map: Path
     """JSON file that says which joints of the files stand for ours (docs/sources.md)."""
-    captions: Path | None = None
-    """JSON lines: id, file, captions, split. Without it clips have no captions."""
-    splits: Path | None = None
-    """Folder of train.txt, val.txt, test.txt; else the captions' `split`, else 80/5/15 by hash of the id."""
     name: str = "bvh"
     """Name of the data set; part of the shards' file names."""
     licence: str
@@ -51,8 +45,6 @@ class BvhConfig(ConvertConfig):
     """Upward axis of the files."""
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton."""
-    uncaptioned: Literal["drop", "keep"] = "drop"
-    """What to do with clips that a captions file does not list."""
 
     def motion_layout(self) -> MotionLayout:
         """The layout of the written shards."""
@@ -66,7 +58,7 @@ class BvhConfig(ConvertConfig):
         given = super().options(*local)
         for key in ("joint_map", "captions"):
             path: Path | None = getattr(self, key)
-            given[key] = {"file": path.name, "sha256": sha256_of(path)} if path else None
+            given[key] = digest_of(path) if path else None
         given["splits"] = bool(self.splits)
         return given
 
@@ -111,17 +103,18 @@ def _decide(
     """Which of the files found become samples, in which split."""
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
     refused = config.licence_problem(config.licence)
-    table = read_captions(config.captions) if config.captions else CaptionTable({}, {})
-    listed, notes = read_split_files(config.splits) if config.splits else ({}, [])
+    table = config.matched(file.path for _, file in found)
+    listed, notes = config.listed_splits()
     broken = [scan.problem for scan in scans if scan.problem is not None]
     draft: PlanDraft[BvhClip] = PlanDraft(config, broken=broken, notes=notes)
     ids: dict[str, str] = {}
     contents: dict[str, str] = {}
     unreadable: set[str] = set()
-    other_rate = 0
+    other_rate = captioned = 0
+    bare_clips: list[str] = []
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
-    for number, clip in sorted(found, key=lambda pair: table.find(pair[1].path) is None):
-        row = table.find(clip.path)
+    for number, clip in sorted(found, key=lambda pair: pair[1].path not in table.rows):
+        row = table.rows.get(clip.path)
         try:
             clip_id = row.id if row else check_id(str(PurePosixPath(clip.path).with_suffix("")), clip.label)
         except UserError as error:
@@ -131,7 +124,7 @@ def _decide(
             unreadable.add(clip_id)
             draft.fail(clip.label, UserError(clip.problem))
             continue
-        texts = row.texts(source="captions") if row else ()
+        texts = row.texts if row else ()
         if config.captions and not texts:
             draft.uncaptioned.append(clip.label)
         other_rate += bool(row and row.fps and abs(row.fps - clip.fps) > 0.01 * clip.fps)
@@ -139,14 +132,18 @@ def _decide(
             reason = f"second file for clip id '{clip_id}'; the first is {ids[clip_id]}"
         elif clip.sha256 in contents:
             reason = f"same bytes as {contents[clip.sha256]}"
-        elif config.captions and not texts and config.uncaptioned == "drop":
-            reason = "no captions"
         elif config.splits and clip_id not in listed:
             reason = "in no split file"
+        elif row and row.left_out:
+            reason = "in a split that is left out (splits_map)"
         else:
             reason = refused or config.length_problem(clip.frames / (config.source_fps or clip.fps))
         ids.setdefault(clip_id, clip.label)
         contents.setdefault(clip.sha256, clip.label)
+        captioned += bool(texts) and not reason
+        if config.captions and not texts and not reason:
+            bare_clips.append(clip.label)
+            reason = "" if config.uncaptioned == "keep" else "no captions"
         if reason:
             draft.leave_out(clip.label, reason)
             continue
@@ -157,7 +154,8 @@ def _decide(
             f"{other_rate} captions state another frame rate than their file; the file's counts"
         )
     draft.limit(lambda clip: clip.id)
-    wanted = {clip_id: row.file or clip_id for clip_id, row in table.rows.items()}
+    settle_captions(config, draft, table, bare_clips, captioned)
+    wanted = {row.id: row.file or row.id for row in table.unused}
     wanted |= {clip_id: clip_id for clip_id in listed if clip_id not in wanted}
     for clip_id, name in wanted.items():
         if clip_id not in ids and clip_id not in unreadable:

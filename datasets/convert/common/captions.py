@@ -1,78 +1,67 @@
-"""`captions.jsonl`: one JSON object a line: id, captions and, where known, file, split, frame rate."""
+"""Captions that people bring for their clips, in any of six forms that are recognised by themselves.
+
+| form | by |
+|---|---|
+| one JSON object a line | `.jsonl`, `.ndjson`, or several objects in one file |
+| a JSON list of such objects | `[` |
+| one JSON object, name -> caption(s) | `{` |
+| CSV, TSV with a header | anything else that is a file |
+| a folder of .txt files with the clips' names, a caption a line | a folder |
+| the same with HumanML3D's lines `caption#tokens#start#end` | the first lines |
+"""
 
 from __future__ import annotations
 
-import json
-from collections import Counter
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator
+from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
-
-from motionloom.datasets.convert.common.splits import check_id
-from motionloom.datasets.schema import Caption, Split, UserError, explain
-
-
-class CaptionRow(BaseModel):
-    """One line; keys beyond these are the source's own business and ignored."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-    id: str
-    captions: list[str | Caption]
-    file: str | None = None
-    archive: str | None = None
-    split: Split | None = None
-    fps: float | None = None
-
-    def texts(self, source: str) -> tuple[Caption, ...]:
-        """The captions that hold text."""
-        made = [c if isinstance(c, Caption) else Caption(text=c, source=source) for c in self.captions]
-        stripped = [c.model_copy(update={"text": " ".join(c.text.split())}) for c in made]
-        return tuple(c for c in stripped if c.text)
+from motionloom.datasets.convert.common.caption_folder import folder_records
+from motionloom.datasets.convert.common.caption_json import json_form, json_records
+from motionloom.datasets.convert.common.caption_row import NEEDED, CaptionRow, is_record, joined, row_of
+from motionloom.datasets.convert.common.caption_table import table_records
+from motionloom.datasets.convert.common.caption_text import Record, read_text
+from motionloom.datasets.convert.common.splits import SplitNames
+from motionloom.datasets.schema import UserError
 
 
-@dataclass(frozen=True)
-class CaptionTable:
-    """All rows by id, and the ways a file of the source finds its row."""
+def read_captions(path: Path, splits: SplitNames | None = None) -> dict[str, CaptionRow]:
+    """The rows of a file or folder by clip id; `UserError` names file, line and column of anything malformed.
 
-    rows: dict[str, CaptionRow]
-    keys: dict[str, str]
-    """Id by: `file`, id, and the bare name of `file` where only one row has it."""
-
-    def find(self, path: str) -> CaptionRow | None:
-        """The row of a motion file: by its path in the source, its path without suffix, or its bare name."""
-        pure = PurePosixPath(path)
-        for key in (path, pure.with_suffix("").as_posix(), pure.stem):
-            if key in self.keys:
-                return self.rows[self.keys[key]]
-        return None
-
-
-def read_captions(path: Path) -> CaptionTable:
-    """Read the file; `UserError` names the line of anything malformed and of an id or file seen before."""
-    rows: dict[str, CaptionRow] = {}
-    files: dict[str, str] = {}
-    try:
-        lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the captions ({error.strerror})") from None
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        where = f"{path}:{number}"
-        try:
-            row = CaptionRow.model_validate(json.loads(line))
-        except ValidationError as error:
-            raise UserError(explain(error, CaptionRow, where)) from None
-        except ValueError as error:
-            raise UserError(f"{where}: not valid JSON ({error})") from None
-        check_id(row.id, where)
-        if row.id in rows:
-            raise UserError(f"{where}: clip id '{row.id}' has a line already; keep one line a clip")
+    `splits` says what other names of splits mean.
+    """
+    if not path.exists():
+        raise UserError(f"{path}: cannot read the captions (no such file or folder)")
+    names, rows, files = splits or SplitNames(), dict[str, CaptionRow](), dict[str, str]()
+    lists: set[str] = set()
+    for record in _records(path):
+        row, is_list = row_of(record, names)
+        before = rows.get(row.id)
         if row.file and files.setdefault(row.file, row.id) != row.id:
-            raise UserError(f"{where}: file '{row.file}' has a line already ('{files[row.file]}')")
-        rows[row.id] = row
-    stems = Counter(PurePosixPath(file).stem for file in files)
-    keys = {stem: row for file, row in files.items() if stems[stem := PurePosixPath(file).stem] == 1}
-    return CaptionTable(rows, {**keys, **{clip_id: clip_id for clip_id in rows}, **files})
+            raise record.wrong(None, f"file '{row.file}' has a record already ('{files[row.file]}')")
+        if before is None:
+            rows[row.id] = row
+        elif is_list or row.id in lists:
+            there = before.record.at(None)
+            what = f"clip id '{row.id}' has a line already ({there}); keep all its captions in one record"
+            raise record.wrong(None, what)
+        else:
+            rows[row.id] = joined(before, row, record)
+        if is_list:
+            lists.add(row.id)
+    if not rows:
+        raise UserError(f"{path}: no captions in it")
+    names.require_known()
+    return rows
+
+
+def _records(path: Path) -> Iterator[Record]:
+    """The records of a file or folder, whatever its form."""
+    if path.is_dir():
+        return folder_records(path)
+    text = read_text(path)
+    start = text.lstrip()[:1]
+    if not start:
+        return iter(())
+    if start in "[{" or path.suffix.lower() in (".jsonl", ".ndjson", ".json"):
+        return json_records(path, text, json_form(path, text, is_record))
+    return table_records(path, text, lambda header: is_record(dict.fromkeys(header)), NEEDED)

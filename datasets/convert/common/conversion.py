@@ -118,6 +118,7 @@ def run_conversion(
     """
     how = WriteOptions(workers, clips_per_shard, seed, strict, progress, part)
     plan, features, convert = conversion.plan, conversion.features, conversion.convert
+    plan.require_settled()
     if strict:
         plan.require_whole()
     if features is None and how.features_only:

@@ -79,6 +79,10 @@ class ConversionPlan(Generic[C]):
     """Disk that the shards will take; None when unknown."""
     seconds_needed: float | None = None
     """Estimated time on the planned number of workers, from a few clips converted for the purpose."""
+    captions: str = ""
+    """How many clips have captions, and which have none, where captions were brought for them."""
+    stop: str = ""
+    """Why it must not be carried out before the user decides something; empty when nothing is open."""
 
     def counts(self) -> dict[Split, int]:
         """Clips a split."""
@@ -103,6 +107,8 @@ class ConversionPlan(Generic[C]):
             table.add_row("time", "", "", _duration(self.seconds_needed))
         for note in self.notes:
             table.add_row("note", "", "", note)
+        if self.stop:
+            table.add_row("stops here", "", "", self.stop)
         return table
 
     def subset_table(self) -> Table | None:
@@ -118,6 +124,11 @@ class ConversionPlan(Generic[C]):
     def left_out(self) -> list[Dropped]:
         """Everything that will not become a sample, with reasons."""
         return [*self.missing, *self.broken, *self.dropped]
+
+    def require_settled(self) -> None:
+        """`UserError` when the user has something to decide first."""
+        if self.stop:
+            raise UserError(self.stop)
 
     def require_whole(self) -> None:
         """`UserError` when anything is missing or broken (`--strict`)."""
@@ -137,6 +148,8 @@ class PlanDraft(Generic[C]):
     dropped: list[Dropped] = field(default_factory=list)
     broken: list[Dropped] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    captions: str = ""
+    stop: str = ""
 
     def take(self, clip: C) -> None:
         """This clip becomes a sample."""
@@ -187,6 +200,8 @@ class PlanDraft(Generic[C]):
             notes=self.notes,
             subsets=dict(subsets or {}),
             licences=dict(sorted(Counter(licence(clip) for _, clip in self.items).items())),
+            captions=self.captions,
+            stop=self.stop,
         )
 
 

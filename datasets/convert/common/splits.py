@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Literal
 
 from motionloom.datasets.schema import Split, UserError
 from motionloom.datasets.shards.index import SPLITS
@@ -13,7 +14,78 @@ from motionloom.datasets.shards.index import SPLITS
 TRAIN_SHARE, VAL_SHARE = 0.80, 0.05
 """80/5/15, the split of HumanML3D and Motion-X, where a source brings none."""
 
+_SYNONYMS: dict[str, Split] = {
+    "train": "train",
+    "training": "train",
+    "val": "val",
+    "valid": "val",
+    "validation": "val",
+    "dev": "val",
+    "development": "val",
+    "test": "test",
+    "testing": "test",
+}
+
 _MIRRORED = re.compile(r"((?:.*/)?)M(\d+)")
+
+
+class SplitNames:
+    """What names of splits mean: ours and their usual synonyms by themselves, others as a mapping says.
+
+    The mapping is `NAME=SPLIT,...` with `train`, `val`, `test`, `drop` (leave such clips out) or `ignore` (as
+    if no split were stated) for SPLIT; `ignore` or `drop` alone is for all other names.
+    """
+
+    def __init__(self, mapping: str = "") -> None:
+        """`ValueError` when the mapping cannot be read."""
+        self._known: dict[str, Split | Literal["drop"] | None] = dict(_SYNONYMS)
+        self._others: Literal["drop", "ignore"] | None = None
+        self._unknown: dict[str, int] = {}
+        self._first = ""
+        for word in filter(None, (word.strip() for word in mapping.split(","))):
+            name, equals, meaning = (piece.strip() for piece in word.partition("="))
+            if not equals and name in ("drop", "ignore"):
+                self._others = "drop" if name == "drop" else "ignore"
+            elif name and meaning in (*SPLITS, "drop", "ignore"):
+                self._known[name.lower()] = None if meaning == "ignore" else meaning  # type: ignore[assignment]
+            else:
+                raise ValueError(
+                    f"'{word}' is not NAME=SPLIT with {', '.join(SPLITS)}, drop or ignore for SPLIT "
+                    f"(such as fold1=train,extra=drop), and not drop or ignore alone"
+                )
+
+    def of(self, name: str, place: Callable[[], str]) -> Split | Literal["drop"] | None:
+        """What a name stated at a place means, None for no split; unknown ones are counted for
+        `require_known`."""
+        key = name.strip().lower()
+        if key in self._known:
+            return self._known[key]
+        if self._others is None:
+            self._first = self._first or place()
+            self._unknown[name.strip()] = self._unknown.get(name.strip(), 0) + 1
+        return "drop" if self._others == "drop" else None
+
+    def require_known(self) -> None:
+        """`UserError` about the names that `of` did not know."""
+        if not self._unknown:
+            return
+        name = next(iter(self._unknown))
+        counts = ", ".join(f"'{other}' ({count})" for other, count in list(self._unknown.items())[:5])
+        more = f"; unknown names and how often: {counts}" if len(self._unknown) > 1 else ""
+        raise UserError(
+            f"{self._first}: split '{name}' is none of {', '.join(_SYNONYMS)}{more}; say what it means with "
+            f"--splits-map '{name}=train' (in a recipe splits_map), or val, test, drop (leave its clips out) "
+            f"or ignore (as if it were not stated)"
+        )
+
+    def files(self, folder: Path) -> list[tuple[Split, Path]]:
+        """The split files of a folder, `train.txt` first: files whose name means one of our splits."""
+        found = []
+        for path in sorted(folder.glob("*.txt")) if folder.is_dir() else ():
+            split = self._known.get(path.stem.lower())
+            if split is not None and split != "drop" and path.is_file():
+                found.append((split, path))
+        return sorted(found, key=lambda pair: SPLITS.index(pair[0]))
 
 
 def hash_split(clip_id: str) -> Split:
@@ -44,14 +116,16 @@ def check_id(clip_id: str, where: str) -> str:
     return clip_id
 
 
-def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
+def read_split_files(folder: Path, names: SplitNames | None = None) -> tuple[dict[str, Split], list[str]]:
     """`train.txt`, `val.txt`, `test.txt` (one id a line) -> split of every id, and notes on repeated lines.
 
-    An id in two splits is a leak and an error; blank lines and CRLF are fine.
+    Files may also have the usual other names (`valid.txt`, `dev.txt`) and those that `names` knows. An id in
+    two splits is a leak and an error; blank lines and CRLF are fine.
     """
     splits: dict[str, Split] = {}
+    origin: dict[str, str] = {}
     notes: list[str] = []
-    files = [(split, folder / f"{split}.txt") for split in SPLITS if (folder / f"{split}.txt").is_file()]
+    files = (names or SplitNames()).files(folder)
     if not files:
         raise UserError(f"{folder}: no train.txt, val.txt or test.txt")
     for split, path in files:
@@ -68,7 +142,10 @@ def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
             check_id(clip_id, where)
             known = splits.setdefault(clip_id, split)
             if known != split:
-                raise UserError(f"{where}: '{clip_id}' is also in {known}.txt; a clip in two splits leaks")
+                raise UserError(
+                    f"{where}: '{clip_id}' is also in {origin[clip_id]}; a clip in two splits leaks"
+                )
+            origin.setdefault(clip_id, path.name)
             if clip_id in here:
                 notes.append(f"{path.name}:{number}: '{clip_id}' is listed twice; the first line counts")
             here.add(clip_id)
@@ -106,6 +183,8 @@ def _line_of(clip_id: str, split: Split, folder: Path | None) -> str:
     """Where a split file lists an id."""
     if folder is None:
         return f"{split}.txt"
-    path = folder / f"{split}.txt"
-    lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
-    return f"{path}:{lines.index(clip_id) + 1}"
+    for path in (path for found, path in SplitNames().files(folder) if found == split):
+        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+        if clip_id in lines:
+            return f"{path}:{lines.index(clip_id) + 1}"
+    return f"{folder}: {split}"

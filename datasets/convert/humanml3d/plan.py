@@ -23,6 +23,7 @@ from motionloom.datasets.convert.common.files import inside, read_in_threads
 from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset, drop
 from motionloom.datasets.convert.common.splits import (
+    SplitNames,
     check_id,
     hash_splits,
     keep_mirrors_together,
@@ -218,7 +219,7 @@ def _list_texts(config: HumanMl3dConfig) -> _Texts:
 
 def _read_splits(config: HumanMl3dConfig, ids: list[str]) -> tuple[dict[str, Split], list[str]]:
     """Split of every id, by the split files, else by hash of the id that a clip has unmirrored."""
-    if not any((config.source / f"{split}.txt").is_file() for split in SPLITS):
+    if not SplitNames().files(config.source):
         return hash_splits(ids)
     splits, notes = read_split_files(config.source)
     keep_mirrors_together(splits, original_of, config.source)
@@ -279,7 +280,7 @@ def _caption_notes(scanned: dict[str, _Scanned]) -> list[str]:
 
 def _count_ignored(config: HumanMl3dConfig, texts: str) -> int:
     """Files of the source that are neither motion, captions nor split files: statistics, samples, lists."""
-    ours = {f"{split}.txt" for split in SPLITS}
+    ours = {path.name for _, path in SplitNames().files(config.source)}
     ends = {texts: ".txt", **dict.fromkeys(config.folders, ".npy")}
     count = 0
     for folder, _, names in os.walk(config.source):

@@ -20,6 +20,7 @@ from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset, drop
 from motionloom.datasets.convert.common.splits import (
+    SplitNames,
     hash_splits,
     keep_mirrors_together,
     original_of,
@@ -219,12 +220,12 @@ def _read_splits(
     config: MotionXConfig, files: MotionXFiles, ids: list[str]
 ) -> tuple[dict[str, Split], set[str], list[str]]:
     """Split of every wanted id, the split files by their names in the source, and notes."""
-    names = [f"{split}.txt" for split in SPLITS]
+    names = SplitNames()
     if config.splits is not None:
         folder: Path | None = config.splits
         origin = "splits: from the folder given"
     else:
-        found = [name for name in _SPLIT_FOLDERS if any((config.source / name / f).is_file() for f in names)]
+        found = [name for name in _SPLIT_FOLDERS if names.files(config.source / name)]
         folder = config.source / found[0] if found else None
         origin = f"splits: {found[0] or '.'}/" if found else ""
     if folder is None:
@@ -244,7 +245,9 @@ def _read_splits(
     used = set()
     if folder.is_relative_to(config.source):
         inner = folder.relative_to(config.source)
-        used = {(inner / name).as_posix() for name in (*names, "all.txt")}
+        used = {
+            (inner / name).as_posix() for name in (*(path.name for _, path in names.files(folder)), "all.txt")
+        }
     wanted = {clip_id: split for clip_id, split in splits.items() if _wanted(config, clip_id)}
     return wanted, used, [f"{origin}; {numbers} in the release", *notes]
 

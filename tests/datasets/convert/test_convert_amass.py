@@ -280,7 +280,9 @@ def test_captions_splits_and_missing_clips(amass: ModuleType, tmp_path: Path) ->
     ]
     captions = tmp_path / "captions.jsonl"
     captions.write_text("\n".join(map(json.dumps, rows)))
-    manifest = amass.make(source, tmp_path / "out", captions=captions)
+    with pytest.raises(UserError, match=r"no captions for 1 of 3 clips \(KIT/3/c_poses\.npz\)"):
+        amass.make(source, tmp_path / "out", captions=captions)
+    manifest = amass.make(source, tmp_path / "out", captions=captions, uncaptioned="drop")
     meta, texts = amass.meta_of(tmp_path / "out", "first")
     assert (meta.source, meta.split) == ("KIT/3/a_poses.npz", hash_split("first"))
     assert [caption.text for caption in texts] == ["walks to the left"]

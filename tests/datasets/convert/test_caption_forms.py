@@ -1,0 +1,365 @@
+"""Captions as people have them: six forms that give the same data set, and errors that name the place."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bvh_clips import write_clip, write_map
+from rich.console import Console
+
+from motionloom.datasets.convert.bvh.plan import BvhConfig, plan_bvh
+from motionloom.datasets.convert.common.caption_match import match, nearest
+from motionloom.datasets.convert.common.caption_text import Form
+from motionloom.datasets.convert.common.captions import read_captions
+from motionloom.datasets.convert.common.splits import SplitNames, hash_split, read_split_files
+from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.pipeline.cli.data_commands import convert_command
+
+TEXTS = {
+    "walk_a": ["a person walks", 'says "hi", then sits'],
+    "jump": ["a person jumps, élan"],
+    "sub/turn": ["turns # left"],
+}
+Rows = dict[str, list[str]]
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three clips, one of them in a folder, and their joint map."""
+    folder = tmp_path_factory.mktemp("source")
+    (folder / "sub").mkdir()
+    for seed, name in enumerate(TEXTS):
+        write_clip(folder / f"{name}.bvh", seed, frames=36)
+    write_map(folder / "map.json")
+    return folder
+
+
+def lines(path: Path, rows: Rows, key: str) -> Path:
+    if key == "captions":
+        records: list[dict[str, Any]] = [{"id": name, "captions": texts} for name, texts in rows.items()]
+    else:
+        records = [{"file": f"{name}.bvh", key: text} for name, texts in rows.items() for text in texts]
+    path = path.with_suffix(".jsonl")
+    path.write_text("\n".join(map(json.dumps, records)))
+    return path
+
+
+def json_list(path: Path, rows: Rows) -> Path:
+    path = path.with_suffix(".json")
+    path.write_text(json.dumps([{"name": name, "captions": texts} for name, texts in rows.items()], indent=1))
+    return path
+
+
+def json_object(path: Path, rows: Rows) -> Path:
+    path = path.with_suffix(".json")
+    given = {f"{name}.bvh": texts[0] if len(texts) == 1 else texts for name, texts in rows.items()}
+    path.write_text("\ufeff" + json.dumps(given, ensure_ascii=False), encoding="utf-8")
+    return path
+
+
+def table(path: Path, rows: Rows, delimiter: str) -> Path:
+    path = path.with_suffix(".tsv" if delimiter == "\t" else ".csv")
+    out = io.StringIO()
+    writer = csv.writer(out, delimiter=delimiter)  # CRLF, as spreadsheets write them
+    writer.writerow(["Clip Id" if delimiter == ";" else "File Name", "Caption"])
+    writer.writerows(
+        [f".\\{name}.bvh".replace("/", "\\"), text] for name, texts in rows.items() for text in texts
+    )
+    path.write_bytes(out.getvalue().encode("utf-8-sig"))
+    return path
+
+
+def folder(path: Path, rows: Rows) -> Path:
+    for name, texts in rows.items():
+        file = path / f"{name}.txt"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("\r\n".join(texts) + "\n\n", encoding="utf-8")
+    return path
+
+
+def humanml(path: Path, rows: Rows) -> Path:
+    return folder(path, {name: [f"{text}#a/DET#0.0#0.0" for text in texts] for name, texts in rows.items()})
+
+
+FORMS: dict[str, Callable[[Path, Rows], Path]] = {
+    "lines of captions": lambda path, rows: lines(path, rows, "captions"),
+    "lines of one caption": lambda path, rows: lines(path, rows, "caption"),
+    "JSON list": json_list,
+    "JSON object": json_object,
+    "CSV": lambda path, rows: table(path, rows, ","),
+    "CSV with semicolons": lambda path, rows: table(path, rows, ";"),
+    "TSV": lambda path, rows: table(path, rows, "\t"),
+    "folder": folder,
+    "HumanML3D": humanml,
+}
+
+
+def convert(source: Path, out: Path, captions: Path) -> str:
+    """The default command; what it prints."""
+    said = io.StringIO()
+    fields = {"source": source, "joint_map": source / "map.json", "licence": "CC0-1.0", "captions": captions}
+    console = Console(file=said, width=200)
+    convert_command(
+        "bvh", fields, out, plan=False, strict=True, workers=1, clips_per_shard=256,
+        cluster=None, wait=True, console=console,
+    )  # fmt: skip
+    return said.getvalue()
+
+
+@pytest.fixture(scope="module")
+def expected(source: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Checksums of the shards by the first form."""
+    folder = tmp_path_factory.mktemp("expected")
+    convert(source, folder / "out", FORMS["lines of captions"](folder / "captions", TEXTS))
+    for split in ("train", "val", "test"):
+        if list((folder / "out").glob(f"*-{split}-*.tar")):
+            dataset = ShardDataset.open(folder / "out", split)  # type: ignore[arg-type]
+            for number, name in enumerate(dataset.ids):
+                assert [caption.text for caption in dataset.texts(number)] == TEXTS[name]
+    return [shard.sha256 for shard in Manifest.load_json(folder / "out/manifest.json").shards]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_gives_the_same_data_set(
+    form: str, source: Path, tmp_path: Path, expected: list[str]
+) -> None:
+    captions = FORMS[form](tmp_path / "captions", TEXTS)
+    assert "3 of 3 clips have captions in captions" in convert(source, tmp_path / "out", captions)
+    if form == "HumanML3D":  # brings tokens, so the shards are not the same bytes
+        rows = read_captions(captions)
+        assert {name: [text.text for text in row.texts] for name, row in rows.items()} == TEXTS
+        assert [text.tokens for row in rows.values() for text in row.texts] == [["a/DET"]] * 4
+        assert all((text.start, text.end) == (0.0, None) for row in rows.values() for text in row.texts)
+        return
+    shards = Manifest.load_json(tmp_path / "out/manifest.json").shards
+    assert [shard.sha256 for shard in shards] == expected
+
+
+LINE = '{"id": "a", "captions": ["x"]}'
+BROKEN: list[tuple[str, str, str, Form]] = [
+    ("c.jsonl", LINE + '\n{"id": "b" "caption": "x"}', ":2:12: not valid JSON", Form.LINES),
+    ("c.jsonl", LINE + "\n" + LINE + LINE, ":2:31: more after", Form.LINES),
+    ("c.jsonl", LINE + '\n{"id": "b", "captions": 5}', ":2:25: 'captions' holds a number", Form.LINES),
+    ("c.jsonl", '\n{"id": null, "caption": "x"}', ":2:1: the record does not name its clip", Form.LINES),
+    ("c.jsonl", LINE + '\n{"id": "b"}', ":2:1: the record has no 'caption' and no 'captions'", Form.LINES),
+    ("c.jsonl", '["a", "x"]', ":1:2: a text where a record belongs", Form.LIST),
+    ("c.jsonl", '{"id": "a", "captions": [{"text": "x", "begin": 1}]}',
+     ":1:25: a caption has the unknown key 'begin'", Form.LINES),
+    ("c.jsonl", '{"id": "a", "caption": "x", "start": 3, "end": 2}',
+     ":1:48: the caption ends at 2", Form.LINES),
+    ("c.jsonl", '{"id": "a", "caption": "\\ud800"}', ":1:24: 'caption' holds half a character", Form.LINES),
+    ("c.json", '[{"id": "a", "caption": "x"},\n {"id": 1.5, "caption": "x"}]',
+     ":2:9: 'id' is a number", Form.LIST),
+    ("c.json", '[{"id": "a", "caption": "x"},\n {"id": "b"]', ":2:12: not valid JSON", Form.LIST),
+    ("c.json", '[\n{"id": "a", "caption": "x"}\n{"id": "b"}]', ":3:1: not valid JSON", Form.LIST),
+    ("c.json", '[\n{"id": "a", "caption": "x"},\n]', ":2:28: not valid JSON (a ',' before", Form.LIST),
+    ("c.json", '{"a": ["x"],\n "b": ["y" 3]}', ":2:12: not valid JSON", Form.OBJECT),
+    ("c.json", '{"a": ["x"],\n "b": true}', ":2:7: 'captions' holds true or false", Form.OBJECT),
+    ("c.json", '{"a": ["x"], "b": ["y"], "a": "z"}', ":1:26: clip id 'a' has a line already (", Form.OBJECT),
+    ("c.json", '"a"', ":1:1: neither a list nor an object", Form.OBJECT),
+    ("c.csv", "name,words\na,x", ":1:1: the first line must name a column for the clip", Form.TABLE),
+    ("c.csv", "name,caption\na,he walks, then sits",
+     ":2:12: 3 columns, but the first line names 2", Form.TABLE),
+    ("c.csv", "name,caption\na,\"x\n\ny\"\nb", ":5:2: 1 columns, but the first line names 2", Form.TABLE),
+    ("c.csv", 'name,caption\na,x\nb,"he walks\nc,z\n',
+     ":3:3: a quote that opens here is not closed", Form.TABLE),
+    ("c.csv", "name,caption,start\na,x,0\nb,x,soon", ":3:5: 'start' is 'soon', not a number", Form.TABLE),
+    ("c.csv", "name,caption\n ,x", ":2:1: 'name' is empty", Form.TABLE),
+    ("c.csv", "name,caption,caption\na,x,y", ":1:14: a second column 'caption'", Form.TABLE),
+    ("c.tsv", "name\tcaption\na\tx\n../b\ty",
+     ":3:1: clip id '../b' is not a plain relative name", Form.TABLE),
+    ("c/a.txt", "walks#a/DET#0.0#0.0\njumps#a/DET#0.0", ":2:16: 3 of the 4 fields", Form.HUMANML),
+    ("c/a.txt", "walks#a/DET#0.0#0.0\njumps#a/DET#0.0#end", ":2:17: end 'end' is not a number", Form.HUMANML),
+    ("c/a.txt", "walks#a/DET#0.0#0.0\njumps#a/DET#one#2.0",
+     ":2:13: start 'one' is not a number", Form.HUMANML),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "text", "place", "form"), BROKEN)
+def test_a_broken_line_is_named_with_the_form_expected(
+    name: str, text: str, place: str, form: Form, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        read_captions(path if path.parent == tmp_path else path.parent)
+    said = str(caught.value)
+    assert said.startswith(f"{path}{place}")
+    assert said.endswith(f"; expected {form.value}")
+    assert not any(word in said for word in ("pydantic", "CaptionRow", "Caption(", "NoneType", "dict", "str"))
+
+
+@pytest.mark.parametrize("name", ["c.jsonl", "c.json", "c.csv", "c.tsv", "c/a.txt"])
+def test_other_encodings_are_named_with_line_and_column(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes("é walks\r\nà l".encode() + b"\xe9ger")
+    given = path if path.parent == tmp_path else path.parent
+    with pytest.raises(UserError, match=r":2:4: byte 0xe9 is not UTF-8 \(as Latin-1 it would be 'é'\); save"):
+        read_captions(given)
+    path.write_bytes("a".encode("utf-16"))
+    with pytest.raises(UserError, match="UTF-16 text; save the file as UTF-8"):
+        read_captions(given)
+    path.write_bytes(b"PK\x03\x04sheet")
+    with pytest.raises(UserError, match="not a text file; save the captions as CSV or JSON"):
+        read_captions(given)
+
+
+def test_nothing_to_read(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such file or folder"):
+        read_captions(tmp_path / "none.csv")
+    with pytest.raises(UserError, match=r"no \.txt file in it; expected one caption a line"):
+        read_captions(tmp_path)
+    for name, text in (("c.csv", " \n"), ("c.json", "[ ]"), ("d.json", "{\n}"), ("c.jsonl", "")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(UserError, match="no captions in it"):
+            read_captions(tmp_path / name)
+    with pytest.raises(UserError, match=r"it holds c\.csv, c\.json, c\.jsonl; name the file itself"):
+        read_captions(tmp_path)
+
+
+def test_captions_with_times_other_keys_and_several_columns(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text(
+        "Caption_2;take;file;fps;Caption 1;split;start;end\n"
+        "walks;7;C:\\mocap\\a.bvh;120;goes;Valid;0.5;2\n"
+        ";8;b.bvh;;;;;\n"
+    )
+    rows = read_captions(path)
+    a = rows["a"]
+    assert [(c.text, c.start, c.end, c.source) for c in a.texts] == [
+        ("walks", 0.5, 2.0, "captions"),
+        ("goes", 0.5, 2.0, "captions"),
+    ]
+    assert (a.split, a.fps, a.file) == ("val", 120.0, "C:/mocap/a.bvh")
+    assert rows["b"].texts == () and rows["b"].split is None
+    path = tmp_path / "c.jsonl"
+    path.write_text(
+        '{"id": 7, "text": "x", "start": 1}\n{"id": 7, "text": "y", "take": 3}\n{"id": 7, "text": "y"}'
+    )
+    assert [(c.text, c.start) for c in read_captions(path)["7"].texts] == [("x", 1.0), ("y", 0.0)]
+    path.write_text('{"id": "a", "text": "x", "split": "dev"}\n{"id": "a", "text": "y", "split": "test"}')
+    with pytest.raises(UserError, match=r":2:35: split of clip 'a' is 'test' here and 'val' at .*:1:1"):
+        read_captions(path)
+
+
+def test_names_of_clips_find_their_files(tmp_path: Path) -> None:
+    def found(names: list[str], paths: list[str]) -> dict[str, str]:
+        rows = read_captions(lines(tmp_path / "c", {name: ["x"] for name in names}, "captions"))
+        return {path: row.id for path, row in match(rows, paths).rows.items()}
+
+    assert found(["a"], ["x/a.bvh"]) == {"x/a.bvh": "a"}
+    assert found(["mocap/x/a"], ["x/a.bvh", "y/a.bvh"]) == {"x/a.bvh": "mocap/x/a"}
+    assert found(["x/a", "a"], ["x/a.bvh", "y/a.bvh"]) == {"x/a.bvh": "x/a", "y/a.bvh": "a"}
+    assert found(["raw/a.BVH"], ["clean/a.bvh", "clean/b.bvh"]) == {"clean/a.bvh": "raw/a"}
+    assert found(["raw/a"], ["clean/a.bvh", "other/a.bvh"]) == {}
+    assert found(["raw/a", "cut/a"], ["clean/a.bvh"]) == {}
+    assert found(["take.001"], ["take.001.bvh"]) == {"take.001.bvh": "take.001"}
+
+
+def test_nearest_names_among_few_and_among_many() -> None:
+    few = ["walks/walk_001.bvh", "walks/walk_002.bvh", "jump.bvh"]
+    assert nearest("Walk-001", few) == ["walks/walk_001.bvh", "walks/walk_002.bvh"]
+    assert nearest("zzz", few) == []
+    many = [f"clips/{number * 7919 % 1_000_003:06d}_take.bvh" for number in range(20_000)]
+    wanted = many[12_345].removeprefix("clips/").removesuffix("_take.bvh")
+    assert nearest(f"{wanted}_tak", many, 1) == [many[12_345]]
+    assert nearest(f"x{wanted}_take", many, 1) == [many[12_345]]
+
+
+def test_many_captions_keep_their_places(tmp_path: Path) -> None:
+    rows = {f"clip_{number:06d}": [f"a person walks {number} steps"] for number in range(2_000)}
+    for form, place in (("lines of captions", ":2000:1"), ("JSON list", ":11996:2"), ("CSV", ":2001:1")):
+        read = read_captions(FORMS[form](tmp_path / "many", rows))
+        assert len(read) == 2_000
+        where = read["clip_001999"].record.at(None)
+        assert where.endswith(place)
+    assert len(match(read, [f"x/{name}.bvh" for name in rows]).rows) == 2_000
+
+
+def plan(source: Path, captions: Path | None, **changes: Any) -> Any:
+    given = {"source": source, "joint_map": source / "map.json", "captions": captions, "licence": "CC0-1.0"}
+    return plan_bvh(BvhConfig.parse({**given, **changes}, "options"))
+
+
+def test_clips_without_captions_stop_the_conversion_until_it_is_decided(source: Path, tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text("name,caption\nwalk_a,walks\njumps,jumps\n")
+    made = plan(source, path)
+    assert made.captions == (
+        "1 of 3 clips have captions in c.csv; 2 have none and are left out (jump.bvh, sub/turn.bvh); "
+        "1 captions are of no clip in the source ('jumps', nearest: jump.bvh)"
+    )
+    assert made.captions in made.notes and len(made.uncaptioned) == 2
+    shown = "".join(str(cell) for column in made.table().columns for cell in column.cells)
+    assert "no captions for 2 of 3 clips" in shown
+    with pytest.raises(UserError, match=r"c\.csv: no captions for 2 of 3 clips \(jump\.bvh, sub/turn\.bvh\)"):
+        made.require_settled()
+    with pytest.raises(UserError, match=r"nearest: jump\.bvh.*--uncaptioned.*drop leaves.*keep converts"):
+        convert(source, tmp_path / "out", path)
+    assert not list((tmp_path / "out").glob("*.tar"))
+    for choice, count in (("drop", 1), ("keep", 3)):
+        settled = plan(source, path, uncaptioned=choice)
+        settled.require_settled()
+        assert sum(settled.counts().values()) == count
+    without = plan(source, None)
+    without.require_settled()
+    assert (without.captions, sum(without.counts().values())) == ("", 3)
+    # A clip that stays out for another reason needs no captions.
+    path.write_text("name,caption\nwalk_a,walks\n")
+    (tmp_path / "splits").mkdir()
+    (tmp_path / "splits/training.txt").write_text("walk_a.bvh\n")
+    listed = plan(source, path, splits=tmp_path / "splits")
+    listed.require_settled()
+    assert listed.counts() == {"train": 1, "val": 0, "test": 0}
+
+
+def test_what_stop_converts_is_what_drop_converts(source: Path, tmp_path: Path) -> None:
+    fields = {"source": source, "joint_map": source / "map.json", "licence": "CC0-1.0"}
+    stop, drop, keep = (BvhConfig.parse({**fields, "uncaptioned": w}, "") for w in ("stop", "drop", "keep"))
+    assert stop.options() == drop.options() != keep.options()
+    assert "splits_map" not in stop.options()
+    folder(tmp_path / "texts", TEXTS)
+    first = BvhConfig.parse({**fields, "captions": tmp_path / "texts"}, "").options()
+    (tmp_path / "texts/jump.txt").write_text("hops")
+    second = BvhConfig.parse({**fields, "captions": tmp_path / "texts"}, "").options()
+    assert first["captions"]["file"] == second["captions"]["file"] == "texts" and first != second
+
+
+def test_names_of_splits(source: Path, tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text("name,caption,split\nwalk_a,walks,Validation\njump,jumps,fold 1\nsub/turn,turns,fold 2\n")
+    message = r":3:12: split 'fold 1' is none of train.*'fold 1' \(1\), 'fold 2' \(1\); say .*--splits-map"
+    with pytest.raises(UserError, match=message):
+        plan(source, path)
+    mapped = plan(source, path, splits_map="fold 1=train, fold 2=drop")
+    assert {clip.id: split for split, clip in mapped.items} == {"walk_a": "val", "jump": "train"}
+    assert [drop.reason for drop in mapped.dropped] == ["in a split that is left out (splits_map)"]
+    ignored = plan(source, path, splits_map="ignore")
+    assert {clip.id: split for split, clip in ignored.items} == {
+        "walk_a": "val",
+        **{name: hash_split(name) for name in ("jump", "sub/turn")},
+    }
+    for mapping in ("fold=dev", "=train", "fold"):
+        with pytest.raises(UserError, match=r"splits_map.*is not NAME=SPLIT"):
+            plan(source, path, splits_map=mapping)
+
+
+def test_split_files_by_other_names(tmp_path: Path) -> None:
+    for name in ("Train", "valid", "testing", "fold1", "all"):
+        (tmp_path / f"{name}.txt").write_text(f"in {name}\n")
+    splits, _ = read_split_files(tmp_path)
+    assert splits == {"in Train": "train", "in valid": "val", "in testing": "test"}
+    splits, _ = read_split_files(tmp_path, SplitNames("fold1=train,testing=ignore"))
+    assert splits == {"in Train": "train", "in fold1": "train", "in valid": "val"}
+    (tmp_path / "dev.txt").write_text("in Train\n")
+    with pytest.raises(UserError, match=r"'in Train' is also in Train\.txt; a clip in two splits leaks"):
+        read_split_files(tmp_path)
