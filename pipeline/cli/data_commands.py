@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,14 @@ from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.shards.index import MANIFEST_FILE
+from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.store.files import require_file_place, require_folder
+
+_REASONS = 12
+"""Reasons for clips that were left out, a line each; the file has every clip."""
 
 
 def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
@@ -33,14 +39,25 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
                 split, str(len(shards)), str(sum(s.samples for s in shards)), f"{minutes:.1f}", f"{size:.1f}"
             )
     console.print(table)
-    for dropped in manifest.dropped[:20]:
-        console.print(f"dropped {dropped.source}: {dropped.reason}")
-    if len(manifest.dropped) > 20:
-        console.print(f"… and {len(manifest.dropped) - 20} more, all in {out / 'manifest.json'}")
+    say_left_out(manifest, out, console)
     console.print(
         f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), "
         f"{manifest.fps:g} fps, {', '.join(manifest.licences) or manifest.licence}"
     )
+
+
+def say_left_out(manifest: Manifest, out: Path, console: Console) -> None:
+    """How much was left out, a line for each reason, and where the whole list is."""
+    if not manifest.dropped:
+        return
+    listed = out / LEFT_OUT_FILE
+    place = listed if listed.exists() else out / MANIFEST_FILE
+    console.print(f"left out: {tally(manifest.dropped)}; all in {place}", markup=False, soft_wrap=True)
+    groups = grouped(manifest.dropped)
+    for group in groups[:_REASONS]:
+        _say(console, f"  {group}")
+    if len(groups) > _REASONS:
+        console.print(f"  … and {len(groups) - _REASONS} more reasons")
 
 
 def synth_command(fields: dict[str, Any], out: Path, *, workers: int, console: Console) -> None:
@@ -64,12 +81,13 @@ def convert_command(
     console: Console,
 ) -> None:
     """Plan a conversion, run it here, or hand it to SLURM."""
+    started = time.perf_counter()
     converter = converter_named(kind)
     config = converter.config().parse(fields, f"data convert {kind}")
     shown = console.is_terminal
     if plan:
-        conversion = converter.prepare(config, workers=workers, progress=shown)
-        say_plan(conversion.estimated(workers), console)
+        conversion = converter.prepare(config, workers=workers, progress=shown).looked()
+        say_plan(conversion.estimated(workers, started), console)
         return
     if cluster:
         from motionloom.pipeline.launch.slurm_convert import ClusterConfig, submit_conversion, wait_for
@@ -89,7 +107,13 @@ def convert_command(
     require_folder(out)
     conversion = converter.prepare(config, out=out, workers=workers, progress=shown)
     manifest = run_conversion(
-        conversion, out, workers=workers, strict=strict, clips_per_shard=clips_per_shard, progress=shown
+        conversion,
+        out,
+        workers=workers,
+        strict=strict,
+        clips_per_shard=clips_per_shard,
+        progress=shown,
+        say=lambda line: _say(console, line),
     )
     say_manifest(manifest, out, console)
 
@@ -100,6 +124,11 @@ def say_plan(plan: ConversionPlan[Any], console: Console) -> None:
     if subsets is not None:
         console.print(subsets)
     console.print(plan.table())
+    if plan.look is None:
+        return
+    console.print(plan.look.table())
+    for line in plan.look.lines():
+        _say(console, line)
 
 
 def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: Console) -> int:

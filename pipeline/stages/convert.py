@@ -64,7 +64,13 @@ def run_convert(context: StageContext) -> None:
     workers = context.hardware.convert_workers
     kind = next(name for name, (_, config) in CONVERTED.items() if isinstance(context.config, config))
     conversion = converter_named(kind).prepare(context.config, out=out, workers=workers)
-    manifest = run_conversion(conversion, out, workers=workers, progress=context.console.is_terminal)
+    manifest = run_conversion(
+        conversion,
+        out,
+        workers=workers,
+        progress=context.console.is_terminal,
+        say=lambda line: context.console.print(f"    {line}", markup=False, soft_wrap=True),
+    )
     say_shards(context, manifest)
 
 
