@@ -2,8 +2,8 @@
 
 Errors: manifest or index absent or contradicting the tars, stray or missing shards, size and sha256, tar
 structure, members that do not parse, NaN, values no motion can have (`ranges.py`), figures that are no people
-standing on a floor (`figures.py`), empty captions, sound that cannot be read, and clips that leak from one split
-into another (`duplicates.py`).
+standing on a floor (`figures.py`), empty captions, sound that cannot be read, and clips that leak from one
+split into another (`duplicates.py`).
 
 Warnings: values beyond what a person can do, clips without captions, captions that reach past their clip, the
 same motion twice in one split, a licence the manifest does not know, no training split.

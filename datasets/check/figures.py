@@ -1,8 +1,9 @@
 """Whether the clips of a data set show people standing on a floor.
 
-The measure is the one that a conversion looks at its source with (`datasets/motion/standing.py`), here of every
-clip. An error when it is so in more than half of the clips, a warning when in more than a fifth: sets hold people
-who lie, climb and crawl, too. Of single folders of the source, for a set put together of several: a warning.
+The measure is the one that a conversion looks at its source with (`datasets/motion/standing.py`), here of
+every clip. An error when it is so in more than half of the clips, a warning when in more than a fifth: sets
+hold people who lie, climb and crawl, too. Of single folders of the source, for a set put together of several:
+a warning.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Is this a person standing on a floor? One clip measured, many clips judged.
 
-A wrong length unit, a wrong upward axis or two rows of a joint map that were swapped give motion that is finite,
-smooth and trains without a complaint. What they do not give is people: so the plan of a conversion, the
-conversion itself and the check of a data set all measure the same few things here and judge them by the same
-bounds (docs/data.md gives each its reason).
+A wrong length unit, a wrong upward axis or two rows of a joint map that were swapped give motion that is
+finite, smooth and trains without a complaint. What they do not give is people: so the plan of a conversion,
+the conversion itself and the check of a data set all measure the same few things here and judge them by the
+same bounds (docs/data.md gives each its reason).
 
 Single clips prove nothing, since people lie down, climb and walk backwards: every bound is about a *share* of
 the clips.
@@ -23,7 +23,7 @@ from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.skeleton import Skeleton
 
 PERSON_METRES = (1.2, 2.2)
-"""Height of a figure: from a child of seven to the tallest people. The wrong units are 2.54 or 10 times off."""
+"""Height of a figure: from a child of seven to the tallest people. Wrong units are 2.54 times off or more."""
 
 UPRIGHT = 0.5
 """Cosine between the upward axis and the way from pelvis to head: 60 degrees, which sitting, squatting and
@@ -68,7 +68,7 @@ _HEIGHT_OF_CHAIN = _NEUTRAL_HEIGHT / float(_chain(np.linalg.norm(_NAMED.offsets,
 
 
 def bone_lengths(joints: NDArray[Any]) -> NDArray[np.float64]:
-    """Length of the bone that ends in each body joint: joints [..., N, 3] -> [..., 22], metres; the root's is 0."""
+    """Length of the bone that ends in each body joint: joints [..., N, 3] -> [..., 22]; the root's is 0."""
     body = np.asarray(joints[..., :BODY_JOINTS, :], dtype=np.float64)
     lengths: NDArray[np.float64] = np.linalg.norm(body - body[..., np.maximum(_PARENTS, 0), :], axis=-1)
     return lengths
@@ -89,7 +89,8 @@ class Standing:
     forward: float | None
     """Cosine between the way the figure goes and the way it faces; None where it stays in its place."""
     toes: float
-    """How far the feet point to where the figure faces, -1 to 1: negative where left and right are swapped."""
+    """How far the feet point to where the figure faces, -1 to 1: negative where left and right are
+    swapped."""
 
     @property
     def is_person_size(self) -> bool:

@@ -1,16 +1,16 @@
 """Which two joints of a figure changed places: what a joint map with two swapped rows leaves in the motion.
 
-A wrong row shows itself without any knowledge of the skeleton it came from, in four ways that need neither the
-length unit nor the upward axis:
+A wrong row shows itself without any knowledge of the skeleton it came from, in four ways that need neither
+the length unit nor the upward axis:
 
 - bones keep their length, since bodies are rigid;
 - both arms and both legs are equally long;
 - left joints are on the left of right ones;
 - along the spine, joints that are further apart in the chain are further apart in space.
 
-The four add up to a strain that is 0 for a body. Every pair of joints is exchanged in turn, and the exchange that
-takes most of the strain away is the answer, unless it takes too little, or another does as well. Lengths of bones
-are not compared with a person's: other skeletons place spine and collars elsewhere.
+The four add up to a strain that is 0 for a body. Every pair of joints is exchanged in turn, and the exchange
+that takes most of the strain away is the answer, unless it takes too little, or another does as well. Lengths
+of bones are not compared with a person's: other skeletons place spine and collars elsewhere.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.skeleton import Skeleton
 
 LEAST_GAIN = 0.08
-"""Strain that an exchange must take away. On real clips the weakest of all 231 exchanges (ankle and foot of one
-leg) makes 0.11, and right maps have less than 0.001."""
+"""Strain that an exchange must take away. On real clips the weakest of all 231 exchanges (ankle and foot of
+one leg) makes 0.11, and right maps have less than 0.001."""
 
 LEAST_MARGIN = 0.015
-"""How much better than the next best exchange it must be; the closest races on real clips of people who hardly
-move are 0.02."""
+"""How much better than the next best exchange it must be; the closest races on real clips of people who
+hardly move are 0.02."""
 
 _MOST_RIGID = 0.5
 """A bone counts as this elastic at most, or one joint in a wrong place would outweigh all else."""

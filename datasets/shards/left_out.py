@@ -1,7 +1,7 @@
 """What was left out of a data set: by reason, counted, and listed in a file beside the shards.
 
-Reasons differ from clip to clip in names and numbers (`0.67 s, shorter than 1 s`); those that differ in nothing
-else are one group: twenty identical messages are one line.
+Reasons differ from clip to clip in names and numbers (`0.67 s, shorter than 1 s`); those that differ in
+nothing else are one group: twenty identical messages are one line.
 """
 
 from __future__ import annotations
@@ -15,14 +15,7 @@ from pathlib import Path
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import Dropped
 
-LEFT_OUT_FILE = "left-out.txt"
-"""Beside the manifest, when there is anything to list: a line a clip or file, `kind <tab> source <tab> reason`."""
-
-_QUOTED = re.compile(r"'[^']*'")
-_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:[.,]\d+)*(?:e[+-]?\d+)?")
-_FILE = re.compile(
-    r"[^\s'\",;:()]*[^\s'\",;:().]\.[A-Za-z]\w{1,4}\b|[^\s'\",;:()]*\d[^\s'\",;:()]*/[^\s'\",;:()]*"
-)
+LEFT_OUT_FILE = re.compile(r"[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()]*")
 
 
 @dataclass(frozen=True)

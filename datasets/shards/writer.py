@@ -127,16 +127,12 @@ class DatasetWriter(Generic[T]):
         if not made:
             return ""
         clips = sum(shard.samples for result in self._results if result and (shard := result[0]) is not None)
+        state = f"{made:,} of {len(self._tasks):,} shards ({clips:,} clips)"
         if self._todo:
-            return (
-                f"{self.out}: goes on after {made:,} of {len(self._tasks):,} shards ({clips:,} clips), which an "
-                f"earlier run has finished"
-            )
+            return f"{self.out}: goes on after {state} of an earlier run"
         whole = self._how.part is None and (self.out / MANIFEST_FILE).exists()
-        return (
-            f"{self.out}: {'finished' if whole else 'all shards are finished'} already, {made:,} shards "
-            + (f"({clips:,} clips); nothing to convert")
-        )
+        word = "finished already" if whole else "all shards are there"
+        return f"{self.out}: {word}, {state}; nothing to convert"
 
     @property
     def work_folder(self) -> Path:

@@ -110,9 +110,7 @@ class BvhClips:
             more = f" and {len(free) - _NAMED_JOINTS} more" if len(free) > _NAMED_JOINTS else ""
             remarks.append(f"joints that no row of the map names: {', '.join(free[:_NAMED_JOINTS])}{more}")
         if twice:
-            remarks.append(
-                f"joints that appear more than once, so that no row can name them: {', '.join(twice)}"
-            )
+            remarks.append(f"joints that appear more than once, which no row can name: {', '.join(twice)}")
         names = tuple(names[0] if len(names) == 1 else names for names in self.joint_map.sources)
         return SourceJoints(joints, self.config.source_fps or motion.fps, names, tuple(remarks))
 

@@ -38,8 +38,8 @@ class ConvertConfig(Config):
     motion_type: MotionType = "float32"
     """`float16` halves the shards; positions then keep about a millimetre."""
     look: int = Field(default=5, ge=0, json_schema_extra={"runtime": True})
-    """Clips of every subset to read and measure first; 0 for none. A source that then shows no people standing
-    on a floor is refused."""
+    """Clips of every subset to read and measure first; 0 for none. A source that then shows no people
+    standing on a floor is refused."""
 
     def motion_layout(self) -> MotionLayout:
         """The layout of the written shards."""

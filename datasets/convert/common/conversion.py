@@ -121,7 +121,7 @@ class Conversion(Generic[C]):
         return sum(-(-count // _CLIPS_PER_SHARD) for count in self.plan.counts().values())
 
     def _trial(self) -> tuple[float, float] | None:
-        """Seconds that the first clip takes and those after it, measured on a few; None when there are none."""
+        """Seconds that the first clip takes and those after it, from a few; None without any."""
         if not self.plan.items:
             return None
         start = time.perf_counter()
@@ -160,8 +160,8 @@ def run_conversion(
 ) -> Manifest:
     """Write the shards. `strict` stops when anything is missing or cannot be read.
 
-    Before the first clip a few are looked at (`config.look`): `UserError` when these are no people standing on
-    a floor. `say` gets a line about what an earlier run has finished, and about what the look found odd.
+    Before the first clip a few are looked at (`config.look`): `UserError` when these are no people standing
+    on a floor. `say` gets a line about what an earlier run has finished, and about what the look found odd.
 
     Same input and options give the same bytes for any `workers`; a killed run goes on at the first unfinished
     shard. With `part`, only that part is made, without a manifest (the one returned covers the part); the run

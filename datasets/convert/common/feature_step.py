@@ -65,8 +65,8 @@ class FeatureStep(Generic[T]):
     ) -> Convert[T]:
         """Make the batches that `items` need and that are not there: all, or those of a part.
 
-        `say` gets a line when an earlier run made some of them. Returns the function from item to sample. A part of the shards makes no batch: `UserError` when one is
-        missing.
+        `say` gets a line when an earlier run made some of them. Returns the function from item to sample. A
+        part of the shards makes no batch: `UserError` when one is missing.
         """
         needed = sorted({self.batch_of(item) for item in items})
         if how.features_only:
@@ -80,9 +80,7 @@ class FeatureStep(Generic[T]):
         made = len(needed) - len(todo)
         if say is not None and made and todo:
             clips = sum(self.batches[position].size for position in needed) - sum(b.size for b in todo)
-            say(
-                f"{folder}: goes on after {made:,} of {len(needed):,} batches of the source ({clips:,} clips)"
-            )
+            say(f"{folder.parent}: goes on after {made:,} of {len(needed):,} batches ({clips:,} clips)")
         if todo:
             folder.mkdir(parents=True, exist_ok=True)
         with Progress(disable=not how.progress or not items) as bar:

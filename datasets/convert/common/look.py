@@ -1,10 +1,10 @@
 """A look at a source before it is converted: a few clips of every subset, in memory, measured as figures.
 
-A plan made of names and headers is the same for a wrong joint map, a wrong length unit and a wrong upward axis,
-and so is everything after it but the people. So a few clips are read the way the conversion would read them, and
-measured (`datasets/motion/standing.py`, as the check of a data set does). Where that is no person standing on a
-floor, the same clips are tried with two joints exchanged, along the other axes and in the other units; what makes
-people of them is suggested, by the option or the lines of the joint map to change.
+A plan made of names and headers is the same for a wrong joint map, a wrong length unit and a wrong upward
+axis, and so is everything after it but the people. So a few clips are read the way the conversion would read
+them, and measured (`datasets/motion/standing.py`, as the check of a data set does). Where that is no person
+standing on a floor, the same clips are tried with two joints exchanged, along the other axes and in the other
+units; what makes people of them is suggested, by the option or the lines of the joint map to change.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.shards.left_out import grouped
 from motionloom.datasets.motion.joint_map import METRES
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.standing import MOST, PERSON_METRES, Crowd, Oddity, measure
 from motionloom.datasets.motion.swapped_joints import Swap, find_swap
 from motionloom.datasets.schema import Dropped, UserError
+from motionloom.datasets.shards.left_out import grouped
 
 MOST_CLIPS = 96
 """Clips that are looked at in all; of sources with more subsets, fewer a subset and then fewer subsets."""
@@ -299,7 +299,7 @@ def _suggest(
     names: tuple[str | tuple[str, ...], ...],
     up: str,
 ) -> list[Suggestion]:
-    """Changes that together make people of the clips, found one after the other: joints, axis, unit, sides."""
+    """Changes that together make people of the clips, one after the other: joints, axis, unit, sides."""
     out: list[Suggestion] = []
     joints = [clip.joints for clip in clips]
     if swap is not None:
@@ -317,19 +317,18 @@ def _suggest(
         out.append(suggestion)
         now = _again(clips, joints)
     if any(oddity.kind == _MIRRORED and oddity.is_error for oddity in now.oddities()):
-        where = (
-            "exchange the left and the right rows" if names else "left and right are exchanged in the source"
-        )
-        out.append(Suggestion("joint_map" if names else "source", where, "the feet point backwards"))
+        why = "the feet point backwards"
+        if names:
+            out.append(Suggestion("joint_map", "exchange the left and the right rows", why))
+        else:
+            out.append(Suggestion("source", "exchange left and right in the source", why))
     return out
 
 
 def _swap_suggestion(swap: Swap, names: tuple[str | tuple[str, ...], ...]) -> Suggestion:
     first, second = swap.names
     if not names:
-        return Suggestion(
-            "source", f"{first} and {second} are exchanged in the source", "bones change length"
-        )
+        return Suggestion("source", f"exchange {first} and {second} in the source", "bones change length")
 
     def line(joint: int, name: str, other: int) -> str:
         source = names[other]

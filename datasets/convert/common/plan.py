@@ -16,9 +16,9 @@ from rich.table import Table
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import Look
-from motionloom.datasets.shards.left_out import grouped, grouped_notes
 from motionloom.datasets.schema import Dropped, Split, UserError
 from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.shards.left_out import grouped, grouped_notes
 
 
 class PlannedClip(Protocol):
