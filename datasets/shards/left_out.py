@@ -15,7 +15,12 @@ from pathlib import Path
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import Dropped
 
-LEFT_OUT_FILE = re.compile(r"[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()]*")
+LEFT_OUT_FILE = "left-out.txt"
+"""Beside the manifest, when there is anything to list: kind, source and reason of each, between tabs."""
+
+_QUOTED = re.compile(r"'[^']*'")
+_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:[.,]\d+)*(?:e[+-]?\d+)?")
+_FILE = re.compile(r"[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()]*")
 
 
 @dataclass(frozen=True)
