@@ -8,7 +8,7 @@ split into another (`duplicates.py`).
 Warnings: values beyond what a person can do, clips without captions, captions that reach past their clip, the
 same motion twice in one split, a licence the manifest does not know, no training split.
 
-One shard's directory and one clip are in memory at a time, and 64 bytes for every clip.
+One shard's directory and one clip are in memory at a time, and 88 bytes for every clip.
 """
 
 from __future__ import annotations

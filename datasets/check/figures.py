@@ -39,8 +39,8 @@ class Figures:
         self._bodies: list[NDArray[np.float64]] = []
         # Retargeted or posed figures have the bones of the layout's skeleton: nothing is left to see in them.
         self._has_own_bones = layout.family == "exact"
-        # `smplx322` stays in the axes and on the floor of its source.
-        self._on_zero = layout.name != "smplx322"
+        # Parameters may stay on the floor of their source.
+        self._on_zero = layout.family != "raw"
 
     def add(self, meta: ClipMeta, motion: NDArray[np.floating]) -> None:
         """Measure one clip [T, D]."""

@@ -234,14 +234,16 @@ class Crowd:
         count(
             "size",
             ~((height >= small) & (height <= tall)),
-            f"show figures that are not {small:g} to {tall:g} m tall (median {self.height:.3g} m): "
-            f"a wrong length unit?",
+            f"show figures that are not {small:g} to {tall:g} m tall (median {self.height:.3g} m; "
+            f"a wrong length unit?)",
         )
-        count("upside down", up < -UPRIGHT, "show figures whose head is below the pelvis: upside down?")
+        count(
+            "upside down", up < -UPRIGHT, "show figures whose head is below the pelvis (a wrong upward axis?)"
+        )
         count(
             "lying",
             np.abs(up) <= UPRIGHT,
-            "show figures whose head is not above the pelvis: lying, by a wrong upward axis?",
+            "show figures whose head is not above the pelvis (they lie: a wrong upward axis?)",
         )
         upright = up > UPRIGHT
         standing = int(upright.sum())
@@ -263,7 +265,7 @@ class Crowd:
             count(
                 "left and right",
                 upright & (_values(self._toes) < 0),
-                "show feet that point backwards: left and right swapped?",
+                "show feet that point backwards (left and right swapped?)",
                 standing,
             )
         if self.walking >= _LEAST_WALKS and self.backwards > MOST * self.walking:

@@ -16,12 +16,15 @@ from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.loading.statistics import compute
-from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.schema import Dropped, Manifest, UserError
 from motionloom.datasets.shards.index import MANIFEST_FILE
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.store.files import require_file_place, require_folder
+
+_ALIKE = 5
+"""Findings that say the same and are still listed one by one."""
 
 _REASONS = 12
 """Reasons for clips that were left out, a line each; the file has every clip."""
@@ -131,8 +134,13 @@ def say_plan(plan: ConversionPlan[Any], console: Console) -> None:
         _say(console, line)
 
 
-def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: Console) -> int:
-    """Check a dataset, a file or a folder of files; prints all there is to say, returns the problems."""
+def check_command(
+    path: Path, rules: dict[str, Any], *, strict: bool, console: Console, every: bool = False
+) -> int:
+    """Check a dataset, a file or a folder of files; prints what there is to say, returns the problems.
+
+    Many findings of a data set that say the same are one line, unless `every` one is asked for.
+    """
     if not path.exists():
         raise UserError(f"{path}: no such folder or file")
     files = path.is_file() or _holds_files(path)
@@ -142,7 +150,7 @@ def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: C
             f"{path}: {', '.join(of_files)} is for single files; a data set says this in its manifest.json; "
             f"leave it out"
         )
-    count, warned = _check_files(path, rules, console) if files else _check_dataset(path, console)
+    count, warned = _check_files(path, rules, console) if files else _check_dataset(path, every, console)
     if strict:
         count += warned
     console.print(f"{path}: {count} problems" if count else f"{path}: no problems", markup=False)
@@ -156,12 +164,16 @@ def _holds_files(folder: Path) -> bool:
     return any(path.suffix.lower() in FILE_SUFFIXES for path in folder.rglob("*"))
 
 
-def _check_dataset(root: Path, console: Console) -> tuple[int, int]:
+def _check_dataset(root: Path, every: bool, console: Console) -> tuple[int, int]:
     report = examine(root, progress=console.is_terminal)
-    for warning in report.warnings:
-        _say(console, f"warning: {warning}")
-    for problem in report.errors:
-        _say(console, str(problem))
+    for title, problems in (("warning: ", report.warnings), ("", report.errors)):
+        findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
+        for group in grouped(findings):
+            if group.count > _ALIKE and not every:
+                _say(console, f"{title}{group}; each of them: --all")
+                continue
+            for finding in group.members:
+                _say(console, f"{title}{finding.source}: {finding.reason}")
     if report.warning_kinds:
         told = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
         _say(console, f"{root}: warnings: {told}")
