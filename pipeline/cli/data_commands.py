@@ -82,9 +82,13 @@ def convert_command(
     cluster: list[str] | None,
     wait: bool,
     console: Console,
+    started: float | None = None,
 ) -> None:
-    """Plan a conversion, run it here, or hand it to SLURM."""
-    started = time.perf_counter()
+    """Plan a conversion, run it here, or hand it to SLURM.
+
+    `started` is when the command began (`time.perf_counter()`), for the time that a plan estimates.
+    """
+    started = time.perf_counter() if started is None else started
     converter = converter_named(kind)
     config = converter.config().parse(fields, f"data convert {kind}")
     shown = console.is_terminal
