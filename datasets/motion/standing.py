@@ -50,28 +50,34 @@ _LEAST_WALKS = 3
 
 _NAMED = Skeleton.named("smpl22")
 _PELVIS, _HEAD = _NAMED.index("pelvis"), _NAMED.index("head")
-_LEGS = [(_NAMED.index(f"{side}_{joint}")) for side in ("left", "right") for joint in ("knee", "ankle")]
-_TRUNK = [_NAMED.index(name) for name in ("spine1", "spine2", "spine3", "neck", "head")]
+_NECK = _NAMED.index("neck")
 _ANKLES = [_NAMED.index(f"{side}_ankle") for side in ("left", "right")]
 _FEET = [_NAMED.index(f"{side}_foot") for side in ("left", "right")]
-_PARENTS = np.array(_NAMED.parents)
 _NEUTRAL_HEIGHT = 1.7
 """Metres: the adult behind the named skeleton (`skeletons/smpl22.json`)."""
 
 
-def _chain(bones: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bone lengths [..., 22] -> length of the mean leg, the trunk and the neck [...]."""
-    return np.asarray(bones[..., _LEGS].sum(axis=-1) / 2 + bones[..., _TRUNK].sum(axis=-1))
+_STRETCHES = [
+    *((_NAMED.index(f"{side}_hip"), _NAMED.index(f"{side}_knee"), 0.5) for side in ("left", "right")),
+    *((_NAMED.index(f"{side}_knee"), _NAMED.index(f"{side}_ankle"), 0.5) for side in ("left", "right")),
+    (_PELVIS, _NECK, 1.0),
+    (_NECK, _HEAD, 1.0),
+]
+"""What a height is made of: (joint, joint, how often it counts). The trunk is one stretch: noise would make
+its five short bones longer, and bending hardly makes it shorter."""
 
 
-_HEIGHT_OF_CHAIN = _NEUTRAL_HEIGHT / float(_chain(np.linalg.norm(_NAMED.offsets, axis=-1)))
+def _length(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Joints [..., 22, 3] -> length of a leg, the trunk and the neck [...]."""
+    return np.asarray(
+        sum(
+            weight * np.linalg.norm(joints[..., first, :] - joints[..., second, :], axis=-1)
+            for first, second, weight in _STRETCHES
+        )
+    )
 
 
-def bone_lengths(joints: NDArray[Any]) -> NDArray[np.float64]:
-    """Length of the bone that ends in each body joint: joints [..., N, 3] -> [..., 22]; the root's is 0."""
-    body = np.asarray(joints[..., :BODY_JOINTS, :], dtype=np.float64)
-    lengths: NDArray[np.float64] = np.linalg.norm(body - body[..., np.maximum(_PARENTS, 0), :], axis=-1)
-    return lengths
+_HEIGHT_OF_LENGTH = _NEUTRAL_HEIGHT / float(_length(_NAMED.rest_joints))
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,7 @@ class Standing:
     """One clip measured. Everything is a median over its frames, so that a bow or a jump does not count."""
 
     height: float
-    """Metres, from the lengths of legs, trunk and neck: the same in any pose."""
+    """Metres, from the lengths of legs, trunk and neck: nearly the same in any pose."""
     up: tuple[float, float, float]
     """Unit vector from pelvis to head."""
     floor: float
@@ -117,7 +123,6 @@ def measure(joints: NDArray[Any], fps: float) -> Standing:
     """Measure a clip of joints [T, N, 3], Y up, the first 22 those of the body skeleton."""
     step = max(1, round(fps / _RATE))
     body = np.asarray(joints[::step, :BODY_JOINTS], dtype=np.float64)
-    bones = np.median(bone_lengths(body), axis=0)
     trunk = body[:, _HEAD] - body[:, _PELVIS]
     up = np.median(trunk / np.maximum(np.linalg.norm(trunk, axis=-1, keepdims=True), 1e-9), axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
@@ -126,7 +131,7 @@ def measure(joints: NDArray[Any], fps: float) -> Standing:
     heading = np.exp(1j * facing(body))
     toes = ground(body[:, _FEET] - body[:, _ANKLES]) * heading.conj()[:, None]
     return Standing(
-        height=float(_chain(bones)) * _HEIGHT_OF_CHAIN,
+        height=float(np.median(_length(body))) * _HEIGHT_OF_LENGTH,
         up=(float(up[0]), float(up[1]), float(up[2])),
         floor=floor,
         above_floor=float(np.median(lowest)) - floor,

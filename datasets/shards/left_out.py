@@ -81,7 +81,7 @@ def grouped_notes(notes: Sequence[str], *, least: int = 4) -> list[str]:
 def tally(dropped: Iterable[Dropped]) -> str:
     """`3 rejected, 1 unreadable file, 2 missing`, each thing counted once; empty when there is nothing."""
     sources = {(drop.kind, drop.source) for drop in dropped}
-    counts = Counter(kind for kind, _ in sources)
+    counts: Counter[str] = Counter(kind for kind, _ in sources)
     words = {"rejected": "rejected", "unreadable": "unreadable file", "missing": "missing"}
     return ", ".join(
         f"{counts[kind]:,} {word}{'s' if kind == 'unreadable' and counts[kind] > 1 else ''}"
