@@ -150,6 +150,9 @@ class Dropped(Config):
 
     source: str
     reason: str
+    kind: Literal["rejected", "unreadable", "missing"] = "rejected"
+    """`rejected`: it is in the source, but cannot or must not become a sample. `unreadable`: a file, of
+    motion or of texts, that is damaged. `missing`: listed somewhere, but not in the source."""
 
 
 class Manifest(Config):

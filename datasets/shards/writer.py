@@ -36,6 +36,7 @@ from motionloom.datasets.shards.index import (
     index_path,
     save_index,
 )
+from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.tasks import (
     Convert,
@@ -119,6 +120,20 @@ class DatasetWriter(Generic[T]):
             (out / MANIFEST_FILE).unlink(missing_ok=True)
 
     @property
+    def progress_line(self) -> str:
+        """What an earlier run has finished, in one line; empty when there is nothing yet."""
+        made = len(self._tasks) - len(self._todo)
+        if not made:
+            return ""
+        clips = sum(shard.samples for result in self._results if result and (shard := result[0]) is not None)
+        state = f"{made:,} of {len(self._tasks):,} shards ({clips:,} clips)"
+        if self._todo:
+            return f"{self.out}: goes on after {state} of an earlier run"
+        whole = self._how.part is None and (self.out / MANIFEST_FILE).exists()
+        word = "finished already" if whole else "all shards are there"
+        return f"{self.out}: {word}, {state}; nothing to convert"
+
+    @property
     def work_folder(self) -> Path:
         """For what a features step makes; removed with everything in it when the manifest stands."""
         return self.out / WORK_FOLDER
@@ -153,9 +168,12 @@ class DatasetWriter(Generic[T]):
             notes=list(facts.notes),
         )
         if self._how.part is None:
+            write_left_out(self.out, manifest.dropped)
             if not shards:
-                some = "; ".join(f"{drop.source}: {drop.reason}" for drop in [*failed, *facts.dropped][:3])
-                raise UserError(f"{self.out}: no clip survived the conversion ({some or 'there was none'})")
+                groups = grouped([*failed, *facts.dropped])
+                some = "; ".join(map(str, groups[:3])) or "there was none"
+                where = f"; all of them: {self.out / LEFT_OUT_FILE}" if len(manifest.dropped) > 1 else ""
+                raise UserError(f"{self.out}: no clip survived the conversion ({some}){where}")
             _finish_index(self.out, shards)
             write_json(self.out / MANIFEST_FILE, manifest.dump())
             shutil.rmtree(self.work_folder, ignore_errors=True)

@@ -7,6 +7,7 @@ command line, a recipe's stage and the Python API can never differ. A converter 
 from __future__ import annotations
 
 import inspect
+import time
 import types
 import typing
 from pathlib import Path
@@ -83,11 +84,13 @@ def _command(name: str) -> Any:
     fields = {key: field for key, field in config.model_fields.items() if key != "source"}
 
     def run(source: Path, out: Path, **values: Any) -> None:
+        started = time.perf_counter()  # the imports are the larger part of a short conversion
         from motionloom.pipeline.cli.data_commands import convert_command
 
         steering = {key: values.pop(key) for key in _RUN_OPTIONS}
         given = {key: _plain(fields[key], value) for key, value in values.items()}
-        convert_command(name, {"source": source, **given}, out, console=make_console(), **steering)
+        fields_given = {"source": source, **given}
+        convert_command(name, fields_given, out, console=make_console(), started=started, **steering)
 
     parameters = [
         _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source"))]),

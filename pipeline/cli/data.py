@@ -59,8 +59,11 @@ def check(
     ] = "auto",
     seconds: Annotated[float | None, typer.Option(help="Files: length of the clips of captions.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Warnings count as problems.")] = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="List every finding, also where many say the same.")
+    ] = False,
 ) -> None:
-    """Checksums, schema, finite values, ranges, duplicates, leaks. Exit code 1 and a list of problems.
+    """Checksums, schema, finite values, ranges, people on a floor, duplicates, leaks. Exit code 1 and a list.
 
     Without manifest.json, single files are checked: .tar, .npy, .npz, .pkl, .bvh, .wav, .txt.
 
@@ -71,7 +74,8 @@ def check(
     from motionloom.pipeline.cli.data_commands import check_command
 
     rules = {"layout": layout, "fps": fps, "texts": texts, "seconds": seconds}
-    raise typer.Exit(1 if check_command(path, rules, strict=strict, console=make_console()) else 0)
+    console = make_console()
+    raise typer.Exit(1 if check_command(path, rules, strict=strict, every=every, console=console) else 0)
 
 
 @data_app.command()

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.schema import Dropped, Manifest, UserError
+from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
     from motionloom.datasets.convert.common.plan import ConversionPlan
+
+_ALIKE = 5
+"""Findings that say the same and are still listed one by one."""
+
+_REASONS = 12
+"""Reasons for clips that were left out, a line each; the file has every clip."""
 
 
 def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
@@ -27,14 +35,27 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
                 split, str(len(shards)), str(sum(s.samples for s in shards)), f"{minutes:.1f}", f"{size:.1f}"
             )
     console.print(table)
-    for dropped in manifest.dropped[:20]:
-        console.print(f"dropped {dropped.source}: {dropped.reason}")
-    if len(manifest.dropped) > 20:
-        console.print(f"… and {len(manifest.dropped) - 20} more, all in {out / 'manifest.json'}")
+    say_left_out(manifest, out, console)
     console.print(
         f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), "
         f"{manifest.fps:g} fps, {', '.join(manifest.licences) or manifest.licence}"
     )
+
+
+def say_left_out(manifest: Manifest, out: Path, console: Console) -> None:
+    """How much was left out, a line for each reason, and where the whole list is."""
+    if not manifest.dropped:
+        return
+    from motionloom.datasets.shards.index import MANIFEST_FILE
+
+    listed = out / LEFT_OUT_FILE
+    place = listed if listed.exists() else out / MANIFEST_FILE
+    console.print(f"left out: {tally(manifest.dropped)}; all in {place}", markup=False, soft_wrap=True)
+    groups = grouped(manifest.dropped)
+    for group in groups[:_REASONS]:
+        _say(console, f"  {group}")
+    if len(groups) > _REASONS:
+        console.print(f"  … and {len(groups) - _REASONS} more reasons")
 
 
 def synth_command(fields: dict[str, Any], out: Path, *, workers: int, console: Console) -> None:
@@ -58,17 +79,22 @@ def convert_command(
     cluster: list[str] | None,
     wait: bool,
     console: Console,
+    started: float | None = None,
 ) -> None:
-    """Plan a conversion, run it here, or hand it to SLURM."""
+    """Plan a conversion, run it here, or hand it to SLURM.
+
+    `started` is when the command began (`time.perf_counter()`), for the time that a plan estimates.
+    """
     from motionloom.datasets.convert.common.conversion import run_conversion
     from motionloom.datasets.convert.table import converter_named
 
+    started = time.perf_counter() if started is None else started
     converter = converter_named(kind)
     config = converter.config().parse(fields, f"data convert {kind}")
     shown = not console.quiet
     if plan:
-        conversion = converter.prepare(config, workers=workers, progress=shown)
-        say_plan(conversion.estimated(workers), console)
+        conversion = converter.prepare(config, workers=workers, progress=shown).looked()
+        say_plan(conversion.estimated(workers, started), console)
         return
     if cluster:
         from motionloom.pipeline.launch.slurm_convert import ClusterConfig, submit_conversion, wait_for
@@ -88,7 +114,13 @@ def convert_command(
     require_folder(out)
     conversion = converter.prepare(config, out=out, workers=workers, progress=shown)
     manifest = run_conversion(
-        conversion, out, workers=workers, strict=strict, clips_per_shard=clips_per_shard, progress=shown
+        conversion,
+        out,
+        workers=workers,
+        strict=strict,
+        clips_per_shard=clips_per_shard,
+        progress=shown,
+        say=lambda line: _say(console, line),
     )
     say_manifest(manifest, out, console)
     if conversion.plan.captions:
@@ -101,10 +133,20 @@ def say_plan(plan: ConversionPlan[Any], console: Console) -> None:
     if subsets is not None:
         console.print(subsets)
     console.print(plan.table())
+    if plan.look is None:
+        return
+    console.print(plan.look.table())
+    for line in plan.look.lines():
+        _say(console, line)
 
 
-def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: Console) -> int:
-    """Check a dataset, a file or a folder of files; prints all there is to say, returns the problems."""
+def check_command(
+    path: Path, rules: dict[str, Any], *, strict: bool, console: Console, every: bool = False
+) -> int:
+    """Check a dataset, a file or a folder of files; prints what there is to say, returns the problems.
+
+    Many findings of a data set that say the same are one line, unless `every` one is asked for.
+    """
     if not path.exists():
         raise UserError(f"{path}: no such folder or file")
     files = path.is_file() or _holds_files(path)
@@ -114,7 +156,7 @@ def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: C
             f"{path}: {', '.join(of_files)} is for single files; a data set says this in its manifest.json; "
             f"leave it out"
         )
-    count, warned = _check_files(path, rules, console) if files else _check_dataset(path, console)
+    count, warned = _check_files(path, rules, console) if files else _check_dataset(path, every, console)
     if strict:
         count += warned
     console.print(f"{path}: {count} problems" if count else f"{path}: no problems", markup=False)
@@ -130,14 +172,18 @@ def _holds_files(folder: Path) -> bool:
     return any(path.suffix.lower() in FILE_SUFFIXES for path in folder.rglob("*"))
 
 
-def _check_dataset(root: Path, console: Console) -> tuple[int, int]:
+def _check_dataset(root: Path, every: bool, console: Console) -> tuple[int, int]:
     from motionloom.datasets.check.dataset import examine
 
     report = examine(root, progress=console.is_terminal)
-    for warning in report.warnings:
-        _say(console, f"warning: {warning}")
-    for problem in report.errors:
-        _say(console, str(problem))
+    for title, problems in (("warning: ", report.warnings), ("", report.errors)):
+        findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
+        for group in grouped(findings):
+            if group.count > _ALIKE and not every:
+                _say(console, f"{title}{group}; each of them: --all")
+                continue
+            for finding in group.members:
+                _say(console, f"{title}{finding.source}: {finding.reason}")
     if report.warning_kinds:
         told = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
         _say(console, f"{root}: warnings: {told}")

@@ -8,8 +8,7 @@ from outside.
 from __future__ import annotations
 
 import json
-import re
-from collections import Counter, defaultdict
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from motionloom.datasets.check.dataset import CheckReport, examine
 from motionloom.datasets.loading.statistics import STD_FLOOR
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.left_out import grouped
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.pipeline.data_page.clips import WATCH_SECONDS, choose, watch
 from motionloom.pipeline.data_page.facts import DataFacts, SplitFacts, gather
@@ -94,7 +94,7 @@ def _overview(page: Page, facts: DataFacts, found: CheckReport | None) -> None:
         "clips": clips,
         "length": _span(seconds),
         "captions": facts.captions.count,
-        "rejected clips": len(facts.manifest.dropped),
+        "rejected clips": sum(drop.kind == "rejected" for drop in facts.manifest.dropped),
         "on disk": _size(sum(split.bytes for split in facts.splits)),
         "licence": _licence(facts),
     }
@@ -262,22 +262,17 @@ def _rejected(page: Page, facts: DataFacts) -> None:
     if not dropped:
         page.add_text("None: every clip of the source is here.")
         return
-    groups: dict[str, Rows] = defaultdict(list)
-    for drop in dropped:
-        groups[_kind(drop.reason, drop.source)].append([drop.source, drop.reason])
-    ranked = sorted(groups.items(), key=lambda item: (-len(item[1]), item[0]))
+    ranked: list[tuple[str, Rows]] = [
+        (group.kind, [[drop.source, drop.reason] for drop in group.members]) for group in grouped(dropped)
+    ]
     rest = [row for _, rows in ranked[REASONS:] for row in rows]
     clips = sum(len(split.seconds) for split in facts.splits)
-    page.add_text(f"{len(dropped):,} clips of {len(dropped) + clips:,} were left out, for these reasons.")
+    rejected = sum(drop.kind == "rejected" for drop in dropped)
+    other = Counter(drop.kind for drop in dropped if drop.kind != "rejected")
+    more = "".join(f"; {count:,} {kind} files" for kind, count in sorted(other.items()))
+    page.add_text(f"{rejected:,} clips of {rejected + clips:,} were left out{more}, for these reasons.")
     for kind, rows in [*ranked[:REASONS], *([("other reasons", rest)] if rest else [])]:
         page.add_folded(f"{len(rows):,} × {kind}", ["source", "reason"], rows)
-
-
-def _kind(reason: str, source: str) -> str:
-    """A reason without what differs from clip to clip, so that equal ones come together."""
-    text = reason.replace(source, "…")
-    text = re.sub(r"'[^']*'", "'…'", text)
-    return re.sub(r"-?\d+(?:[.,]\d+)*", "…", text)[:200]
 
 
 def _source(page: Page, facts: DataFacts) -> None:

@@ -142,6 +142,9 @@ def submit_conversion(
     if strict:
         conversion.plan.require_whole()
     conversion.plan.require_settled()
+    seen = conversion.look()  # here and not in the jobs: all parts would look at the same clips
+    if seen is not None:
+        seen.require_people(conversion.plan.name)
     steps = _steps(conversion, cluster.tasks, clips_per_shard)
     record = ConvertJob(
         kind=kind,

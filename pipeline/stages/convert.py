@@ -66,7 +66,13 @@ def run_convert(context: StageContext) -> None:
     kind = next(name for name, (_, config) in CONVERTED.items() if isinstance(context.config, config))
     shown = not context.console.quiet
     conversion = converter_named(kind).prepare(context.config, out=out, workers=workers, progress=shown)
-    manifest = run_conversion(conversion, out, workers=workers, progress=shown)
+    manifest = run_conversion(
+        conversion,
+        out,
+        workers=workers,
+        progress=shown,
+        say=lambda line: context.console.print(f"    {line}", markup=False, soft_wrap=True),
+    )
     say_shards(context, manifest)
     if conversion.plan.captions:
         context.console.print(

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.shards.left_out import tally
 from motionloom.datasets.shards.reader import manifest_layout, read_manifest, require_layout
 from motionloom.datasets.shards.reading import CacheConfig, Reading
 from motionloom.datasets.shards.store import is_url, open_store
@@ -199,7 +200,7 @@ def say_shards(context: StageContext, manifest: Manifest, name: str = "") -> Non
     """One line about a data set: clips, minutes, layout."""
     clips = sum(s.samples for s in manifest.shards)
     seconds = sum(s.frames for s in manifest.shards) / manifest.fps
-    dropped = f", {len(manifest.dropped)} dropped" if manifest.dropped else ""
+    dropped = f", {tally(manifest.dropped)}" if manifest.dropped else ""
     context.console.print(
         f"    {name and name + ': '}{clips} clips, {seconds / 60:.1f} minutes at {manifest.fps:g} fps, "
         f"layout {manifest.layout} ({manifest.family}), {len(manifest.shards)} shards{dropped}"

@@ -14,14 +14,20 @@ from motionloom.datasets.motion.skeleton import Skeleton
 SKELETON = Skeleton.named("smpl22")
 
 
-def write_clip(path: Path, seed: int, frames: int = 90, fps: float = 30.0) -> Path:
-    """Every joint swings a little about its own axis, at its own pace, while the figure walks off slowly."""
+def write_clip(path: Path, seed: int, frames: int = 90, fps: float = 30.0, *, z_up: bool = False) -> Path:
+    """Every joint swings a little about its own axis, at its own pace, while the figure walks off slowly.
+
+    With `z_up` the file's z axis points up, as some tools export it.
+    """
     rng = np.random.default_rng(seed)
     times = np.arange(frames)[:, None, None] / fps
     axes = rng.standard_normal((1, len(SKELETON), 3)) * 0.08
     turns = axes * np.sin(times * rng.uniform(0.5, 3.0, (1, len(SKELETON), 1)))
     rotations = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix().reshape(frames, -1, 3, 3)
     root = np.array([0.0, 0.95, 0.0]) + times[:, 0] * rng.uniform(-0.3, 0.3, 3) * [1, 0, 1]
+    if z_up:
+        turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+        rotations[:, 0], root = turn @ rotations[:, 0], root @ turn.T
     write_bvh(path, SKELETON, rotations, root, fps)
     return path
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from motionloom.datasets.motion.features import encode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Manifest, Split
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
@@ -25,8 +26,13 @@ def items(count: int) -> list[tuple[Split, int]]:
 
 
 def clip_motion(i: int) -> np.ndarray:
+    """Somebody who stands and trembles, each clip in its own way."""
     frames = 20 + i % 70
-    return np.random.default_rng(i).standard_normal((frames, LAYOUT.dim)).astype(np.float32)
+    joints = LAYOUT.skeleton.rest_joints[None].repeat(2, axis=0)
+    joints[..., 1] -= joints[..., 1].min()
+    stands = encode(joints, LAYOUT)[:1]
+    trembles = 0.01 * np.random.default_rng(i).standard_normal((frames, LAYOUT.dim))
+    return np.asarray(stands + trembles, dtype=np.float32)
 
 
 def clip(i: int, split: Split = "train") -> Sample:

@@ -39,6 +39,7 @@ from motionloom.datasets.convert.aistpp.plan import (
 from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
 from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.motion.canonical import canonicalize, facing, resample, resample_quaternions
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
@@ -91,7 +92,15 @@ def prepare_aistpp(config: AistppConfig, *, workers: int = 1, progress: bool = F
         version=CONVERTER_VERSION,
         options=options,
         audio=settings.dump() if settings else None,
+        see=partial(see_clip, config, body),
+        subset_of=lambda clip: genre_of(clip.id),
     )
+
+
+def see_clip(config: AistppConfig, body: BodyModel, clip: AistClip) -> SourceJoints:
+    """The joints of one dance, as far as it is used."""
+    poses, trans = _read_dance(config, clip)
+    return SourceJoints(smpl_joints(poses[:, :BODY_JOINTS], trans, body), FPS)
 
 
 def audio_settings(config: AistppConfig) -> AudioSettings | None:
@@ -104,12 +113,7 @@ def audio_settings(config: AistppConfig) -> AudioSettings | None:
 def convert_clip(config: AistppConfig, body: BodyModel, clip: AistClip) -> Sample:
     """Read one sequence and its music. `UserError` for what cannot be a person's motion, or is not sound."""
     layout = config.motion_layout()
-    label = clip.label()
-    source = read_aist_motion(inside(config.source / MOTIONS, f"{clip.id}.pkl", label), label)
-    if len(source.poses) != clip.frames:
-        raise UserError(f"{label}: {len(source.poses)} frames, {clip.frames} when the plan was made")
-    poses = source.poses[: clip.used].reshape(-1, SMPL_JOINTS, 3).astype(np.float64)
-    trans = source.metres()[: clip.used]
+    poses, trans = _read_dance(config, clip)
     joints = smpl_joints(poses[:, :BODY_JOINTS], trans, body)
     require_human(joints, FPS)
     if layout.family == "raw":
@@ -121,7 +125,7 @@ def convert_clip(config: AistppConfig, body: BodyModel, clip: AistClip) -> Sampl
         features, wav = music_of_clip(config, clip.sound, len(motion))
     meta = layout.clip_meta(
         clip.id,
-        source=label,
+        source=clip.label(),
         split=clip.split,
         frames=len(motion),
         licence=clip.licence,
@@ -130,6 +134,16 @@ def convert_clip(config: AistppConfig, body: BodyModel, clip: AistClip) -> Sampl
     )
     texts = [_genre_caption(clip.id)] if config.caption_genre else []
     return Sample(meta=meta, motion=motion, texts=texts, audio=features, wav=wav)
+
+
+def _read_dance(config: AistppConfig, clip: AistClip) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Axis-angles [T, 24, 3] and translation [T, 3] in metres of the frames that are used."""
+    label = clip.label()
+    source = read_aist_motion(inside(config.source / MOTIONS, f"{clip.id}.pkl", label), label)
+    if len(source.poses) != clip.frames:
+        raise UserError(f"{label}: {len(source.poses)} frames, {clip.frames} when the plan was made")
+    poses = source.poses[: clip.used].reshape(-1, SMPL_JOINTS, 3).astype(np.float64)
+    return poses, np.asarray(source.metres()[: clip.used], dtype=np.float64)
 
 
 def canonical_smpl75(

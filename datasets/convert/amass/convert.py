@@ -18,13 +18,15 @@ from functools import cached_property
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.amass.plan import AmassClip, plan_amass
 from motionloom.datasets.convert.amass.source import LICENCE, AmassConfig
 from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import features_of
-from motionloom.datasets.convert.common.smpl_npz import read_motion
+from motionloom.datasets.convert.common.look import SourceJoints
+from motionloom.datasets.convert.common.smpl_npz import SmplMotion, read_motion
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.motion.smpl import BodyModel, SkeletonName, smpl_joints
@@ -63,14 +65,17 @@ def prepare_amass(config: AmassConfig, *, workers: int = 1, progress: bool = Fal
     ]
     options = config.options(*_PATHS, *_MODEL_PATHS.values())
     options |= {"humanml_index": config.humanml_index is not None, "bodies": statements}
+    maker = ClipMaker(config, bodies)
     return Conversion(
         config=config,
         plan=plan,
-        convert=ClipMaker(config, bodies),
+        convert=maker,
         licence=config.licence or LICENCE,
         converter=CONVERTER,
         version=CONVERTER_VERSION,
         options=options | {"source_sha256": sha256_of_json(content)},
+        see=maker.see,
+        subset_of=lambda clip: clip.file.subset,
     )
 
 
@@ -89,17 +94,11 @@ class ClipMaker:
 
     def __call__(self, clip: AmassClip) -> Sample:
         """One sample; `UserError` when the motion cannot be used."""
-        fingers = self.layout.num_joints > BODY_JOINTS
-        motion = read_motion(
-            clip.file.path, clip.file.label, hands=fingers, frames=slice(clip.first, clip.last)
-        )
+        motion = self._read(clip)
         # Resampling would take every 6th frame as it is (120 to 20 a second): pose no others.
         ratio = clip.fps / self.layout.fps
         step = max(round(ratio), 1) if abs(ratio - round(ratio)) < 1e-6 else 1
-        body = self.bodies.get(clip.header.gender) or self.bodies["neutral"]
-        joints = smpl_joints(motion.rotations[::step], motion.trans[::step], body, motion.betas)
-        if self.config.up == "z":
-            joints = joints[..., [0, 2, 1]] * [1.0, 1.0, -1.0]
+        joints = self._joints(clip, motion, step)
         if clip.mirror_of is not None:
             joints = mirror(joints, self.layout.skeleton)
         features = features_of(joints, clip.fps / step, self.layout, same_bones=self.config.retarget)
@@ -115,3 +114,20 @@ class ClipMaker:
             mirror_of=clip.mirror_of,
         )
         return Sample(meta, features, texts=list(clip.texts))
+
+    def see(self, clip: AmassClip) -> SourceJoints:
+        """The joints of one clip, Y up."""
+        return SourceJoints(self._joints(clip, self._read(clip), 1), clip.fps)
+
+    def _read(self, clip: AmassClip) -> SmplMotion:
+        fingers = self.layout.num_joints > BODY_JOINTS
+        frames = slice(clip.first, clip.last)
+        return read_motion(clip.file.path, clip.file.label, hands=fingers, frames=frames)
+
+    def _joints(self, clip: AmassClip, motion: SmplMotion, step: int) -> NDArray[np.float64]:
+        """World joints [T, N, 3], Y up, of every `step`-th frame."""
+        body = self.bodies.get(clip.header.gender) or self.bodies["neutral"]
+        joints = smpl_joints(motion.rotations[::step], motion.trans[::step], body, motion.betas)
+        if self.config.up == "z":
+            joints = joints[..., [0, 2, 1]] * [1.0, 1.0, -1.0]
+        return np.asarray(joints, dtype=np.float64)

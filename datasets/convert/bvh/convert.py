@@ -27,6 +27,7 @@ from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.feature_step import FeatureStep
 from motionloom.datasets.convert.common.feature_store import store_batch, stored_batch, stored_features
 from motionloom.datasets.convert.common.features import features_of
+from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.joint_map import JointMap
@@ -38,6 +39,9 @@ __all__ = ["BvhConfig", "plan_bvh", "prepare_bvh"]
 
 CONVERTER = "bvh"
 CONVERTER_VERSION = 2
+
+_NAMED_JOINTS = 12
+"""Joints without a row that are named; a hand alone has twenty."""
 
 
 def prepare_bvh(
@@ -66,6 +70,9 @@ def prepare_bvh(
         version=CONVERTER_VERSION,
         options=options,
         features=FeatureStep(batches, lambda clip: positions[clip.number], clips.take),
+        see=clips.see,
+        subset_of=lambda clip: clip.subset,
+        in_order=lambda clip: clip.batch.archive is not None,
     )
 
 
@@ -89,9 +96,31 @@ class BvhClips:
 
     def __call__(self, clip: BvhClip) -> Sample:
         """One clip by itself. An archive is read up to the clip: for many clips, make the batch."""
-        for file in clip.batch.read(SUFFIX):
-            if file.path == clip.found.path:
-                return self._sample(clip, self.features(clip.label(), file.data))
+        return self._sample(clip, self.features(clip.label(), self._read(clip)))
+
+    def see(self, clip: BvhClip) -> SourceJoints:
+        """The joints of one clip as the map reads them, and the joints that no row of it names."""
+        motion = read_bvh(self._read(clip), name=clip.label())
+        joints = self.joint_map.apply(motion, unit=self.config.unit, up=self.config.up)
+        used = {name for names in self.joint_map.sources for name in names}
+        free = [name for name in motion.joints if name not in used and name not in self.joint_map.unmapped]
+        twice = sorted({name for name in free if motion.joints.count(name) > 1})
+        remarks = []
+        if free:
+            more = f" and {len(free) - _NAMED_JOINTS} more" if len(free) > _NAMED_JOINTS else ""
+            remarks.append(f"joints that no row of the map names: {', '.join(free[:_NAMED_JOINTS])}{more}")
+        if twice:
+            remarks.append(f"joints that appear more than once, which no row can name: {', '.join(twice)}")
+        names = tuple(names[0] if len(names) == 1 else names for names in self.joint_map.sources)
+        return SourceJoints(joints, self.config.source_fps or motion.fps, names, tuple(remarks))
+
+    def _read(self, clip: BvhClip) -> bytes:
+        batch = clip.batch
+        if batch.archive is None:  # no need to read the loose files before it
+            batch = Batch(batch.root, None, (clip.found.path,))
+        for file in batch.read(SUFFIX):
+            if file.path == clip.found.path and not file.error:
+                return file.data
         raise UserError(f"{clip.label()}: no longer in the source")
 
     def take(self, clip: BvhClip, folder: Path) -> Sample:

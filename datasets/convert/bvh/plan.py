@@ -75,6 +75,12 @@ class BvhClip:
     split: Split
     texts: tuple[Caption, ...]
 
+    @property
+    def subset(self) -> str:
+        """Its archive, or the folder at the top of the source that it lies in; empty for neither."""
+        folders = PurePosixPath(self.found.path).parts[:-1]
+        return self.batch.archive or (folders[0] if folders else "")
+
     def label(self) -> str:
         """Name of the clip in reports."""
         return self.found.label

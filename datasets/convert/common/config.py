@@ -37,6 +37,9 @@ class ConvertConfig(Config):
     """Convert only this many clips, chosen by a hash of the id so that they stay spread over the source."""
     motion_type: MotionType = "float32"
     """`float16` halves the shards; positions then keep about a millimetre."""
+    look: int = Field(default=5, ge=0, json_schema_extra={"runtime": True})
+    """Clips of every subset to read and measure first; 0 for none. A source that then shows no people
+    standing on a floor is refused."""
 
     def motion_layout(self) -> MotionLayout:
         """The layout of the written shards."""
@@ -44,7 +47,7 @@ class ConvertConfig(Config):
 
     def options(self, *local: str) -> dict[str, Any]:
         """What the output depends on, for the manifest: without `source` and other `local` paths."""
-        return {key: value for key, value in self.dump().items() if key not in ("source", *local)}
+        return {key: value for key, value in self.dump().items() if key not in ("source", "look", *local)}
 
     def licence_problem(self, licence: str) -> str:
         """Why a clip under `licence` is left out; empty when it may come."""

@@ -54,11 +54,18 @@ class FeatureStep(Generic[T]):
     take: Take[T]
     """The sample of an item, from the files of its batch. Picklable; raises what stopped the clip."""
 
-    def make(self, items: Sequence[T], folder: Path, pool: Workers, how: WriteOptions) -> Convert[T]:
+    def make(
+        self,
+        items: Sequence[T],
+        folder: Path,
+        pool: Workers,
+        how: WriteOptions,
+        say: Callable[[str], None] | None = None,
+    ) -> Convert[T]:
         """Make the batches that `items` need and that are not there: all, or those of a part.
 
-        Returns the function from item to sample. A part of the shards makes no batch: `UserError` when one is
-        missing.
+        `say` gets a line when an earlier run made some of them. Returns the function from item to sample. A
+        part of the shards makes no batch: `UserError` when one is missing.
         """
         needed = sorted({self.batch_of(item) for item in items})
         if how.features_only:
@@ -69,6 +76,10 @@ class FeatureStep(Generic[T]):
                 f"{folder}: features of {len(todo)} batches are missing; "
                 f"run the parts of step 'features' first"
             )
+        made = len(needed) - len(todo)
+        if say is not None and made and todo:
+            clips = sum(self.batches[position].size for position in needed) - sum(b.size for b in todo)
+            say(f"{folder.parent}: goes on after {made:,} of {len(needed):,} batches ({clips:,} clips)")
         if todo:
             folder.mkdir(parents=True, exist_ok=True)
         clips = sum(batch.size for batch in todo)

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from dataclasses import asdict, dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
 
 from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.look import Look
 from motionloom.datasets.schema import Dropped, Split, UserError
 from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.shards.left_out import grouped, grouped_notes
 
 
 class PlannedClip(Protocol):
@@ -78,11 +80,14 @@ class ConversionPlan(Generic[C]):
     bytes_needed: int | None = None
     """Disk that the shards will take; None when unknown."""
     seconds_needed: float | None = None
-    """Estimated time on the planned number of workers, from a few clips converted for the purpose."""
+    """Estimated time on the planned number of workers, start-up included, from a few clips converted for the
+    purpose."""
     captions: str = ""
     """How many clips have captions, and which have none, where captions were brought for them."""
     stop: str = ""
     """Why it must not be carried out before the user decides something; empty when nothing is open."""
+    look: Look | None = None
+    """What a few clips showed; None when none was looked at."""
 
     def counts(self) -> dict[Split, int]:
         """Clips a split."""
@@ -98,18 +103,42 @@ class ConversionPlan(Generic[C]):
         table.add_row("without captions", str(len(self.uncaptioned)), "", _some(self.uncaptioned))
         kinds = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
         for title, drops in kinds:
-            table.add_row(title, str(len(drops)), "", _some([f"{d.source}: {d.reason}" for d in drops]))
+            table.add_row(title, str(len(drops)), "", _some(grouped(drops)))
         for licence, count in sorted(self.licences.items()):
             table.add_row("licence", str(count), "", licence)
         if self.bytes_needed is not None:
             table.add_row("disk", "", "", f"{self.bytes_needed / 2**20:,.1f} MiB")
         if self.seconds_needed is not None:
             table.add_row("time", "", "", _duration(self.seconds_needed))
-        for note in self.notes:
+        for note in grouped_notes(self.notes):
             table.add_row("note", "", "", note)
         if self.stop:
             table.add_row("stops here", "", "", self.stop)
         return table
+
+    def dump(self) -> dict[str, Any]:
+        """The plan as plain JSON values, every clip that is left out by name and reason."""
+        left: dict[str, list[dict[str, str]]] = {
+            name: [{"source": drop.source, "reason": drop.reason} for drop in drops]
+            for name, drops in (
+                ("missing", self.missing), ("rejected", self.dropped), ("unreadable", self.broken)
+            )
+        }  # fmt: skip
+        return {
+            "name": self.name,
+            "found": self.found,
+            "clips": dict(self.counts()),
+            "frames": dict(self.frames),
+            **left,
+            "uncaptioned": list(self.uncaptioned),
+            "ignored": self.ignored,
+            "notes": list(self.notes),
+            "subsets": {name: asdict(subset) for name, subset in self.subsets.items()},
+            "licences": dict(self.licences),
+            "bytes_needed": self.bytes_needed,
+            "seconds_needed": self.seconds_needed,
+            "look": None if self.look is None else self.look.dump(),
+        }
 
     def subset_table(self) -> Table | None:
         """Found and missing per subset beside the official release; None for a source without subsets."""
@@ -123,7 +152,11 @@ class ConversionPlan(Generic[C]):
 
     def left_out(self) -> list[Dropped]:
         """Everything that will not become a sample, with reasons."""
-        return [*self.missing, *self.broken, *self.dropped]
+        return [
+            *(drop.model_copy(update={"kind": "missing"}) for drop in self.missing),
+            *(drop.model_copy(update={"kind": "unreadable"}) for drop in self.broken),
+            *self.dropped,
+        ]
 
     def require_settled(self) -> None:
         """`UserError` when the user has something to decide first."""
@@ -227,6 +260,6 @@ def _duration(seconds: float) -> str:
     return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"
 
 
-def _some(lines: Sequence[str], limit: int = 5) -> str:
+def _some(lines: Sequence[object], limit: int = 5) -> str:
     more = [f"... and {len(lines) - limit} more"] if len(lines) > limit else []
-    return "\n".join([*lines[:limit], *more])
+    return "\n".join([*map(str, lines[:limit]), *more])

@@ -25,6 +25,7 @@ from motionloom.datasets.convert.common.arrays import load_array
 from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.humanml3d.plan import (
     FPS,
@@ -67,7 +68,13 @@ def prepare_humanml3d(
         converter=CONVERTER,
         version=CONVERTER_VERSION,
         options=config.options() | {"source_sha256": sha256_of_json(content)},
+        see=partial(see_clip, config),
     )
+
+
+def see_clip(config: HumanMl3dConfig, clip: HumanMl3dClip) -> SourceJoints:
+    """The joints of one clip."""
+    return SourceJoints(_joints(_load(config, clip, clip.files[0])), FPS)
 
 
 def convert_clip(config: HumanMl3dConfig, clip: HumanMl3dClip) -> Sample:

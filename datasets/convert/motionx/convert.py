@@ -26,6 +26,7 @@ from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.arrays import load_array
 from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
+from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.motionx.parameters import (
     BETAS,
@@ -85,7 +86,14 @@ def prepare_motionx(
             "body_model": body.statement,
             "source_sha256": sha256_of_json(content),
         },
+        see=partial(see_clip, config, body),
+        subset_of=lambda clip: clip.subset,
     )
+
+
+def see_clip(config: MotionXConfig, body: BodyModel, clip: MotionXClip) -> SourceJoints:
+    """The joints of one clip in metres, Y up."""
+    return SourceJoints(parameters_to_joints(read_parameters(config, clip), body), FPS)
 
 
 def convert_clip(config: MotionXConfig, body: BodyModel, clip: MotionXClip) -> Sample:

@@ -344,7 +344,7 @@ def test_damaged_archive_keeps_what_came_before(copy: Path, tmp_path: Path) -> N
 
 def test_wrong_unit_and_wrong_map_are_explained(copy: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"measures .* is the length unit right\? \(read with unit 'm'"):
-        convert(config(copy, unit="m"), tmp_path / "out")
+        convert(config(copy, unit="m", look=0), tmp_path / "out")
     data = json.loads((copy / "joint_map.json").read_text())
     data["smpl22"][0][2] = "Pelvis"
     (copy / "joint_map.json").write_text(json.dumps(data))

@@ -242,6 +242,42 @@ def test_convert_plans_and_converts(tmp_path: Path, call: Call) -> None:
     assert strict.code == 2 and "frame_time_zero.bvh" in strict.err and "Frame Time" in strict.err
 
 
+def test_a_forgotten_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, call: Call) -> None:
+    source, out = tmp_path / "mocap", tmp_path / "out"
+    for seed in range(3):
+        write_clip(source / f"{seed}.bvh", seed, z_up=True)
+    joint_map = write_map(tmp_path / "joint_map.json")
+    words = (
+        "data",
+        "convert",
+        "bvh",
+        source,
+        out,
+        "--joint-map",
+        joint_map,
+        "--licence",
+        "CC0",
+        "--workers",
+        1,
+    )
+    plan = call(*words, "--plan")
+    assert plan.code == 0 and not out.exists()
+    assert "0 of 3, along +z of the files" in plan.out and "try: --up z" in plan.out
+    refused = call(*words)
+    assert refused.code == 2 and "no people standing on a floor" in refused.err and "--up z" in refused.err
+    assert "problem" not in call(*words, "--up", "z", "--plan").out
+    assert call(*words, "--up", "z").code == 0
+    again = call(*words, "--up", "z")
+    assert again.code == 0 and "finished already, " in again.out and "nothing to convert" in again.out
+    assert call("data", "check", out).code == 0
+    lying = tmp_path / "lying"
+    assert call(*words[:4], lying, *words[5:], "--look", 0).code == 0
+    found = call("data", "check", lying)
+    assert (
+        found.code == 1 and "3 of 3 clips (100%)" in found.out and "head is not above the pelvis" in found.out
+    )
+
+
 def test_info_says_what_a_bug_report_needs(call: Call) -> None:
     done = call("info")
     assert done.code == 0

@@ -1,0 +1,105 @@
+"""What was left out of a data set: by reason, counted, and listed in a file beside the shards.
+
+Reasons differ from clip to clip in names and numbers (`0.67 s, shorter than 1 s`); those that differ in
+nothing else are one group: twenty identical messages are one line.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from motionloom.datasets.base.files import write_text
+from motionloom.datasets.schema import Dropped
+
+LEFT_OUT_FILE = "left-out.txt"
+"""Beside the manifest, when there is anything to list: kind, source and reason of each, between tabs."""
+
+_QUOTED = re.compile(r"'[^']*'")
+_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:[.,]\d+)*(?:e[+-]?\d+)?")
+_FILE = re.compile(r"[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()]*")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Messages that say the same of different things."""
+
+    kind: str
+    """The reason with `…` for what differs."""
+    members: tuple[Dropped, ...]
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.members)
+
+    def __str__(self) -> str:
+        first = self.members[0]
+        if self.count == 1:
+            return f"{first.source}: {first.reason}"
+        return f"{self.count} x {self._common()} (the first: {first.source})"
+
+    def _common(self) -> str:
+        """The reason, with `…` for the words that are not the same in all."""
+        first, *others = [member.reason.split(" ") for member in self.members]
+        if any(len(words) != len(first) for words in others):
+            return self.kind
+        same = [len(set(words)) == 1 for words in zip(first, *others, strict=True)]
+        return " ".join(word if agrees else "…" for word, agrees in zip(first, same, strict=True))
+
+
+def kind_of_reason(reason: str, source: str = "") -> str:
+    """A reason without what differs from clip to clip: its name, quoted words, other files, numbers."""
+    text = reason.replace(source, "…") if source else reason
+    text = _FILE.sub("…", _QUOTED.sub("'…'", text))
+    return _NUMBER.sub("…", text)[:200]
+
+
+def grouped(dropped: Iterable[Dropped]) -> list[Group]:
+    """The groups, the largest first."""
+    groups: dict[str, list[Dropped]] = defaultdict(list)
+    for drop in dropped:
+        groups[kind_of_reason(drop.reason, drop.source)].append(drop)
+    ranked = sorted(groups.items(), key=lambda item: (-len(item[1]), item[0]))
+    return [Group(kind, tuple(members)) for kind, members in ranked]
+
+
+def grouped_notes(notes: Sequence[str], *, least: int = 4) -> list[str]:
+    """Notes in their order; from `least` of one kind on, one line with their number and the first of them."""
+    kinds: dict[str, list[str]] = defaultdict(list)
+    for note in notes:
+        kinds[kind_of_reason(note)].append(note)
+    out: list[str] = []
+    for same in kinds.values():
+        out += same if len(same) < least else [f"{same[0]} (and {len(same) - 1} more like it)"]
+    return out
+
+
+def tally(dropped: Iterable[Dropped]) -> str:
+    """`3 rejected, 1 unreadable file, 2 missing`, each thing counted once; empty when there is nothing."""
+    sources = {(drop.kind, drop.source) for drop in dropped}
+    counts: Counter[str] = Counter(kind for kind, _ in sources)
+    words = {"rejected": "rejected", "unreadable": "unreadable file", "missing": "missing"}
+    return ", ".join(
+        f"{counts[kind]:,} {word}{'s' if kind == 'unreadable' and counts[kind] > 1 else ''}"
+        for kind, word in words.items()
+        if counts[kind]
+    )
+
+
+def write_left_out(out: Path, dropped: Sequence[Dropped]) -> None:
+    """List everything that was left out in `LEFT_OUT_FILE`, in the manifest's order; no file for nothing."""
+    path = out / LEFT_OUT_FILE
+    if not dropped:
+        path.unlink(missing_ok=True)
+        return
+    lines = [f"{drop.kind}\t{_one_line(drop.source)}\t{_one_line(drop.reason)}\n" for drop in dropped]
+    write_text(path, "".join(lines))
+
+
+def _one_line(text: str) -> str:
+    """Names may be any bytes, and one line is one clip."""
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
