@@ -2,8 +2,8 @@
 
 A map file is JSON: one key named after the target skeleton holds rows `[index, target joint, source]`, where
 `source` is a joint name or a list of names whose mean position is taken (a pair is the midpoint, a repeated
-name weighs more); `null` is a row still to be filled in. `note` and `unmapped` (joints left out on purpose) are
-optional. Only positions cross the map: rest poses and bone axes of the two skeletons differ.
+name weighs more); `null` is a row still to be filled in. `note` and `unmapped` (joints left out on purpose)
+are optional. Only positions cross the map: rest poses and bone axes of the two skeletons differ.
 `joint_guess/guess.py` makes such files.
 """
 

@@ -178,10 +178,9 @@ CONVENTIONS = (
     ),
 )
 
-SPARE_WORDS = frozenset(
-    ("end", "nub", "site", "tip", "top", "leaf", "twist", "roll", "helper", "ik", "pole", "target", "ctrl")
-    + ("eff", "effector", "prop", "weapon", "jaw", "eye")
-)
+_ENDS = ("end", "leaf", "nub", "site", "tip", "top")
+_HANDLES = ("ctrl", "eff", "effector", "helper", "ik", "pole", "prop", "target", "weapon")
+SPARE_WORDS = frozenset([*_ENDS, *_HANDLES, "eye", "jaw", "roll", "twist"])
 """A name with one of these words is no joint of the body: ends of chains, twist bones, handles."""
 
 SIDE_WORDS = {"left": "left", "lft": "left", "l": "left", "right": "right", "rgt": "right", "r": "right"}

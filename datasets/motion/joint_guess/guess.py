@@ -1,26 +1,24 @@
 """Guess the joint map of any figure: names first, checked and completed by its tree and by its poses.
 
-1. Legs and arms by the words of their names along a chain; without such words, as mirrored branches (`limbs.py`).
-2. Left and right as the names say, if the pose does not contradict; without names as the pose says (`sides.py`).
-3. Pelvis, spine, neck and head between and above them (`trunk.py`); fingers, where the target has some, by name.
+1. Legs and arms by the words of their names along a chain, else as mirrored branches (`limbs.py`).
+2. Left and right as the names say, if the pose does not contradict, else as the pose says (`sides.py`).
+3. Pelvis, spine, neck and head between and above them (`trunk.py`); fingers by name (`fingers.py`).
 4. A joint that is missing between two others is a mean of its neighbours.
 
-What is not certain is not guessed: the row stays empty, with the joints that it could be. All of this is [ours].
+What is not certain is not guessed: the row stays empty, with the joints that it could be. All of it is [ours].
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
-from typing import Any, Literal
 
 from motionloom.datasets.motion.bvh import BvhMotion
 from motionloom.datasets.motion.joint_guess.figure import Figure
 from motionloom.datasets.motion.joint_guess.fingers import fill_fingers
-from motionloom.datasets.motion.joint_guess.limbs import How, Kind, Limb
+from motionloom.datasets.motion.joint_guess.limbs import Kind, Limb
+from motionloom.datasets.motion.joint_guess.result import GuessedJoint, JointGuess
 from motionloom.datasets.motion.joint_guess.sides import CLEAR, LimbPair, find_pairs, handedness
 from motionloom.datasets.motion.joint_guess.trunk import Rows, fill_trunk
-from motionloom.datasets.motion.joint_map import JointMap, map_text
 from motionloom.datasets.motion.skeleton import Skeleton
 
 _SLOTS: dict[Kind, tuple[str, str, str, str]] = {
@@ -29,83 +27,9 @@ _SLOTS: dict[Kind, tuple[str, str, str, str]] = {
 }
 
 _UNEVEN = 0.25
-"""Long bones of the left and the right differ by at most this share, or one of them is another joint [ours]."""
+"""Long bones of left and right differ by at most this share, or one of them is another joint [ours]."""
 _ALIKE = 2.5
 """The two long bones of a limb differ by at most this factor (those of people by 1.3) [ours]."""
-
-
-@dataclass(frozen=True)
-class GuessedJoint:
-    """One row: a joint of the target and what stands for it."""
-
-    joint: str
-    sources: tuple[str, ...]
-    """Source joints whose mean is taken, a repeated one weighing more; none when the row is to be filled in."""
-    how: How | Literal["missing"]
-    candidates: tuple[str, ...] = ()
-    """Joints that it could be, where it is not certain."""
-
-
-@dataclass(frozen=True)
-class JointGuess:
-    """A guessed joint map."""
-
-    source: str
-    """The clip it was made from."""
-    target: Skeleton
-    rows: tuple[GuessedJoint, ...]
-    """One for every joint of the target."""
-    unmapped: tuple[str, ...]
-    """Source joints that stand for nothing."""
-    problems: tuple[str, ...]
-    """What contradicts the rows, each a clause."""
-
-    @property
-    def open_rows(self) -> tuple[GuessedJoint, ...]:
-        """Rows that are to be filled in."""
-        return tuple(row for row in self.rows if not row.sources)
-
-    @property
-    def certain(self) -> bool:
-        """Whether it may be used without anyone looking at it."""
-        return not self.open_rows and not self.problems
-
-    def joint_map(self, where: str) -> JointMap:
-        """The map, if it is certain; errors name it `where`."""
-        if not self.certain:
-            raise ValueError(f"{self.source}: the guess is not certain: {self.doubts()}")
-        return JointMap(where, self.target, tuple(row.sources for row in self.rows), self.unmapped)
-
-    def summary(self) -> str:
-        """How the joints were found, in one line."""
-        counts = Counter(row.how for row in self.rows)
-        kinds = (
-            ("name", "by name"),
-            ("hierarchy", "by hierarchy"),
-            ("mean", "as means"),
-            ("missing", "open"),
-        )
-        found = ", ".join(f"{counts[how]} {text}" for how, text in kinds if counts[how])
-        return f"{found}; {len(self.unmapped)} of the source's joints stand for nothing"
-
-    def doubts(self) -> str:
-        """What is not certain, in one sentence without its full stop; empty when all is."""
-        rows = [
-            f"{row.joint} ({' or '.join(row.candidates[:4])}?)" if row.candidates else row.joint
-            for row in self.open_rows
-        ]
-        shown = ", ".join(rows[:8]) + (f" and {len(rows) - 8} more" if len(rows) > 8 else "")
-        return "; ".join([*self.problems, *([f"no certain joint for {shown}"] if rows else [])])
-
-    def text(self) -> str:
-        """The map file, to be filled in or corrected by hand."""
-        note = f"guessed from {self.source}: {self.summary()}"
-        if not self.certain:
-            note += f". NOT CERTAIN: {self.doubts()}. Fill in every row that says null"
-        sources: list[tuple[str, ...] | None] = [row.sources or None for row in self.rows]
-        candidates = {row.joint: list(row.candidates) for row in self.open_rows if row.candidates}
-        more: dict[str, Any] = {"candidates": candidates} if candidates else {}
-        return map_text(self.target, sources, note=note, unmapped=self.unmapped, **more)
 
 
 def guess_joint_map(motion: BvhMotion, target: Skeleton) -> JointGuess:
@@ -153,7 +77,7 @@ def _sided(figure: Figure, pair: LimbPair, legs: LimbPair, problems: list[str]) 
     if pair.sides_named:
         if cosine < -CLEAR:
             problems.append(
-                f"the names of the {pair.kind}s say left where the pose, seen from its feet, has right"
+                f"the names of the {pair.kind}s call left what the pose has on the right (as its feet point)"
             )
     elif abs(cosine) < CLEAR:
         problems.append(f"nothing says which of the two {pair.kind}s is the left one")
@@ -171,7 +95,7 @@ def _fill_limbs(figure: Figure, pair: LimbPair, rows: Rows) -> None:
 
 
 def _fill_collars(figure: Figure, arms: LimbPair, rows: Rows) -> None:
-    """Collars that no name gave: the only joint between chest and shoulder, else the mean of what is around."""
+    """Collars without a name: the only joint between chest and shoulder, else the mean of what is around."""
     chest = figure.common_ancestor(arms.roots)
     for side, arm in (("left", arms.left), ("right", arms.right)):
         shoulder, collar = arm.essential("arm")[0], f"{side}_collar"
@@ -210,7 +134,7 @@ def _guess(figure: Figure, source: str, target: Skeleton, rows: Rows, problems: 
 
     made = []
     for joint in target.joints:
-        how: How | Literal["missing"] = rows.how[joint] if joint in rows.sources else "missing"
+        how = rows.how[joint] if joint in rows.sources else "missing"
         candidates = named(rows.candidates.get(joint, ()))
         made.append(GuessedJoint(joint, named(rows.sources.get(joint, ())), how, candidates))
     used = {name for row in made for name in row.sources}

@@ -73,7 +73,7 @@ def _pelvis(figure: Figure, legs: LimbPair, arms: LimbPair, rows: Rows) -> int:
 
 
 def _fill_spine(figure: Figure, pelvis: int, spine: tuple[int, ...], rows: Rows) -> None:
-    """Three joints out of any number [ours]: the lowest, the middle, that of the collars; means where fewer."""
+    """Three of any number [ours]: the lowest, the middle and that of the collars; means where fewer."""
     if not spine:
         return
     middle = spine[(len(spine) - 1) // 2 : len(spine) // 2 + 1]
