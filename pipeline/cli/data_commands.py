@@ -68,7 +68,7 @@ def convert_command(
     config = converter.config().parse(fields, f"data convert {kind}")
     shown = console.is_terminal
     if plan:
-        conversion = converter.prepare(config, workers=workers, progress=shown)
+        conversion = converter.prepare(config, maps=out, workers=workers, progress=shown)
         say_plan(conversion.estimated(workers), console)
         return
     if cluster:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -9,6 +10,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.convert.bvh.maps import SUFFIX, MapChoice, skeleton_key
 from motionloom.datasets.convert.common.archives import Batch, list_batches
 from motionloom.datasets.convert.common.captions import CaptionTable, read_captions
 from motionloom.datasets.convert.common.config import ConvertConfig
@@ -16,12 +18,10 @@ from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft
 from motionloom.datasets.convert.common.scan import BatchScan, FoundFile, scan_batches
 from motionloom.datasets.convert.common.splits import check_id, hash_split, read_split_files
-from motionloom.datasets.motion.bvh_text import read_header
+from motionloom.datasets.motion.bvh_text import find_motion, load_text, parse_hierarchy
 from motionloom.datasets.motion.joint_map import Unit, Up
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Split, UserError
-
-SUFFIX = ".bvh"
 
 
 class BvhConfig(ConvertConfig):
@@ -29,8 +29,8 @@ class BvhConfig(ConvertConfig):
 
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""
-    joint_map: Path
-    """JSON file that says which joints of the files stand for ours (docs/sources.md)."""
+    joint_map: MapChoice = "auto"
+    """`auto`, or a JSON file that says which joints of the files stand for ours (docs/sources.md)."""
     captions: Path | None = None
     """JSON lines: id, file, captions, split. Without it clips have no captions."""
     splits: Path | None = None
@@ -65,8 +65,9 @@ class BvhConfig(ConvertConfig):
         """What the output depends on, for the manifest: files by name and checksum instead of local paths."""
         given = super().options(*local)
         for key in ("joint_map", "captions"):
-            path: Path | None = getattr(self, key)
-            given[key] = {"file": path.name, "sha256": sha256_of(path)} if path else None
+            path: Path | Literal["auto"] | None = getattr(self, key)
+            if path != "auto":
+                given[key] = {"file": path.name, "sha256": sha256_of(path)} if path else None
         given["splits"] = bool(self.splits)
         return given
 
@@ -100,9 +101,14 @@ def plan_bvh(
     return _decide(config, batches, scans, ignored)
 
 
-def _header(data: bytes, label: str) -> tuple[int, float]:
-    header = read_header(data, name=label)
-    return header.frames, header.fps
+def _header(data: bytes, label: str) -> tuple[int, float, str]:
+    text, where = load_text(data, label)
+    section = find_motion(text, where)
+    key = ""
+    with suppress(UserError):  # a broken hierarchy is reported when the clip is converted
+        joints = parse_hierarchy(text[: section.start], where)
+        key = skeleton_key(joints.names, joints.parents)
+    return section.frames, section.fps, key
 
 
 def _decide(

@@ -5,7 +5,7 @@
 3. Pelvis, spine, neck and head between and above them (`trunk.py`); fingers by name (`fingers.py`).
 4. A joint that is missing between two others is a mean of its neighbours.
 
-What is not certain is not guessed: the row stays empty, with the joints that it could be. All of it is [ours].
+What is not certain is not guessed: the row stays empty, with what it could be. All of it is [ours].
 """
 
 from __future__ import annotations
