@@ -8,13 +8,19 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.files import FILE_SUFFIXES, FileRules, check_file, check_folder
+from motionloom.datasets.convert.bvh.maps import guess_source
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.loading.statistics import compute
+from motionloom.datasets.motion.joint_guess.result import JointGuess
+from motionloom.datasets.motion.joint_map import map_text
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
@@ -88,6 +94,8 @@ def convert_command(
         return
     require_folder(out)
     conversion = converter.prepare(config, out=out, workers=workers, progress=shown)
+    for note in conversion.plan.notes:
+        _say(console, f"note: {note}")
     manifest = run_conversion(
         conversion, out, workers=workers, strict=strict, clips_per_shard=clips_per_shard, progress=shown
     )
@@ -153,8 +161,47 @@ def _check_files(path: Path, given: dict[str, Any], console: Console) -> tuple[i
 
 def _say(console: Console, text: str) -> None:
     """Print text from a stranger's file: one line, and no control characters for the terminal to obey."""
-    shown = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
-    console.print(shown, markup=False, highlight=False, soft_wrap=True)
+    console.print(_printable(text), markup=False, highlight=False, soft_wrap=True)
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
+
+
+def joints_command(source: str, skeleton: str, out: Path | None, *, console: Console) -> None:
+    """List the joints of a skeleton, or guess the joint map of a BVH file."""
+    if out is not None:
+        require_file_place(out)
+    if Path(source).exists():
+        guess = guess_source(Path(source), Skeleton.named(skeleton))
+        _show_guess(guess, console)
+        text = guess.text()
+    else:
+        try:
+            target = Skeleton.named(source)
+        except UserError as error:
+            raise UserError(f"{source}: no such file or folder, and {error}") from None
+        table = Table("", "joint", "parent", title=target.name)
+        for index, (joint, parent) in enumerate(zip(target.joints, target.parents, strict=True)):
+            table.add_row(str(index), joint, target.joints[parent] if parent >= 0 else "")
+        console.print(table)
+        text = map_text(target, [None] * len(target), note="a joint map to be filled in")
+    if out is not None:
+        write_text(out, text)
+        _say(console, str(out))
+
+
+def _show_guess(guess: JointGuess, console: Console) -> None:
+    table = Table("", guess.target.name, "stands for it", "found")
+    for index, row in enumerate(guess.rows):
+        names = " + ".join(row.sources) or " or ".join(row.candidates)
+        cells = (str(index), row.joint, names if row.sources else f"{names}?", row.how)
+        table.add_row(*(Text(_printable(cell)) for cell in cells))
+    console.print(table)
+    _say(console, f"{guess.source}: {guess.summary()}")
+    if guess.unmapped:
+        _say(console, f"stand for nothing: {', '.join(guess.unmapped)}")
+    _say(console, "certain" if guess.certain else f"not certain: {guess.doubts()}")
 
 
 def report_command(root: Path, out: Path | None, *, check: bool, clips: int, console: Console) -> None:

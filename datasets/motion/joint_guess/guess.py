@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter
 
 from motionloom.datasets.motion.bvh import BvhMotion
+from motionloom.datasets.motion.joint_guess.conventions import CONVENTIONS
 from motionloom.datasets.motion.joint_guess.figure import Figure
 from motionloom.datasets.motion.joint_guess.fingers import fill_fingers
 from motionloom.datasets.motion.joint_guess.limbs import Kind, Limb
@@ -40,6 +41,10 @@ def guess_joint_map(motion: BvhMotion, target: Skeleton) -> JointGuess:
     if legs is None or arms is None:
         kinds = [kind for kind, pair in (("legs", legs), ("arms", arms)) if pair is None]
         problems.append(f"found no {' and no '.join(kinds)}, by name or as two branches with equal bones")
+        for pair in (legs, arms):
+            if pair is not None and pair.sides_named:
+                _fill_limbs(figure, pair, rows)
+        _fill_by_words(figure, rows)
     else:
         legs = _with_feet(figure, legs, rows)
         legs, arms = (_sided(figure, pair, legs, problems) for pair in (legs, arms))
@@ -48,6 +53,7 @@ def guess_joint_map(motion: BvhMotion, target: Skeleton) -> JointGuess:
             _fill_limbs(figure, pair, rows)
             problems.extend(_disproportions(figure, pair))
         _fill_collars(figure, arms, rows)
+        problems.extend(_contradictions(figure, rows))
         for side, arm in (("left", arms.left), ("right", arms.right)):
             fill_fingers(figure, side, arm, rows)
     return _guess(figure, motion.name, target, rows, problems)
@@ -76,8 +82,9 @@ def _sided(figure: Figure, pair: LimbPair, legs: LimbPair, problems: list[str]) 
     cosine = handedness(figure, pair, legs)
     if pair.sides_named:
         if cosine < -CLEAR:
+            name = figure.joints[pair.left.essential(pair.kind)[0]]
             problems.append(
-                f"the names of the {pair.kind}s call left what the pose has on the right (as its feet point)"
+                f"the names call '{name}' the left {pair.kind}, but as the feet point it is the right"
             )
     elif abs(cosine) < CLEAR:
         problems.append(f"nothing says which of the two {pair.kind}s is the left one")
@@ -94,6 +101,23 @@ def _fill_limbs(figure: Figure, pair: LimbPair, rows: Rows) -> None:
                 rows.put(name, [joint], limb.how)
 
 
+def _fill_by_words(figure: Figure, rows: Rows) -> None:
+    """What single names say where a figure makes no whole: for the one who completes the map."""
+    slots: list[tuple[str, str, set[str]]] = [
+        *(("", joint, {known.neck[i] for known in CONVENTIONS}) for i, joint in enumerate(("neck", "head"))),
+        ("", "pelvis", {known.trunk[0] for known in CONVENTIONS}),
+    ]
+    for kind, words in _SLOTS.items():
+        for i, word in enumerate(words):
+            fits = {getattr(known, kind)[i] for known in CONVENTIONS}
+            slots += [(side, f"{side}_{word}", fits) for side in ("left", "right")]
+    for side, joint, fits in slots:
+        if joint not in rows.sources:
+            found = [j for j, n in enumerate(figure.names) if n.word in fits - {""} and n.side == side]
+            if found:
+                rows.doubt(joint, found)
+
+
 def _fill_collars(figure: Figure, arms: LimbPair, rows: Rows) -> None:
     """Collars without a name: the only joint between chest and shoulder, else the mean of what is around."""
     chest = figure.common_ancestor(arms.roots)
@@ -108,6 +132,17 @@ def _fill_collars(figure: Figure, arms: LimbPair, rows: Rows) -> None:
             rows.doubt(collar, between)
         else:  # our collar lies in the middle of these three to 2 cm
             rows.put(collar, [chest, *rows.sources.get("neck", ())[:1], shoulder], "mean")
+
+
+def _contradictions(figure: Figure, rows: Rows) -> list[str]:
+    """Names that say another side than their row: where the tree or the pose found the limb."""
+    other = {"left": "right", "right": "left"}
+    return [
+        f"'{figure.joints[joint]}' would be {row}"
+        for row, joints in rows.sources.items()
+        for joint in joints
+        if figure.names[joint].side == other.get(row.partition("_")[0], "none")
+    ]
 
 
 def _disproportions(figure: Figure, pair: LimbPair) -> list[str]:

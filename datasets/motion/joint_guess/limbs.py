@@ -21,7 +21,7 @@ _LONGER = 1.25
 _ALIKE = 1.8
 """... and the one at most this many times the other (bones of people: below 1.3) [ours]."""
 _MIRRORED = 0.1
-"""Bones of mirrored limbs differ by less than this share [ours]."""
+"""Bones of mirrored limbs differ by less than this share of the longest one [ours]."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,8 @@ def _pairs_at(figure: Figure, joint: int) -> Iterator[MirroredPair]:
         first = _long_bones(lengths[0])
         if first is None or len(one) != len(other) or first != _long_bones(lengths[1]):
             continue
-        same = all(abs(a - b) <= _MIRRORED * max(a, b) for a, b in zip(*lengths, strict=True))
-        if same:
+        slack = _MIRRORED * max(lengths[0])
+        if all(abs(a - b) < slack for a, b in zip(*lengths, strict=True)):
             yield MirroredPair(joint, (one, other), first, sum(lengths[0][first : first + 2]))
 
 

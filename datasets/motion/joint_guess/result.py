@@ -73,7 +73,8 @@ class JointGuess:
         """The map file, to be filled in or corrected by hand."""
         note = f"guessed from {self.source}: {self.summary()}"
         if not self.certain:
-            note += f". NOT CERTAIN: {self.doubts()}. Fill in every row that says null"
+            todo = "Fill in the rows that say null" if self.open_rows else "Correct the rows"
+            note += f". NOT CERTAIN: {self.doubts()}. {todo}"
         sources: list[tuple[str, ...] | None] = [row.sources or None for row in self.rows]
         candidates = {row.joint: list(row.candidates) for row in self.open_rows if row.candidates}
         more: dict[str, Any] = {"candidates": candidates} if candidates else {}
