@@ -210,6 +210,86 @@ FOREIGN = (
     ),
 )
 
+OTHERS = (
+    Foreign(
+        "3ds Max Biped",
+        ("Bip01",),
+        (
+            "Bip01 Pelvis@pelvis",
+            "Bip01 Spine@spine1",
+            "Bip01 Spine1@spine2",
+            "Bip01 Spine2@spine3",
+            "Bip01 Neck@neck",
+        ),
+        ("Bip01 Head@head", "Bip01 HeadNub@top"),
+        tuple(
+            f"Bip01 {{}} {n}" for n in ("Thigh@hip", "Calf@knee", "Foot@ankle", "Toe0@foot", "Toe0Nub@toe")
+        ),
+        tuple(
+            f"Bip01 {{}} {n}" for n in ("Clavicle@collar", "UpperArm@shoulder", "Forearm@elbow", "Hand@wrist")
+        ),
+        sides=("L", "R"),
+    ),
+    Foreign(
+        "Kinect",
+        (),
+        ("SpineBase@pelvis", "SpineMid@spine2", "SpineShoulder@spine3"),
+        ("Neck@neck", "Head@head"),
+        ("Hip{}@hip", "Knee{}@knee", "Ankle{}@ankle", "Foot{}@foot"),
+        ("Shoulder{}@shoulder", "Elbow{}@elbow", "Wrist{}@wrist", "Hand{}@middle1"),
+        means={
+            "spine1": ("SpineBase", "SpineMid"),
+            "left_collar": ("SpineShoulder", "Neck", "ShoulderLeft"),
+            "right_collar": ("SpineShoulder", "Neck", "ShoulderRight"),
+        },
+    ),
+    Foreign(
+        "CMU (ASF)",
+        (),
+        ("root@pelvis", "lowerback@spine1", "upperback@spine2", "thorax@spine3"),
+        ("lowerneck@neck", "upperneck@a2", "head@head"),
+        ("{}hipjoint@a3", "{}femur@hip", "{}tibia@knee", "{}foot@ankle", "{}toes@foot"),
+        ("{}clavicle@collar", "{}humerus@shoulder", "{}radius@elbow", "{}wrist@wrist", "{}hand@middle1"),
+        sides=("l", "r"),
+    ),
+    Foreign(
+        "Xsens MVN (segments)",
+        (),
+        ("Pelvis@pelvis", "L5@spine1", "L3@spine2", "T12@a1", "T8@spine3"),
+        ("Neck@neck", "Head@head"),
+        ("{}UpperLeg@hip", "{}LowerLeg@knee", "{}Foot@ankle", "{}Toe@foot"),
+        ("{}Shoulder@collar", "{}UpperArm@shoulder", "{}Forearm@elbow", "{}Hand@wrist"),
+        means={"spine2": ("L3", "T12")},
+    ),
+    Foreign(
+        "Unity, VRM",
+        (),
+        ("hips@pelvis", "spine@spine1", "chest@spine2", "upperChest@spine3"),
+        ("neck@neck", "head@head", "jaw@jaw"),
+        ("{}UpperLeg@hip", "{}LowerLeg@knee", "{}Foot@ankle", "{}Toes@foot"),
+        ("{}Shoulder@collar", "{}UpperArm@shoulder", "{}LowerArm@elbow", "{}Hand@wrist"),
+        sides=("left", "right"),
+        fingers=lambda side, finger, n: (
+            f"{side}{ {'Pinky': 'Little'}.get(finger, finger) }"
+            + (
+                ("Metacarpal", "Proximal", "Distal")
+                if finger == "Thumb"
+                else ("Proximal", "Intermediate", "Distal")
+            )[n - 1]
+        ),
+    ),
+    Foreign(
+        "DAZ, Poser",
+        (),
+        ("hip@pelvis", "abdomen@spine2", "chest@spine3"),
+        ("neck@neck", "head@head", "leftEye@jaw"),
+        ("{}Thigh@hip", "{}Shin@knee", "{}Foot@ankle", "{}Toe@foot"),
+        ("{}Collar@collar", "{}Shldr@shoulder", "{}ForeArm@elbow", "{}Hand@wrist"),
+        sides=("l", "r"),
+        means={"spine1": ("hip", "abdomen")},
+    ),
+)
+
 
 @dataclass
 class Built:

@@ -1,4 +1,4 @@
-"""BVH conversion without a joint map: a guess for each skeleton, the same features as by a hand-written map."""
+"""BVH conversion without a joint map: a guess for each skeleton, as good as a hand-written map."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foreign_figures import FOREIGN, OTHERS, UNITS, Built, Foreign, build, write_figure
 
 from motionloom.datasets.motion.bvh import BvhMotion, read_bvh
 from motionloom.datasets.motion.joint_guess.guess import guess_joint_map
@@ -18,7 +19,6 @@ from motionloom.datasets.motion.joint_guess.result import JointGuess
 from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from foreign_figures import FOREIGN, UNITS, Built, Foreign, build, write_figure
 
 BODY, WHOLE = Skeleton.named("smpl22"), Skeleton.named("smplx52")
 BY_TOOL = {spec.tool: spec for spec in FOREIGN}
@@ -69,6 +69,15 @@ def test_the_map_gives_the_joints_of_the_figure(spec: Foreign, tmp_path: Path) -
     true = [world[:, [index[n] for n in built.ours[joint]]].mean(axis=1) for joint in BODY.joints]
     # Angles and offsets are written to 1e-6 degrees and mm: some 1e-8 rad along two metres of bones.
     np.testing.assert_allclose(joints, np.stack(true, axis=1), atol=1e-6)
+
+
+@pytest.mark.parametrize("spec", OTHERS, ids=lambda spec: spec.tool)
+def test_the_other_tools_of_the_table(spec: Foreign, tmp_path: Path) -> None:
+    built = build(spec)
+    target = WHOLE if spec.fingers else BODY
+    guess = guess_joint_map(clip(tmp_path, built, unit="m", up="z", twisted=True), target)
+    assert guess.certain, guess.doubts()
+    assert sources(guess) == {joint: built.ours[joint] for joint in target.joints}
 
 
 def without_names(spec: Foreign) -> Built:
