@@ -26,8 +26,9 @@ class Converter:
     """One line for the help."""
     example: str
     """What follows `motionloom data convert NAME` in the example of the help."""
-    keeps_scan: bool = False
-    """Whether prepare takes `scan`: a file that remembers what it found in files that have not changed."""
+    reads_skeletons: bool = False
+    """Whether prepare takes `scan`, a file that remembers what it found in files that have not changed, and
+    `maps`, a folder for guessed joint maps."""
 
     def config(self) -> type[ConvertConfig]:
         """The config class."""
@@ -35,17 +36,26 @@ class Converter:
         return found
 
     def prepare(
-        self, config: ConvertConfig, *, out: Path | None = None, workers: int = 1, progress: bool = False
+        self,
+        config: ConvertConfig,
+        *,
+        out: Path | None = None,
+        maps: Path | None = None,
+        workers: int = 1,
+        progress: bool = False,
     ) -> Conversion[Any]:
         """Look at the whole source and decide what becomes of every file.
 
         With `out`, the folder of the shards, a source whose listing must read every file (archives) is read
-        once and not again by the next run or by the other parts of a conversion.
+        once and not again by the next run or by the other parts of a conversion. Joint maps that are guessed
+        are written into `maps`, by default `out`.
         """
         from motionloom.datasets.convert.common.conversion import SCAN_FILE
 
         prepare = getattr(importlib.import_module(self.module), self.prepare_name)
-        more = {"scan": out / SCAN_FILE} if self.keeps_scan and out is not None else {}
+        more: dict[str, Any] = {}
+        if self.reads_skeletons:
+            more = {"scan": None if out is None else out / SCAN_FILE, "maps": maps or out}
         made: Conversion[Any] = prepare(config, workers=workers, progress=progress, **more)
         return made
 
@@ -86,8 +96,8 @@ CONVERTERS: dict[str, Converter] = {
         "BvhConfig",
         "prepare_bvh",
         "BVH files of any skeleton, loose or in tar archives, to shards.",
-        "mocap shards --joint-map map.json --captions captions.jsonl --licence CC-BY-4.0",
-        keeps_scan=True,
+        "mocap shards --captions captions.jsonl --licence CC-BY-4.0",
+        reads_skeletons=True,
     ),
 }
 

@@ -1,9 +1,10 @@
 """Joint maps are data: which joints of a foreign skeleton stand for the joints of a named one.
 
 A map file is JSON: one key named after the target skeleton holds rows `[index, target joint, source]`, where
-`source` is a joint name or a list of names whose mean position is taken (a pair is the midpoint); `note` and
-`unmapped` (joints left out on purpose) are optional. Only positions cross the map: rest poses and bone axes
-of the two skeletons differ.
+`source` is a joint name or a list of names whose mean position is taken (a pair is the midpoint, a repeated
+name weighs more); `null` is a row still to be filled in. `note` and `unmapped` (joints left out on purpose)
+are optional. Only positions cross the map: rest poses and bone axes of the two skeletons differ.
+`joint_guess/guess.py` makes such files.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from __future__ import annotations
 import difflib
 import json
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +30,7 @@ Up = Literal["y", "z"]
 
 METRES: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 
-_ROWS = TypeAdapter(list[tuple[int, str, str | list[str]]])
+_ROWS = TypeAdapter(list[tuple[int, str, str | list[str] | None]])
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,11 @@ class JointMap:
                 f"{path}: {target} row {at}: expected [index, target joint, source joint(s)]"
             ) from None
         sources: dict[int, tuple[str, ...]] = {}
+        empty = [name for _, name, source in rows if source is None]
+        if empty:
+            raise UserError(f"{path}: {target} rows still to be filled in (null): {', '.join(empty)}")
         for index, name, source in rows:
+            assert source is not None
             names = (source,) if isinstance(source, str) else tuple(source)
             if skeleton.index(name) != index:
                 raise UserError(
@@ -105,3 +111,24 @@ class JointMap:
         if up == "z":
             joints = np.stack([joints[..., 0], joints[..., 2], -joints[..., 1]], axis=-1)
         return joints
+
+
+def map_text(
+    target: Skeleton,
+    sources: Sequence[tuple[str, ...] | None],
+    *,
+    note: str,
+    unmapped: Sequence[str] = (),
+    **more: Any,
+) -> str:
+    """A map file with one row a line, so that it can be corrected by hand; None is a row to be filled in."""
+
+    def row(index: int, names: tuple[str, ...] | None) -> str:
+        source = names[0] if names is not None and len(names) == 1 else names
+        return json.dumps([index, target.joints[index], source], ensure_ascii=False)
+
+    rows = ",\n  ".join(row(index, names) for index, names in enumerate(sources))
+    fields = {"note": note, **more, "unmapped": list(unmapped)}
+    rest = [f"{json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}" for key, value in fields.items()]
+    body = ",\n ".join([*rest[:-1], f'"{target.name}": [\n  {rows}]', rest[-1]])
+    return "{" + body + "}\n"

@@ -127,9 +127,11 @@ def _option(key: str, field: FieldInfo) -> inspect.Parameter:
 
 
 def _choices(annotation: Any) -> list[str]:
-    """The words of a field that takes one of several."""
+    """The words of a field that takes one of several; none where it takes any path as well."""
     if typing.get_origin(annotation) is Literal:
         return [str(value) for value in typing.get_args(annotation)]
+    if Path in typing.get_args(annotation):
+        return []
     return [word for part in typing.get_args(annotation) for word in _choices(part)]
 
 

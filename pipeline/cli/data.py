@@ -79,6 +79,30 @@ def check(
 
 
 @data_app.command()
+def joints(
+    source: Annotated[
+        str,
+        typer.Argument(help="A .bvh file, or a folder or archive of them; or a skeleton: smpl22, smplx52."),
+    ] = "smpl22",
+    skeleton: Annotated[
+        str, typer.Option(help="Of a file: the skeleton to map to, smpl22 or smplx52 (with fingers).")
+    ] = "smpl22",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Also write the joint map, to be completed.")
+    ] = None,
+) -> None:
+    """Joint names of a skeleton of ours; or which joints of a BVH file stand for them, as far as can be said.
+
+    Example: `motionloom data joints smplx52`
+
+    Example: `motionloom data joints walk.bvh -o joint_map.json`
+    """
+    from motionloom.pipeline.cli.data_commands import joints_command
+
+    joints_command(source, skeleton, out, console=make_console())
+
+
+@data_app.command()
 def report(
     root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
     out: Annotated[

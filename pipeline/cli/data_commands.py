@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from motionloom.datasets.schema import Dropped, Manifest, UserError
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
@@ -15,6 +16,7 @@ from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
     from motionloom.datasets.convert.common.plan import ConversionPlan
+    from motionloom.datasets.motion.joint_guess.result import JointGuess
 
 _ALIKE = 5
 """Findings that say the same and are still listed one by one."""
@@ -93,7 +95,7 @@ def convert_command(
     config = converter.config().parse(fields, f"data convert {kind}")
     shown = not console.quiet
     if plan:
-        conversion = converter.prepare(config, workers=workers, progress=shown).looked()
+        conversion = converter.prepare(config, maps=out, workers=workers, progress=shown).looked()
         say_plan(conversion.estimated(workers, started), console)
         return
     if cluster:
@@ -113,6 +115,8 @@ def convert_command(
         return
     require_folder(out)
     conversion = converter.prepare(config, out=out, workers=workers, progress=shown)
+    for note in conversion.plan.notes:
+        _say(console, f"note: {note}")
     manifest = run_conversion(
         conversion,
         out,
@@ -206,8 +210,52 @@ def _check_files(path: Path, given: dict[str, Any], console: Console) -> tuple[i
 
 def _say(console: Console, text: str) -> None:
     """Print text from a stranger's file: one line, and no control characters for the terminal to obey."""
-    shown = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
-    console.print(shown, markup=False, highlight=False, soft_wrap=True)
+    console.print(_printable(text), markup=False, highlight=False, soft_wrap=True)
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
+
+
+def joints_command(source: str, skeleton: str, out: Path | None, *, console: Console) -> None:
+    """List the joints of a skeleton, or guess the joint map of a BVH file."""
+    from motionloom.datasets.base.files import write_text
+    from motionloom.datasets.convert.bvh.maps import guess_source
+    from motionloom.datasets.motion.joint_map import map_text
+    from motionloom.datasets.motion.skeleton import Skeleton
+
+    if out is not None:
+        require_file_place(out)
+    if Path(source).exists():
+        guess = guess_source(Path(source), Skeleton.named(skeleton))
+        _show_guess(guess, console)
+        text = guess.text()
+    else:
+        try:
+            target = Skeleton.named(source)
+        except UserError as error:
+            raise UserError(f"{source}: no such file or folder, and {error}") from None
+        table = Table("", "joint", "parent", title=target.name)
+        for index, (joint, parent) in enumerate(zip(target.joints, target.parents, strict=True)):
+            table.add_row(str(index), joint, target.joints[parent] if parent >= 0 else "")
+        console.print(table)
+        text = map_text(target, [None] * len(target), note="a joint map to be filled in")
+    if out is not None:
+        write_text(out, text)
+        _say(console, str(out))
+
+
+def _show_guess(guess: JointGuess, console: Console) -> None:
+    table = Table("", guess.target.name, "stands for it", "found")
+    for index, row in enumerate(guess.rows):
+        names = " + ".join(row.sources) or " or ".join(row.candidates)
+        cells = (str(index), row.joint, names if row.sources else f"{names}?", row.how)
+        table.add_row(*(Text(_printable(cell)) for cell in cells))
+    console.print(table)
+    _say(console, f"{guess.source}: {guess.summary()}")
+    if guess.unmapped:
+        _say(console, f"stand for nothing: {', '.join(guess.unmapped)}")
+    _say(console, "certain" if guess.certain else f"not certain: {guess.doubts()}")
 
 
 def report_command(root: Path, out: Path | None, *, check: bool, clips: int, console: Console) -> None:

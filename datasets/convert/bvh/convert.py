@@ -11,6 +11,7 @@ nothing.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,14 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
-from motionloom.datasets.convert.bvh.plan import SUFFIX, BvhClip, BvhConfig, plan_bvh
+from motionloom.datasets.convert.bvh.maps import SUFFIX, JointMaps, guess_maps, map_name
+from motionloom.datasets.convert.bvh.plan import BvhClip, BvhConfig, plan_bvh
 from motionloom.datasets.convert.common.archives import Batch
 from motionloom.datasets.convert.common.conversion import Conversion
 from motionloom.datasets.convert.common.feature_step import FeatureStep
 from motionloom.datasets.convert.common.feature_store import store_batch, stored_batch, stored_features
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.common.look import SourceJoints
-from motionloom.datasets.convert.common.plan import drop
+from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
@@ -45,13 +47,29 @@ _NAMED_JOINTS = 12
 
 
 def prepare_bvh(
-    config: BvhConfig, *, workers: int = 1, progress: bool = False, scan: Path | None = None
+    config: BvhConfig,
+    *,
+    workers: int = 1,
+    progress: bool = False,
+    scan: Path | None = None,
+    maps: Path | None = None,
 ) -> Conversion[BvhClip]:
-    """Plan the conversion. `scan` is a file that remembers what unchanged files hold."""
-    clips = BvhClips.of(config)  # a wrong map should fail before the long part
+    """Plan the conversion. `scan` is a file that remembers what unchanged files hold, `maps` a folder for the
+    joint maps that are guessed.
+    """
+    target = config.motion_layout().skeleton
+    given = None
+    if config.joint_map != "auto":  # a wrong map should fail before the long part
+        given = JointMap.load(config.joint_map, target=target.name)
     plan = plan_bvh(config, workers=workers, progress=progress, scan=scan)
     contents = [clip.found.sha256 for _, clip in plan.items]
     options = config.options() | {"source_sha256": sha256_of_json(contents)}
+    guessed: dict[str, JointMap] = {}
+    if given is None:
+        plan, guessed = _guessed(config, plan, maps)
+        sources = {key: joint_map.sources for key, joint_map in guessed.items()}
+        options["joint_map"] = {"file": "auto", "sha256": sha256_of_json(sources)}
+    clips = BvhClips(config, JointMaps(given, guessed))
     made_from = sha256_of_json(options)
     groups: dict[int, list[BvhClip]] = {}
     for _, clip in plan.items:
@@ -76,18 +94,26 @@ def prepare_bvh(
     )
 
 
+def _guessed(
+    config: BvhConfig, plan: ConversionPlan[BvhClip], folder: Path | None
+) -> tuple[ConversionPlan[BvhClip], dict[str, JointMap]]:
+    """The plan, with a note on each guessed joint map, and the maps."""
+    clips = ((clip.batch, clip.label(), clip.found.skeleton) for _, clip in plan.items)
+    guesses = guess_maps(clips, config.motion_layout().skeleton, config.source, folder)
+    notes = [
+        f"{map_name(number)}: guessed from {guess.source}; {guess.summary()}"
+        for number, guess in enumerate(guesses.values(), start=1)
+    ]
+    maps = {key: guess.joint_map(f"the guess from {guess.source}") for key, guess in guesses.items()}
+    return dataclasses.replace(plan, notes=[*plan.notes, *notes]), maps
+
+
 @dataclass(frozen=True)
 class BvhClips:
     """Turns clips into samples; holds what all clips of a conversion share."""
 
     config: BvhConfig
-    joint_map: JointMap
-
-    @staticmethod
-    def of(config: BvhConfig) -> BvhClips:
-        """Read the joint map."""
-        target = config.motion_layout().skeleton_name
-        return BvhClips(config, JointMap.load(config.joint_map, target=target))
+    maps: JointMaps
 
     @cached_property
     def layout(self) -> MotionLayout:
@@ -101,9 +127,10 @@ class BvhClips:
     def see(self, clip: BvhClip) -> SourceJoints:
         """The joints of one clip as the map reads them, and the joints that no row of it names."""
         motion = read_bvh(self._read(clip), name=clip.label())
-        joints = self.joint_map.apply(motion, unit=self.config.unit, up=self.config.up)
-        used = {name for names in self.joint_map.sources for name in names}
-        free = [name for name in motion.joints if name not in used and name not in self.joint_map.unmapped]
+        joint_map = self.maps.of(motion)
+        joints = joint_map.apply(motion, unit=self.config.unit, up=self.config.up)
+        used = {name for names in joint_map.sources for name in names}
+        free = [name for name in motion.joints if name not in used and name not in joint_map.unmapped]
         twice = sorted({name for name in free if motion.joints.count(name) > 1})
         remarks = []
         if free:
@@ -111,7 +138,7 @@ class BvhClips:
             remarks.append(f"joints that no row of the map names: {', '.join(free[:_NAMED_JOINTS])}{more}")
         if twice:
             remarks.append(f"joints that appear more than once, which no row can name: {', '.join(twice)}")
-        names = tuple(names[0] if len(names) == 1 else names for names in self.joint_map.sources)
+        names = tuple(names[0] if len(names) == 1 else names for names in joint_map.sources)
         return SourceJoints(joints, self.config.source_fps or motion.fps, names, tuple(remarks))
 
     def _read(self, clip: BvhClip) -> bytes:
@@ -131,7 +158,7 @@ class BvhClips:
         """Features [T', D] of one file; `label` names it in errors."""
         config = self.config
         motion = read_bvh(data, name=label)
-        joints = self.joint_map.apply(motion, unit=config.unit, up=config.up)
+        joints = self.maps.of(motion).apply(motion, unit=config.unit, up=config.up)
         try:
             return features_of(
                 joints, config.source_fps or motion.fps, self.layout, same_bones=config.retarget

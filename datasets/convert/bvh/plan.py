@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pydantic import Field
 
+from motionloom.datasets.convert.bvh.maps import SUFFIX, MapChoice, skeleton_key
 from motionloom.datasets.convert.common.archives import Batch, list_batches
 from motionloom.datasets.convert.common.caption_options import CaptionConfig, digest_of, settle_captions
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft
 from motionloom.datasets.convert.common.scan import BatchScan, FoundFile, scan_batches
 from motionloom.datasets.convert.common.splits import check_id, hash_split
-from motionloom.datasets.motion.bvh_text import read_header
+from motionloom.datasets.motion.bvh_text import find_motion, load_text, parse_hierarchy
 from motionloom.datasets.motion.joint_map import Unit, Up
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Split, UserError
-
-SUFFIX = ".bvh"
 
 
 class BvhConfig(CaptionConfig):
@@ -27,8 +27,8 @@ class BvhConfig(CaptionConfig):
 
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""
-    joint_map: Path
-    """JSON file that says which joints of the files stand for ours (docs/sources.md)."""
+    joint_map: MapChoice = "auto"
+    """`auto`, or a JSON file that says which joints of the files stand for ours (docs/sources.md)."""
     name: str = "bvh"
     """Name of the data set; part of the shards' file names."""
     licence: str
@@ -57,8 +57,9 @@ class BvhConfig(CaptionConfig):
         """What the output depends on, for the manifest: files by name and checksum instead of local paths."""
         given = super().options(*local)
         for key in ("joint_map", "captions"):
-            path: Path | None = getattr(self, key)
-            given[key] = digest_of(path) if path else None
+            path: MapChoice | None = getattr(self, key)
+            if path != "auto":
+                given[key] = digest_of(path) if path else None
         given["splits"] = bool(self.splits)
         return given
 
@@ -98,9 +99,14 @@ def plan_bvh(
     return _decide(config, batches, scans, ignored)
 
 
-def _header(data: bytes, label: str) -> tuple[int, float]:
-    header = read_header(data, name=label)
-    return header.frames, header.fps
+def _header(data: bytes, label: str) -> tuple[int, float, str]:
+    text, where = load_text(data, label)
+    section = find_motion(text, where)
+    key = ""
+    with suppress(UserError):  # a broken hierarchy is reported when the clip is converted
+        joints = parse_hierarchy(text[: section.start], where)
+        key = skeleton_key(joints.names, joints.parents)
+    return section.frames, section.fps, key
 
 
 def _decide(

@@ -20,7 +20,7 @@ from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.schema import Config, Dropped, UserError
 
-_VERSION = 1
+_VERSION = 2
 _SAVE_SECONDS = 30.0
 """How much of a long scan a kill may cost."""
 
@@ -35,6 +35,8 @@ class FoundFile(Config):
     sha256: str
     frames: int
     fps: float
+    skeleton: str
+    """The same in files with one hierarchy; empty when it cannot be read."""
     problem: str
     """Why the file cannot be read; empty when it can."""
 
@@ -46,8 +48,8 @@ class BatchScan(Config):
     problem: Dropped | None
 
 
-Header = Callable[[bytes, str], tuple[int, float]]
-"""(content, label) -> frames and frame rate; `UserError` when the file cannot be read."""
+Header = Callable[[bytes, str], tuple[int, float, str]]
+"""(content, label) -> frames, frame rate and skeleton; `UserError` when the file cannot be read."""
 
 
 class _Memory(Config):
@@ -111,17 +113,23 @@ def _scan(suffix: str, header: Header, batch: Batch) -> tuple[BatchScan, bool]:
     certain = True
     try:
         for file in batch.read(suffix):
-            frames, fps, problem = 0, 0.0, file.error
+            frames, fps, skeleton, problem = 0, 0.0, "", file.error
             certain = certain and not file.error
             try:
                 if not problem:
-                    frames, fps = header(file.data, file.label)
+                    frames, fps, skeleton = header(file.data, file.label)
             except UserError as error:
                 problem = str(error)
             sha256 = hashlib.sha256(file.data).hexdigest()
             files.append(
                 FoundFile(
-                    label=file.label, path=file.path, sha256=sha256, frames=frames, fps=fps, problem=problem
+                    label=file.label,
+                    path=file.path,
+                    sha256=sha256,
+                    frames=frames,
+                    fps=fps,
+                    skeleton=skeleton,
+                    problem=problem,
                 )
             )
     except UserError as error:

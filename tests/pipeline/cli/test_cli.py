@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 import typer
 from bvh_clips import write_clip, write_map
+from foreign_figures import FOREIGN, build, write_figure
 from safetensors.numpy import load_file
 
+from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.pipeline.cli.main import app
 
 Call = Callable[..., Any]
@@ -51,6 +54,7 @@ def test_the_commands_are_these() -> None:
         "retrieval",
         "data check",
         "data stats",
+        "data joints",
     }
 
 
@@ -276,6 +280,38 @@ def test_a_forgotten_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, c
     assert (
         found.code == 1 and "3 of 3 clips (100%)" in found.out and "head is not above the pelvis" in found.out
     )
+
+
+def test_joints_of_a_skeleton_and_of_a_file(tmp_path: Path, call: Call) -> None:
+    named = call("data", "joints", "smplx52", "-o", tmp_path / "empty.json")
+    assert named.code == 0 and "right_thumb3" in named.out and "left_wrist" in named.out
+    rows = json.loads((tmp_path / "empty.json").read_text())["smplx52"]
+    assert len(rows) == 52 and rows[22] == [22, "left_index1", None]
+    source = write_figure_of("Mixamo", tmp_path / "mocap" / "walk.bvh")
+    for where in (source, source.parent):
+        shown = call("data", "joints", where, "-o", tmp_path / "map.json")
+        assert shown.code == 0 and "mixamorig:LeftUpLeg" in shown.out and "22 by name" in shown.out
+        assert shown.out.rstrip().splitlines()[-2] == "certain"
+        assert JointMap.load(tmp_path / "map.json").sources[0] == ("mixamorig:Hips",)
+    fingers = call("data", "joints", source, "--skeleton", "smplx52")
+    assert "mixamorig:LeftHandIndex1" in fingers.out and "52 by name" in fingers.out
+    wrong = call("data", "joints", "nowhere.bvh")
+    assert wrong.code == 2 and "nowhere.bvh: no such file or folder" in wrong.err and "smpl22" in wrong.err
+
+
+def test_convert_without_a_map_shows_the_guess(tmp_path: Path, call: Call) -> None:
+    source, out = write_figure_of("Unreal mannequin", tmp_path / "mocap" / "walk.bvh"), tmp_path / "out"
+    words = ("data", "convert", "bvh", source.parent, out, "--licence", "CC0")
+    plan = call(*words, "--plan")
+    assert plan.code == 0 and "guessed from walk.bvh; 22 by name" in text_of(plan.out)
+    assert [path.name for path in out.iterdir()] == ["joint_map.json"]
+    done = call(*words, "--joint-map", "auto", "--workers", 1)
+    assert done.code == 0 and "note: joint_map.json: guessed from walk.bvh; 22 by name" in done.out
+
+
+def write_figure_of(tool: str, path: Path) -> Path:
+    write_figure(path, build(next(spec for spec in FOREIGN if spec.tool == tool)), frames=70)
+    return path
 
 
 def test_info_says_what_a_bug_report_needs(call: Call) -> None:

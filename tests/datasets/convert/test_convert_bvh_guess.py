@@ -1,0 +1,162 @@
+"""BVH conversion without a joint map: a guess for each skeleton, as good as a hand-written map."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from foreign_figures import FOREIGN, Built, build, write_figure
+from numpy.typing import NDArray
+
+from motionloom.datasets.convert.bvh.convert import BvhConfig, prepare_bvh
+from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
+from motionloom.datasets.convert.table import converter_named
+from motionloom.datasets.motion.canonical import canonicalize, resample
+from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.joint_map import JointMap, map_text
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import Manifest, Split, UserError
+from motionloom.datasets.shards.reader import ShardDataset
+
+BY_TOOL = {spec.tool: spec for spec in FOREIGN}
+LAFAN1 = BY_TOOL["LAFAN1"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+def convert(source: Path, out: Path, **changes: Any) -> Manifest:
+    config = BvhConfig(source=source, licence="CC0", name="x", **changes)
+    prepared = prepare_bvh(config, scan=out / SCAN_FILE, maps=out)
+    return run_conversion(prepared, out, progress=False)
+
+
+def joints_by_id(folder: Path) -> dict[str, NDArray[np.float64]]:
+    """Decoded joints of every clip of a data set."""
+    found = {}
+    for split in SPLITS:
+        if list(folder.glob(f"*-{split}-*.tar")):
+            dataset = ShardDataset.open(folder, split)
+            for i, clip_id in enumerate(dataset.ids):
+                found[clip_id] = decode(np.array(dataset.motion(i), np.float64), dataset.layout)
+    return found
+
+
+def true_joints(built: Built, world: NDArray[np.float64], layout: MotionLayout) -> NDArray[np.float64]:
+    index = {name: i for i, name in enumerate(built.names)}
+    rows = [[index[name] for name in built.ours[joint]] for joint in layout.skeleton.joints]
+    joints = np.stack([world[:, row].mean(axis=1) for row in rows], axis=1)
+    return canonicalize(resample(joints, 60.0, layout.fps))
+
+
+def test_one_folder_of_every_tool(tmp_path: Path) -> None:
+    """Two clips of each skeleton, with bones of different lengths: one guess for both."""
+    layout = MotionLayout.named("body133")
+    expected = {}
+    for number, spec in enumerate(FOREIGN):
+        for take, size in enumerate((1.0, 1.1)):
+            built = build(spec, a_pose=bool(take))
+            built.points = [point * size for point in built.points]
+            path = tmp_path / "mocap" / f"{number:02}-{take}.bvh"
+            world = write_figure(path, built, twisted=bool(number % 2), frames=66, seed=10 * number + take)
+            expected[path.stem] = true_joints(built, world, layout)
+    manifest = convert(tmp_path / "mocap", tmp_path / "out")
+    assert not manifest.dropped
+    found = joints_by_id(tmp_path / "out")
+    assert set(found) == set(expected)
+    for clip_id, joints in expected.items():
+        # Features are float32, and the root's path is a sum of 21 steps: 1e-4 m is some hundred roundings.
+        np.testing.assert_allclose(found[clip_id], joints, atol=1e-4, err_msg=clip_id)
+    assert len([note for note in manifest.notes if "guessed from" in note]) == len(FOREIGN)
+    assert manifest.options["joint_map"]["file"] == "auto"
+    for number, spec in enumerate(FOREIGN, start=1):
+        path = tmp_path / "out" / ("joint_map.json" if number == 1 else f"joint_map-{number}.json")
+        rows = JointMap.load(path)
+        assert rows.sources == tuple(build(spec).ours[joint] for joint in rows.target.joints)
+
+
+@pytest.mark.parametrize("tool", ["BONES, SOMA 77", "Mixamo"])
+def test_hands_come_along_in_a_layout_that_has_them(tool: str, tmp_path: Path) -> None:
+    built = build(BY_TOOL[tool])
+    options: dict[str, Any] = {"layout": "wholebody313", "fps": 30.0, "unit": "m", "up": "z"}
+    write_figure(tmp_path / "mocap/a.bvh", built, unit="m", up="z", frames=66)
+    convert(tmp_path / "mocap", tmp_path / "guessed", **options)
+    target = Skeleton.named("smplx52")
+    own = map_text(target, [built.ours[joint] for joint in target.joints], note="by hand")
+    (tmp_path / "map.json").write_text(own)
+    convert(tmp_path / "mocap", tmp_path / "own", joint_map=tmp_path / "map.json", **options)
+    guessed, by_hand = joints_by_id(tmp_path / "guessed")["a"], joints_by_id(tmp_path / "own")["a"]
+    assert guessed.shape[-2] == 52
+    np.testing.assert_array_equal(guessed, by_hand)
+
+
+def toeless(folder: Path) -> Path:
+    """A clip whose toes nothing tells from its heels."""
+    built = build(dataclasses.replace(LAFAN1, leg=(*LAFAN1.leg[:3], "{}A@foot")))
+    for side in ("Left", "Right"):
+        ankle = built.names.index(f"{side}Foot")
+        built.add(f"{side}B", ankle, built.points[ankle] + [0.0, -0.06, -0.05])
+    write_figure(folder / "a.bvh", built, frames=66)
+    return folder
+
+
+def test_what_is_not_certain_is_refused_with_a_map_to_complete(tmp_path: Path) -> None:
+    source, out = toeless(tmp_path / "mocap"), tmp_path / "out"
+    path = out / "joint_map.json"
+    with pytest.raises(UserError) as caught:
+        convert(source, out)
+    assert str(caught.value) == (
+        f"{source}: the joint map is not certain: no certain joint for left_foot (LeftA or LeftB?), "
+        f"right_foot (RightA or RightB?); complete {path} and pass it with --joint-map {path}"
+    )
+    assert [p.name for p in sorted(out.iterdir())] == [".scan.json", "joint_map.json"]
+    with pytest.raises(UserError, match="still to be filled in"):
+        convert(source, out, joint_map=path)
+    data = json.loads(path.read_text())
+    for row, name in ((10, "LeftA"), (11, "RightA")):
+        assert data["smpl22"][row][2] is None
+        data["smpl22"][row][2] = name
+    path.write_text(json.dumps(data))
+    with pytest.raises(UserError, match=r"joint_map.json: not the joint map that is guessed; use it with"):
+        convert(source, out)
+    assert json.loads(path.read_text()) == data, "what a hand has filled in stays"
+    assert not convert(source, out, joint_map=path).dropped
+
+
+def test_swapped_sides_are_refused(tmp_path: Path) -> None:
+    built = build(LAFAN1)
+    swap = {"Left": "Right", "Right": "Left"}
+    built.names = [
+        next((swap[s] + n.removeprefix(s) for s in swap if n.startswith(s)), n) for n in built.names
+    ]
+    write_figure(tmp_path / "mocap/a.bvh", built, frames=66, twisted=True)
+    with pytest.raises(UserError) as caught:
+        convert(tmp_path / "mocap", tmp_path / "out")
+    said = str(caught.value)
+    assert "the names call 'LeftUpLeg' the left leg, but as the feet point it is the right" in said
+    assert "the names call 'LeftArm' the left arm" in said and "joint_map.json" in said
+    assert not convert(
+        tmp_path / "mocap", tmp_path / "out", joint_map=tmp_path / "out/joint_map.json"
+    ).dropped
+
+
+def test_a_guess_needs_no_whole_first_file_and_no_folder(tmp_path: Path) -> None:
+    source = tmp_path / "mocap"
+    for name in ("a", "b"):
+        write_figure(source / f"{name}.bvh", build(LAFAN1), frames=66, seed=ord(name))
+    text = (source / "a.bvh").read_text()
+    (source / "a.bvh").write_text(text[: -len(text) // 3])
+    config = BvhConfig(source=source, licence="CC0")
+    prepared = prepare_bvh(config)
+    assert "guessed from b.bvh" in prepared.plan.notes[0] and "22 by name" in prepared.plan.notes[0]
+    assert not [p for p in tmp_path.rglob("*") if p.suffix != ".bvh" and p.is_file()]
+    manifest = convert(source, tmp_path / "out")
+    assert [d.source for d in manifest.dropped] == ["a.bvh"]
+    again = converter_named("bvh").prepare(config, out=tmp_path / "out")
+    assert again.options == prepared.options, "neither the folder nor an earlier run matters"
+    toeless(tmp_path / "other")
+    with pytest.raises(UserError, match=r"`motionloom data joints a.bvh -o joint_map.json` writes a map"):
+        prepare_bvh(BvhConfig(source=tmp_path / "other", licence="CC0"))
