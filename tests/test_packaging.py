@@ -159,11 +159,12 @@ def test_the_sdist_is_the_tree(sdist: Path) -> None:
 
 
 def test_the_wheel_has_every_file_of_the_packages(wheel: Path) -> None:
-    """Recipes, the papers' tables, skeletons, the pages' css, js and html, and the markers of typed packages."""
+    """Recipes, the papers' tables, skeletons, the pages' css, js and html, the marks of typed packages."""
     with zipfile.ZipFile(wheel) as archive:
         inside = {name for name in archive.namelist() if ".dist-info/" not in name}
     assert inside == {f"motionloom/{name}" for name in files_of(*FOLDERS)}
-    assert {Path(name).suffix for name in inside} == {".py", ".yaml", ".json", ".css", ".js", ".html", ".typed"}
+    kinds = {".py", ".yaml", ".json", ".css", ".js", ".html", ".typed"}
+    assert {Path(name).suffix or Path(name).name for name in inside} == kinds
 
 
 def test_the_wheel_says_what_pyproject_says(wheel: Path) -> None:
