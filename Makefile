@@ -9,13 +9,15 @@ RECIPE ?= humantomato-tiny
 DEMO_ARGS ?=
 NUMERIC_TESTS := tests/models tests/datasets/motion
 
-.PHONY: demo test test-numeric lint install clean help
+.PHONY: demo test test-numeric lint dist test-dist install clean help
 
 help:
 	@echo "make demo   whole pipeline on synthetic data, ends with the path of a page to watch"
 	@echo "make test   the tests"
 	@echo "make lint   ruff and mypy"
 	@echo "make test-numeric   the numeric tests as older processors compute: AVX2 and none, one thread and two"
+	@echo "make dist   sdist and wheel, in dist/"
+	@echo "make test-dist   the wheel in an environment of its own, away from the tree"
 
 install: $(STAMP)
 
@@ -50,5 +52,14 @@ lint: $(STAMP)
 	@for d in pipeline datasets models configs; do ln -sfn ../../../$$d build/types/motionloom/$$d; done
 	cd build/types && MYPYPATH=. $(BIN)/mypy --config-file ../../pyproject.toml -p motionloom.datasets -p motionloom.models -p motionloom.pipeline -p motionloom.configs
 
+# The wheel is built from the unpacked sdist: what the tree has beside it, old files in build/ too, is in neither.
+dist: $(STAMP)
+	rm -rf dist
+	$(BIN)/python -P -c 'from setuptools import build_meta; build_meta.build_sdist("dist")' >/dev/null
+	$(BIN)/python -m pip wheel --quiet --no-index --no-deps --no-build-isolation --wheel-dir dist dist/motionloom-*.tar.gz
+
+test-dist: dist
+	.ci/test-dist $(BIN) dist
+
 clean:
-	rm -rf build .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache

@@ -1,13 +1,21 @@
-"""What pyproject.toml requires is what the packages import, no more and no less."""
+"""What pyproject.toml requires is what the packages import, and what it builds is all of them."""
 
 from __future__ import annotations
 
 import ast
 import re
+import shutil
+import subprocess
 import sys
+import tarfile
 import tomllib
+import zipfile
+from configparser import ConfigParser
+from email import message_from_bytes
 from importlib.metadata import packages_distributions
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("configs", "datasets", "models", "pipeline")
@@ -93,13 +101,84 @@ def test_nothing_is_both_required_and_optional() -> None:
     assert not REQUIRED & OPTIONAL
 
 
-def test_every_recipe_comes_with_the_package() -> None:
-    configs = ROOT / "configs"
-    taken = {
-        path
-        for glob in CONFIG["tool"]["setuptools"]["package-data"]["motionloom.configs"]
-        for path in configs.glob(glob)
-    }
-    assert taken == {
-        path for path in configs.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")
-    }
+BESIDE = (".ci", "benchmarks", "docs", "tests")
+"""Folders of the source distribution that are no part of the package."""
+ALONE = (
+    ".gitignore",
+    ".pre-commit-config.yaml",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "LICENSE",
+    "MANIFEST.in",
+    "Makefile",
+    "README.md",
+    "constraints.txt",
+    "pyproject.toml",
+)
+
+
+def files_of(*folders: str) -> set[str]:
+    """Files of the tree's folders, without what running the code leaves there."""
+    paths = (path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file())
+    return {p.relative_to(ROOT).as_posix() for p in paths if "__pycache__" not in p.parts}
+
+
+def hook(name: str, tree: Path, out: Path) -> Path:
+    """What the build backend's `build_sdist` or `build_wheel` makes of a tree."""
+    code = f"from setuptools import build_meta; build_meta.{name}({str(out)!r})"
+    subprocess.run([sys.executable, "-P", "-c", code], cwd=tree, check=True, capture_output=True)
+    (made,) = out.iterdir()
+    return made
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The source distribution, built from a copy: building writes into the tree."""
+    tree = tmp_path_factory.mktemp("tree")
+    for name in (*files_of(*FOLDERS, *BESIDE), *ALONE):
+        (tree / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, tree / name)
+    return hook("build_sdist", tree, tmp_path_factory.mktemp("sdist"))
+
+
+@pytest.fixture(scope="module")
+def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from the unpacked source distribution and nothing else."""
+    folder = tmp_path_factory.mktemp("unpacked")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(folder, filter="data")
+    (tree,) = folder.iterdir()
+    return hook("build_wheel", tree, tmp_path_factory.mktemp("wheel"))
+
+
+def test_the_sdist_is_the_tree(sdist: Path) -> None:
+    with tarfile.open(sdist) as archive:
+        inside = {name.partition("/")[2] for name in archive.getnames() if archive.getmember(name).isfile()}
+    generated = {name for name in inside if name.startswith("motionloom.egg-info/")}
+    assert inside - generated - {"PKG-INFO", "setup.cfg"} == files_of(*FOLDERS, *BESIDE) | set(ALONE)
+
+
+def test_the_wheel_has_every_file_of_the_packages(wheel: Path) -> None:
+    """Recipes, the papers' tables, skeletons, the pages' css, js and html, the marks of typed packages."""
+    with zipfile.ZipFile(wheel) as archive:
+        inside = {name for name in archive.namelist() if ".dist-info/" not in name}
+    assert inside == {f"motionloom/{name}" for name in files_of(*FOLDERS)}
+    kinds = {".py", ".yaml", ".json", ".css", ".js", ".html", ".typed"}
+    assert {Path(name).suffix or Path(name).name for name in inside} == kinds
+
+
+def test_the_wheel_says_what_pyproject_says(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        (folder,) = {name.split("/")[0] for name in archive.namelist() if ".dist-info/" in name}
+        about = message_from_bytes(archive.read(f"{folder}/METADATA"))
+        points = archive.read(f"{folder}/entry_points.txt").decode()
+        assert archive.read(f"{folder}/licenses/LICENSE") == (ROOT / "LICENSE").read_bytes()
+    assert wheel.name == f"motionloom-{PROJECT['version']}-py3-none-any.whl"
+    assert about["Requires-Python"] == PROJECT["requires-python"]
+    required = [line for line in about.get_all("Requires-Dist", []) if "extra ==" not in line]
+    assert declared(required) == REQUIRED
+    assert set(about.get_all("Provides-Extra", [])) == set(PROJECT["optional-dependencies"])
+    parser = ConfigParser()
+    parser.read_string(points)
+    groups = {"console_scripts": PROJECT["scripts"], **PROJECT["entry-points"]}
+    assert {group: dict(parser[group]) for group in parser.sections()} == groups

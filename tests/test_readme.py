@@ -6,6 +6,7 @@ import ast
 import importlib
 import re
 import shlex
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,8 +25,22 @@ from motionloom.pipeline.runs.shipped import shipped_recipes
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
 DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
-OTHER_PROGRAMS = {".", "diff", "git", "python", "sbatch", "tensorboard"}
+OTHER_PROGRAMS = {
+    ".",
+    "conda",
+    "diff",
+    "export",
+    "git",
+    "hf",
+    "module",
+    "pip",
+    "python",
+    "sbatch",
+    "tensorboard",
+    "uv",
+}
 LAUNCHERS = {"srun", "torchrun"}
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
 class Block(NamedTuple):
@@ -92,6 +107,45 @@ def test_command_is_real(where: str, words: list[str]) -> None:
         assert targets and set(targets) <= make_targets(), where
     else:
         assert program in OTHER_PROGRAMS | {"pre-commit"}, f"{where}: '{program}' is not known here"
+
+
+PIP = [command for command in COMMANDS if "pip" in command[1][:2]]
+
+
+@pytest.mark.parametrize(("where", "words"), PIP, ids=[where for where, _ in PIP])
+def test_pip_command_is_real(where: str, words: list[str]) -> None:
+    words = words[words.index("pip") + 1 :]
+    for extra in re.findall(r"\[([\w,-]+)\]", " ".join(words)):
+        assert set(extra.split(",")) <= set(PROJECT["optional-dependencies"]), where
+    wheels = [word for word in words if word.startswith("dist/")]
+    assert all(word.startswith(f"dist/motionloom-{PROJECT['version']}-py3-none-any.whl") for word in wheels)
+    commands = pytest.importorskip("pip._internal.commands")
+    known = [word for word in words[1:] if not word.startswith("--torch-backend")]  # uv's own
+    options, packages = commands.create_command(words[0]).parse_args(known)
+    assert packages or options.dependency_groups, where
+
+
+def test_the_workflow_is_one_that_runs() -> None:
+    """Its commands are real, its recipe is beside it, and it uploads what its steps write."""
+    text = (ROOT / "docs" / "workflow.yml").read_text(encoding="utf-8")
+    workflow = yaml.safe_load(text)
+    (job,) = workflow["jobs"].values()
+    assert workflow[True] and job["runs-on"] and job["timeout-minutes"]  # YAML reads `on` as true
+    scripts = [step["run"] for step in job["steps"] if "run" in step]
+    assert all(("run" in step) != ("uses" in step) for step in job["steps"])
+    lines = [line.strip() for s in scripts for line in re.sub(r"\\\n\s*", "", s).splitlines()]
+    ours = [parsed(shlex.split(line)) for line in lines if line.startswith("motionloom ")]
+    assert [given["command"] for given in ours] == [
+        *("info", "bvh", "synth", "check", "report", "run", "report")
+    ]
+    written = {str(given.get("out")) for given in ours}
+    (upload,) = [step["with"]["path"].split() for step in job["steps"] if "upload" in step.get("uses", "")]
+    assert all(any(path == out or path.startswith(f"{out}/") for out in written) for path in upload)
+    (run,) = [given for given in ours if given["command"] == "run"]
+    recipe = load_recipe(ROOT / "docs" / str(run["recipe"]))
+    assert str(recipe.stage("data").config.path) in {str(given.get("out")) for given in ours}
+    for name in re.findall(r"\$([A-Z]+)", text):
+        assert name in workflow["env"], f"${name} is not set"
 
 
 def test_inline_make_targets_exist() -> None:

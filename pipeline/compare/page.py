@@ -20,12 +20,18 @@ from motionloom.pipeline.store.flatten import setting_text
 NO_PAGES = ("report",)
 """Kinds of stages that nothing compared here comes from."""
 LETTERS = "ABCDEFGH"
+NAMED = 3
+"""So many runs are named in the page's title, more are counted."""
 
 
 def comparison_page(runs: Sequence[ComparedRun]) -> Page:
     """The page of `runs`."""
     names = " and ".join((", ".join(run.label for run in runs[:-1]), runs[-1].label))
-    page = Page(f"motionloom: {len(runs)} runs compared", names)
+    what = "settings that differ, figures on held-out clips, training curves"
+    if len(runs) <= NAMED:
+        page = Page(f"{names} compared", what.capitalize())
+    else:
+        page = Page(f"{len(runs)} runs compared", f"{names}: {what}")
     _who(page, runs)
     _settings(page, runs, setting_differences(runs))
     charts, tables = curve_charts(runs), compared_tables(runs)

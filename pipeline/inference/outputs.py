@@ -36,13 +36,14 @@ def write_motions(
     formats: Sequence[Format],
     *,
     title: str,
+    note: str = "",
     seed: int,
     scores: Sequence[Score] | None = None,
 ) -> list[Path]:
     """Write every motion in every format; the page holds all of them. Returns the paths.
 
-    `scores`, one for each motion: sound for the film and the page, beats and segments for the page. Without
-    them each motion comes with what drove it.
+    `title` and `note` are the page's. `scores`, one for each motion: sound for the film and the page, beats
+    and segments for the page. Without them each motion comes with what drove it.
     """
     require_folder(folder)
     scores = [score_of(motion) for motion in motions] if scores is None else scores
@@ -64,7 +65,7 @@ def write_motions(
     if "html" in formats:
         page = folder / "index.html"
         shown = [viewer_motion(m, "generated", score=s) for m, s in zip(motions, scores, strict=True)]
-        write_viewer(page, shown, title)
+        write_viewer(page, shown, title, note)
         out.append(page)
     return out
 

@@ -1,4 +1,4 @@
-/* Theme switch, tables that are wider than the window, and the values under the pointer on line charts. */
+/* Theme switch, tables that are larger than their box, and the values under the pointer on line charts. */
 (function () {
   "use strict";
   const tip = document.getElementById("tip");
@@ -9,13 +9,18 @@
   });
   const boxes = [...document.querySelectorAll(".scroll")];
   const hint = (box) => {
-    const wide = box.scrollWidth > box.clientWidth + 2;
+    const wide = box.scrollWidth > box.clientWidth + 2, tall = box.scrollHeight > box.clientHeight + 2;
+    const end = box.scrollLeft + box.clientWidth >= box.scrollWidth - 2, foot = box.scrollTop + box.clientHeight >= box.scrollHeight - 2;
     box.classList.toggle("wide", wide);
-    box.classList.toggle("end", wide && box.scrollLeft + box.clientWidth >= box.scrollWidth - 2);
-    if (wide) box.tabIndex = 0; else box.removeAttribute("tabindex");
+    box.classList.toggle("end", wide && end);
+    const words = [];
+    if (wide) words.push(end ? "← scroll back" : "scroll sideways for more →");
+    if (tall) words.push(foot ? "↑ more above" : "scroll down for more ↓");
+    if (words.length) box.dataset.more = words.join(" · "); else delete box.dataset.more;
+    if (words.length) box.tabIndex = 0; else box.removeAttribute("tabindex");
   };
   for (const box of boxes) box.addEventListener("scroll", () => hint(box), { passive: true });
-  const hints = () => boxes.forEach(hint);
+  const hints = () => { boxes.forEach(hint); boxes.forEach(hint); }; // the words may themselves need the last of the room
   hints();
   window.addEventListener("resize", hints);
   for (const fold of document.querySelectorAll("details")) fold.addEventListener("toggle", hints);

@@ -36,20 +36,23 @@ function mountViewer(root, data, options) {
   const calm = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
   const state = { time: 0, playing: !calm, speed: 1, follow: true, loop: false, draws: 0, close: false };
   const camera = { yaw: 0, pitch: 0, zoom: 1, panX: 0, panY: 0 };
-  let theme, stale = true, dragging = 0;
+  let theme, stale = true, dragging = 0, printing = false;
   const refresh = () => { stale = true; };
 
-  // ---- page furniture
-  if (page) {
-    root.append(element("header", { className: "mlv-header" },
-      element("h1", { textContent: data.title }), ...(data.note ? [element("p", { textContent: data.note })] : [])));
-  }
+  // ---- page furniture: on a page of its own the bar is the window's lower edge, in a report it stands above the figures
+  const header = element("header", { className: "mlv-header" },
+    element("h1", { textContent: data.title }), ...(data.note ? [element("p", { textContent: data.note })] : []));
   const { board, cells } = buildCells(clips);
-  root.append(board);
   const strip = scores.length ? buildStrip(duration) : null;
-  const bar = buildBar(root, last, duration, strip, sounds.length > 0);
+  const bar = buildBar(last, duration, strip, sounds.length > 0);
+  const { box, more } = buildScroller(clips.length, ...(page ? [header, board, bar.help] : [board]));
+  root.append(...(page ? [box, more, bar.node] : [bar.node, box, more, bar.help]));
   root.classList.toggle("mlv-single", clips.length === 1);
-  root.classList.toggle("mlv-tall", page || board.children.length > 1 || clips.length > 4);
+  root.classList.toggle("mlv-few", clips.length > 1 && clips.length < 4 && board.children.length === 1);
+  if (page) {
+    box.tabIndex = -1; // the keys that scroll a page scroll the box
+    box.focus({ preventScroll: true });
+  }
   bar.theme.hidden = !page;
   const button = (name, act) => bar[name].addEventListener("click", act);
 
@@ -168,7 +171,7 @@ function mountViewer(root, data, options) {
       if (state.time > duration + (state.loop ? 1 / rate : 0.35)) state.time = 0;
       stale = true;
     } else player.rest();
-    if (stale) {
+    if (stale && !printing) {
       stale = false;
       for (const cell of cells) if (cell.visible) paint(cell);
       const shown = Math.min(state.time, duration);
@@ -237,7 +240,17 @@ function mountViewer(root, data, options) {
   bar.scrub.addEventListener("pointerdown", () => { dragging += 1; });
   window.addEventListener("pointerup", () => { dragging = 0; });
 
-  const rethemed = () => { theme = readTheme(root); refresh(); };
+  // Paper is white and has every figure: also those out of sight, and in light colours whatever the screen has.
+  window.addEventListener("beforeprint", () => {
+    const set = document.documentElement.dataset, chosen = set.theme;
+    printing = true;
+    set.theme = "light";
+    theme = readTheme(root);
+    cells.forEach(paint);
+    if (chosen === undefined) delete set.theme; else set.theme = chosen;
+  });
+  window.addEventListener("afterprint", () => { printing = false; rethemed(); });
+  const rethemed = () => { if (!printing) { theme = readTheme(root); refresh(); } };
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", rethemed);
   new MutationObserver(rethemed).observe(document.documentElement, { attributes: true, attributeFilter: ["data-theme"] });
   const sizes = new ResizeObserver(refresh);

@@ -40,7 +40,23 @@ function buildCells(clips) {
   return { board, cells };
 }
 
-function buildBar(root, last, duration, strip, sounding) {
+/* The board's own scrolling box, so that the bar beside it never lies over a figure, and a line that says there is more. */
+function buildScroller(count, ...children) {
+  const box = element("div", { className: "mlv-scroll" }, ...children);
+  const more = element("p", { className: "mlv-more", hidden: true });
+  const update = () => {
+    const room = box.clientHeight + (more.hidden ? 0 : more.offsetHeight); // what the box would have without the line
+    const below = box.scrollHeight - box.clientHeight - box.scrollTop > 8;
+    more.hidden = box.scrollHeight <= room + 2;
+    more.textContent = (count > 1 ? `${count} motions: ` : "") + (below ? "scroll for more ↓" : "more above ↑");
+  };
+  box.addEventListener("scroll", update, { passive: true });
+  const sizes = new ResizeObserver(update);
+  for (const node of [box, ...children]) sizes.observe(node);
+  return { box, more };
+}
+
+function buildBar(last, duration, strip, sounding) {
   const button = (textContent, title, pressed) => {
     const node = element("button", { type: "button", textContent, title });
     node.setAttribute("aria-label", title);
@@ -76,14 +92,13 @@ function buildBar(root, last, duration, strip, sounding) {
   });
   const legend = element("span", { className: "mlv-legend" },
     element("i", { className: "mlv-left" }), "left ", element("i", { className: "mlv-right" }), "right");
-  root.append(
-    element("div", { className: "mlv-bar", role: "toolbar" },
-      ...track,
-      element("span", { className: strip ? "mlv-line mlv-tight" : "mlv-line" },
-        bar.play, bar.back, bar.forth, ...(strip ? [] : [bar.scrub]), bar.time),
-      ...sound,
-      element("span", { className: "mlv-line mlv-wrap" }, bar.speed, views, bar.close, bar.follow, bar.loop, bar.theme, legend)),
-    element("p", { className: "mlv-help", textContent: `Drag to orbit · Shift-drag or right-drag to pan · wheel or pinch to zoom · double-click to reset · ${KEYS}${sounding ? " · M sound" : ""}` }));
+  bar.node = element("div", { className: "mlv-bar", role: "toolbar" },
+    ...track,
+    element("span", { className: strip ? "mlv-line mlv-tight" : "mlv-line" },
+      bar.play, bar.back, bar.forth, ...(strip ? [] : [bar.scrub]), bar.time),
+    ...sound,
+    element("span", { className: "mlv-line mlv-wrap" }, bar.speed, views, bar.close, bar.follow, bar.loop, bar.theme, legend));
+  bar.help = element("p", { className: "mlv-help", textContent: `Drag to orbit · Shift-drag or right-drag to pan · wheel or pinch to zoom · double-click to reset · ${KEYS}${sounding ? " · M sound" : ""}` });
   return bar;
 }
 

@@ -145,6 +145,7 @@ def generate_motions(
     """
     from motionloom.pipeline.inference.bundle import Bundle
     from motionloom.pipeline.inference.outputs import write_motions
+    from motionloom.pipeline.inference.page_words import page_note, page_title
     from motionloom.pipeline.inference.script import Script, read_music
 
     if not captions and not audio and script is None:
@@ -179,7 +180,9 @@ def generate_motions(
             sampling=drawing,
             strict=True,
         )
-    paths = write_motions(out, motions, wanted, title=folder.name, seed=seed)  # type: ignore[arg-type]
+    title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
+    note = page_note(len(motions), folder.resolve().name, seed)
+    paths = write_motions(out, motions, wanted, title=title, note=note, seed=seed)  # type: ignore[arg-type]
     for path in paths:
         console.print(str(path), soft_wrap=True)
     return paths

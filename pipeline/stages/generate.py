@@ -14,6 +14,7 @@ from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
 from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.inference.formats import FORMATS, Format
+from motionloom.pipeline.inference.page_words import page_note
 from motionloom.pipeline.render.score import Score
 
 
@@ -61,7 +62,8 @@ class GenerateStage(StageKind):
             context.folder / "motions",
             motions,
             config.formats,
-            title="Generated motions",
+            title=f"Generated motions of {context.recipe}",
+            note=page_note(len(motions), context.recipe, context.seed),
             seed=context.seed,
             scores=[Score()] * len(said) + [clip.score() for _, clip in danced],
         )

@@ -94,7 +94,7 @@ class ReportStage(StageKind):
                     f"shown; raise count or dances of stage '{context.name}' if they are 0"
                 )
         # The recipe's name, not the folder's: equal runs write equal pages wherever they lie.
-        page = Page(f"motionloom: {context.recipe}", subtitle)
+        page = Page(f"Report of {context.recipe}", subtitle)
         if state is not None:
             say_missing(page, state)
         _watch(page, context, said, danced)

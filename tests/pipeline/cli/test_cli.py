@@ -118,7 +118,7 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
         ["run", "humantomato-paper", "--set", "data.path=nowhere"],
         "nowhere: no such folder; set the path of the data stage",
     ),
-    "not a run": (["generate", "nowhere", "a person walks"], "nowhere: not a run folder"),
+    "not a run": (["generate", "nowhere", "a person walks"], "nowhere: no such folder"),
     "no caption": (["generate", "nowhere"], "give at least one caption"),
     "empty caption": (["generate", "nowhere", "a person walks", " "], "captions[1] is empty"),
     "no format": (["generate", "nowhere", "a person walks", "-f", ""], "names no format"),

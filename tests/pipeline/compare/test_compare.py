@@ -287,6 +287,7 @@ def test_the_page_in_a_browser(width: int, height: int, browser: Any, tmp_path: 
     page.on("pageerror", lambda error: trouble.append(str(error)))
     page.on("request", lambda r: None if r.url.startswith("file:") else trouble.append(r.url))
     page.goto(path.as_uri())
+    assert page.title() == f"{runs[0].name}, {runs[1].name} and {runs[2].name} compared"
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     curves = page.locator("svg.chart").first.locator("polyline.curve")
     assert curves.count() == 3, "training; one validation is a dot"
