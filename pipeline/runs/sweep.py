@@ -221,7 +221,8 @@ def _say_outcome(axes: Sequence[Axis], runs: Sequence[Combination], console: Con
         if found is not None:
             columns.append((title, next(c for c in found.columns if c.title == name), found))
     titles = [*_short([axis.key for axis in axes]), "finished", *(title for title, _, _ in columns)]
-    table = Table(*titles, title=f"{len(runs)} runs (* best of those measured alike)", title_justify="left")
+    what = " (* best of those measured alike)" if columns else ""
+    table = Table(*titles, title=f"{len(runs)} runs{what}", title_justify="left")
     for run, shown in zip(runs, opened, strict=True):
         done = sum(stage.usable for stage in shown.state.stages)
         cells = [*map(escape, run.values), f"{done} of {len(shown.state.stages)}"]

@@ -109,6 +109,12 @@ def test_what_is_taken_over_is_the_other_runs(go: Sweep, tmp_path: Path) -> None
     assert not (one / "evaluate/value.json").samefile(two / "evaluate/value.json")
 
 
+def test_a_run_that_takes_over_everything_is_a_run(go: Sweep, tmp_path: Path) -> None:
+    assert "made already in threads=1: data, net, evaluate" in go("hardware.threads=1,2")
+    assert len(RAN) == 3
+    assert "threads: 2" in (tmp_path / "sweep/threads=2/recipe.yaml").read_text()
+
+
 def test_a_killed_sweep_goes_on(go: Sweep, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         go("net.add=1,-1,2")
