@@ -95,6 +95,7 @@ def run_recipe(
             f"{loaded.name} in {run}: {len(todo)} of {len(plan)} stages to run "
             f"on {loaded.hardware.describe()}"
         )
+    if todo or not (run / "recipe.yaml").is_file():  # all may have been taken over from another run
         execute(loaded, run, plan, console)
     for row in plan:
         page = stage_folder(run, row.stage.name) / "report.html"

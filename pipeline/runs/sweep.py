@@ -9,7 +9,10 @@ the runs that follow (`take_over.py`).
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -24,7 +27,7 @@ from motionloom.pipeline.compare.measures import HEADLINES
 from motionloom.pipeline.compare.runs import MOST, ComparedRun
 from motionloom.pipeline.compare.tables import compared_tables
 from motionloom.pipeline.launch.console import make_console
-from motionloom.pipeline.launch.process import process_rank
+from motionloom.pipeline.launch.process import srun_tasks
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.graph import make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
@@ -94,7 +97,9 @@ def run_sweep(
     if dry_run:
         console.print(_plan_table(axes, runs, index))
         return [run.folder for run in runs]
-    folders = [run.folder for run in runs]
+    folders, launched = [run.folder for run in runs], "RANK" in os.environ or srun_tasks() > 1
+    if launched and index is None:
+        raise UserError("a launcher has started several processes: give them one combination, --index K")
     if not replace:  # before anything runs
         for number, run in enumerate(runs):
             if index in (None, number):
@@ -104,16 +109,29 @@ def run_sweep(
         if index not in (None, number):
             continue
         console.print(f"[bold]sweep {number + 1}/{len(runs)}[/] {escape(run.folder.name)}")
-        if process_rank() == 0:
+        if not launched:  # several processes would not all see the same plan
             others = [folder for folder in folders if folder != run.folder]
             taken = take_over(make_plan(run.recipe, run.folder), run.folder, others)
             for source in dict.fromkeys(taken.values()):
                 names = ", ".join(name for name, place in taken.items() if place == source)
                 console.print(f"    made already in {escape(source.name)}: {names}", soft_wrap=True)
-        run_recipe(recipe, run.folder, overrides=run.sets, replace=replace, console=console)
+        if launched or run.recipe.hardware.world() == 1:
+            run_recipe(recipe, run.folder, overrides=run.sets, replace=replace, console=console)
+        else:
+            _run_alone(recipe, run, replace)
     if index is None:
         _say_outcome(axes, runs, console)
     return folders
+
+
+def _run_alone(recipe: str | Path, run: Combination, replace: bool) -> None:
+    """A run of several processes by a command of its own: they form one team, and a team is formed once."""
+    words = [word for text in run.sets for word in ("--set", text)]
+    more = ["--replace"] if replace else []
+    command = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "run", str(recipe)]
+    code = subprocess.run([*command, "--out", str(run.folder), *words, *more], check=False).returncode
+    if code:
+        raise UserError(f"{run.folder}: stopped with exit code {code}; the same command goes on from here")
 
 
 def _combinations(
@@ -203,7 +221,8 @@ def _say_outcome(axes: Sequence[Axis], runs: Sequence[Combination], console: Con
         if found is not None:
             columns.append((title, next(c for c in found.columns if c.title == name), found))
     titles = [*_short([axis.key for axis in axes]), "finished", *(title for title, _, _ in columns)]
-    table = Table(*titles, title=f"{len(runs)} runs (* best of those measured alike)", title_justify="left")
+    what = " (* best of those measured alike)" if columns else ""
+    table = Table(*titles, title=f"{len(runs)} runs{what}", title_justify="left")
     for run, shown in zip(runs, opened, strict=True):
         done = sum(stage.usable for stage in shown.state.stages)
         cells = [*map(escape, run.values), f"{done} of {len(shown.state.stages)}"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -108,6 +109,12 @@ def test_what_is_taken_over_is_the_other_runs(go: Sweep, tmp_path: Path) -> None
     assert not (one / "evaluate/value.json").samefile(two / "evaluate/value.json")
 
 
+def test_a_run_that_takes_over_everything_is_a_run(go: Sweep, tmp_path: Path) -> None:
+    assert "made already in threads=1: data, net, evaluate" in go("hardware.threads=1,2")
+    assert len(RAN) == 3
+    assert "threads: 2" in (tmp_path / "sweep/threads=2/recipe.yaml").read_text()
+
+
 def test_a_killed_sweep_goes_on(go: Sweep, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         go("net.add=1,-1,2")
@@ -183,3 +190,28 @@ def test_values_and_names(go: Sweep, tmp_path: Path) -> None:
     assert Axis.parse("a.b=[1, 2],'x,y',{c: 1, d: 2}").values == ("[1, 2]", "'x,y'", "{c: 1, d: 2}")
     go("net.add=1", "data.add=2", "net.words=[x, y]")
     assert [path.name for path in (tmp_path / "sweep").iterdir()] == ["net.add=1_data.add=2_net.words=x-y"]
+
+
+def test_runs_of_several_processes_are_commands_of_their_own(
+    go: Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Processes form one team, once; the first run's would otherwise go on to the second's."""
+    commands: list[list[str]] = []
+
+    def note(command: list[str], *, check: bool) -> subprocess.CompletedProcess[str]:
+        commands.append(command)
+        return subprocess.CompletedProcess(command, 3 if "seed=2" in command else 0)
+
+    monkeypatch.setattr(subprocess, "run", note)
+    with pytest.raises(UserError, match=r"seed=2: stopped with exit code 3; the same command goes on"):
+        go("seed=1,2,3", sets=("hardware.cpu_devices=2",), replace=True)
+    assert not RAN and len(commands) == 2
+    folder = tmp_path / "sweep/seed=1"
+    words = "--out {} --set hardware.accelerator=cpu --set hardware.cpu_devices=2 --set seed=1 --replace"
+    assert commands[0][1:] == [
+        "-P", "-m", "motionloom.pipeline.cli.main", "run", str(tmp_path / "recipe.yaml"),
+        *words.format(folder).split(),
+    ]  # fmt: skip
+    monkeypatch.setenv("RANK", "1")
+    with pytest.raises(UserError, match="give them one combination, --index K"):
+        go("seed=1,2")

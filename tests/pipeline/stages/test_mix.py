@@ -92,6 +92,32 @@ def test_a_moved_run_still_works(run: Path, tmp_path: Path) -> None:
     assert all(np.array_equal(a, b) for a, b in zip(found, wanted, strict=True))
 
 
+def test_data_of_another_run(run: Path, tmp_path: Path) -> None:
+    """It is named by its path, weighed by the name of both, and found again when both runs are moved."""
+    text = f"""
+name: more
+hardware: {{accelerator: cpu, convert_workers: 1}}
+stages:
+  own: {{kind: synth, layout: body133, clips: 4, val_fraction: 0.0, test_fraction: 0.0, actions: [walk]}}
+  data: {{kind: mix, inputs: {{data: [own, {tmp_path}/run/stages/dances]}}, weights: {{"run:dances": 3}}}}
+"""
+    shutil.copytree(run, tmp_path / "run")
+    made = run_recipe(write(tmp_path, text), tmp_path / "more", console=Console(quiet=True))
+    dataset = open_split(stage(made, "data"), "train")
+    own, dances = (open_split(folder, "train") for folder in (stage(made, "own"), stage(run, "dances")))
+    assert [source.weight for source in dataset.sources()] == [1.0, 3.0]
+    wanted = clips(own) + clips(dances)
+    assert all(np.array_equal(a, b) for a, b in zip(clips(dataset), wanted, strict=True))
+    with pytest.raises(UserError, match=r"weights\.dances is of no stage .*; these are own, run:dances"):
+        load_recipe(tmp_path / "recipe.yaml", ["data.weights={dances: 1}"])
+    with pytest.raises(UserError, match="stages/data', a mix itself"):
+        load_recipe(tmp_path / "recipe.yaml", [f"data.inputs.data=[own, {tmp_path}/run/stages/data]"])
+    (tmp_path / "both").mkdir()
+    for name in ("run", "more"):
+        (tmp_path / name).rename(tmp_path / "both" / name)
+    assert len(open_split(stage(tmp_path / "both/more", "data"), "train")) == len(wanted)
+
+
 def test_shards_that_lie_elsewhere_share_the_weight_of_their_stage(tmp_path: Path) -> None:
     """One of them has test clips alone, so the training weight of its stage goes to the other."""
     for seed, split in ((1, 0.0), (2, 0.4), (3, 0.0)):
