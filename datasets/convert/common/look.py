@@ -392,11 +392,7 @@ def _turned(joints: NDArray[np.float64], up: str, axis: str) -> NDArray[np.float
     """Joints with Y up, when `axis` of the files is the upward one after all."""
     x, y, z = np.moveaxis(_file_axes(joints, up), -1, 0)
     turned = {
-        "+y": (x, y, z),
-        "-y": (x, -y, -z),
-        "+z": (x, z, -y),
-        "-z": (x, -z, y),
-        "+x": (-y, x, z),
-        "-x": (y, -x, z),
-    }[axis]
+        "+y": (x, y, z), "-y": (x, -y, -z), "+z": (x, z, -y),
+        "-z": (x, -z, y), "+x": (-y, x, z), "-x": (y, -x, z),
+    }[axis]  # fmt: skip
     return np.stack(turned, axis=-1)
