@@ -19,7 +19,6 @@ import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy, Strategy
 from pydantic import BaseModel, Field
-from rich.markup import escape
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from motionloom.datasets.base.files import remove_temporaries
@@ -358,7 +357,8 @@ def _start(context: StageContext, config: TrainConfig) -> Start:
     folder = context.folder / "checkpoints"
     if folder.is_dir():
         remove_temporaries(folder)
-    return start_of(folder, config, lambda text: context.console.print(f"    [yellow]{escape(text)}[/]"))
+    say = partial(context.console.print, style="yellow", markup=False, soft_wrap=True)
+    return start_of(folder, config, say)
 
 
 def start_of(folder: Path, config: TrainConfig, say: Callable[[str], None] = warnings.warn) -> Start:
