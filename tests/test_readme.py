@@ -23,7 +23,7 @@ from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.shipped import shipped_recipes
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")]
 DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
 OTHER_PROGRAMS = {
     ".",

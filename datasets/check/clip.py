@@ -48,7 +48,7 @@ def read_meta(file: BinaryIO, path: Path, clip: TarClip) -> ClipMeta:
     where = f"{path}: '{clip.key}.meta.json'"
     try:
         data = json.loads(read_member(file, clip, "meta.json"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{where}: not valid JSON ({error})") from None
     return ClipMeta.parse(data, where)
 

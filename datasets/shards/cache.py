@@ -9,6 +9,7 @@ whoever has it mapped keeps its content until letting go.
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -18,6 +19,9 @@ from typing import BinaryIO
 from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reading import CacheConfig
+
+_OURS = re.compile(r"[0-9a-f]{64}\.(tar|index\.npz|manifest\.json)")
+"""Names of what is kept. Nothing else is ever deleted: a recipe may name any folder for the cache."""
 
 _PART = ".part"
 _LOCKS = ".locks"
@@ -87,16 +91,18 @@ class FileCache:
         used = size
         with os.scandir(self.folder) as entries:
             for entry in entries:
-                if not entry.is_file():
+                part = entry.name.startswith(".") and entry.name.endswith(_PART)
+                whole = entry.name.removeprefix(".").removesuffix(_PART) if part else entry.name
+                if not entry.is_file() or not _OURS.fullmatch(whole):
                     continue
-                if entry.name.endswith(_PART):
+                if part:
                     self._remove_abandoned(entry.name)
                 try:
                     status = entry.stat()
                 except FileNotFoundError:  # another process was faster
                     continue
                 used += status.st_size
-                if entry.name != keep and not entry.name.startswith("."):
+                if entry.name != keep and not part:
                     files.append((status.st_mtime_ns, entry.name, status.st_size))
         for _, name, length in sorted(files):
             if used <= self.limit:

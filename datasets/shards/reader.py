@@ -56,7 +56,7 @@ def read_manifest(store: Store, digest: str | None = None) -> tuple[Manifest, st
         ) from None
     try:
         data = json.loads(raw)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{where}: not valid JSON ({error})") from None
     manifest = Manifest.parse(data, where)
     if manifest.schema_version != SCHEMA_VERSION:

@@ -117,7 +117,7 @@ def captions_from_json(raw: bytes, where: str) -> list[Caption]:
     """The captions of a `texts.json` member; `UserError` naming `where` otherwise."""
     try:
         data = json.loads(raw)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{where}: not valid JSON ({error})") from None
     if not isinstance(data, Sequence) or isinstance(data, str):
         raise UserError(f"{where}: expected a list of captions")

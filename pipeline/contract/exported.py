@@ -108,7 +108,7 @@ def _build(
 def _format_of(path: Path) -> Any:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RecursionError) as error:
         raise UserError(f"{path}: cannot be read ({error}); export the run again") from None
     return data.get("format") if isinstance(data, dict) else None
 

@@ -8,9 +8,10 @@ Lightning's launcher (which repeats the command) or from torchrun or SLURM.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import torch.distributed as dist
 
@@ -20,6 +21,8 @@ from motionloom.pipeline.launch.process import TeamError, srun_tasks
 
 if TYPE_CHECKING:
     from lightning.fabric.plugins.environments.cluster_environment import ClusterEnvironment
+
+Found = TypeVar("Found")
 
 _PATIENCE = timedelta(days=30)
 """How long the others wait for a stage that only the lead runs; a dead lead ends the wait at once."""
@@ -67,6 +70,25 @@ class Team:
             dist.barrier(self.waiting)
         except RuntimeError as error:
             raise TeamError(str(error)) from None
+
+
+def lead_finds(find: Callable[[], Found]) -> Found:
+    """What `find` gives in the lead, in every process that trains with it.
+
+    Files on a shared file system may look different to two nodes for a moment, and one process is enough to
+    read gigabytes. Where no processes have met yet, each finds for itself.
+    """
+    if not dist.is_initialized() or dist.get_world_size() == 1:
+        return find()
+    try:
+        group = dist.new_group(backend="gloo", timeout=_PATIENCE)
+        found = [find() if dist.get_rank() == 0 else None]
+        dist.broadcast_object_list(found, src=0, group=group)
+    except RuntimeError as error:
+        if "by peer" in str(error):
+            raise TeamError(str(error)) from None
+        raise
+    return cast(Found, found[0])
 
 
 def environment() -> ClusterEnvironment | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable, Iterator, Sized
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -19,6 +20,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy, Strategy
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from motionloom.datasets.base.files import remove_temporaries
 from motionloom.models.layers.transformer import Transformer
 from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.players import PlayersModule
@@ -27,13 +29,14 @@ from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
-from motionloom.pipeline.launch.team import environment
+from motionloom.pipeline.launch.team import environment, lead_finds
 from motionloom.pipeline.stages.loggers import Loggers
 from motionloom.pipeline.stages.progress import MetricLog, StepProgress
 from motionloom.pipeline.stages.train_config import BatchSource, EvalSource, TrainConfig
+from motionloom.pipeline.store.checkpoints import SealedCheckpoints, readable
 
 _KEPT = 2
-"""Checkpoints kept: the newest, and one more in case that is torn."""
+"""Checkpoints kept: the newest, and one more in case that is torn or damaged."""
 
 
 class ChunkSampler(Sampler[int]):
@@ -62,7 +65,7 @@ def fit(
     hardware = context.hardware
     if hardware.threads:
         torch.set_num_threads(hardware.threads)
-    newest, chunk, longer = start_of(context.folder / "checkpoints", config)
+    newest, chunk, longer = lead_finds(partial(_start, context, config))
     data = _Data(train, validation, config, chunk, hardware)
     checkpoints = ModelCheckpoint(
         dirpath=context.folder / "checkpoints",
@@ -79,9 +82,10 @@ def fit(
     loggers = Loggers(hardware.loggers, context.folder, context.recipe, f"{context.recipe}/{context.name}")
     if hardware.resolved_accelerator() == "gpu":
         hardware.device()  # refuses in one sentence where there is no GPU
+    launcher = environment()
     trainer = L.Trainer(
         default_root_dir=context.folder,
-        plugins=environment(),
+        plugins=[SealedCheckpoints(), *([launcher] if launcher else [])],
         accelerator=hardware.lightning_accelerator(),
         devices=hardware.resolved_devices(),
         num_nodes=hardware.nodes,
@@ -239,8 +243,17 @@ class Start(NamedTuple):
     """Whether the checkpoint is of a training of fewer steps."""
 
 
-def start_of(folder: Path, config: TrainConfig) -> Start:
-    """Where a training with these checkpoints begins.
+def _start(context: StageContext, config: TrainConfig) -> Start:
+    """Where the stage begins; done by the lead, once what a killed run was writing is gone."""
+    folder = context.folder / "checkpoints"
+    if folder.is_dir():
+        remove_temporaries(folder)
+    say = partial(context.console.print, style="yellow", markup=False, soft_wrap=True)
+    return start_of(folder, config, say)
+
+
+def start_of(folder: Path, config: TrainConfig, say: Callable[[str], None] = warnings.warn) -> Start:
+    """Where a training with these checkpoints begins; `say` is given why any was passed over.
 
     It keeps the chunks that it began with as long as `checkpoint_every` is the same, also when `steps` has
     been raised. Its last chunk may then have been cut short: it is trained again, so that the validations and
@@ -248,7 +261,7 @@ def start_of(folder: Path, config: TrainConfig) -> Start:
     """
     chunk = min(config.checkpoint_every, config.steps)
     short: Start | None = None
-    for path, checkpoint in _readable(folder):
+    for path, checkpoint in readable(folder, say):
         state = checkpoint.get("callbacks", {}).get(ResumeBetweenChunks.__qualname__)
         if state is None:
             return Start(path, chunk)
@@ -260,22 +273,6 @@ def start_of(folder: Path, config: TrainConfig) -> Start:
             return start
         short = short or start
     return short or Start(None, chunk)
-
-
-def newest_checkpoint(folder: Path) -> Path | None:
-    """The newest checkpoint that loads; a torn one is passed over."""
-    return next((path for path, _ in _readable(folder)), None)
-
-
-def _readable(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Checkpoints that load, newest first."""
-    for path in sorted(folder.glob("*.ckpt"), reverse=True):
-        try:
-            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # a torn file fails in many ways, all of which mean the same
-            warnings.warn(f"{path}: cannot be read ({type(error).__name__}), passed over", stacklevel=2)
-            continue
-        yield path, checkpoint
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:

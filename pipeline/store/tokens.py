@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -83,7 +84,10 @@ class TokenStore:
         """Read a store; its streams must be the tokenizer's."""
         if not path.is_file():
             raise UserError(f"{path}: no tokens; run the tokens stage for this split")
-        tensors = load_file(path)
+        try:
+            tensors = load_file(path)
+        except SafetensorError as error:
+            raise UserError(f"{path}: cannot be read ({error}); run the tokens stage again") from None
         codes = {k.removeprefix("codes."): v.long() for k, v in tensors.items() if k.startswith("codes.")}
         if set(codes) != set(per_group):
             raise UserError(f"{path}: holds streams {sorted(codes)}, the tokenizer has {sorted(per_group)}")

@@ -55,7 +55,8 @@ def load_yaml(text: str, where: str) -> Any:
     """Plain data from YAML; a `UserError` names `where` (a file or an option)."""
     try:
         return yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a value that its explicit tag does not allow
+    # ValueError: a value that its explicit tag does not allow. RecursionError: thousands of nested brackets.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split()).replace('in "<unicode string>", ', "at ")
         raise UserError(f"{where}: not valid YAML: {reason}") from None
 

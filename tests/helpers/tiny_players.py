@@ -96,12 +96,12 @@ class Duel(PlayersModule):
         return {"loss": (real - 1).square().mean() + fake.square().mean(), "margin": (real - fake).mean()}
 
 
-def context(folder: Path, **hardware: Any) -> StageContext:
+def context(folder: Path, console: Console, **hardware: Any) -> StageContext:
     """A stage in `folder`."""
     given: dict[str, Any] = {"accelerator": "cpu", "devices": 1, "threads": 1, "loggers": (), **hardware}
     return StageContext(
         name="duel", recipe="test", config=None, folder=folder, inputs={}, seed=0,
-        hardware=Hardware(**given), console=Console(quiet=True), shelf=Shelf(),
+        hardware=Hardware(**given), console=console, shelf=Shelf(),
     )  # fmt: skip
 
 
@@ -112,6 +112,7 @@ def train(
     dtype: torch.dtype = torch.float32,
     module: dict[str, Any] | None = None,
     dies_at: int | None = None,
+    console: Console | None = None,
     **settings: Any,
 ) -> Duel:
     """Train a duel in `folder`, from its newest checkpoint; `dies_at` a step all ends with an error."""
@@ -121,7 +122,7 @@ def train(
     config = TrainConfig(**given)
     duel = Duel(seed=3, max_steps=config.steps, **(module or {})).to(dtype)
     fit(
-        context(folder, **(hardware or {})),
+        context(folder, console or Console(quiet=True), **(hardware or {})),
         duel,
         config,
         lambda batch, rank, world: Vectors(

@@ -51,6 +51,26 @@ def test_the_cache_keeps_what_was_used_last(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*.part"))
 
 
+def test_other_files_in_its_folder_are_never_deleted(tmp_path: Path) -> None:
+    """A recipe, also a stranger's, names the folder."""
+    others = [
+        "thesis.tar",
+        "photo.jpg",
+        ".hidden",
+        "film.part",
+        ".film.part",
+        "f" * 64,
+        f"{'f' * 64}.tar.part",
+    ]
+    for name in others:
+        (tmp_path / name).write_bytes(bytes(5000))
+    cache = FileCache(CacheConfig(folder=str(tmp_path), gigabytes=1.5e-6))
+    for number in (1, 2, 3):
+        name, data = content(number)
+        cache.get(name, 1000, lambda path, data=data: path.write_bytes(data)).close()
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_file()) == sorted([*others, name])
+
+
 def test_a_failed_or_killed_download_leaves_nothing_behind(tmp_path: Path) -> None:
     cache = FileCache(CacheConfig(folder=str(tmp_path), gigabytes=1e-5))
     name, data = content(1)

@@ -22,6 +22,8 @@ from motionloom.datasets.shards import access
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import MEMBERS, npy_bytes
+from motionloom.datasets.shards.store import LocalStore
+from motionloom.datasets.shards.stream import read_shard
 from motionloom.datasets.shards.tar import scan_tar
 
 
@@ -112,6 +114,33 @@ def test_damage_is_named(root: Path) -> None:
         ShardDataset.open(root, "train")
 
 
+def test_every_flipped_bit_of_a_shard_is_found(made: ModuleType, tmp_path: Path) -> None:
+    """By `data check`, by opening with `verify`, and by the stream, which verifies as it reads."""
+    root = tmp_path / "data"
+    made.write(root, 20, clips_per_shard=2)
+    shards = {path: path.read_bytes() for path in sorted(root.glob("*.tar"))}
+    splits = {split: ShardDataset.open(root, split) for split in ("train", "val", "test")}
+    rng = np.random.default_rng(0)
+    rounds = -(-100 // len(shards))
+    for _ in range(rounds):
+        for path, content in shards.items():
+            flipped = bytearray(content)
+            flipped[rng.integers(len(content))] ^= 1 << rng.integers(8)
+            path.write_bytes(flipped)
+        found = {problem.where for problem in check(root)}
+        assert found >= {path.name for path in shards}
+        for split, data in splits.items():
+            with pytest.raises(UserError, match="the sha256 is not the manifest's"):
+                ShardDataset.open(root, split, verify=True)
+            for number, shard in enumerate(data._shards):
+                rows = range(data._first[number], data._first[number + 1])
+                with pytest.raises(UserError, match=shard.name):
+                    read_shard(LocalStore(root), shard, data._index, rows, {"motion.npy"})
+    for path, content in shards.items():
+        path.write_bytes(content)
+    assert check(root) == []
+
+
 def test_a_forged_index_cannot_lead_outside_a_shard(root: Path) -> None:
     path = root / "index.npz"
     with np.load(path) as stored:
@@ -147,11 +176,13 @@ def test_a_manifest_cannot_name_files_elsewhere(root: Path) -> None:
         ShardDataset.open(root, "train")
 
 
-def entry(name: str, content: bytes = b"{}", kind: bytes = tarfile.REGTYPE) -> tuple[tarfile.TarInfo, bytes]:
+def entry(
+    name: str, content: bytes = b"{}", kind: bytes = tarfile.REGTYPE, size: int | None = None
+) -> tuple[tarfile.TarInfo, bytes]:
     info = tarfile.TarInfo(name)
     info.type = kind
     info.linkname = "/etc/passwd" if kind != tarfile.REGTYPE else ""
-    info.size = len(content) if kind == tarfile.REGTYPE else 0
+    info.size = (len(content) if size is None else size) if kind == tarfile.REGTYPE else 0
     return info, content
 
 
@@ -172,6 +203,7 @@ np.save(OBJECTS, np.array([{}]), allow_pickle=True)
         ([entry("a.meta.json"), entry("a.meta.json")], "appears twice"),
         ([entry("a.meta.json"), entry("b.meta.json"), entry("a.motion.npy")], "do not stand together"),
         ([entry("a.meta.json")], "key 'a' has no motion.npy"),
+        ([entry("a.meta.json", size=2**40)], "truncated inside 'a.meta.json'"),
     ],
 )
 def test_hostile_tars_are_refused(
@@ -180,7 +212,10 @@ def test_hostile_tars_are_refused(
     path = tmp_path / "x-train-000000.tar"
     with tarfile.open(path, "w") as archive:
         for info, content in entries:
-            archive.addfile(info, io.BytesIO(content))
+            if info.size > len(content):  # a header that lies
+                archive.fileobj.write(info.tobuf(tarfile.GNU_FORMAT) + content)
+            else:
+                archive.addfile(info, io.BytesIO(content))
     with pytest.raises(UserError, match=said) as raised:
         scan_tar(path)
     assert path.name in str(raised.value)

@@ -14,15 +14,17 @@ from typing import Any
 
 import pytest
 import torch
+from rich.console import Console
 from tiny_players import Duel, train
 from torch import Tensor
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.team import lead_finds
 from motionloom.pipeline.stages.gpt import GptStageConfig
 from motionloom.pipeline.stages.train_config import TrainConfig
-from motionloom.pipeline.stages.training import read_metrics, start_of
+from motionloom.pipeline.stages.training import Start, read_metrics, start_of
 
 # A constant schedule for both: a cosine would depend on the number of steps.
 CONSTANT: dict[str, Any] = {"critic": Duel(seed=0, max_steps=1).optim_config}
@@ -122,6 +124,28 @@ def test_longer_equals_long(short: int, every: int, first: int, tmp_path: Path) 
     assert_same_stage(tmp_path / "long", tmp_path / "longer", long, longer)
 
 
+def test_a_damaged_newest_checkpoint_changes_no_weight(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The one before it is used, and what a killed writer left is gone."""
+    settings = {"steps": 8, "checkpoint_every": 2, "validate_every": 0}
+    whole = train(tmp_path / "whole", **settings)
+    with pytest.raises(ConnectionResetError):
+        train(tmp_path / "hit", dies_at=7, **settings)
+    folder = tmp_path / "hit/checkpoints"
+    names = ["step=00000004.ckpt", "step=00000006.ckpt"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    damaged = bytearray((folder / names[1]).read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    (folder / names[1]).write_bytes(damaged)
+    (folder / f".{names[1]}.{'0' * 16}.tmp").write_bytes(damaged[:100])
+    again = train(tmp_path / "hit", console=Console(width=999), **settings)
+    assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
+    said = capsys.readouterr().out
+    assert f"{folder / names[1]}: the bytes are not those that were written" in said
+    assert sorted(path.name for path in folder.iterdir()) == ["step=00000006.ckpt", "step=00000008.ckpt"]
+
+
 def test_longer_than_a_training_of_less_than_a_chunk(tmp_path: Path) -> None:
     """Its length stays the interval, so the end is validated; the weights are those of the long one."""
     settings = {**FULL, "checkpoint_every": 100, "validate_every": 24, "module": CONSTANT}
@@ -148,6 +172,8 @@ def worker(out: Path) -> None:
     for name, settings in PAIRS.items():
         duel = train(out / name, **pair, **settings)
         torch.save(duel.state_dict(), out / f"{name}-{os.environ['RANK']}.pt")
+    # Which checkpoint a training goes on from is found once, also where the ranks see different files.
+    assert lead_finds(lambda: Start(out / os.environ["RANK"], 6)) == Start(out / "0", 6)
     torch.distributed.barrier()
     os._exit(0)  # without destructors, as the program does
 

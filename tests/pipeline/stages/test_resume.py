@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
-from motionloom.pipeline.stages.training import newest_checkpoint
+from motionloom.pipeline.store.checkpoints import newest_checkpoint
 
 pytestmark = pytest.mark.slow
 
@@ -93,13 +92,3 @@ def test_another_checkpoint_interval_changes_no_weight(
     assert done.code == 0 and "resuming tokenizer at step 24 of 30" in done.out
     outputs = [json.loads(artifacts(r)["tokenizer"])["outputs"] for r in (run, small_run.folder)]
     assert outputs[0]["model.safetensors"] == outputs[1]["model.safetensors"]
-
-
-def test_torn_checkpoints_are_passed_over(tmp_path: Path) -> None:
-    assert newest_checkpoint(tmp_path) is None
-    for step in (10, 20, 30):
-        torch.save({"step": step}, tmp_path / f"step={step:08d}.ckpt")
-    newest = tmp_path / "step=00000030.ckpt"
-    newest.write_bytes(newest.read_bytes()[:-20])
-    (tmp_path / "step=00000040.ckpt").write_bytes(b"")
-    assert newest_checkpoint(tmp_path) == tmp_path / "step=00000020.ckpt"
