@@ -26,6 +26,8 @@ class Converter:
     """What follows `motionloom data convert NAME` in the example of the help."""
     keeps_scan: bool = False
     """Whether prepare takes `scan`: a file that remembers what it found in files that have not changed."""
+    features_first: bool = False
+    """Whether its clips are decoded in a step of their own before the first shard (`Conversion.features`)."""
 
     def config(self) -> type[ConvertConfig]:
         """The config class."""
@@ -84,6 +86,7 @@ CONVERTERS: dict[str, Converter] = {
         "BVH files of any skeleton, loose or in tar archives, to shards.",
         "mocap shards --joint-map map.json --captions captions.jsonl --licence CC-BY-4.0",
         keeps_scan=True,
+        features_first=True,
     ),
 }
 

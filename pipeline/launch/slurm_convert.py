@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import shutil
 import subprocess
@@ -35,6 +34,7 @@ from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.schema import Config, Manifest, UserError
 from motionloom.datasets.shards.index import MANIFEST_FILE
 from motionloom.pipeline.launch.convert_job import ConvertJob, JobResult, Step, result_path
+from motionloom.pipeline.launch.options import fields_of, one_line_options
 
 LOG_FOLDER = ".slurm"
 """Inside the folder of the shards: records, logs and results of the jobs. May be deleted when all is over."""
@@ -64,27 +64,12 @@ class ClusterConfig(Config):
     extra: dict[str, str] = Field(default_factory=dict)
     """More options of sbatch, such as `{"constraint": "cpu"}`."""
 
-    @field_validator("extra")
-    @classmethod
-    def _plain_names(cls, extra: dict[str, str]) -> dict[str, str]:
-        for name, value in extra.items():
-            if not re.fullmatch(r"[a-z][a-z0-9-]*", name) or "\n" in value:
-                raise ValueError(f"'{name}': an sbatch option is a word such as 'mail-type' and has one line")
-        return extra
+    _extra_is_plain = field_validator("extra")(one_line_options)
 
     @classmethod
     def from_words(cls, words: Sequence[str], where: str = "--cluster") -> ClusterConfig:
         """From `KEY=VALUE` words; keys that are not ours are sbatch's when written `extra.KEY=VALUE`."""
-        fields: dict[str, Any] = {}
-        for word in words:
-            key, separator, value = word.partition("=")
-            if not separator:
-                raise UserError(f"{where} '{word}': write KEY=VALUE, for example partition=cpu")
-            if key.startswith("extra."):
-                fields.setdefault("extra", {})[key.removeprefix("extra.")] = value
-            else:
-                fields[key] = value
-        return cls.parse(fields, where)
+        return cls.parse(fields_of(words, where), where)
 
 
 @dataclass(frozen=True)
