@@ -118,7 +118,8 @@ def launch(
     nodes: Annotated[int, typer.Option(help="Machines that train together.")] = 1,
     gpus_per_node: Annotated[int, typer.Option(help="GPUs of each; 0 trains on CPUs.")] = 8,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Run folder, as the cluster sees it; default runs/NAME.")
+        Path | None,
+        typer.Option("--out", "-o", help="Run folder, as the cluster sees it; default runs/NAME."),
     ] = None,
     sets: Sets = None,
     cluster: Annotated[

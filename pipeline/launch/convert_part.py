@@ -88,7 +88,9 @@ def _number(environment: Mapping[str, str], names: Sequence[str], default: int |
         if name in environment:
             return int(environment[name])
     if default is None:
-        raise UserError(f"which part to make is in none of {', '.join(names)}: start this as an array of jobs")
+        raise UserError(
+            f"which part to make is in none of {', '.join(names)}: start this as an array of jobs"
+        )
     return default
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from motionloom.datasets.schema import Config, UserError
 
@@ -60,7 +60,7 @@ Mount = Annotated[PurePosixPath, AfterValidator(_mount)]
 class LaunchOptions(Config):
     """What all engines take."""
 
-    name: str | None = Field(None, pattern=r"^[a-z]([a-z0-9-]{0,38}[a-z0-9])?$")
+    name: str | None = Field(None, pattern=r"^[a-z]([a-z0-9-]{0,28}[a-z0-9])?$")
     """Of the jobs; default made from the recipe's."""
     time_minutes: int = Field(1440, ge=1)
     """Time limit of a group that takes all machines."""
@@ -85,7 +85,8 @@ class SlurmOptions(LaunchOptions):
     """Of `--engine slurm`."""
 
     partition: Line | None = None
-    """Partition of the groups with GPUs, and of the others without `light_partition`; default the cluster's."""
+    """Partition of the groups with GPUs, and of the others if `light_partition` is not given; default the
+    cluster's."""
     light_partition: Line | None = None
     """Partition of the groups without GPUs."""
     account: Line | None = None
@@ -102,6 +103,15 @@ class SlurmOptions(LaunchOptions):
     """More options of sbatch, such as `{"constraint": "h100"}`."""
 
     _extra_is_plain = field_validator("extra")(one_line_options)
+
+    @model_validator(mode="after")
+    def _warned_in_time(self) -> Self:
+        if 2 * self.warn_seconds > 60 * min(self.time_minutes, self.light_minutes):
+            raise ValueError(
+                f"warn_seconds {self.warn_seconds} is more than half of a time limit: jobs would be "
+                f"queued again before they have done anything; raise time_minutes and light_minutes"
+            )
+        return self
 
 
 class KubernetesOptions(LaunchOptions):

@@ -2,8 +2,8 @@
 
 An engine (SLURM, Kubernetes, SkyPilot) schedules; this only describes. A group is one command,
 `motionloom run RECIPE -o OUT --until LAST`, whose selection covers exactly the stages of the group: what they
-need has been made by the groups before. The run graph stays the judge of what is done: a group that is started
-twice, after a kill or by mistake, skips what is finished and resumes what is not.
+need has been made by the groups before. The run graph stays the judge of what is done: a group that is
+started twice, after a kill or by mistake, skips what is finished and resumes what is not.
 """
 
 from __future__ import annotations
@@ -77,11 +77,6 @@ class Group:
     """Name of the group that must be done before."""
     parts: Parts | None = None
 
-    @property
-    def waits_for(self) -> str:
-        """For people."""
-        return self.after or ""
-
 
 @dataclass(frozen=True)
 class LaunchPlan:
@@ -101,7 +96,7 @@ class LaunchPlan:
         return f"{self.name}-{group.name}"
 
     def command(self, group: Group, recipe: str, program: Sequence[str]) -> list[str]:
-        """The words that run a group: `program` is `motionloom`, `recipe` the recipe's file where it has one."""
+        """The words that run a group: `program` is `motionloom`, `recipe` the file of a recipe not shipped."""
         sets = [word for setting in (*self._overrides, *group.settings) for word in ("--set", setting)]
         return [*program, "run", self.given or recipe, "-o", self.out, "--until", ",".join(group.last), *sets]
 
@@ -124,7 +119,7 @@ class LaunchPlan:
             if group.parts is not None:
                 stages += f" ({group.parts.step} in {group.parts.count} parts)"
             limit = f"{group.machines.minutes} min"
-            table.add_row(group.name, stages, _say_machines(group), limit, group.waits_for)
+            table.add_row(group.name, stages, _say_machines(group), limit, group.after or "")
         return table
 
 
@@ -147,19 +142,16 @@ def make_launch_plan(
     settings = _Settings(options, nodes, gpus_per_node)
     groups: list[Group] = []
     for need, stages in _cut(recipe, gpus_per_node):
-        if not groups:
-            for one in _parts_of(stages, parts):
-                name = f"{len(groups) + 1}-{one.step}"
-                if sum(p.step == one.step for p in _parts_of(stages, parts)) > 1:
-                    name += f"-{_word(one.stage)[:20]}"
-                groups.append(settings.group(name, "cpu", (one.stage,), groups, one))
+        for one in [] if groups else _parts_of(stages, parts):
+            name = f"{len(groups) + 1}-{_label(one.stage)}-{one.step}"
+            groups.append(settings.group(name, "cpu", (one.stage,), groups, one))
         names = tuple(stage.name for stage in stages)
         read = {name for stage in stages for name in stage.inputs.values()}
         last = tuple(name for name in names if name not in read)
-        label = _label(stages, need)
+        label = "train" if any(stage.kind.trains for stage in stages) else _label(names[0])
         groups.append(settings.group(f"{len(groups) + 1}-{label}", need, names, groups, last=last))
     _require_fit(recipe, groups)
-    word = options.name or _word(recipe.name)[:40].strip("-")
+    word = options.name or _word(recipe.name)[:30].strip("-")
     name = word if word[:1].isalpha() else f"run-{word}"
     return LaunchPlan(name, recipe, given, tuple(overrides), str(out), tuple(groups))
 
@@ -223,7 +215,7 @@ def _cut(recipe: Recipe, gpus: int) -> list[tuple[Need, list[Stage]]]:
 
 
 def _needs(recipe: Recipe, gpus: int) -> dict[str, Need]:
-    """By stage: a training, or work that processes divide, takes all; what loads a trained network one GPU."""
+    """By stage: what trains, or divides its work, takes all; what reads a trained network takes one GPU."""
     needs: dict[str, Need] = {}
     for stage in recipe.stages:
         if stage.kind.trains or stage.kind.shares:
@@ -251,7 +243,8 @@ def _require_fit(recipe: Recipe, groups: Sequence[Group]) -> None:
     """Refuse before anything waits in a queue what its group's processes could not run."""
     for group in groups:
         hardware = recipe.hardware.model_copy(
-            update={"nodes": group.machines.nodes, "devices": group.machines.processes}
+            # What is installed here says nothing of the cluster, so loggers are not asked after.
+            update={"nodes": group.machines.nodes, "devices": group.machines.processes, "loggers": ()}
         )
         for name in group.stages:
             try:
@@ -260,12 +253,8 @@ def _require_fit(recipe: Recipe, groups: Sequence[Group]) -> None:
                 raise UserError(f"stage {name}: {error}") from None
 
 
-def _label(stages: Sequence[Stage], need: Need) -> str:
-    if any(stage.kind.trains for stage in stages):
-        return "train"
-    if need == "all":
-        return "share"
-    return _word(stages[0].name)[:20].strip("-")
+def _label(stage: str) -> str:
+    return _word(stage)[:12].strip("-")
 
 
 def _word(text: str) -> str:

@@ -136,14 +136,14 @@ def submit_conversion(
         clips_per_shard=clips_per_shard,
         strict=strict,
     )
-    logs = _new_folder(out / LOG_FOLDER)
+    logs = new_folder(out / LOG_FOLDER)
     write_json(logs / _RECORD, record.dump())
     links: list[Link] = []
     for step, count in steps:
         try:
             links.append(Link(step, _submit(step, count, logs, cluster, after=links[-1:]), count))
         except UserError:
-            _cancel([link.job for link in links])
+            cancel_jobs([link.job for link in links])
             raise
         after = f", after job {links[-2].job}" if len(links) > 1 else ""
         console.print(f"{step}: job {links[-1].job}, {count} task{'s' * (count > 1)}{after}")
@@ -229,7 +229,8 @@ def _alive(ids: Sequence[str]) -> list[str] | None:
     return [] if "Invalid job id" in asked.stderr else None  # all of them are forgotten: long over
 
 
-def _cancel(ids: Sequence[str]) -> None:
+def cancel_jobs(ids: Sequence[str]) -> None:
+    """Cancel jobs; those that are over already do not matter."""
     if ids:
         subprocess.run(["scancel", *ids], capture_output=True)
 
@@ -261,7 +262,7 @@ def _require_success(submission: Submission) -> None:
         )
 
 
-def _new_folder(parent: Path) -> Path:
+def new_folder(parent: Path) -> Path:
     """A folder of its own for every submission."""
     stamp = time.strftime("%Y%m%d-%H%M%S")
     for number in range(1000):

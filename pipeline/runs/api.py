@@ -70,7 +70,7 @@ def run_recipe(
         console.print(plan_table(loaded, plan))
         require_fit(todo, loaded.hardware)
     if not replace:
-        _require_same_recipe(run, loaded.name)
+        require_same_recipe(run, loaded.name)
     finished, started = replaced_trainings(run, plan)
     for what, names in (("finished", finished), ("unfinished", started)):
         if names:
@@ -99,7 +99,7 @@ def run_recipe(
     return run
 
 
-def _require_same_recipe(run: Path, name: str) -> None:
+def require_same_recipe(run: Path, name: str) -> None:
     """Never replace the stages of another recipe's run unasked."""
     path = run / "recipe.yaml"
     try:
