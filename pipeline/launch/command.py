@@ -39,8 +39,8 @@ def launch_recipe(
 ) -> LaunchPlan:
     """Submit a recipe to SLURM, or write the YAML for Kubernetes or SkyPilot and say how to start it.
 
-    `options` are `KEY=VALUE` words of the engine's class in `options.py`. With `dry_run` everything is printed
-    and nothing written.
+    `options` are `KEY=VALUE` words of the engine's class in `options.py`. With `dry_run` everything is
+    printed and nothing written.
     """
     if engine not in get_args(Engine):
         raise UserError(f"--engine {engine}: no such engine{nearest(engine, get_args(Engine))}")

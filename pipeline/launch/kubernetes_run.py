@@ -2,7 +2,7 @@
 
 - A group is a `batch/v1` Job; the parts of a conversion are an Indexed Job. A group of several nodes is a
   `TrainJob` of Kubeflow Trainer 2.2 or later, whose runtime tells torchrun the nodes by its PET_ variables.
-- Kubernetes starts all that is applied. So every group but the first is suspended: it has no pods and occupies
+- Kubernetes starts all that is applied. So every group but the first is suspended: it has no pods and takes
   no GPU. Two kubectl commands a group wait for the one before and resume the next (`kubernetes_steps`). A pod
   that waits for a marker of the group before would be simpler to start, and would occupy its GPUs meanwhile.
 - The run folder lies in a PersistentVolumeClaim that all groups mount. All containers have one user, because

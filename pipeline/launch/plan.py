@@ -96,7 +96,7 @@ class LaunchPlan:
         return f"{self.name}-{group.name}"
 
     def command(self, group: Group, recipe: str, program: Sequence[str]) -> list[str]:
-        """The words that run a group: `program` is `motionloom`, `recipe` the file of a recipe not shipped."""
+        """The words that run a group: `program` is `motionloom`, `recipe` the file of an own recipe."""
         sets = [word for setting in (*self._overrides, *group.settings) for word in ("--set", setting)]
         return [*program, "run", self.given or recipe, "-o", self.out, "--until", ",".join(group.last), *sets]
 
@@ -186,7 +186,9 @@ class _Settings:
 
     def _hardware(self, need: Need) -> tuple[str, ...]:
         nodes, devices = (self.nodes, max(self.gpus, 1)) if need == "all" else (1, 1)
-        fields = [f"nodes={nodes}", f"devices={devices}", f"convert_workers={self.options.light_cpus}"]
+        fields = [f"nodes={nodes}", f"devices={devices}"]
+        if need != "all":
+            fields.append(f"convert_workers={self.options.light_cpus}")
         if need == "cpu" or self.gpus == 0:
             fields.append("accelerator=cpu")
         return tuple(f"hardware.{field}" for field in fields)

@@ -2,7 +2,7 @@
 
 - The first document names the chain, the others are the groups; SkyPilot starts a task when the one before
   has succeeded, on machines of its own, and starts it again where machines are withdrawn.
-- So the run folder must outlive the machines: in a SkyPilot volume, or in a bucket. Machines write to a bucket
+- So the run folder must outlive the machines: in a SkyPilot volume or a bucket. Machines write to a bucket
   through a cache of their own, and processes on several nodes would not see each other's files in time:
   several nodes need a volume.
 - What SkyPilot tells each node (its rank, the addresses) goes to torchrun; the user's words are quoted.
