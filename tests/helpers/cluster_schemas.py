@@ -1,3 +1,4 @@
+# ruff: noqa: N815 - the fields are called as the APIs call them
 """What Kubernetes, Kubeflow Trainer and SkyPilot accept: the published fields of the objects that we write.
 
 Written from the documentation of `batch/v1` Job and `v1` ConfigMap (Kubernetes 1.31), of `TrainJob` in

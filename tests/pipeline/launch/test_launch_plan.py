@@ -1,4 +1,4 @@
-"""A recipe cut into groups: exactly its stages, in an order that can run, on the machines that they can use."""
+"""A recipe cut into groups: exactly its stages, in an order that can run, on machines that they can use."""
 
 from __future__ import annotations
 
