@@ -102,7 +102,7 @@ def test_names_suit_every_engine(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
     path.write_text("extends: humantomato-paper\nname: 9.Own_Recipe-of-a-very-long-and-winding-name\n")
     plan = plan_of(path)
-    assert plan.name == "run-9-own-recipe-of-a-very-long-a"
+    assert plan.name == "run-9-own-recipe-of-a-very-long-an"
     assert max(len(plan.job(group)) for group in plan.groups) <= 56
 
 
