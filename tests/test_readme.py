@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import io
 import re
 import shlex
 import tomllib
@@ -14,11 +15,13 @@ from typing import Any, NamedTuple
 import pytest
 import typer
 import yaml
+from rich.console import Console
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.contract.registry import stage_kinds
 from motionloom.pipeline.inference.script import Script
+from motionloom.pipeline.launch.command import launch_recipe
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.shipped import shipped_recipes
 
@@ -88,6 +91,21 @@ def parsed(words: list[str]) -> dict[str, Any]:
     return dict(command.make_context(command.name, words).params) | {"command": command.name}
 
 
+def launch_dry(given: dict[str, Any]) -> None:
+    """Run a documented `motionloom launch` as a dry run."""
+    assert given["dry_run"]
+    launch_recipe(
+        given["recipe"],
+        given["engine"],
+        nodes=given["nodes"],
+        gpus_per_node=given["gpus_per_node"],
+        overrides=given["sets"] or (),
+        options=given["cluster"] or (),
+        dry_run=True,
+        console=Console(file=io.StringIO()),
+    )
+
+
 def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
 
@@ -102,6 +120,8 @@ def test_command_is_real(where: str, words: list[str]) -> None:
         recipe = str(given.get("recipe", ""))
         if given["command"] == "run" and not recipe.endswith(".yaml"):
             load_recipe(recipe, given["sets"] or ())
+        if given["command"] == "launch":
+            launch_dry(given)
     elif program == "make":
         targets = [word for word in words[1:] if "=" not in word]
         assert targets and set(targets) <= make_targets(), where

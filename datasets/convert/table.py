@@ -29,6 +29,8 @@ class Converter:
     reads_skeletons: bool = False
     """Whether prepare takes `scan`, a file that remembers what it found in files that have not changed, and
     `maps`, a folder for guessed joint maps."""
+    features_first: bool = False
+    """Whether its clips are decoded in a step of their own before the first shard (`Conversion.features`)."""
 
     def config(self) -> type[ConvertConfig]:
         """The config class."""
@@ -98,6 +100,7 @@ CONVERTERS: dict[str, Converter] = {
         "BVH files of any skeleton, loose or in tar archives, to shards.",
         "mocap shards --captions captions.jsonl --licence CC-BY-4.0",
         reads_skeletons=True,
+        features_first=True,
     ),
 }
 

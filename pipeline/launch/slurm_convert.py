@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import shutil
 import subprocess
@@ -35,6 +34,7 @@ from motionloom.datasets.convert.table import converter_named
 from motionloom.datasets.schema import Config, Manifest, UserError
 from motionloom.datasets.shards.index import MANIFEST_FILE
 from motionloom.pipeline.launch.convert_job import ConvertJob, JobResult, Step, result_path
+from motionloom.pipeline.launch.options import fields_of, one_line_options
 
 LOG_FOLDER = ".slurm"
 """Inside the folder of the shards: records, logs and results of the jobs. May be deleted when all is over."""
@@ -64,27 +64,12 @@ class ClusterConfig(Config):
     extra: dict[str, str] = Field(default_factory=dict)
     """More options of sbatch, such as `{"constraint": "cpu"}`."""
 
-    @field_validator("extra")
-    @classmethod
-    def _plain_names(cls, extra: dict[str, str]) -> dict[str, str]:
-        for name, value in extra.items():
-            if not re.fullmatch(r"[a-z][a-z0-9-]*", name) or "\n" in value:
-                raise ValueError(f"'{name}': an sbatch option is a word such as 'mail-type' and has one line")
-        return extra
+    _extra_is_plain = field_validator("extra")(one_line_options)
 
     @classmethod
     def from_words(cls, words: Sequence[str], where: str = "--cluster") -> ClusterConfig:
         """From `KEY=VALUE` words; keys that are not ours are sbatch's when written `extra.KEY=VALUE`."""
-        fields: dict[str, Any] = {}
-        for word in words:
-            key, separator, value = word.partition("=")
-            if not separator:
-                raise UserError(f"{where} '{word}': write KEY=VALUE, for example partition=cpu")
-            if key.startswith("extra."):
-                fields.setdefault("extra", {})[key.removeprefix("extra.")] = value
-            else:
-                fields[key] = value
-        return cls.parse(fields, where)
+        return cls.parse(fields_of(words, where), where)
 
 
 @dataclass(frozen=True)
@@ -155,14 +140,14 @@ def submit_conversion(
         clips_per_shard=clips_per_shard,
         strict=strict,
     )
-    logs = _new_folder(out / LOG_FOLDER)
+    logs = new_folder(out / LOG_FOLDER)
     write_json(logs / _RECORD, record.dump())
     links: list[Link] = []
     for step, count in steps:
         try:
             links.append(Link(step, _submit(step, count, logs, cluster, after=links[-1:]), count))
         except UserError:
-            _cancel([link.job for link in links])
+            cancel_jobs([link.job for link in links])
             raise
         after = f", after job {links[-2].job}" if len(links) > 1 else ""
         console.print(f"{step}: job {links[-1].job}, {count} task{'s' * (count > 1)}{after}")
@@ -248,7 +233,8 @@ def _alive(ids: Sequence[str]) -> list[str] | None:
     return [] if "Invalid job id" in asked.stderr else None  # all of them are forgotten: long over
 
 
-def _cancel(ids: Sequence[str]) -> None:
+def cancel_jobs(ids: Sequence[str]) -> None:
+    """Cancel jobs; those that are over already do not matter."""
     if ids:
         subprocess.run(["scancel", *ids], capture_output=True)
 
@@ -280,7 +266,7 @@ def _require_success(submission: Submission) -> None:
         )
 
 
-def _new_folder(parent: Path) -> Path:
+def new_folder(parent: Path) -> Path:
     """A folder of its own for every submission."""
     stamp = time.strftime("%Y%m%d-%H%M%S")
     for number in range(1000):

@@ -54,7 +54,7 @@ class Selection:
     first: str | None = None
     """Run this stage and all below it again."""
     until: str | None = None
-    """Stop after this stage: only it and what it needs."""
+    """Stop after this stage: only it and what it needs. Several with commas between them."""
     only: str | None = None
     """Just this stage; its inputs must be finished."""
     force: bool = False
@@ -114,13 +114,16 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
 def selected(recipe: Recipe, select: Selection) -> set[str]:
     """Names of the stages that may run; refuses selections that contradict each other."""
     first, until, only = select.first, select.until, select.only
-    for option, name in (("--from", first), ("--until", until), ("--only", only)):
+    last = [name.strip() for name in until.split(",")] if until is not None else []
+    named = [("--from", first), *(("--until", name) for name in last), ("--only", only)]
+    for option, name in named:
         if name is not None:
             recipe.stage(name, option)
     for option, name in (("--from", first), ("--until", until)):
         if only and name and name != only:
             raise UserError(f"--only {only} runs that stage alone: leave {option} {name} out")
-    if first and until and first not in _ancestors(recipe, until):
+    needed = _ancestors(recipe, *last)
+    if first and until and first not in needed:
         raise UserError(
             f"--from {first} --until {until}: '{until}' does not need '{first}', so there is nothing between "
             f"them; leave one out"
@@ -132,7 +135,7 @@ def selected(recipe: Recipe, select: Selection) -> set[str]:
         )
     if only:
         return {only}
-    return _ancestors(recipe, until) if until else {stage.name for stage in recipe.stages}
+    return needed if until is not None else {stage.name for stage in recipe.stages}
 
 
 def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> dict[str, Any]:
@@ -216,8 +219,10 @@ def _changed_fields(old: Any, new: Any, prefix: str = "") -> Iterator[str]:
         yield f"{prefix} {old} -> {new}"
 
 
-def _ancestors(recipe: Recipe, name: str) -> set[str]:
-    out, todo = set(), [name]
+def _ancestors(recipe: Recipe, *names: str) -> set[str]:
+    """These stages and all that they need."""
+    out: set[str] = set()
+    todo = list(names)
     while todo:
         current = todo.pop()
         out.add(current)
@@ -333,6 +338,12 @@ def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]
         return made[name]
 
     return {role: finished(name) for role, name in stage.inputs.items()}
+
+
+def begin(run: Path, row: PlannedStage) -> None:
+    """Mark a stage of a plan as begun, so that parts of it can be made before it is run."""
+    with _lock(run, needed=True):
+        _prepare(stage_folder(run, row.stage.name), row)
 
 
 def _prepare(folder: Path, row: PlannedStage) -> None:

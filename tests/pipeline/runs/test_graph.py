@@ -131,6 +131,9 @@ def test_selection(tmp_path: Path) -> None:
     assert go(tmp_path, select=Selection(until="both")) == ["left", "right", "both"]
     with pytest.raises(UserError, match="did you mean 'both'"):
         go(tmp_path, select=Selection(until="bot"))
+    assert go(tmp_path, select=Selection(until="left, one")) == ["one"]
+    with pytest.raises(UserError, match="did you mean 'one'"):
+        go(tmp_path, select=Selection(until="left,ones"))
     go(tmp_path)
     assert go(tmp_path, select=Selection(first="both")) == ["both", "top"]
     assert go(tmp_path, select=Selection(only="one", force=True)) == ["one"]

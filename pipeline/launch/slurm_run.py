@@ -1,0 +1,169 @@
+"""A launch plan on SLURM: one batch script a group, each waiting for the one before.
+
+- Plain scripts for sbatch, not submitit as for conversions: submitit answers a time limit by itself, by
+  queueing a pickled object of its own again, and a training needs nothing but its command once more.
+- `--dependency=afterok` with `--kill-on-invalid-dep`: a group starts when the one before has succeeded, and
+  is cancelled when that can no longer happen. A job that is queued again keeps its id, so what waits for it
+  goes on waiting.
+- Preemption and broken nodes queue a job again (`--requeue`). A time limit would not: the batch script is
+  warned before it and queues itself again. Nothing needs saving then: a run may be killed at any moment and
+  goes on from its newest checkpoint, so `train.checkpoint_every` steps are the most that is made twice.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from motionloom.datasets.base.files import write_text
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch.options import SlurmOptions
+from motionloom.pipeline.launch.plan import Group, LaunchPlan
+from motionloom.pipeline.launch.slurm_convert import LOG_FOLDER, cancel_jobs, new_folder
+
+PYTHON = (sys.executable, "-P")
+"""This Python, which must lie under the same path on every node."""
+
+PROGRAM = (*PYTHON, "-m", "motionloom.pipeline.cli.main")
+
+RECIPE_FILE = "recipe.yaml"
+"""The resolved recipe of a launch, beside its scripts."""
+
+_AGAIN = """\
+again() {{
+  if [ "${{SLURM_RESTART_COUNT:-0}}" -lt {requeues} ] && scontrol requeue {job}; then
+    echo "the time limit is near: queued again, goes on from the newest checkpoint"
+    sleep 3600  # SLURM ends this try
+  fi
+}}
+trap again USR1
+"""
+"""Runs when SLURM warns the batch script."""
+
+_WAIT = """\
+code=0
+wait "$child" || code=$?
+if [ "$code" -eq 138 ]; then  # the warning ended the wait, not the command
+  code=0
+  wait "$child" || code=$?
+fi
+exit "$code"
+"""
+
+
+@dataclass(frozen=True)
+class Script:
+    """A group as sbatch takes it."""
+
+    group: Group
+    path: Path
+    text: str
+
+    def submit(self, after: str | None) -> list[str]:
+        """The command that submits it behind the job `after`."""
+        waiting = [f"--dependency=afterok:{after}"] if after else []
+        return ["sbatch", "--parsable", *waiting, str(self.path)]
+
+
+def slurm_scripts(plan: LaunchPlan, options: SlurmOptions, folder: Path, cwd: Path) -> list[Script]:
+    """The batch scripts of a plan, to be written into `folder`; jobs run in `cwd`."""
+    return [
+        Script(group, folder / f"{group.name}.sbatch", _text(plan, group, options, folder, cwd))
+        for group in plan.groups
+    ]
+
+
+def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> list[str]:
+    """Write the scripts into the run folder and submit them; the job ids."""
+    if shutil.which("sbatch") is None:
+        raise UserError("no sbatch here: start this where jobs are submitted, or look with --dry-run")
+    folder = new_folder(Path(plan.out) / LOG_FOLDER)
+    if plan.given is None:
+        write_text(folder / RECIPE_FILE, plan.recipe.to_yaml())
+    scripts = slurm_scripts(plan, options, folder, Path.cwd())
+    for script in scripts:
+        write_text(script.path, script.text)
+    ids: list[str] = []
+    for script in scripts:
+        asked = subprocess.run(script.submit(ids[-1] if ids else None), capture_output=True, text=True)
+        if asked.returncode != 0:
+            cancel_jobs(ids)
+            raise UserError(f"sbatch refused {script.path}: {asked.stderr.strip()}")
+        ids.append(asked.stdout.strip().partition(";")[0])
+        after = f", after job {ids[-2]}" if len(ids) > 1 else ""
+        console.print(f"{script.group.name}: job {ids[-1]}{after}")
+    console.print(
+        f"watch: squeue --jobs {','.join(ids)}; stop: scancel {' '.join(ids)}; logs: {folder}",
+        soft_wrap=True,
+        markup=False,
+    )
+    return ids
+
+
+def _text(plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, cwd: Path) -> str:
+    lines = ["#!/bin/bash", *(_directive(*one) for one in _options(plan, group, options, folder, cwd))]
+    job = '"$SLURM_JOB_ID"'
+    if group.parts is not None:
+        job = '"${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"'
+    lines += [_AGAIN.format(requeues=options.requeues, job=job).rstrip()]
+    lines += [f"{shlex.join(_command(plan, group, folder))} &", "child=$!", _WAIT.rstrip()]
+    return "\n".join(lines) + "\n"
+
+
+def _options(
+    plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, cwd: Path
+) -> list[tuple[str, str | None]]:
+    machines, parts = group.machines, group.parts
+    partition = options.partition if machines.gpus else options.light_partition or options.partition
+    log = f"{str(folder / group.name).replace('%', '%%')}-{'%A_%a' if parts else '%j'}.log"
+    asked: list[tuple[str, str | None]] = [
+        ("job-name", plan.job(group)),
+        ("partition", partition),
+        ("account", options.account),
+        ("qos", options.qos),
+        ("nodes", str(machines.nodes)),
+        ("ntasks-per-node", str(machines.processes)),
+        ("cpus-per-task", str(machines.cpus // machines.processes)),
+        ("gpus-per-node", str(machines.gpus) if machines.gpus else None),
+        ("mem", f"{machines.memory_mib}M"),
+        ("time", str(machines.minutes)),
+        ("array", f"0-{parts.count - 1}" if parts else None),
+        ("chdir", str(cwd)),
+        ("output", log),
+        ("open-mode", "append"),
+        ("signal", f"B:USR1@{options.warn_seconds}"),
+        ("kill-on-invalid-dep", "yes"),
+        *options.extra.items(),
+    ]
+    return [("requeue", None), *((name, value) for name, value in asked if value is not None)]
+
+
+def _directive(name: str, value: str | None) -> str:
+    """A line for sbatch, which splits it at blanks and knows quotes and backslashes, but is no shell."""
+    if value is None:
+        return f"#SBATCH --{name}"
+    if not all(character.isalnum() or character in "-_./:,@%=+" for character in value):
+        value = '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return f"#SBATCH --{name}={value}"
+
+
+def _command(plan: LaunchPlan, group: Group, folder: Path) -> Sequence[str]:
+    recipe = str(folder / RECIPE_FILE)
+    if group.parts is not None:
+        return plan.part_command(group.parts, recipe, PYTHON)
+    command, machines = plan.command(group, recipe, PROGRAM), group.machines
+    if machines.nodes * machines.processes == 1:
+        return command
+    asked = [f"--nodes={machines.nodes}", f"--ntasks-per-node={machines.processes}"]
+    asked += [f"--cpus-per-task={machines.cpus // machines.processes}"]
+    if machines.gpus:
+        # All GPUs of a node for each of its processes, which choose theirs.
+        asked.append(f"--gpus-per-node={machines.gpus}")
+    return ["srun", *asked, "--kill-on-bad-exit=1", *command]
