@@ -18,7 +18,8 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from motionloom.datasets.convert.table import CONVERTERS
-from motionloom.datasets.schema import Config
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.cli.json_output import AsJson
 from motionloom.pipeline.launch.console import make_console
 
 _RUN_OPTIONS: dict[str, tuple[Any, Any]] = {
@@ -45,6 +46,7 @@ _RUN_OPTIONS: dict[str, tuple[Any, Any]] = {
         ],
         None,
     ),
+    "as_json": (AsJson, False),
     "wait": (
         Annotated[bool, typer.Option("--wait/--no-wait", help="With --cluster: wait for the jobs to end.")],
         True,
@@ -87,7 +89,10 @@ def _command(name: str) -> Any:
 
         steering = {key: values.pop(key) for key in _RUN_OPTIONS}
         given = {key: _plain(fields[key], value) for key, value in values.items()}
-        convert_command(name, {"source": source, **given}, out, console=make_console(), **steering)
+        if steering["as_json"] and not steering["plan"]:
+            raise UserError("--json is for the plan: give --plan too")
+        console = make_console(aside=steering["as_json"])
+        convert_command(name, {"source": source, **given}, out, console=console, **steering)
 
     parameters = [
         _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source"))]),

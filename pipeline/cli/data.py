@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from motionloom.pipeline.cli.convert import convert_app
+from motionloom.pipeline.cli.json_output import AsJson
 from motionloom.pipeline.launch.console import make_console
 
 data_app = typer.Typer(
@@ -59,6 +60,7 @@ def check(
     ] = "auto",
     seconds: Annotated[float | None, typer.Option(help="Files: length of the clips of captions.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Warnings count as problems.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Checksums, schema, finite values, ranges, duplicates, leaks. Exit code 1 and a list of problems.
 
@@ -71,7 +73,8 @@ def check(
     from motionloom.pipeline.cli.data_commands import check_command
 
     rules = {"layout": layout, "fps": fps, "texts": texts, "seconds": seconds}
-    raise typer.Exit(1 if check_command(path, rules, strict=strict, console=make_console()) else 0)
+    console = make_console(aside=as_json)
+    raise typer.Exit(1 if check_command(path, rules, strict=strict, console=console, as_json=as_json) else 0)
 
 
 @data_app.command()

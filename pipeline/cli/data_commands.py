@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from motionloom.datasets.schema import Manifest, UserError
+from motionloom.pipeline.cli.json_output import plain, print_json
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
@@ -58,6 +60,7 @@ def convert_command(
     cluster: list[str] | None,
     wait: bool,
     console: Console,
+    as_json: bool = False,
 ) -> None:
     """Plan a conversion, run it here, or hand it to SLURM."""
     from motionloom.datasets.convert.common.conversion import run_conversion
@@ -68,7 +71,11 @@ def convert_command(
     shown = console.is_terminal
     if plan:
         conversion = converter.prepare(config, workers=workers, progress=shown)
-        say_plan(conversion.estimated(workers), console)
+        planned = conversion.estimated(workers)
+        if as_json:
+            print_json(plan_facts(planned))
+        else:
+            say_plan(planned, console)
         return
     if cluster:
         from motionloom.pipeline.launch.slurm_convert import ClusterConfig, submit_conversion, wait_for
@@ -93,6 +100,12 @@ def convert_command(
     say_manifest(manifest, out, console)
 
 
+def plan_facts(plan: ConversionPlan[Any]) -> dict[str, Any]:
+    """The plan for programs: its counts and reasons, without the list of clips."""
+    facts = {field.name: getattr(plan, field.name) for field in fields_of(plan) if field.name != "items"}
+    return {**facts, "clips": plan.counts()}
+
+
 def say_plan(plan: ConversionPlan[Any], console: Console) -> None:
     """The plan, per subset beside the official release where the source has subsets."""
     subsets = plan.subset_table()
@@ -101,8 +114,13 @@ def say_plan(plan: ConversionPlan[Any], console: Console) -> None:
     console.print(plan.table())
 
 
-def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: Console) -> int:
-    """Check a dataset, a file or a folder of files; prints all there is to say, returns the problems."""
+def check_command(
+    path: Path, rules: dict[str, Any], *, strict: bool, console: Console, as_json: bool = False
+) -> int:
+    """Check a dataset, a file or a folder of files; prints all there is to say, returns the problems.
+
+    With `as_json` what was found goes to standard output too, as JSON.
+    """
     if not path.exists():
         raise UserError(f"{path}: no such folder or file")
     files = path.is_file() or _holds_files(path)
@@ -112,10 +130,12 @@ def check_command(path: Path, rules: dict[str, Any], *, strict: bool, console: C
             f"{path}: {', '.join(of_files)} is for single files; a data set says this in its manifest.json; "
             f"leave it out"
         )
-    count, warned = _check_files(path, rules, console) if files else _check_dataset(path, console)
+    count, warned, found = _check_files(path, rules, console) if files else _check_dataset(path, console)
     if strict:
         count += warned
     console.print(f"{path}: {count} problems" if count else f"{path}: no problems", markup=False)
+    if as_json:
+        print_json({"path": path, "problems": count, **found})
     return count
 
 
@@ -128,7 +148,7 @@ def _holds_files(folder: Path) -> bool:
     return any(path.suffix.lower() in FILE_SUFFIXES for path in folder.rglob("*"))
 
 
-def _check_dataset(root: Path, console: Console) -> tuple[int, int]:
+def _check_dataset(root: Path, console: Console) -> tuple[int, int, dict[str, Any]]:
     from motionloom.datasets.check.dataset import examine
 
     report = examine(root, progress=console.is_terminal)
@@ -139,21 +159,22 @@ def _check_dataset(root: Path, console: Console) -> tuple[int, int]:
     if report.warning_kinds:
         told = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
         _say(console, f"{root}: warnings: {told}")
-    return sum(report.error_kinds.values()), sum(report.warning_kinds.values())
+    return sum(report.error_kinds.values()), sum(report.warning_kinds.values()), plain(report)
 
 
-def _check_files(path: Path, given: dict[str, Any], console: Console) -> tuple[int, int]:
+def _check_files(path: Path, given: dict[str, Any], console: Console) -> tuple[int, int, dict[str, Any]]:
     from motionloom.datasets.check.files import FileRules, check_file, check_folder
 
     rules = FileRules(**given)
-    bad = warned = 0
+    bad, warned, found = 0, 0, []
     for verdict in [check_file(path, rules)] if path.is_file() else check_folder(path, rules):
         _say(console, str(verdict))
         for note in verdict.notes:
             _say(console, f"{verdict.path}: note: {note}")
         bad += not verdict.ok
         warned += bool(verdict.ok and verdict.notes)
-    return bad, warned
+        found.append({**plain(verdict), "ok": verdict.ok})
+    return bad, warned, {"files": found}
 
 
 def _say(console: Console, text: str) -> None:
