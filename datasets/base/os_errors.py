@@ -47,6 +47,8 @@ _OF_THE_MACHINE = {
     errno.EFBIG,
 }
 
+_NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
 _RUST = re.compile(r"\(os error (\d+)\)")
 _NUMPY_SHORT = re.compile(r"\d+ requested and \d+ written")
 _TORCH = ("PytorchStreamWriter", "PytorchStreamReader", "inline_container")
@@ -92,8 +94,8 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def _named(error: OSError, words: str) -> str:
-    """`words` behind the name of the file, where the error has one."""
-    name = error.filename
+    """`words` behind the name of the file, where the error has one; of a copy where no more fits."""
+    name = error.filename2 if error.errno in _NO_MORE and error.filename2 is not None else error.filename
     if name is None or isinstance(name, int):
         return words
     return f"{os.fsdecode(name) if isinstance(name, bytes) else name}: {words}"

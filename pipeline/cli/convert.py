@@ -19,7 +19,8 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from motionloom.datasets.convert.table import CONVERTERS
-from motionloom.datasets.schema import Config
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.cli.json_output import AsJson
 from motionloom.pipeline.launch.console import make_console
 
 _RUN_OPTIONS: dict[str, tuple[Any, Any]] = {
@@ -46,6 +47,7 @@ _RUN_OPTIONS: dict[str, tuple[Any, Any]] = {
         ],
         None,
     ),
+    "as_json": (AsJson, False),
     "wait": (
         Annotated[bool, typer.Option("--wait/--no-wait", help="With --cluster: wait for the jobs to end.")],
         True,
@@ -89,8 +91,11 @@ def _command(name: str) -> Any:
 
         steering = {key: values.pop(key) for key in _RUN_OPTIONS}
         given = {key: _plain(fields[key], value) for key, value in values.items()}
+        if steering["as_json"] and not steering["plan"]:
+            raise UserError("--json is for the plan: give --plan too")
+        console = make_console(aside=steering["as_json"])
         fields_given = {"source": source, **given}
-        convert_command(name, fields_given, out, console=make_console(), started=started, **steering)
+        convert_command(name, fields_given, out, console=console, started=started, **steering)
 
     parameters = [
         _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source"))]),

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from motionloom.pipeline.cli.convert import convert_app
+from motionloom.pipeline.cli.json_output import AsJson
 from motionloom.pipeline.launch.console import make_console
 
 data_app = typer.Typer(
@@ -62,6 +63,7 @@ def check(
     every: Annotated[
         bool, typer.Option("--all", help="List every finding, also where many say the same.")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Checksums, schema, finite values, ranges, people on a floor, duplicates, leaks. Exit code 1 and a list.
 
@@ -74,8 +76,9 @@ def check(
     from motionloom.pipeline.cli.data_commands import check_command
 
     rules = {"layout": layout, "fps": fps, "texts": texts, "seconds": seconds}
-    console = make_console()
-    raise typer.Exit(1 if check_command(path, rules, strict=strict, every=every, console=console) else 0)
+    console = make_console(aside=as_json)
+    problems = check_command(path, rules, strict=strict, every=every, console=console, as_json=as_json)
+    raise typer.Exit(1 if problems else 0)
 
 
 @data_app.command()

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from motionloom.datasets.schema import Dropped, Manifest, UserError
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
+from motionloom.pipeline.cli.json_output import plain, print_json
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def convert_command(
     wait: bool,
     console: Console,
     started: float | None = None,
+    as_json: bool = False,
 ) -> None:
     """Plan a conversion, run it here, or hand it to SLURM.
 
@@ -96,7 +98,11 @@ def convert_command(
     shown = not console.quiet
     if plan:
         conversion = converter.prepare(config, maps=out, workers=workers, progress=shown).looked()
-        say_plan(conversion.estimated(workers, started), console)
+        planned = conversion.estimated(workers, started)
+        if as_json:
+            print_json(planned.dump())
+        else:
+            say_plan(planned, console)
         return
     if cluster:
         from motionloom.pipeline.launch.slurm_convert import ClusterConfig, submit_conversion, wait_for
@@ -145,11 +151,18 @@ def say_plan(plan: ConversionPlan[Any], console: Console) -> None:
 
 
 def check_command(
-    path: Path, rules: dict[str, Any], *, strict: bool, console: Console, every: bool = False
+    path: Path,
+    rules: dict[str, Any],
+    *,
+    strict: bool,
+    console: Console,
+    every: bool = False,
+    as_json: bool = False,
 ) -> int:
     """Check a dataset, a file or a folder of files; prints what there is to say, returns the problems.
 
-    Many findings of a data set that say the same are one line, unless `every` one is asked for.
+    Many findings of a data set that say the same are one line, unless `every` one is asked for. With
+    `as_json` what was found goes to standard output too, as JSON.
     """
     if not path.exists():
         raise UserError(f"{path}: no such folder or file")
@@ -160,10 +173,13 @@ def check_command(
             f"{path}: {', '.join(of_files)} is for single files; a data set says this in its manifest.json; "
             f"leave it out"
         )
-    count, warned = _check_files(path, rules, console) if files else _check_dataset(path, every, console)
+    check = _check_files(path, rules, console) if files else _check_dataset(path, every, console)
+    count, warned, found = check
     if strict:
         count += warned
     console.print(f"{path}: {count} problems" if count else f"{path}: no problems", markup=False)
+    if as_json:
+        print_json({"path": path, "problems": count, **found})
     return count
 
 
@@ -176,7 +192,7 @@ def _holds_files(folder: Path) -> bool:
     return any(path.suffix.lower() in FILE_SUFFIXES for path in folder.rglob("*"))
 
 
-def _check_dataset(root: Path, every: bool, console: Console) -> tuple[int, int]:
+def _check_dataset(root: Path, every: bool, console: Console) -> tuple[int, int, dict[str, Any]]:
     from motionloom.datasets.check.dataset import examine
 
     report = examine(root, progress=console.is_terminal)
@@ -191,21 +207,22 @@ def _check_dataset(root: Path, every: bool, console: Console) -> tuple[int, int]
     if report.warning_kinds:
         told = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
         _say(console, f"{root}: warnings: {told}")
-    return sum(report.error_kinds.values()), sum(report.warning_kinds.values())
+    return sum(report.error_kinds.values()), sum(report.warning_kinds.values()), plain(report)
 
 
-def _check_files(path: Path, given: dict[str, Any], console: Console) -> tuple[int, int]:
+def _check_files(path: Path, given: dict[str, Any], console: Console) -> tuple[int, int, dict[str, Any]]:
     from motionloom.datasets.check.files import FileRules, check_file, check_folder
 
     rules = FileRules(**given)
-    bad = warned = 0
+    bad, warned, found = 0, 0, []
     for verdict in [check_file(path, rules)] if path.is_file() else check_folder(path, rules):
         _say(console, str(verdict))
         for note in verdict.notes:
             _say(console, f"{verdict.path}: note: {note}")
         bad += not verdict.ok
         warned += bool(verdict.ok and verdict.notes)
-    return bad, warned
+        found.append({**plain(verdict), "ok": verdict.ok})
+    return bad, warned, {"files": found}
 
 
 def _say(console: Console, text: str) -> None:

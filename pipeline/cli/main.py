@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from rich.console import Console
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.data import data_app
+from motionloom.pipeline.cli.json_output import AsJson, print_json
 from motionloom.pipeline.cli.sweep import sweep
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
 from motionloom.pipeline.launch.process import TeamError, leave, process_rank
@@ -27,7 +29,6 @@ app = typer.Typer(
     name="motionloom",
     help="Text or music to whole-body motion: data, training and generation (HumanTOMATO, UDE).",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -47,11 +48,27 @@ _INTERRUPTED = 130
 _CLOSED_PIPE = 141
 
 
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"motionloom {metadata.version('motionloom')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _program(
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", callback=_say_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Text or music to whole-body motion: data, training and generation (HumanTOMATO, UDE)."""
+
+
 @app.command()
 def info(
     recipe_schema: Annotated[
         bool, typer.Option("--recipe-schema", help="Print the JSON schema of recipes, for editors.")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Versions, devices, text encoder and shipped recipes.
 
@@ -66,9 +83,12 @@ def info(
 
         typer.echo(json.dumps(schema(), indent=1))
         return
-    from motionloom.pipeline.cli.info import show_info
+    from motionloom.pipeline.cli import info as facts
 
-    show_info(make_console())
+    if as_json:
+        print_json(facts.info())
+    else:
+        facts.show_info(make_console())
 
 
 @app.command()
@@ -96,6 +116,7 @@ def run(
             help="Go on in this folder even where that replaces finished trainings, or another recipe's run.",
         ),
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
 
@@ -109,8 +130,17 @@ def run(
 
     Example: `motionloom run humantomato-tiny --set face_gpt.train.steps=900 --replace`
     """
-    from motionloom.pipeline.runs.api import run_recipe
     from motionloom.pipeline.runs.graph import Selection
+
+    if as_json:
+        if not dry_run:
+            raise UserError("--json is for the plan: give --dry-run too")
+        from motionloom.pipeline.runs.plan_record import plan_record
+
+        select = Selection(first, until, only, force)
+        print_json(plan_record(recipe, out, overrides=sets or (), select=select))
+        return
+    from motionloom.pipeline.runs.api import run_recipe
 
     run_recipe(
         recipe,
@@ -280,6 +310,7 @@ def evaluate(
         str | None, typer.Option("--format", help="Of a table: text, markdown, csv, latex or json.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="File for a table.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Figures on the test split, each beside its trivial answer; with --table, beside a paper's.
 
@@ -289,6 +320,8 @@ def evaluate(
     """
     runs = run_folders or []
     if tables or table is not None:
+        if as_json:
+            raise UserError("--json is of figures measured anew; of a table, give --format json")
         _show_table(table, tables, runs, format_, out, measuring=clips or repeats or device != "auto")
         return
     if format_ is not None or out is not None:
@@ -298,9 +331,13 @@ def evaluate(
             f"{len(runs)} run folders to evaluate; name one, like: motionloom evaluate runs/NAME "
             f"(several only with --table)"
         )
+    from motionloom.pipeline.evaluation.written import figures_in
     from motionloom.pipeline.runs.api import evaluate_run
 
-    evaluate_run(runs[0], clips=clips, repeats=repeats, device=device, share=True, console=make_console())
+    console = make_console(aside=as_json)
+    folder = evaluate_run(runs[0], clips=clips, repeats=repeats, device=device, share=True, console=console)
+    if as_json and process_rank() == 0:
+        print_json(figures_in(folder))
 
 
 def _show_table(

@@ -11,10 +11,13 @@ from rich.console import Console
 from motionloom.pipeline.launch.process import process_rank
 
 
-def make_console() -> Console:
-    """Standard output; silent on every rank but the first, wide enough for tables in a log file."""
-    width = None if os.environ.get("COLUMNS") or os.isatty(1) else 120
-    return Console(quiet=process_rank() > 0, width=width, highlight=False)
+def make_console(*, aside: bool = False) -> Console:
+    """Standard output; silent on every rank but the first, wide enough for tables in a log file.
+
+    `aside` takes standard error, where standard output is for a program.
+    """
+    width = None if os.environ.get("COLUMNS") or os.isatty(2 if aside else 1) else 120
+    return Console(stderr=aside, quiet=process_rank() > 0, width=width, highlight=False)
 
 
 def quiet_libraries() -> None:

@@ -62,11 +62,15 @@ def run_recipe(
     console = console or make_console()
     loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
-    if dry_run:
-        _say_estimate(loaded, console)  # first: it needs no data, the plan looks at them
-    plan = make_plan(loaded, run, select)
+    try:
+        plan = make_plan(loaded, run, select)
+    except UserError:
+        if dry_run:
+            _say_estimate(loaded, console)  # it needs no data, the plan looks at them
+        raise
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if dry_run:
+        _say_estimate(loaded, console, [row.stage for row in todo])
         console.print(plan_table(loaded, plan))
         require_fit(todo, loaded.hardware)
     replaced = replaced_stages(run, plan)
@@ -105,11 +109,12 @@ def run_recipe(
     return run
 
 
-def _say_estimate(recipe: Recipe, console: Console) -> None:
-    """What the trainings would take, where the recipe says enough."""
+def _say_estimate(recipe: Recipe, console: Console, todo: Sequence[Stage] | None = None) -> None:
+    """What the trainings of the stages `todo` (None = all) would take, where the recipe says enough."""
     from motionloom.pipeline.runs.estimate import estimate, estimate_table
 
-    if not any(stage.kind.trains for stage in recipe.stages):
+    todo = recipe.stages if todo is None else todo
+    if not any(stage.kind.trains for stage in todo):
         return
     stages = {stage.name: stage for stage in recipe.stages}
     for stage in recipe.stages:
@@ -120,7 +125,7 @@ def _say_estimate(recipe: Recipe, console: Console) -> None:
         except UserError as error:
             console.print(str(error))
             return
-    console.print(estimate_table(estimate(recipe)))
+    console.print(estimate_table(estimate(recipe, {stage.name for stage in todo})))
 
 
 def generate_motions(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from rich.table import Table
 
 from motionloom.datasets.schema import UserError
@@ -10,11 +12,15 @@ from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.recipe import Recipe
 
 
-def estimate(recipe: Recipe) -> dict[str, ModelCard]:
-    """A card for each stage that trains, by name; `UserError` when the layout of the data is not known."""
+def estimate(recipe: Recipe, names: Collection[str] | None = None) -> dict[str, ModelCard]:
+    """A card for each stage that trains, of `names` or of all; `UserError` when the layout of the data is not
+    known.
+    """
     stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
     cards = {}
     for stage in recipe.stages:
+        if names is not None and stage.name not in names:
+            continue
         try:
             card = stage.kind.estimate(stage.config, previews(stage, stages), recipe.hardware)
         except UserError as error:

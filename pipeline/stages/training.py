@@ -121,6 +121,10 @@ def fit(
             trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise KeyboardInterrupt from None
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(context.folder / "checkpoints")  # Lightning writes them without saying so
+        raise
     except RuntimeError as error:
         if "by peer" in str(error):  # how the backends report a connection that broke
             raise TeamError(str(error)) from None

@@ -62,8 +62,10 @@ def new_folder(folder: Path) -> Iterator[Path]:
         yield temporary
         temporary.rename(folder)
     except OSError as error:
-        if str(error.filename).startswith(str(temporary)):
-            error.filename = str(error.filename).replace(str(temporary), str(folder), 1)
+        for side in ("filename", "filename2"):
+            name = getattr(error, side)
+            if name is not None and str(name).startswith(str(temporary)):
+                setattr(error, side, str(name).replace(str(temporary), str(folder), 1))
         raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

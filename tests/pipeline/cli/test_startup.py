@@ -1,0 +1,73 @@
+"""Commands that compute next to nothing import next to nothing; seconds are in `benchmarks/startup.py`.
+
+One process runs them in turn, from the lightest on, and says after each which libraries have come in.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+HEAVY = (
+    "torch",
+    "torch._dynamo",
+    "lightning",
+    "torchmetrics",
+    "transformers",
+    "sentence_transformers",
+    "huggingface_hub",
+    "scipy",
+    "librosa",
+    "soundfile",
+    "roma",
+    "PIL",
+    "matplotlib",
+    "webdataset",
+)
+
+PROGRAM = """
+import contextlib, io, json, sys
+from motionloom.pipeline.cli import main as cli
+heavy, commands = json.loads(sys.argv[1])
+for words in commands:
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
+        sys.argv = ["motionloom", *words]
+        code = cli._exit_code()
+    assert code == 0, (words, said.getvalue())
+    print(json.dumps([name for name in heavy if name in sys.modules]))
+"""
+
+
+@pytest.fixture(scope="module")
+def imported(small_run: Any) -> dict[str, set[str]]:
+    """Heavy libraries that are in after a command and those before it."""
+    shards = small_run.folder / "stages" / "data" / "shards"
+    run = ["run", str(small_run.recipe), "--out", str(small_run.folder)]
+    commands = {
+        "version": ["--version"],
+        "help": ["--help"],
+        "run help": ["run", "--help"],
+        "convert help": ["data", "convert", "bvh", "--help"],
+        "tables": ["evaluate", "--tables"],
+        "check": ["data", "check", str(shards)],
+        "info": ["info"],
+        "nothing to do": run,
+        "dry run": [*run, "--dry-run"],
+    }
+    words = [sys.executable, "-P", "-c", PROGRAM, json.dumps([HEAVY, list(commands.values())])]
+    said = subprocess.run(words, check=True, capture_output=True, text=True).stdout.splitlines()
+    return {name: set(json.loads(line)) for name, line in zip(commands, said, strict=True)}
+
+
+@pytest.mark.parametrize("command", ["version", "help", "run help", "convert help", "tables", "check"])
+def test_without_any_of_them(command: str, imported: dict[str, set[str]]) -> None:
+    assert not imported[command]
+
+
+@pytest.mark.parametrize("command", ["info", "nothing to do", "dry run"])
+def test_with_torch_alone(command: str, imported: dict[str, set[str]]) -> None:
+    assert imported[command] == {"torch"}
