@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from foreign_figures import FOREIGN, Built, build, write_figure
+from foreign_figures import Built, build, write_figure
+from foreign_tools import FOREIGN
 from numpy.typing import NDArray
 
 from motionloom.datasets.convert.bvh.convert import BvhConfig, prepare_bvh

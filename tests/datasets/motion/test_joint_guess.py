@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from foreign_figures import FOREIGN, OTHERS, UNITS, Built, Foreign, build, write_figure
+from foreign_figures import UNITS, Built, build, write_figure
+from foreign_tools import FOREIGN, OTHERS, Foreign
 
 from motionloom.datasets.motion.bvh import BvhMotion, read_bvh
 from motionloom.datasets.motion.joint_guess.guess import guess_joint_map

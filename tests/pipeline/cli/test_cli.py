@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import typer
 from bvh_clips import write_clip, write_map
-from foreign_figures import FOREIGN, build, write_figure
+from foreign_figures import build, write_figure
+from foreign_tools import FOREIGN
 from safetensors.numpy import load_file
 
 from motionloom.datasets.motion.joint_map import JointMap
