@@ -20,7 +20,10 @@ from rich.console import Console
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.data import data_app
+from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.json_output import AsJson, print_json
+from motionloom.pipeline.cli.launch import launch
+from motionloom.pipeline.cli.options import Device, ModelFolder, RunFolder, Sets
 from motionloom.pipeline.cli.sweep import sweep
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
 from motionloom.pipeline.launch.process import TeamError, leave, process_rank
@@ -35,15 +38,6 @@ app = typer.Typer(
 )
 app.add_typer(data_app, name="data")
 
-ModelFolder = Annotated[Path, typer.Argument(help="A run folder (runs/NAME), or a folder made by export.")]
-RunFolder = Annotated[Path, typer.Argument(help="A run folder (runs/NAME).")]
-Sets = Annotated[
-    list[str] | None,
-    typer.Option("--set", "-s", help="Override one value: stage.field=value. May be repeated."),
-]
-Device = Annotated[
-    str, typer.Option(help="auto (a GPU if there is one; stages go by the recipe), cpu, cuda or cuda:N.")
-]
 _INTERRUPTED = 130
 _CLOSED_PIPE = 141
 
@@ -154,53 +148,7 @@ def run(
 
 
 app.command()(sweep)
-
-
-@app.command()
-def launch(
-    recipe: Annotated[str, typer.Argument(help="A shipped recipe's name (see info) or a .yaml file.")],
-    engine: Annotated[str, typer.Option("--engine", "-e", help="slurm, kubernetes or skypilot.")],
-    nodes: Annotated[int, typer.Option(help="Machines that train together.")] = 1,
-    gpus_per_node: Annotated[int, typer.Option(help="GPUs of each; 0 trains on CPUs.")] = 8,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Run folder, as the cluster sees it; default runs/NAME."),
-    ] = None,
-    sets: Sets = None,
-    cluster: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--cluster", help="Of the engine: KEY=VALUE (partition, image, claim, ...). May be repeated."
-        ),
-    ] = None,
-    file: Annotated[
-        Path | None, typer.Option("--file", help="Where to write the YAML; default NAME-ENGINE.yaml.")
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print the plan and what would be submitted; write nothing.")
-    ] = False,
-) -> None:
-    """Run a recipe on a cluster: its stages in groups, each with the machines that it needs.
-
-    On SLURM the jobs are submitted. For Kubernetes and SkyPilot it writes one YAML file and says how to
-    start it.
-
-    Example: `motionloom launch humantomato-paper --engine slurm --nodes 2 --cluster partition=gpu --dry-run`
-    """
-    from motionloom.pipeline.launch.command import launch_recipe
-
-    launch_recipe(
-        recipe,
-        engine,
-        nodes=nodes,
-        gpus_per_node=gpus_per_node,
-        out=out,
-        overrides=sets or (),
-        options=cluster or (),
-        file=file,
-        dry_run=dry_run,
-        console=make_console(),
-    )
+app.command()(launch)
 
 
 @app.command()
@@ -290,79 +238,7 @@ def generate(
     )
 
 
-@app.command()
-def evaluate(
-    run_folders: Annotated[
-        list[Path] | None,
-        typer.Argument(help="A run folder (runs/NAME). With --table several, or none.", show_default=False),
-    ] = None,
-    clips: Annotated[int | None, typer.Option(help="At most this many test clips.")] = None,
-    repeats: Annotated[
-        int | None, typer.Option(help="Repetitions of everything that draws at random.")
-    ] = None,
-    device: Device = "auto",
-    table: Annotated[
-        str | None,
-        typer.Option(help="Measure nothing; show a table of a paper with the finished runs' rows: ude/2."),
-    ] = None,
-    tables: Annotated[bool, typer.Option("--tables", help="List the tables of the papers.")] = False,
-    format_: Annotated[
-        str | None, typer.Option("--format", help="Of a table: text, markdown, csv, latex or json.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="File for a table.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Figures on the test split, each beside its trivial answer; with --table, beside a paper's.
-
-    Example: `motionloom evaluate runs/humantomato-tiny --repeats 5`
-
-    Example: `motionloom evaluate --table humantomato/7 runs/baselines-tiny runs/humantomato-tiny -o seven.md`
-    """
-    runs = run_folders or []
-    if tables or table is not None:
-        if as_json:
-            raise UserError("--json is of figures measured anew; of a table, give --format json")
-        _show_table(table, tables, runs, format_, out, measuring=clips or repeats or device != "auto")
-        return
-    if format_ is not None or out is not None:
-        raise UserError("--format and --out are of a table; name one, like --table humantomato/7")
-    if len(runs) != 1:
-        raise UserError(
-            f"{len(runs)} run folders to evaluate; name one, like: motionloom evaluate runs/NAME "
-            f"(several only with --table)"
-        )
-    from motionloom.pipeline.evaluation.written import figures_in
-    from motionloom.pipeline.runs.api import evaluate_run
-
-    console = make_console(aside=as_json)
-    folder = evaluate_run(runs[0], clips=clips, repeats=repeats, device=device, share=True, console=console)
-    if as_json and process_rank() == 0:
-        print_json(figures_in(folder))
-
-
-def _show_table(
-    table: str | None,
-    tables: bool,
-    runs: list[Path],
-    form: str | None,
-    out: Path | None,
-    *,
-    measuring: object,
-) -> None:
-    """A table of a paper, or the list of all; what is not of tables is refused."""
-    from motionloom.pipeline.published.compare import compare_with_paper, list_tables
-
-    if measuring:
-        raise UserError(
-            "--clips, --repeats and --device measure anew, and a table shows what was measured; "
-            "leave them out"
-        )
-    if table is not None:
-        compare_with_paper(table, runs, format=form, out=out, console=make_console())
-    elif runs or form is not None or out is not None:
-        raise UserError("--tables lists the tables alone; to see one, give --table NAME RUN...")
-    else:
-        list_tables(make_console())
+app.command()(evaluate)
 
 
 @app.command()

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from motionloom.pipeline.runs.estimate import estimate
-from motionloom.pipeline.runs.graph import PlannedStage, Selection, make_plan, replaced_trainings, require_fit
+from motionloom.pipeline.runs.graph import PlannedStage, Selection, make_plan, require_fit
 from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.replace import replaced_stages, started_trainings
 
 
 def plan_record(
@@ -20,7 +21,8 @@ def plan_record(
 ) -> dict[str, Any]:
     """The stages in order, each with what happens to it and why, and what its training takes.
 
-    `replaces` are trainings that the run would delete. Refuses what the run would refuse.
+    `replaces` are stages that the run would delete, which it refuses without `--replace`, and trainings that
+    it would begin anew. Refuses what the run would refuse.
     """
     loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
@@ -28,13 +30,15 @@ def plan_record(
     todo = [row for row in plan if row.action in {"run", "resume"}]
     require_fit(todo, loaded.hardware)
     cards = estimate(loaded, {row.stage.name for row in todo})
-    finished, started = replaced_trainings(run, plan)
     return {
         "recipe": loaded.name,
         "folder": run,
         "hardware": loaded.hardware,
         "stages": [_row(row, cards) for row in plan],
-        "replaces": {"finished": finished, "started": started},
+        "replaces": {
+            "finished": [one.stage for one in replaced_stages(run, plan)],
+            "started": started_trainings(run, plan),
+        },
     }
 
 

@@ -1,0 +1,88 @@
+"""`motionloom evaluate`: figures of a run, alone or beside a paper's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cli.json_output import AsJson, print_json
+from motionloom.pipeline.cli.options import Device
+from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.launch.process import process_rank
+
+
+def evaluate(
+    run_folders: Annotated[
+        list[Path] | None,
+        typer.Argument(help="A run folder (runs/NAME). With --table several, or none.", show_default=False),
+    ] = None,
+    clips: Annotated[int | None, typer.Option(help="At most this many test clips.")] = None,
+    repeats: Annotated[
+        int | None, typer.Option(help="Repetitions of everything that draws at random.")
+    ] = None,
+    device: Device = "auto",
+    table: Annotated[
+        str | None,
+        typer.Option(help="Measure nothing; show a table of a paper with the finished runs' rows: ude/2."),
+    ] = None,
+    tables: Annotated[bool, typer.Option("--tables", help="List the tables of the papers.")] = False,
+    format_: Annotated[
+        str | None, typer.Option("--format", help="Of a table: text, markdown, csv, latex or json.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File for a table.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Figures on the test split, each beside its trivial answer; with --table, beside a paper's.
+
+    Example: `motionloom evaluate runs/humantomato-tiny --repeats 5`
+
+    Example: `motionloom evaluate --table humantomato/7 runs/baselines-tiny runs/humantomato-tiny -o seven.md`
+    """
+    runs = run_folders or []
+    if tables or table is not None:
+        if as_json:
+            raise UserError("--json is of figures measured anew; of a table, give --format json")
+        _show_table(table, tables, runs, format_, out, measuring=clips or repeats or device != "auto")
+        return
+    if format_ is not None or out is not None:
+        raise UserError("--format and --out are of a table; name one, like --table humantomato/7")
+    if len(runs) != 1:
+        raise UserError(
+            f"{len(runs)} run folders to evaluate; name one, like: motionloom evaluate runs/NAME "
+            f"(several only with --table)"
+        )
+    from motionloom.pipeline.evaluation.written import figures_in
+    from motionloom.pipeline.runs.api import evaluate_run
+
+    console = make_console(aside=as_json)
+    folder = evaluate_run(runs[0], clips=clips, repeats=repeats, device=device, share=True, console=console)
+    if as_json and process_rank() == 0:
+        print_json(figures_in(folder))
+
+
+def _show_table(
+    table: str | None,
+    tables: bool,
+    runs: list[Path],
+    form: str | None,
+    out: Path | None,
+    *,
+    measuring: object,
+) -> None:
+    """A table of a paper, or the list of all; what is not of tables is refused."""
+    from motionloom.pipeline.published.compare import compare_with_paper, list_tables
+
+    if measuring:
+        raise UserError(
+            "--clips, --repeats and --device measure anew, and a table shows what was measured; "
+            "leave them out"
+        )
+    if table is not None:
+        compare_with_paper(table, runs, format=form, out=out, console=make_console())
+    elif runs or form is not None or out is not None:
+        raise UserError("--tables lists the tables alone; to see one, give --table NAME RUN...")
+    else:
+        list_tables(make_console())
