@@ -31,7 +31,7 @@ def clip_motion(i: int) -> np.ndarray:
     joints = LAYOUT.skeleton.rest_joints[None].repeat(2, axis=0)
     joints[..., 1] -= joints[..., 1].min()
     stands = encode(joints, LAYOUT)[:1]
-    trembles = 0.01 * np.random.default_rng(i).standard_normal((frames, LAYOUT.dim))
+    trembles = 0.05 * np.random.default_rng(i).standard_normal((frames, LAYOUT.dim))
     return np.asarray(stands + trembles, dtype=np.float32)
 
 
