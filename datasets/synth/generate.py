@@ -47,7 +47,7 @@ from motionloom.datasets.synth.smpl75 import smpl75_of
 from motionloom.datasets.synth.song import render_song
 from motionloom.datasets.synth.truth import ACTIONS, HANDS, Span, Truth, draw
 
-CONVERTER_VERSION = 1
+CONVERTER_VERSION = 2  # the face's words are about the body's person
 LICENCE = "CC0-1.0"
 _GOLDEN = 0.6180339887498949
 
@@ -221,7 +221,7 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
         joints=canonicalize(solved[:, : layout.num_joints] * size),
         face=face,
         texts=texts if said else [],
-        face_texts=face_captions(truth, words) if has_face and said else [],
+        face_texts=face_captions(truth, words, body=texts) if has_face and said else [],
         truth=truth.record(hands=hands, face=has_face),
         wav=wav,
         audio=audio,

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from motionloom.datasets.synth.truth import Truth
 
 _WHO = ("a person", "a man", "a woman", "someone", "the person", "a figure")
+_GENDERED = ("a man", "a woman")
 _TIMES = {1: ("once", "one time"), 2: ("twice", "two times"), 3: ("three times",)}
 _WORDS = {4: "four", 5: "five"}
 _SPEED = {"slowly": ("slowly", "at a slow pace"), "quickly": ("quickly", "fast", "at a fast pace")}
@@ -84,10 +87,18 @@ def body_captions(truth: Truth, rng: np.random.Generator, number: int = 3, hands
     return found
 
 
-def face_captions(truth: Truth, rng: np.random.Generator, number: int = 2) -> list[str]:
-    """Captions of the face alone."""
+def face_captions(
+    truth: Truth, rng: np.random.Generator, number: int = 2, body: Sequence[str] = ()
+) -> list[str]:
+    """Captions of the face alone, about a person that none of the clip's `body` captions contradicts.
+
+    Any of them may be trained on together: where a body caption says "a woman" no face is a man's, and where
+    others of the same clip say "a man" the face is a person's.
+    """
+    said = {who for who in _GENDERED if any(text.startswith(f"{who} ") for text in body)}
+    people = tuple(who for who in _WHO if who not in _GENDERED or said <= {who})
     order = rng.permutation(len(_FACES[truth.face]))[:number]
-    return [f"{_pick(rng, _WHO)} {_FACES[truth.face][int(k)]}" for k in order]
+    return [f"{_pick(rng, people)} {_FACES[truth.face][int(k)]}" for k in order]
 
 
 def _sentence(truth: Truth, rng: np.random.Generator, hands: bool) -> str:

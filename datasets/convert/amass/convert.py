@@ -6,7 +6,7 @@
 | `trans` | the path of the root in `motion.npy` |
 | `betas`, `gender` | bone lengths, when a body model is given |
 | `mocap_framerate` or `mocap_frame_rate` | resampled by time to `fps` |
-| captions.jsonl, or HumanML3D's texts | `texts.json` |
+| captions of your own, or HumanML3D's texts | `texts.json` |
 
 Z up becomes Y up. Jaw, eyes, soft tissue (`dmpls`) and markers are not used.
 """

@@ -109,6 +109,21 @@ def test_face_captions_name_the_emotion(emotion: str) -> None:
     assert all(any(root in text for root in roots[emotion]) for text in texts)
 
 
+def test_face_captions_are_about_the_person_of_the_body_captions() -> None:
+    truth = Truth("jump", face="neutral")
+    people = {
+        (): {"a person", "a man", "a woman", "someone", "the person", "a figure"},
+        ("someone jumps",): {"a person", "a man", "a woman", "someone", "the person", "a figure"},
+        ("a woman jumps", "a figure jumps"): {"a person", "a woman", "someone", "the person", "a figure"},
+        ("a man jumps", "a woman jumps"): {"a person", "someone", "the person", "a figure"},
+    }
+    for body, allowed in people.items():
+        rng = np.random.default_rng(0)
+        texts = [text for _ in range(40) for text in face_captions(truth, rng, body=body)]
+        said = {who for who in people[()] if any(text.startswith(f"{who} ") for text in texts)}
+        assert said == allowed
+
+
 @pytest.mark.parametrize("bpm", [80, 105, 140])
 def test_music_clicks_on_its_beats(bpm: int) -> None:
     wav = music.render(bpm, 0.2, 4.0, np.random.default_rng(bpm))
