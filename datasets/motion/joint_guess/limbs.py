@@ -62,7 +62,7 @@ def named_limb(figure: Figure, kind: Kind, side: str) -> Limb | None:
             top = score
     if not best:
         return None
-    fitting = [{joint for fit in best if (joint := fit[slot]) is not None} for slot in range(4)]
+    fitting = [{one for fit in best if (one := fit[slot]) is not None} for slot in range(4)]
     rivals = tuple(tuple(sorted(joints)) if len(joints) > 1 else () for joints in fitting)
     a, b, c, d = best[0]
     return Limb((a, b, c, d), "name", rivals)
