@@ -62,15 +62,17 @@ def named_limb(figure: Figure, kind: Kind, side: str) -> Limb | None:
             top = score
     if not best:
         return None
-    rivals = [tuple(sorted({c[slot] for c in best} - {None})) for slot in range(4)]  # type: ignore[type-var]
+    fitting = [{one for fit in best if (one := fit[slot]) is not None} for slot in range(4)]
+    rivals = tuple(tuple(sorted(joints)) if len(joints) > 1 else () for joints in fitting)
     a, b, c, d = best[0]
-    return Limb((a, b, c, d), "name", tuple(r if len(r) > 1 else () for r in rivals))  # type: ignore[arg-type]
+    return Limb((a, b, c, d), "name", rivals)
 
 
 def _agreement(figure: Figure, kind: Kind, choice: tuple[int | None, ...]) -> int:
     """In how many slots one and the same convention has the words."""
     words = ["" if joint is None else figure.names[joint].word for joint in choice]
-    return max(sum(a == b for a, b in zip(words, getattr(known, kind), strict=True)) for known in CONVENTIONS)
+    rows: list[tuple[str, ...]] = [getattr(known, kind) for known in CONVENTIONS]
+    return max(sum(a == b for a, b in zip(words, row, strict=True)) for row in rows)
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ class JointGuess:
 
     def summary(self) -> str:
         """How the joints were found, in one line."""
-        counts = Counter(row.how for row in self.rows)
+        counts: Counter[str] = Counter(row.how for row in self.rows)
         kinds = {"name": "by name", "hierarchy": "by hierarchy", "mean": "as means", "missing": "open"}
         found = ", ".join(f"{counts[how]} {text}" for how, text in kinds.items() if counts[how])
         return f"{found}; {len(self.unmapped)} of the source's joints stand for nothing"

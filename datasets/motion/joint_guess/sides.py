@@ -55,8 +55,8 @@ def find_pairs(figure: Figure) -> tuple[LimbPair | None, LimbPair | None]:
         ]
         if len(choices) == 1:
             low, high = choices[0]
-            legs = legs or (low and _tree_pair(figure, "leg", low))
-            arms = arms or (high and _tree_pair(figure, "arm", high))
+            legs = legs if low is None else _tree_pair(figure, "leg", low)
+            arms = arms if high is None else _tree_pair(figure, "arm", high)
     return legs, arms
 
 
