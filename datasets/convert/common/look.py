@@ -10,9 +10,9 @@ units; what makes people of them is suggested, by the option or the lines of the
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,16 @@ from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.motion.joint_map import METRES
+from motionloom.datasets.convert.common.corrections import (
+    Names,
+    SeenClip,
+    Suggestion,
+    crowd_of,
+    head_axis,
+    suggest,
+)
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.motion.standing import MOST, PERSON_METRES, Crowd, Oddity, measure
-from motionloom.datasets.motion.swapped_joints import Swap, find_swap
+from motionloom.datasets.motion.swapped_joints import find_swap
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import grouped
 
@@ -31,7 +37,6 @@ MOST_CLIPS = 96
 """Clips that are looked at in all; of sources with more subsets, fewer a subset and then fewer subsets."""
 
 _FRAMES_A_SECOND = 10.0
-_MIRRORED = "left and right"
 
 T = TypeVar("T")
 
@@ -43,7 +48,7 @@ class SourceJoints:
     joints: NDArray[Any]
     """World positions [T, N, 3] in metres, Y up, after the options for unit and axis."""
     fps: float
-    names: tuple[str | tuple[str, ...], ...] = ()
+    names: Names = ()
     """What stands for each joint in the file (several: their mean), where a joint map says it."""
     remarks: tuple[str, ...] = ()
     """What a user should know about the file, the same words for the same thing."""
@@ -71,23 +76,6 @@ class SubsetLook:
     """Of these, those in which it goes backwards."""
     fps: tuple[float, ...]
     """Frame rates of the files."""
-
-
-@dataclass(frozen=True)
-class Suggestion:
-    """A change that makes people of what was seen."""
-
-    option: Literal["up", "unit", "joint_map", "source"]
-    value: str
-    """What to give it: an axis, a unit, or lines of the joint map; a sentence where no option helps."""
-    why: str
-
-    def __str__(self) -> str:
-        if self.option in ("up", "unit"):
-            return f"--{self.option} {self.value} ({self.why})"
-        if self.option == "joint_map":
-            return f"in the joint map: {self.value} ({self.why})"
-        return f"{self.value} ({self.why})"
 
 
 @dataclass(frozen=True)
@@ -154,16 +142,6 @@ class Look:
         )
 
 
-@dataclass(frozen=True)
-class _Clip:
-    """One clip that was read: its frames at about ten a second."""
-
-    subset: str
-    joints: NDArray[np.float64]
-    fps: float
-    file_fps: float
-
-
 def look_at(
     items: Sequence[T],
     see: Callable[[T], SourceJoints],
@@ -179,10 +157,10 @@ def look_at(
     ones: in an archive, what comes late costs time.
     """
     chosen, subsets = _choose(items, subset_of, config.look, label, in_order)
-    clips: list[_Clip] = []
+    clips: list[SeenClip] = []
     failed: list[tuple[str, Dropped]] = []
     remarks: Counter[str] = Counter()
-    names: tuple[str | tuple[str, ...], ...] = ()
+    names: Names = ()
     for name, item in chosen:
         try:
             seen = see(item)
@@ -194,7 +172,7 @@ def look_at(
             continue
         step = max(1, round(seen.fps / _FRAMES_A_SECOND))
         body = np.asarray(seen.joints[::step, :BODY_JOINTS], dtype=np.float64)
-        clips.append(_Clip(name, body, seen.fps / step, seen.fps))
+        clips.append(SeenClip(name, body, seen.fps / step, seen.fps))
         remarks.update(seen.remarks)
         names = names or seen.names
     unreadable = Counter(name for name, _ in failed)
@@ -243,22 +221,15 @@ def _choose(
     return chosen, len(by_subset)
 
 
-def _crowd(clips: Iterable[_Clip]) -> Crowd:
-    crowd = Crowd()
-    for clip in clips:
-        crowd.add(measure(clip.joints, clip.fps))
-    return crowd
-
-
-def _subset(name: str, clips: list[_Clip], unreadable: int, up: str) -> SubsetLook:
-    crowd = _crowd(clips)
+def _subset(name: str, clips: list[SeenClip], unreadable: int, up: str) -> SubsetLook:
+    crowd = crowd_of(clips)
     return SubsetLook(
         name=name,
         clips=len(clips),
         unreadable=unreadable,
         height=round(crowd.height, 4) if clips else None,
         upright=round(crowd.upright * len(clips)) if clips else 0,
-        head=_head_axis(clips, up) if clips else "",
+        head=head_axis(clips, up) if clips else "",
         above_floor=round(crowd.above_floor, 4) if clips else None,
         walking=crowd.walking,
         backwards=crowd.backwards,
@@ -267,14 +238,14 @@ def _subset(name: str, clips: list[_Clip], unreadable: int, up: str) -> SubsetLo
 
 
 def _judge(
-    clips: list[_Clip], config: ConvertConfig, names: tuple[str | tuple[str, ...], ...], up: str
+    clips: list[SeenClip], config: ConvertConfig, names: Names, up: str
 ) -> tuple[list[str], list[str], list[Suggestion]]:
     """Problems, warnings, and what would make people of the clips."""
-    oddities = _crowd(clips).oddities()
+    oddities = crowd_of(clips).oddities()
     swap = find_swap([clip.joints for clip in clips])
     problems = [oddity.text for oddity in oddities if oddity.is_error]
     warnings = [oddity.text for oddity in oddities if not oddity.is_error]
-    by_subset: dict[str, list[_Clip]] = defaultdict(list)
+    by_subset: dict[str, list[SeenClip]] = defaultdict(list)
     for clip in clips:
         by_subset[clip.subset].append(clip)
     known = {oddity.kind for oddity in oddities if oddity.is_error}
@@ -282,117 +253,10 @@ def _judge(
         if len(by_subset) > 1:
             warnings += [
                 f"{name}: {oddity.text}"
-                for oddity in _crowd(members).oddities()
+                for oddity in crowd_of(members).oddities()
                 if oddity.is_error and oddity.kind not in known
             ]
     if swap is not None:
         first, second = swap.names
         problems.insert(0, f"{first} and {second} stand in each other's place")
-    return problems, warnings, _suggest(clips, oddities, swap, config, names, up) if problems else []
-
-
-def _suggest(
-    clips: list[_Clip],
-    oddities: list[Oddity],
-    swap: Swap | None,
-    config: ConvertConfig,
-    names: tuple[str | tuple[str, ...], ...],
-    up: str,
-) -> list[Suggestion]:
-    """Changes that together make people of the clips, one after the other: joints, axis, unit, sides."""
-    out: list[Suggestion] = []
-    joints = [clip.joints for clip in clips]
-    if swap is not None:
-        joints = [swap.undo(each) for each in joints]
-        out.append(_swap_suggestion(swap, names))
-    now = _again(clips, joints)
-    if now.upright <= MOST:
-        axis = _head_axis(_with(clips, joints), up)
-        joints = [_turned(each, up, axis) for each in joints]
-        out.append(_axis_suggestion(axis, config))
-        now = _again(clips, joints)
-    if not PERSON_METRES[0] <= now.height <= PERSON_METRES[1]:
-        factor, suggestion = _unit_suggestion(now.height, config)
-        joints = [each * factor for each in joints]
-        out.append(suggestion)
-        now = _again(clips, joints)
-    if any(oddity.kind == _MIRRORED and oddity.is_error for oddity in now.oddities()):
-        why = "the feet point backwards"
-        if names:
-            out.append(Suggestion("joint_map", "exchange the left and the right rows", why))
-        else:
-            out.append(Suggestion("source", "exchange left and right in the source", why))
-    return out
-
-
-def _swap_suggestion(swap: Swap, names: tuple[str | tuple[str, ...], ...]) -> Suggestion:
-    first, second = swap.names
-    if not names:
-        return Suggestion("source", f"exchange {first} and {second} in the source", "bones change length")
-
-    def line(joint: int, name: str, other: int) -> str:
-        source = names[other]
-        word = f'"{source}"' if isinstance(source, str) else str(list(source)).replace("'", '"')
-        return f'[{joint}, "{name}", {word}]'
-
-    lines = f"{line(swap.first, first, swap.second)}, {line(swap.second, second, swap.first)}"
-    return Suggestion("joint_map", lines, "then bones keep their length")
-
-
-def _axis_suggestion(axis: str, config: ConvertConfig) -> Suggestion:
-    why = f"the head is above the pelvis along the {axis} axis of the files"
-    if hasattr(config, "up") and axis in ("+y", "+z"):
-        return Suggestion("up", axis[1], why)
-    return Suggestion("source", "turn the files so that y or z points up", why)
-
-
-def _unit_suggestion(height: float, config: ConvertConfig) -> tuple[float, Suggestion]:
-    """The factor that makes a person of a figure of `height`, and the unit that has it."""
-    given = METRES.get(getattr(config, "unit", "m"), 1.0)
-    factors = {unit: metres / given for unit, metres in METRES.items()}
-    fits = {u: f for u, f in factors.items() if PERSON_METRES[0] <= height * f <= PERSON_METRES[1]}
-    if not fits:
-        why = f"the figures are {height:.3g} m tall, and no unit makes 1.2 to 2.2 m of it"
-        return 1.7 / max(height, 1e-9), Suggestion("source", "scale the files", why)
-    unit, factor = min(fits.items(), key=lambda item: abs(np.log(height * item[1] / 1.7)))
-    why = f"then the figures are {height * factor:.2f} m tall"
-    if hasattr(config, "unit"):
-        return factor, Suggestion("unit", unit, why)
-    return factor, Suggestion("source", f"the lengths look like {unit}: scale the files to metres", why)
-
-
-def _with(clips: list[_Clip], joints: list[NDArray[np.float64]]) -> list[_Clip]:
-    return [
-        _Clip(clip.subset, each, clip.fps, clip.file_fps) for clip, each in zip(clips, joints, strict=True)
-    ]
-
-
-def _again(clips: list[_Clip], joints: list[NDArray[np.float64]]) -> Crowd:
-    return _crowd(_with(clips, joints))
-
-
-def _file_axes(vectors: NDArray[Any], up: str) -> NDArray[Any]:
-    """Vectors [..., 3] with Y up, in the axes of the files, of which `up` was taken for the upward one."""
-    if up == "z":
-        return np.stack([vectors[..., 0], -vectors[..., 2], vectors[..., 1]], axis=-1)
-    return vectors
-
-
-def _head_axis(clips: Iterable[_Clip], up: str) -> str:
-    """The axis of the files along which the head lies from the pelvis in most clips."""
-    found: Counter[str] = Counter()
-    for clip in clips:
-        way = _file_axes(np.array(measure(clip.joints, clip.fps).up), up)
-        axis = int(np.abs(way).argmax())
-        found[("+" if way[axis] > 0 else "-") + "xyz"[axis]] += 1
-    return found.most_common(1)[0][0]
-
-
-def _turned(joints: NDArray[np.float64], up: str, axis: str) -> NDArray[np.float64]:
-    """Joints with Y up, when `axis` of the files is the upward one after all."""
-    x, y, z = np.moveaxis(_file_axes(joints, up), -1, 0)
-    turned = {
-        "+y": (x, y, z), "-y": (x, -y, -z), "+z": (x, z, -y),
-        "-z": (x, -z, y), "+x": (-y, x, z), "-x": (y, -x, z),
-    }[axis]  # fmt: skip
-    return np.stack(turned, axis=-1)
+    return problems, warnings, suggest(clips, swap, config, names, up) if problems else []
