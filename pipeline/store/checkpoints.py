@@ -21,7 +21,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
 import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
@@ -55,15 +55,18 @@ def write_checkpoint(checkpoint: dict[str, Any], path: Path) -> None:
     Raises:
         UserError: The file could not be written (a full disk, most often); nothing half-written stays.
     """
-    sink: _Sink | None = None
+    failure: OSError | None = None
     try:
         with atomic_file(path) as file:
             sink = _Sink(file)
-            torch.save({**checkpoint, _SEALED: True}, sink)
+            try:
+                torch.save({**checkpoint, _SEALED: True}, cast(IO[bytes], sink))
+            finally:
+                failure = sink.failure
             file.write(b"\nmotionloom sha256 %s\n" % sink.hexdigest.encode())
     except (OSError, RuntimeError) as error:
         # torch answers a failed write with an error about its own position in the file.
-        cause = error if isinstance(error, OSError) else sink and sink.failure
+        cause = error if isinstance(error, OSError) else failure
         if cause is None:
             raise
         raise UserError(

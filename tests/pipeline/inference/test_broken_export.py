@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -197,6 +199,28 @@ def test_a_part_that_the_layout_does_not_have_is_named(model: Path) -> None:
     change(model / "tma/model.json", lambda facts: facts["extra"].update(part="wings"))
     with pytest.raises(UserError, match=r"model.json: key 'extra.part' = 'wings' is no part of layout"):
         Bundle.open(model)
+
+
+class Payload:
+    """Runs a shell command wherever it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        return os.system, ("touch PWNED",)
+
+
+def test_pickles_in_place_of_weights_are_refused(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    files = sorted(model.rglob("*.safetensors"))
+    assert {path.parent.name for path in files} >= {"stats", "tokenizer", "gpt", "face_diffusion"}
+    for path in files:
+        whole = path.read_bytes()
+        path.write_bytes(pickle.dumps(Payload()))
+        with pytest.raises(UserError, match=f"{path.parent.name}/{path.name}"):
+            Bundle.open(model)
+        path.write_bytes(whole)
+    assert Bundle.open(model) and not (tmp_path / "PWNED").exists()
 
 
 def test_seeds_go_by_the_place_in_the_list(whole: Path) -> None:
