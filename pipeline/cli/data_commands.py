@@ -18,6 +18,7 @@ from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.render.labels import label
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
 
@@ -184,7 +185,7 @@ def stats_command(root: Path, *, group: bool, out: Path | None, console: Console
     for name, size in dataset.layout.fields:
         columns = dataset.layout.slice(name)
         mean, std = np.abs(stats.mean[columns]).mean(), stats.std[columns]
-        table.add_row(name, str(size), f"{mean:.4f}", f"{std.mean():.4f}", f"{std.max():.4f}")
+        table.add_row(label(name), str(size), f"{mean:.4f}", f"{std.mean():.4f}", f"{std.max():.4f}")
     console.print(table)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
