@@ -13,6 +13,7 @@ from rich.text import Text
 from motionloom.datasets.schema import Dropped, Manifest, UserError
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.pipeline.cli.json_output import plain, print_json
+from motionloom.pipeline.render.labels import label
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
@@ -305,7 +306,7 @@ def stats_command(root: Path, *, group: bool, out: Path | None, console: Console
     for name, size in dataset.layout.fields:
         columns = dataset.layout.slice(name)
         mean, std = np.abs(stats.mean[columns]).mean(), stats.std[columns]
-        table.add_row(name, str(size), f"{mean:.4f}", f"{std.mean():.4f}", f"{std.max():.4f}")
+        table.add_row(label(name), str(size), f"{mean:.4f}", f"{std.mean():.4f}", f"{std.max():.4f}")
     console.print(table)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from motionloom.pipeline.render.labels import label
+
 Better = Literal["lower", "higher", ""]
 Form = Literal["mm", "percent", "plain"]
 SUBJECT = ""
@@ -280,7 +282,7 @@ TABLES: tuple[TableSpec, ...] = (
         ("agreement_with_caption",),
         "generated",
         {"truth": "recorded motion"},
-        {(name,): Measure(name.replace("_", " "), "higher", "percent") for name in _ASPECTS},
+        {(name,): Measure(label(name), "higher", "percent") for name in _ASPECTS},
         _JOINTLY,
     ),
     _dance(

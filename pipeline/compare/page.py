@@ -14,6 +14,7 @@ from motionloom.pipeline.compare.runs import ComparedRun
 from motionloom.pipeline.compare.settings import ABSENT, StageDifferences, setting_differences
 from motionloom.pipeline.compare.tables import ComparedTable, compared_tables
 from motionloom.pipeline.render.charts import Line
+from motionloom.pipeline.render.labels import curve_label
 from motionloom.pipeline.render.page import Cell, Page, Value
 from motionloom.pipeline.store.flatten import setting_text
 
@@ -191,7 +192,7 @@ def _chart(page: Page, chart: CurveChart) -> None:
         Line(f"{c.run.label} ({c.split})", c.steps, c.values, dashed=c.split == "val", colour=c.run.colour)
         for c in chart.curves
     ]
-    page.add_plot(lines, f"{chart.stage}: {chart.figure.replace('_', ' ')}")
+    page.add_plot(lines, f"{chart.stage}: {curve_label(chart.figure)}")
 
 
 def _chip(run: ComparedRun) -> Cell:

@@ -23,6 +23,8 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.pipeline.data_page.clips import WATCH_SECONDS, choose, watch
 from motionloom.pipeline.data_page.facts import DataFacts, SplitFacts, gather
 from motionloom.pipeline.render.charts import Line
+from motionloom.pipeline.render.joint_names import joint_label
+from motionloom.pipeline.render.labels import label
 from motionloom.pipeline.render.page import Page, Value
 
 BINS = 24
@@ -221,7 +223,7 @@ def _features(page: Page, facts: DataFacts, opened: dict[str, ShardDataset]) -> 
         still = int((std[part] < STD_FLOOR).sum())
         means = float(np.abs(mean[part]).mean()), float(std[part].mean()), float(std[part].max())
         ends = float(facts.low[part].min()), float(facts.high[part].max())
-        rows.append([name, size, *means, *ends, still])
+        rows.append([label(name), size, *means, *ends, still])
     columns = ["feature", "columns", "mean of |mean|", "mean deviation", "largest", "lowest value"]
     page.add_table([*columns, "highest value", "still columns"], rows, digits=4)
     for name, size in layout.fields:
@@ -236,13 +238,15 @@ def _field_plots(page: Page, name: str, mean: np.ndarray, std: np.ndarray) -> No
     axes = _AXES[6] if name == "rotations_6d" else _AXES[3]
     if name not in _FIRST_JOINT:
         order = np.arange(len(mean))
-        page.add_plot([Line("mean", order, mean), Line("deviation", order, std)], name, x_label="column")
+        page.add_plot(
+            [Line("mean", order, mean), Line("deviation", order, std)], label(name), x_label="column"
+        )
         return
     for what, values in (("mean", mean), ("deviation", std)):
         joints = values.reshape(-1, len(axes))
         number = np.arange(len(joints)) + _FIRST_JOINT[name]
         lines = [Line(axis, number, joints[:, k]) for k, axis in enumerate(axes)]
-        page.add_plot(lines, f"{name}: {what}", x_label="joint")
+        page.add_plot(lines, f"{label(name)}: {what}", x_label="joint")
 
 
 def _outlier_table(page: Page, facts: DataFacts, opened: dict[str, ShardDataset]) -> None:
@@ -337,14 +341,14 @@ def _value_name(column: int, layout: MotionLayout) -> str:
     """A column in words: the field, and the joint and axis where it has them."""
     field = next(name for name, _ in layout.fields if column < layout.slice(name).stop)
     part = layout.slice(field)
-    at, label = column - part.start, field.replace("_", " ")
+    at, name = column - part.start, label(field)
     if field not in _FIRST_JOINT:
-        return f"{label} {at}" if part.stop - part.start > 1 else label
+        return f"{name} {at}" if part.stop - part.start > 1 else name
     axes = _AXES[6] if field == "rotations_6d" else _AXES[3]
     number = at // len(axes) + _FIRST_JOINT[field]
     known = number < layout.num_joints
-    joint = layout.skeleton.joints[number].replace("_", " ") if known else f"joint {number}"
-    return f"{label}: {joint}, {axes[at % len(axes)]}"
+    joint = joint_label(layout.skeleton.joints[number]) if known else f"joint {number}"
+    return f"{name}: {joint}, {axes[at % len(axes)]}"
 
 
 def _round_up(value: float) -> float:

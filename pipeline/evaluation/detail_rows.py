@@ -8,10 +8,10 @@ from typing import Any
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.showing import Clips, JointMap, Matrix, Showing
 from motionloom.pipeline.evaluation.cases import Case, read_cases
+from motionloom.pipeline.render.labels import label
 from motionloom.pipeline.render.viewer import ViewerMotion
 
 _MOTIONS = {"generated": "generated motion", "real": "recorded motion"}
-_NAMES = {"left_hand": "left hand", "right_hand": "right hand", "genre": "genre of a dance"}
 _MADE = {
     "reconstruction": ("reconstruction", "Worst and best reconstructions"),
     "generated": ("generated", "Worst and best generated motions"),
@@ -39,16 +39,16 @@ def detail_showings(folder: Path, figures: dict[str, Any]) -> list[Showing]:
         )
     out += [_matrix(found) for found in figures.get("confusions", [])]
     cases = read_cases(folder, figures)
-    for of, (label, title) in _MADE.items():
+    for of, (name, title) in _MADE.items():
         chosen = [case for case in cases if case.of == of]
         if chosen:
-            motions = [motion for case in chosen for motion in _pair(case, label, figures)]
+            motions = [motion for case in chosen for motion in _pair(case, name, figures)]
             out.append(Clips(title, _NOTES[of], motions))
     return out
 
 
 def _matrix(found: dict[str, Any]) -> Matrix:
-    about = _NAMES.get(found["about"], found["about"])
+    about = "genre of a dance" if found["about"] == "genre" else label(found["about"])
     motion = _MOTIONS[found["of"]]
     if found["by"] == "joints":
         title = f"The action that is asked for, and what the joints of the {motion} show"
@@ -62,22 +62,18 @@ def _matrix(found: dict[str, Any]) -> Matrix:
     return Matrix(
         title,
         corner,
-        [_plain(name) for name in found["rows"]],
-        [_plain(name) for name in found["columns"]],
+        [name if found["about"] == "caption" else label(name) for name in found["rows"]],
+        [name if found["about"] == "caption" else label(name) for name in found["columns"]],
         found["counts"],
         more=found["about"] not in ("action", "caption"),
     )
 
 
-def _plain(name: str) -> str:
-    return name.replace("_", " ")
-
-
-def _pair(case: Case, label: str, figures: dict[str, Any]) -> list[ViewerMotion]:
+def _pair(case: Case, made: str, figures: dict[str, Any]) -> list[ViewerMotion]:
     unit = " mm" if case.of == "reconstruction" else " from its words"
     group = f"{case.place}: {case.error:.3g}{unit}"
     parents = Skeleton.named(figures["skeleton"]).parents[: case.recorded.shape[1]]
     return [
         ViewerMotion(joints, figures["fps"], parents, name, case.caption, group)
-        for name, joints in (("recorded", case.recorded), (label, case.made))
+        for name, joints in (("recorded", case.recorded), (made, case.made))
     ]

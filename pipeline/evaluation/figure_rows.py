@@ -8,6 +8,7 @@ from typing import Any
 from motionloom.pipeline.evaluation.dance_figures import KINETIC
 from motionloom.pipeline.evaluation.figures import chance
 from motionloom.pipeline.evaluation.paired import POSITION_TITLES
+from motionloom.pipeline.render.labels import label
 
 Rows = tuple[str, list[str], list[list[str]]]
 """Title, columns, rows."""
@@ -60,9 +61,7 @@ def figure_rows(figures: dict[str, Any]) -> list[Rows]:
     if "agreement_with_caption" in figures:
         found = figures["agreement_with_caption"]
         names = sorted({*found["truth"], *found["generated"]})
-        rows = [
-            [n.replace("_", " "), *(_percent(found[k].get(n)) for k in ("truth", "generated"))] for n in names
-        ]
+        rows = [[label(n), *(_percent(found[k].get(n)) for k in ("truth", "generated"))] for n in names]
         out.append(
             (
                 "Does the motion do what its caption says? (measured on the joints)",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from motionloom.pipeline.render.labels import label
+
 _NAMES = {
     "collar": "collarbone",
     "foot": "ball of the foot",
@@ -21,10 +23,10 @@ def joint_label(joint: str) -> str:
     """A joint of `smpl22` or `smplx52` in words; other names without their underscores."""
     side, _, rest = joint.partition("_")
     if side not in ("left", "right"):
-        return _NAMES.get(joint, joint.replace("_", " "))
+        return _NAMES.get(joint, label(joint))
     finger, place = rest[:-1], rest[-1:]
     if finger == "thumb" and place in _ALONG_THUMB:
         return f"{side} thumb, {_ALONG_THUMB[place]}"
     if finger in _NAMES and place in _ALONG_FINGER:
         return f"{side} {_NAMES[finger]}, {_ALONG_FINGER[place]}"
-    return f"{side} {_NAMES.get(rest, rest.replace('_', ' '))}"
+    return f"{side} {_NAMES.get(rest, label(rest))}"

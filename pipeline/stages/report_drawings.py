@@ -13,6 +13,7 @@ from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.render.body_map import body_map
 from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.joint_names import joint_label
+from motionloom.pipeline.render.labels import curve_label
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.store.training_log import read_training_log
 
@@ -87,7 +88,7 @@ def draw_curves(page: Page, stages: Sequence[Finished]) -> None:
         for curve in stage.kind.curves(stage.config):
             lines = [line for key in keys if key.startswith(curve.prefix) for line in _lines(rows, key)]
             if lines:
-                page.add_plot(lines, f"{stage.name}: {curve.title or curve.prefix}")
+                page.add_plot(lines, f"{stage.name}: {curve.title or curve_label(curve.prefix)}")
 
 
 def _lines(rows: list[dict[str, float]], key: str) -> list[Line]:
@@ -96,5 +97,5 @@ def _lines(rows: list[dict[str, float]], key: str) -> list[Line]:
         points = [(row["step"], row[f"{kind}/{key}"]) for row in rows if f"{kind}/{key}" in row]
         if points:
             steps, values = zip(*points, strict=True)
-            out.append(Line(f"{key} ({kind})", steps, values, dashed))
+            out.append(Line(f"{curve_label(key)} ({kind})", steps, values, dashed))
     return out

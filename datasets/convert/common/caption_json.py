@@ -128,7 +128,9 @@ def kind_of(value: Any) -> str:
         return "true or false"
     if isinstance(value, (int, float)):
         return "a number"
-    return {str: "a text", list: "a list"}.get(type(value), "an object")
+    if isinstance(value, str):
+        return "a text"
+    return "a list" if isinstance(value, list) else "an object"
 
 
 def _decode(path: Path, text: str, start: int, form: Form, end: int | None = None) -> tuple[Any, int]:

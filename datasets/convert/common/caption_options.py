@@ -86,18 +86,18 @@ def settle_captions(
     if config.captions is None:
         return
     file, total = config.captions.name, captioned + len(bare_clips)
-    become = "kept" if config.uncaptioned == "keep" else "left out"
+    become = {"stop": "", "drop": " and are left out", "keep": " and are kept"}[config.uncaptioned]
     said = [f"{captioned} of {total} clips have captions in {file}"]
     if bare_clips:
-        said.append(f"{len(bare_clips)} have none and are {become} ({_some(bare_clips)})")
+        said.append(f"{len(bare_clips)} have none{become} ({_some(bare_clips)})")
     if found.unused:
-        said.append(f"{len(found.unused)} captions are of no clip in the source ({_unused(found)})")
+        said.append(f"captions for {_unused(found)}")
     draft.captions = "; ".join(said)
     draft.notes.append(draft.captions)
     if bare_clips and config.uncaptioned == "stop":
         draft.stop = (
             f"{config.captions}: no captions for {len(bare_clips)} of {total} clips ({_some(bare_clips)})"
-            + (f"; {len(found.unused)} captions are of no clip ({_unused(found)})" if found.unused else "")
+            + (f"; captions for {_unused(found)}" if found.unused else "")
             + "; add them, or choose with --uncaptioned (in a recipe uncaptioned): drop leaves these clips "
             "out, keep converts them without words"
         )
@@ -109,10 +109,11 @@ def _some(names: list[str]) -> str:
 
 
 def _unused(found: CaptionMatch) -> str:
-    """The first captions without a clip, each with the nearest names."""
+    """How many clips have captions and no file, and the first of them with the nearest names."""
     shown = []
     for row in found.unused[:_SHOWN]:
         near = found.nearest(row)
         shown.append(f"'{row.file or row.id}'" + (f", nearest: {' and '.join(near)}" if near else ""))
     more = f"; and {len(found.unused) - _SHOWN} more" if len(found.unused) > _SHOWN else ""
-    return "; ".join(shown) + more
+    which = "clip that is" if len(found.unused) == 1 else "clips that are"
+    return f"{len(found.unused)} {which} not in the source ({'; '.join(shown)}{more})"

@@ -295,8 +295,8 @@ def test_clips_without_captions_stop_the_conversion_until_it_is_decided(source: 
     path.write_text("name,caption\nwalk_a,walks\njumps,jumps\n")
     made = plan(source, path)
     assert made.captions == (
-        "1 of 3 clips have captions in c.csv; 2 have none and are left out (jump.bvh, sub/turn.bvh); "
-        "1 captions are of no clip in the source ('jumps', nearest: jump.bvh)"
+        "1 of 3 clips have captions in c.csv; 2 have none (jump.bvh, sub/turn.bvh); "
+        "captions for 1 clip that is not in the source ('jumps', nearest: jump.bvh)"
     )
     assert made.captions in made.notes and len(made.uncaptioned) == 2
     shown = "".join(str(cell) for column in made.table().columns for cell in column.cells)
@@ -310,6 +310,7 @@ def test_clips_without_captions_stop_the_conversion_until_it_is_decided(source: 
         settled = plan(source, path, uncaptioned=choice)
         settled.require_settled()
         assert sum(settled.counts().values()) == count
+        assert f"2 have none and are {'kept' if choice == 'keep' else 'left out'} (" in settled.captions
     without = plan(source, None)
     without.require_settled()
     assert (without.captions, sum(without.counts().values())) == ("", 3)

@@ -226,7 +226,7 @@ def test_synth_writes_the_same_shards_as_the_function(shards: Path, tmp_path: Pa
 def test_stats_describes_and_writes(shards: Path, tmp_path: Path, call: Call) -> None:
     out = tmp_path / "new/folder/stats.safetensors"
     done = call("data", "stats", shards, "--out", out)
-    assert done.code == 0 and "clip length: median" in done.out and "root_height" in done.out
+    assert done.code == 0 and "clip length: median" in done.out and "root height" in done.out
     first, stored = out.read_bytes(), load_file(out)
     assert stored["mean"].shape == stored["std"].shape == (363,) and (stored["std"] > 0).all()
     assert np.isfinite(stored["mean"]).all()

@@ -108,6 +108,7 @@ def test_it_says_what_is_in_the_set(page: Path, nasty: Path) -> None:
         "No errors",
         "40 warnings",
         "positions: deviation",
+        "root yaw velocity",
         "Most unusual values",
     ):
         assert word in whole, word

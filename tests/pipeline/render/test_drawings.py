@@ -13,6 +13,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body_map import Scale, body_map
 from motionloom.pipeline.render.charts import Line, line_chart
 from motionloom.pipeline.render.joint_names import joint_label
+from motionloom.pipeline.render.labels import curve_label
 from motionloom.pipeline.render.matrix import matrix_table
 from motionloom.pipeline.render.page import Cell, Page
 
@@ -54,6 +55,24 @@ class Balanced(HTMLParser):
 )
 def test_joints_have_names_for_people(joint: str, label: str) -> None:
     assert joint_label(joint) == label
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("ce", "cross-entropy"),
+        ("tokens_ce", "tokens cross-entropy"),
+        ("tokens_accuracy_left_hand", "tokens accuracy: left hand"),
+        ("accuracy_body", "accuracy: body"),
+        ("dead_code", "dead codes"),
+        ("resets_level12", "reset codes: level 12"),
+        ("rec_motion", "reconstructed motion"),
+        ("critic_loss", "critic loss"),
+        ("my_own_figure", "my own figure"),
+    ],
+)
+def test_figures_of_a_log_have_names_for_people(key: str, words: str) -> None:
+    assert curve_label(key) == words
 
 
 def test_every_joint_has_a_name_of_its_own() -> None:
