@@ -12,8 +12,8 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.options import Part
-from motionloom.pipeline.launch import convert_part
-from motionloom.pipeline.launch.convert_part import main, make_part
+from motionloom.pipeline.cluster import convert_part
+from motionloom.pipeline.cluster.convert_part import main, make_part
 from motionloom.pipeline.runs.api import run_recipe
 
 KEPT = "stages/data/shards"

@@ -16,8 +16,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cluster.plan import Group, LaunchPlan
 from motionloom.pipeline.launch.options import SkyPilotOptions
-from motionloom.pipeline.launch.plan import Group, LaunchPlan
 from motionloom.pipeline.store.yaml import dump_yaml
 
 _RECIPE = PurePosixPath("/tmp/motionloom-recipe.yaml")
