@@ -19,9 +19,9 @@ from rich.console import Console
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.cli.main import app
+from motionloom.pipeline.cluster.command import launch_recipe
 from motionloom.pipeline.contract.registry import stage_kinds
 from motionloom.pipeline.inference.script import Script
-from motionloom.pipeline.launch.command import launch_recipe
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.shipped import shipped_recipes
 

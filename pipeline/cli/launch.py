@@ -41,7 +41,7 @@ def launch(
 
     Example: `motionloom launch humantomato-paper --engine slurm --nodes 2 --cluster partition=gpu --dry-run`
     """
-    from motionloom.pipeline.launch.command import launch_recipe
+    from motionloom.pipeline.cluster.command import launch_recipe
 
     launch_recipe(
         recipe,

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from motionloom.pipeline.launch import slurm_run
+from motionloom.pipeline.cluster import slurm_run
+from motionloom.pipeline.cluster.plan import LaunchPlan, make_launch_plan
+from motionloom.pipeline.cluster.slurm_run import submit_run
 from motionloom.pipeline.launch.options import SlurmOptions
-from motionloom.pipeline.launch.plan import LaunchPlan, make_launch_plan
-from motionloom.pipeline.launch.slurm_run import submit_run
 from motionloom.pipeline.runs.recipe import load_recipe
 
 

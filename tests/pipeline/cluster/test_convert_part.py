@@ -12,8 +12,8 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.options import Part
-from motionloom.pipeline.launch import convert_part
-from motionloom.pipeline.launch.convert_part import main, make_part
+from motionloom.pipeline.cluster import convert_part
+from motionloom.pipeline.cluster.convert_part import main, make_part
 from motionloom.pipeline.runs.api import run_recipe
 
 KEPT = "stages/data/shards"
@@ -29,7 +29,7 @@ def recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, name in enumerate(names):
         write_clip(source / f"{name}.bvh", number)
     captions = folder / "captions.jsonl"
-    rows = [{"id": name, "text": "a person walks", "split": "train"} for name in names]
+    rows = [{"id": name, "captions": ["a person walks"], "split": "train"} for name in names]
     captions.write_text("".join(json.dumps(row) + "\n" for row in rows))
     fields = {
         "kind": "bvh",

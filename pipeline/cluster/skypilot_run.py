@@ -16,8 +16,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cluster.plan import Group, LaunchPlan
 from motionloom.pipeline.launch.options import SkyPilotOptions
-from motionloom.pipeline.launch.plan import Group, LaunchPlan
 from motionloom.pipeline.store.yaml import dump_yaml
 
 _RECIPE = PurePosixPath("/tmp/motionloom-recipe.yaml")
@@ -83,7 +83,8 @@ def _task(plan: LaunchPlan, group: Group, options: SkyPilotOptions, recipe: Path
         "image_id": f"docker:{options.image}" if options.image else None,
         "use_spot": True if options.use_spot else None,
     }
-    mount, mounts = str(options.mount), {}
+    mount = str(options.mount)
+    mounts: dict[str, Any] = {}
     if _is_bucket(options):
         mounts[mount] = {"source": options.storage, "mode": "MOUNT_CACHED"}
     if recipe is not None:

@@ -9,13 +9,13 @@ import pytest
 
 from motionloom.datasets.convert.table import CONVERTERS
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cluster.plan import LaunchPlan, make_launch_plan
 from motionloom.pipeline.launch.options import (
     KubernetesOptions,
     LaunchOptions,
     SkyPilotOptions,
     SlurmOptions,
 )
-from motionloom.pipeline.launch.plan import LaunchPlan, make_launch_plan
 from motionloom.pipeline.runs.graph import Selection, selected
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.shipped import shipped_recipes
@@ -84,7 +84,7 @@ def test_a_conversion_at_the_beginning_is_made_in_parts() -> None:
     parts = plan.groups[0].parts
     assert parts is not None
     assert plan.part_command(parts, "r.yaml", python)[2:] == [
-        *("-m", "motionloom.pipeline.launch.convert_part", "bvh-body", "/runs/x", "data", "features", "3")
+        *("-m", "motionloom.pipeline.cluster.convert_part", "bvh-body", "/runs/x", "data", "features", "3")
     ]
     assert plan_of("bvh-body").groups[0].parts is None
     assert [name for name, entry in CONVERTERS.items() if entry.features_first] == ["bvh"]

@@ -27,7 +27,7 @@ from motionloom.pipeline.stages.convert import ConvertStage
 Need = Literal["cpu", "gpu", "all"]
 """One process without a GPU; one process with one; as many processes on all nodes as there are GPUs."""
 
-PARTS_MODULE = "motionloom.pipeline.launch.convert_part"
+PARTS_MODULE = "motionloom.pipeline.cluster.convert_part"
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cluster.plan import Group, LaunchPlan
 from motionloom.pipeline.launch.options import KubernetesOptions
-from motionloom.pipeline.launch.plan import Group, LaunchPlan
 from motionloom.pipeline.store.yaml import dump_yaml
 
 _CONTAINER = "node"

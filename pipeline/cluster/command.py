@@ -10,12 +10,12 @@ from rich.console import Console
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.launch.kubernetes_run import kubernetes_steps, kubernetes_yaml
+from motionloom.pipeline.cluster.kubernetes_run import kubernetes_steps, kubernetes_yaml
+from motionloom.pipeline.cluster.plan import LaunchPlan, make_launch_plan
+from motionloom.pipeline.cluster.skypilot_run import skypilot_steps, skypilot_yaml
+from motionloom.pipeline.cluster.slurm_run import RECIPE_FILE, slurm_scripts, submit_run
 from motionloom.pipeline.launch.options import KubernetesOptions, SkyPilotOptions, SlurmOptions
-from motionloom.pipeline.launch.plan import LaunchPlan, make_launch_plan
-from motionloom.pipeline.launch.skypilot_run import skypilot_steps, skypilot_yaml
 from motionloom.pipeline.launch.slurm_convert import LOG_FOLDER
-from motionloom.pipeline.launch.slurm_run import RECIPE_FILE, slurm_scripts, submit_run
 from motionloom.pipeline.runs.graph import make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.replace import replaced_stages, require_asked

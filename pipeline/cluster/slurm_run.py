@@ -24,8 +24,8 @@ from rich.console import Console
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cluster.plan import Group, LaunchPlan
 from motionloom.pipeline.launch.options import SlurmOptions
-from motionloom.pipeline.launch.plan import Group, LaunchPlan
 from motionloom.pipeline.launch.slurm_convert import LOG_FOLDER, cancel_jobs, new_folder
 
 PYTHON = (sys.executable, "-P")

@@ -1,6 +1,6 @@
 """One part of a recipe's conversion, made in the run folder before the stage itself is run there.
 
-    python -m motionloom.pipeline.launch.convert_part RECIPE OUT STAGE STEP COUNT [SETTING ...]
+    python -m motionloom.pipeline.cluster.convert_part RECIPE OUT STAGE STEP COUNT [SETTING ...]
 
 is what each of COUNT tasks of a SLURM array or pods of an Indexed Job runs (`plan.py`). STEP is `features` or
 `shards`. Which part it is says the engine's own variable. The stage, run after all parts, finds their shards,

@@ -1,0 +1,1 @@
+"""A recipe on a cluster that another engine schedules: SLURM, Kubernetes, SkyPilot."""
