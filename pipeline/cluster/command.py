@@ -67,7 +67,8 @@ def launch_recipe(
 
     if engine == "slurm":
         require_folder(folder)
-        require_asked(folder, loaded.name, replaced_stages(folder, make_plan(loaded, folder)))
+        if (folder / "recipe.yaml").is_file():
+            require_asked(folder, loaded.name, replaced_stages(folder, make_plan(loaded, folder)))
         asked = SlurmOptions.from_words(options)
         made = plan(asked, PurePosixPath(folder.absolute()))
         if dry_run:

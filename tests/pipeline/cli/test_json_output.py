@@ -103,7 +103,7 @@ def test_a_conversions_plan(call: Call, tmp_path: Path) -> None:
     words = ("data", "convert", "bvh", tmp_path / "mocap", tmp_path / "out", "--licence", "x")
     words += ("--joint-map", write_map(tmp_path / "map.json"), "--workers", "1")
     plan = loaded(call(*words, "--plan", "--json").out)
-    assert plan["found"] == 1 and sum(plan["clips"].values()) == 1 and not plan["broken"]
+    assert plan["found"] == 1 and sum(plan["clips"].values()) == 1 and not plan["unreadable"]
     refused = call(*words, "--json")
     assert refused.code == 2 and "give --plan too" in refused.err and not (tmp_path / "out").exists()
 

@@ -134,7 +134,8 @@ def test_the_hub_is_asked_when_its_cache_lacks_the_model(
             raise huggingface_hub.errors.LocalEntryNotFoundError("not here")
         return str(encoder)
 
-    monkeypatch.setattr(encoder_files, "snapshot_download", download)
+    monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    monkeypatch.setattr(encoder_files, "hub_is_away", lambda: False)
     encoder_files.copy_encoder(HUB_NAME, tmp_path / "text", tmp_path / "copy")
     assert asked == [True, False] and (tmp_path / "copy/model.safetensors").is_file()
 

@@ -240,7 +240,7 @@ def test_the_commands_options_reach_the_sampling(
     call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
     seen: dict[str, Any] = {}
-    monkeypatch.setattr("motionloom.pipeline.runs.api.Bundle.open", lambda *_: _Watching(seen))
+    monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: _Watching(seen))
     words = (
         "--sampler",
         "dpm++",

@@ -320,7 +320,7 @@ def test_what_a_run_lacks_is_one_sentence(baselines: Make, tmp_path: Path, recor
     bare = records.write_run(tmp_path / "bare", {"evaluate": {"kind": "evaluate", "finished": False}})
     with pytest.raises(UserError, match="bare: no finished evaluation that this table takes figures of"):
         filled("humantomato/7", bare)
-    with pytest.raises(UserError, match="nowhere: not a run folder"):
+    with pytest.raises(UserError, match="nowhere: no such folder"):
         filled("humantomato/7", tmp_path / "nowhere")
 
 

@@ -213,7 +213,7 @@ def test_a_table_of_ones_own(baselines: Callable[..., Path], tmp_path: Path) -> 
     ("words", "says"),
     [
         (["--table", "humantomato/70"], "no such table; did you mean 'humantomato/7'?"),
-        (["--table", "ude/1", "nowhere"], "nowhere: not a run folder"),
+        (["--table", "ude/1", "nowhere"], "nowhere: no such folder"),
         (["--table", "ude/1", "--format", "latx"], "--format latx: no such format; did you mean 'latex'?"),
         (["--table", "ude/1", "--clips", "4"], "--clips, --repeats and --device measure anew"),
         (["--table", "ude/1", "-o", "."], ".: is a folder; name a file"),

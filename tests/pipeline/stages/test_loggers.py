@@ -117,7 +117,7 @@ def test_a_server_knows_a_training_that_goes_on(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow", "trackio"])
 def test_a_missing_package_is_named_with_its_extra(name: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loggers.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(UserError, match=rf"pip install 'motionloom\[{name}\]'"):
         TmaStageConfig().require_fit(Hardware(accelerator="cpu", loggers=("csv", name)))
 

@@ -35,9 +35,9 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import captions_from_json
 from motionloom.datasets.text.cache import CacheInfo, TextCache
 from motionloom.datasets.text.encoder import load_text_encoder
+from motionloom.pipeline.contract.exported import open_exported
 from motionloom.pipeline.evaluation.cases import read_cases
 from motionloom.pipeline.evaluation.face_basis import read_basis
-from motionloom.pipeline.inference.exported import open_exported
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.checkpoints import readable, write_checkpoint
 from motionloom.pipeline.store.tokens import TokenStore
