@@ -195,7 +195,7 @@ def test_mistakes_are_one_sentence(tmp_path: Path) -> None:
         open_runs([good] * 9)
     with pytest.raises(UserError, match="is named twice"):
         open_runs([good, tmp_path / "other" / ".." / "good"])
-    with pytest.raises(UserError, match=r"nothing: not a run folder \(no recipe.yaml\)"):
+    with pytest.raises(UserError, match=r"nothing: no such folder"):
         open_runs([good, tmp_path / "nothing"])
     with pytest.raises(UserError, match="is a folder; name a file"):
         compare_runs([good, other], tmp_path, console=QUIET)
