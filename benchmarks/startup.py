@@ -35,18 +35,20 @@ NEW_RECIPE = "humantomato-tiny"
 """Shipped; nothing of it has run."""
 
 BVH_TO_NPZ = """
+from pathlib import Path
 import sys, numpy
 from motionloom.datasets.motion.bvh import read_bvh
-numpy.savez(sys.argv[2], joints=read_bvh(sys.argv[1]).positions())
+numpy.savez(sys.argv[2], joints=read_bvh(Path(sys.argv[1])).positions())
 """
 
 TO_BVH = """
+from pathlib import Path
 import sys, numpy
 from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.skeleton import Skeleton
 body = Skeleton.named("smpl22")
 turns = numpy.tile(numpy.eye(3), (60, len(body), 1, 1))
-write_bvh(sys.argv[1], turns, numpy.zeros((60, 3)), body, 30.0)
+write_bvh(Path(sys.argv[1]), body, turns, numpy.zeros((60, 3)), 30.0)
 """
 
 
