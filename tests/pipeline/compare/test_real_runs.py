@@ -78,7 +78,7 @@ def test_the_report_of_an_unfinished_run(unfinished: Path, call: Callable[..., A
     assert "gpt: in training, step 12 of 30" in text and "evaluate: not run yet" in text
     assert "the recorded clip, and what the tokenizer keeps of it." in text
     assert "a motion that the model made" not in text and "Figures on held-out clips" not in text
-    assert "gpt: ce" in text and "tokenizer: recon" in text, "its curves so far"
+    assert "gpt: cross-entropy" in text and "tokenizer: reconstruction" in text, "its curves so far"
     assert "9 of 15" not in text and "8 of 15" in text
 
 

@@ -177,7 +177,7 @@ def test_killed_and_resumed_equals_undisturbed(run: Path, recipe: Path) -> None:
 
 def test_its_curves_are_in_the_report(run: Path) -> None:
     page = (run / "stages/report/report.html").read_text()
-    assert "pacer: margin of the critic" in page and "pacer: pacer_distance" in page
+    assert "pacer: margin of the critic" in page and "pacer: pacer distance" in page
     rows = read_metrics(run / "stages/pacer")
     assert {"train/critic_margin", "train/pacer_distance"} <= set(rows[0])
     assert {row["step"] for row in rows if "val/critic_margin" in row} == {*range(20, STEPS + 1, 20)}

@@ -210,6 +210,6 @@ def test_an_error_of_the_lead_ends_those_who_wait(
     shutil.copytree(single, run)
     (run / "stages/.tokens.removed").write_text("in the way")  # the lead cannot clear the stage's folder
     words = ("run", recipe, "--out", run, "--from", "tokens", "--until", "gpt", *PAIR)
-    output = finish(running(*words), code=1, seconds=60)
-    assert "NotADirectoryError" in output
+    output = finish(running(*words), code=2, seconds=60)
+    assert "a file stands where a folder is needed" in output
     assert "process 1: another process of this run has stopped" in output

@@ -195,7 +195,7 @@ def test_two_processes_train_as_one(judge: Path, start: Callable[..., Any], tmp_
 def test_an_evaluation_is_judged_by_it(judge: Path, call: Callable[..., Any], tmp_path: Path) -> None:
     (judge / "judged.yaml").write_text(JUDGED)
     shutil.copytree(judge / "run", tmp_path / "run")
-    done = call("run", judge / "judged.yaml", "--out", tmp_path / "run")
+    done = call("run", judge / "judged.yaml", "--out", tmp_path / "run", "--replace")
     assert done.code == 0, done.err
     figures = json.loads((tmp_path / "run/stages/evaluate/metrics.json").read_text())
     weights = sha256_of(tmp_path / "run/stages/evaluator/model.safetensors")
