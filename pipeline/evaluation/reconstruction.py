@@ -37,17 +37,19 @@ _SUM = "sum"
 """Begins the names of a clip's sums over frames: "sum_hand_mean_pose/mpjpe"."""
 
 
-def clip_errors(tokenizer: TrainedTokenizer, nearest: NearestClip, truth: Truth) -> Row:
+def clip_errors(
+    tokenizer: TrainedTokenizer, nearest: NearestClip, truth: Truth, found: NDArray[np.float32]
+) -> Row:
     """Both families of errors of one clip, through the tokenizer, as the mean pose (`_mean_pose`) and as the
     nearest training clip (`_nearest_train_clip`): sums over frames of the papers', means of ours.
 
-    Of a clip without hands the body's joints alone count, and nothing in `_hand`.
+    `found` [T, D] is what the tokenizer makes of the clip (`reconstruct_truth`). Of a clip without hands the
+    body's joints alone count, and nothing in `_hand`.
     """
     layout = tokenizer.layout
     body = tokenizer.stats.mean[layout.part("bodyhand")].astype(np.float32)
     real = torch.from_numpy(local_joints(truth.features, layout))
     target = torch.from_numpy(truth.joints)
-    found = reconstruct_truth(tokenizer, truth)
     constant = np.broadcast_to(body, truth.features.shape)
     compared = {
         "": (local_joints(found, layout), joints_of(found, layout)),
@@ -94,7 +96,8 @@ def reconstruction_figures(
 ) -> dict[str, float]:
     """Errors over all of the clips `truths`, millimetres."""
     nearest = NearestClip(train)
-    return mean_errors(clip_errors(tokenizer, nearest, truth) for truth in truths)
+    rebuilt = ((truth, reconstruct_truth(tokenizer, truth)) for truth in truths)
+    return mean_errors(clip_errors(tokenizer, nearest, truth, found) for truth, found in rebuilt)
 
 
 def published_errors(made: Tensor, real: Tensor) -> dict[str, JointErrors]:

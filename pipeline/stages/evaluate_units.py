@@ -196,7 +196,9 @@ class EvaluationUnits:
         """Errors of clips through the tokenizer, and of expressions where a tokenizer models them."""
         tokenizer = self.tokenizer
         assert tokenizer is not None
-        out = as_table([clip_errors(tokenizer, self._nearest, truth) for truth in truths], JOINTS)
+        bodies = [reconstruct_truth(tokenizer, truth) for truth in truths]
+        pairs = zip(truths, bodies, strict=True)
+        out = as_table([clip_errors(tokenizer, self._nearest, truth, body) for truth, body in pairs], JOINTS)
         faces = self.context.given.get("face_tokenizer", tokenizer)
         models_faces = faces.layout.has("face") and faces.net.part in ("face", "all")
         if models_faces:
@@ -204,7 +206,7 @@ class EvaluationUnits:
         for role, judge in self.judges.items():
             some = self.judged(judge, truths)
             if judge.motions.part != "face":
-                made = [reconstruct_truth(tokenizer, t) for t in some]
+                made = bodies
             elif models_faces:
                 made = [reconstruct_all(faces, t)[:, faces.layout.slice("face")] for t in some]
             else:
