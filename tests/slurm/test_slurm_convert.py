@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import io
 import json
 import tarfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
+from slurm_cluster import Cluster, why_not
 
 from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -26,18 +25,9 @@ from motionloom.pipeline.launch.slurm_convert import LOG_FOLDER, ClusterConfig, 
 pytest.importorskip("submitit")
 
 
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-CLUSTER = load("cluster")
 pytestmark = [
     pytest.mark.slurm,
-    pytest.mark.skipif(bool(CLUSTER.why_not()), reason=CLUSTER.why_not()),
+    pytest.mark.skipif(bool(why_not()), reason=why_not()),
 ]
 SPLITS = ("train", "train", "train", "val", "test")
 SHARDS = {"clips_per_shard": 3}
@@ -45,7 +35,7 @@ SHARDS = {"clips_per_shard": 3}
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    with CLUSTER.Cluster() as started, pytest.MonkeyPatch.context() as patch:
+    with Cluster() as started, pytest.MonkeyPatch.context() as patch:
         for name, value in started.environment.items():
             patch.setenv(name, value)
         yield started

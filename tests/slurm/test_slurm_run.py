@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from types import ModuleType
 from typing import Any
 
 import pytest
 from rich.console import Console
+from slurm_cluster import Cluster, why_not
 
 from motionloom.pipeline.cluster import slurm_run
 from motionloom.pipeline.cluster.plan import LaunchPlan, make_launch_plan
@@ -21,19 +20,9 @@ from motionloom.pipeline.cluster.slurm_run import submit_run
 from motionloom.pipeline.launch.options import SlurmOptions
 from motionloom.pipeline.runs.recipe import load_recipe
 
-
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-CLUSTER = load("cluster")
 pytestmark = [
     pytest.mark.slurm,
-    pytest.mark.skipif(bool(CLUSTER.why_not()), reason=CLUSTER.why_not()),
+    pytest.mark.skipif(bool(why_not()), reason=why_not()),
 ]
 WORDS = ["light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=0.5", "memory_gb_per_gpu=0.5"]
 OPTIONS = SlurmOptions.from_words([*WORDS, "extra.comment=two words"])
@@ -41,7 +30,7 @@ OPTIONS = SlurmOptions.from_words([*WORDS, "extra.comment=two words"])
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    with CLUSTER.Cluster() as started, pytest.MonkeyPatch.context() as patch:
+    with Cluster() as started, pytest.MonkeyPatch.context() as patch:
         for name, value in started.environment.items():
             patch.setenv(name, value)
         yield started
