@@ -24,13 +24,14 @@ def convert(out):
     pid = os.fork()
     if not pid:
         try:
-            os.setsid()
+            os.setpgid(0, 0)
             run_conversion(prepare_bvh(config, scan=out / SCAN_FILE), out, progress=False, clips_per_shard=8)
         except BaseException:
             import traceback
             traceback.print_exc()
             os._exit(1)
         os._exit(0)
+    os.setpgid(pid, pid)  # by both: the group is there for whoever comes first, however late the other runs
     return pid
 
 def finished(out):
