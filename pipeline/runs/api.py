@@ -153,6 +153,7 @@ def generate_motions(
     from motionloom.pipeline.inference.outputs import write_motions
     from motionloom.pipeline.inference.page_words import page_note, page_title
     from motionloom.pipeline.inference.script import Script, read_music
+    from motionloom.pipeline.inference.unknown import unknown_captions
 
     if not captions and not audio and script is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
@@ -174,6 +175,9 @@ def generate_motions(
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     bundle = Bundle.open(folder, choose_device(device))
+    said = captions if segments is None else [segment.prompt.text for segment in segments]
+    for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
+        console.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
     if segments is not None:
         motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
     else:
