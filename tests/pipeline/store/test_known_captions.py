@@ -48,7 +48,7 @@ def test_representatives_leave_no_caption_far() -> None:
     made = representatives(texts, vectors, 12)
     distances = np.sqrt(np.maximum(0, 2 - 2 * vectors.astype(np.float64) @ made.embeddings.T))
     radius = distances.min(axis=1).max()
-    # Gonzalez: with the farthest caption 13 lie pairwise `radius` apart or more; no 12 balls of less than half do.
+    # Gonzalez: with the farthest caption, 13 lie pairwise `radius` apart; smaller balls need more than 12.
     chosen = made.embeddings.astype(np.float64)
     apart = np.sqrt(np.maximum(0, 2 - 2 * chosen @ chosen.T))[np.triu_indices(12, 1)].min()
     assert apart >= radius - 1e-6
