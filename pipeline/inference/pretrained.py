@@ -31,7 +31,7 @@ from motionloom.pipeline.inference.unknown import unknown_captions
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.outside import BUNDLE_FILE
-from motionloom.pipeline.store.weights import LayoutFacts
+from motionloom.pipeline.store.weights import LayoutFacts, halve_weights
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -151,11 +151,13 @@ class MotionModel(
         return cls(folder, device)
 
 
-def write_bundle(run: Path, out: Path) -> None:
-    """Copy what generation needs of a run's finished stages into `out`."""
+def write_bundle(run: Path, out: Path, *, half: bool = False) -> None:
+    """Copy what generation needs of a run's finished stages into `out`; with `half`, weights as 16 bits."""
     bundle = Bundle.from_run(run)
     for stage in bundle.stages:
         bundle.of(stage)  # opens every stage, so a broken one is found before anything is copied
     out.mkdir(parents=True, exist_ok=True)
     write_exported(bundle.stages, LayoutFacts.of(bundle.layout), bundle.layout.skeleton, out)
+    for weights in sorted(out.glob("*/model.safetensors")) if half else ():
+        halve_weights(weights)
     write_json(out / "config.json", _HUB_CONFIG)

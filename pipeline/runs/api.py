@@ -330,8 +330,8 @@ def report_run(
     return page
 
 
-def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Path:
-    """Copy what generation needs into one folder."""
+def export_run(folder: Path, out: Path, *, half: bool = False, console: Console | None = None) -> Path:
+    """Copy what generation needs into one folder; with `half`, weights in half precision."""
     from motionloom.pipeline.inference.pretrained import write_bundle
 
     console = console or make_console()
@@ -339,7 +339,7 @@ def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Pa
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
     with new_folder(out.absolute()) as whole:
-        write_bundle(folder, whole)
+        write_bundle(folder, whole, half=half)
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     console.print(
         f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"', soft_wrap=True
