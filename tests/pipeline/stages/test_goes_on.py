@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 import torch
 from rich.console import Console
+from same_stage import assert_equal, assert_same_stage, newest
 from tiny_players import Duel, train
-from torch import Tensor
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.schema import UserError
@@ -29,38 +29,6 @@ from motionloom.pipeline.stages.training import Start, read_metrics, start_of
 # A constant schedule for both: a cosine would depend on the number of steps.
 CONSTANT: dict[str, Any] = {"critic": Duel(seed=0, max_steps=1).optim_config}
 FULL: dict[str, Any] = {"ema": 0.9, "accumulate": 2}
-
-
-def newest(folder: Path) -> dict[str, Any]:
-    """What training goes on from, without the clock and the paths in it."""
-    path = max((folder / "checkpoints").iterdir())
-    checkpoint: dict[str, Any] = torch.load(path, weights_only=True)
-    kept = {name: checkpoint[name] for name in ("global_step", "epoch", "state_dict", "optimizer_states")}
-    average = checkpoint["callbacks"].get("AveragedWeights")
-    return {**kept, "average": average, "rows": checkpoint["callbacks"]["MetricLog"]["rows"]}
-
-
-def assert_equal(one: Any, two: Any, where: str = "") -> None:
-    """Bit for bit, through all levels."""
-    if isinstance(one, Tensor):
-        assert torch.equal(one, two), where
-    elif isinstance(one, dict):
-        assert one.keys() == two.keys(), where
-        for name in one:
-            assert_equal(one[name], two[name], f"{where}.{name}")
-    elif isinstance(one, list | tuple):
-        assert len(one) == len(two), where
-        for index, pair in enumerate(zip(one, two, strict=True)):
-            assert_equal(*pair, f"{where}[{index}]")
-    else:
-        assert one == two, where
-
-
-def assert_same_stage(one: Path, two: Path, first: Duel, second: Duel) -> None:
-    """The same saved weights, checkpoint and log."""
-    assert_equal(first.state_dict(), second.state_dict())
-    assert_equal(newest(one), newest(two))
-    assert read_metrics(one) == read_metrics(two)
 
 
 @pytest.mark.parametrize("settings", [FULL, {**FULL, "precision": "bf16-mixed", "accumulate": 1}])
