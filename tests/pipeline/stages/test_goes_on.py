@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from two_ranks import run_two_ranks
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import Interrupted
 from motionloom.pipeline.launch.team import lead_finds
 from motionloom.pipeline.stages.gpt import GptStageConfig
 from motionloom.pipeline.stages.train_config import TrainConfig
@@ -126,12 +128,29 @@ def test_longer_than_a_training_of_less_than_a_chunk(tmp_path: Path) -> None:
 
 
 def test_workers_change_nothing(tmp_path: Path) -> None:
-    """They live from chunk to chunk, and each chunk begins at its own batch."""
+    """They live from chunk to chunk, each chunk begins at its own batch, and no signal ends them."""
     settings = {"steps": 8, "checkpoint_every": 2, "validate_every": 0}
     alone = train(tmp_path / "alone", **settings)
-    other = train(tmp_path / "other", hardware={"workers": 1}, **settings)
+    # It reaches the reader: a worker, as one to the whole group of processes does.
+    reached = {3: signal.SIGTERM}
+    other = train(tmp_path / "other", hardware={"workers": 1}, signalled=reached, **settings)
     assert_same_stage(tmp_path / "alone", tmp_path / "other", alone, other)
     assert alone.readers == {os.getpid()} and len(other.readers - alone.readers) == 1
+
+
+def interrupt(out: Path, rank: int, hardware: dict[str, Any]) -> None:
+    """One rank gets the signal, or the other, or both; all stop at the same step and go on from there."""
+    settings = {**FULL, "checkpoint_every": 7, "validate_every": 7, "hardware": hardware}
+    whole = train(out / "whole", **settings)
+    stops = []
+    for step, ranks in ((1, (1,)), (9, (0,)), (17, (0, 1))):
+        signalled = {step: signal.SIGTERM} if rank in ranks else None
+        with pytest.raises(Interrupted) as stopped:
+            train(out / "interrupted", signalled=signalled, **settings)
+        stops.append(stopped.value.step)
+    again = train(out / "interrupted", **settings)
+    assert_equal(whole.state_dict(), again.state_dict())
+    (out / f"stops-{rank}.json").write_text(json.dumps(stops))
 
 
 def worker(out: Path) -> None:
@@ -140,6 +159,7 @@ def worker(out: Path) -> None:
     for name, settings in PAIRS.items():
         duel = train(out / name, **pair, **settings)
         torch.save(duel.state_dict(), out / f"{name}-{os.environ['RANK']}.pt")
+    interrupt(out, int(os.environ["RANK"]), pair["hardware"])
     # Which checkpoint a training goes on from is found once, also where the ranks see different files.
     assert lead_finds(lambda: Start(out / os.environ["RANK"], 6)) == Start(out / "0", 6)
     torch.distributed.barrier()
@@ -173,6 +193,16 @@ def test_two_ranks_equal_one_with_two_optimizers(name: str, pair: Path, tmp_path
     assert json.dumps([sorted(r) for r in rows[0]]) == json.dumps([sorted(r) for r in rows[1]])
     for row, other in zip(*rows, strict=True):
         assert other == pytest.approx(row, rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.timeout(240)
+def test_two_ranks_agree_on_the_step_of_a_signal(pair: Path) -> None:
+    first, second = (json.loads((pair / f"stops-{rank}.json").read_text()) for rank in range(2))
+    assert first == second
+    for step, signalled in zip(first, (2, 10, 18), strict=True):
+        assert signalled <= step <= -(-signalled // 7) * 7  # at the latest where the chunk ends
+    assert_equal(newest(pair / "whole"), newest(pair / "interrupted"))
+    assert read_metrics(pair / "whole") == read_metrics(pair / "interrupted")
 
 
 if __name__ == "__main__":
