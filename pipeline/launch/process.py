@@ -6,9 +6,31 @@ import os
 import sys
 from typing import NoReturn
 
+SAVED = 75
+"""Exit code of a run that a signal has ended with all its steps saved, whatever signal it was.
+
+The system's number for "try again later" (`EX_TEMPFAIL`): the same command goes on.
+"""
+
 
 class TeamError(Exception):
     """Another process of this run has stopped; the message is the backend's."""
+
+
+class Interrupted(BaseException):
+    """A signal came while a stage was trained: its last step is saved, and the same command goes on there.
+
+    No `Exception`, as Ctrl-C is none: nothing has failed.
+    """
+
+    def __init__(self, stage: str, step: int, steps: int, signal: str) -> None:
+        super().__init__(f"{signal}: {stage} is saved at step {step} of {steps}")
+        self.stage, self.step, self.steps, self.signal = stage, step, steps, signal
+
+    @property
+    def exit_code(self) -> int:
+        """`SAVED`; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise."""
+        return 0 if _started_by_lead() else SAVED
 
 
 def process_rank() -> int:
@@ -21,6 +43,10 @@ def process_rank() -> int:
     if srun_tasks() > 1:
         return int(os.environ["SLURM_PROCID"])
     return int(os.environ.get("NODE_RANK", 0)) + int(os.environ.get("LOCAL_RANK", 0))
+
+
+def _started_by_lead() -> bool:
+    return "RANK" not in os.environ and srun_tasks() == 1 and int(os.environ.get("LOCAL_RANK", 0)) > 0
 
 
 def srun_tasks() -> int:
