@@ -24,6 +24,7 @@ from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.json_output import AsJson, print_json
 from motionloom.pipeline.cli.launch import launch
 from motionloom.pipeline.cli.options import Device, ModelFolder, RunFolder, Sets
+from motionloom.pipeline.cli.replay import replay
 from motionloom.pipeline.cli.sweep import sweep
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
 from motionloom.pipeline.launch.process import TeamError, leave, process_rank
@@ -149,6 +150,7 @@ def run(
 
 app.command()(sweep)
 app.command()(launch)
+app.command()(replay)
 
 
 @app.command()
