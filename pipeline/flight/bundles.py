@@ -6,12 +6,14 @@ import platform
 import shlex
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import lightning as L
+import torch.distributed as dist
 from rich.markup import escape
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -47,7 +49,16 @@ class Bundles:
     accumulate: int
     steps: int
     """How many of the last steps a bundle lists."""
+    settle: Callable[[], None]
+    """Returns when the checkpoint that is being written is on disk."""
     watch: Watch | None = None
+
+    def wait(self, world: int) -> None:
+        """Let what is being written end, of the process that writes; all processes call it."""
+        with suppress(UserError, OSError):
+            self.settle()
+        if world > 1:
+            dist.barrier()
 
     def of_failure(
         self, trainer: L.Trainer, module: StageModule, failure: Failure, said: str

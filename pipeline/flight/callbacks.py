@@ -27,10 +27,12 @@ def flight_callbacks(
     on_not_finite: Literal["stop", "continue"],
     branched: bool,
     waits: Waiting | None = None,
+    settle: Callable[[], None] = lambda: None,
 ) -> list[Callback]:
     """What stands before all other callbacks of a training, the log of its figures among them.
 
     `waits` measures what the training waits for, where something does that closer than Lightning's hooks.
+    `settle` returns when the checkpoint that is being written is on disk.
     """
     own: list[Callback] = [OwnSettings()] if branched else []
     if context.watched_by:
@@ -44,7 +46,7 @@ def flight_callbacks(
         rows=hardware.flight_rows,
         steps=hardware.crash_steps,
     )
-    bundles = Bundles(context, train, batch_size, accumulate, hardware.crash_steps)
+    bundles = Bundles(context, train, batch_size, accumulate, hardware.crash_steps, settle)
     failures = NotFinite(context.name, context.console, stop=on_not_finite == "stop")
     own.append(FlightRecorder(settings, failures, bundles, context.console, waits))
     if hardware.profile:

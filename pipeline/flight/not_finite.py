@@ -45,6 +45,7 @@ class NotFinite:
             return
         self._over = True
         rank = list(codes).index(code)
+        bundles.wait(trainer.world_size)
         said: list[str | None] = [None]
         if rank == trainer.global_rank:
             assert failure is not None

@@ -142,9 +142,14 @@ class FlightRecorder(Callback):
         self._ended, self._idle = self._ended + pause, self._idle + pause
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Before the checkpoint: one is never made of a network that is lost."""
-        self._check(trainer, pl_module)
+        """Until the next chunk begins, a checkpoint is made."""
         self._paused = time.perf_counter()
+
+    def on_save_checkpoint(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """None is made of a network that is lost."""
+        self._check(trainer, pl_module)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Say how fast it was and what it waited for."""
