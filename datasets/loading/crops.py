@@ -106,7 +106,7 @@ class Crops:
 def places(
     spans: Sequence[CaptionSpan], at: NDArray[np.float64], most: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """First frame, length and whether it is whole, each [B], of spans cropped to `most` frames at `at` [B]."""
+    """First frame, length and whether it is whole, each [B], of spans cropped at `at` [B] to `most`."""
     whole = np.array([span.frames for span in spans], dtype=np.int64)
     length = np.minimum(whole, most)
     begin = np.array([span.first for span in spans], dtype=np.int64)

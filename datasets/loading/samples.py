@@ -1,4 +1,4 @@
-"""Which clips a batch is made of, said without reading their motion: for those who look for what went wrong."""
+"""Which clips a batch is made of, said without reading their motion."""
 
 from __future__ import annotations
 

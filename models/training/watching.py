@@ -1,4 +1,4 @@
-"""What looks on while a training steps, such as the flight recorder: it sees figures and gradients, changes none."""
+"""What looks on while a training steps, such as the flight recorder; it changes nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 
 class Watcher(Protocol):
-    """Called by a `StageModule` in every step. What it is given stays on its device: reading it waits for it."""
+    """Called by a `StageModule` in every step, with tensors on its device: reading one waits for it."""
 
     def figures(self, names: tuple[str, ...], values: Tensor) -> None:
         """The losses and metrics of one part of a step, float32 [len(names)], before its backward pass."""

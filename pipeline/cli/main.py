@@ -112,6 +112,17 @@ def run(
             help="Go on in this folder even where that replaces finished trainings, or another recipe's run.",
         ),
     ] = False,
+    from_checkpoint: Annotated[
+        str | None,
+        typer.Option(
+            "--from-checkpoint",
+            metavar="STEP",
+            help="With --only: branch off at a kept checkpoint (a step or a file) with other settings.",
+        ),
+    ] = None,
+    profile: Annotated[
+        int, typer.Option("--profile", metavar="STEPS", min=0, help="Profile so many steps of each training.")
+    ] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
@@ -145,6 +156,8 @@ def run(
         select=Selection(first, until, only, force),
         dry_run=dry_run,
         replace=replace,
+        from_checkpoint=from_checkpoint,
+        profile=profile,
         console=make_console(),
     )
 

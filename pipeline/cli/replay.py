@@ -23,8 +23,8 @@ def replay(
 ) -> None:
     """Repeat the step in which a training went wrong, from the checkpoint before it.
 
-    The same batches, draws and processes; the run is not touched. Prints the losses, the gradient norms of each
-    layer group, and whether it failed again. Exit code 1 if it did.
+    The same batches, draws and processes; the run is not touched. Prints the losses, the gradient norms of
+    each layer group, and whether it failed again. Exit code 1 if it did.
 
     Example: `motionloom replay runs/humantomato-tiny/stages/gpt/crash/step_00001234 --anomaly`
     """

@@ -33,7 +33,7 @@ RUNTIME: JsonDict = {"runtime": True}
 """Marks a config field that changes how a stage runs, not what it makes: it is not fingerprinted."""
 
 WHERE_SET: JsonDict = {"where_set": True}
-"""Marks a config field that is fingerprinted only where it is not None: stages without it stay what they were."""
+"""Marks a config field that is fingerprinted only where it is not None, as if there were none else."""
 
 GENERATOR = "generator"
 """What a stage gives that makes motion: `StageKind.generator`."""

@@ -1,1 +1,1 @@
-"""What a training notes of itself while it runs: flight recorder, crash bundles, replays, branches, profiles."""
+"""What a training notes of itself: flight recorder, crash bundles, replays, branches, profiles."""

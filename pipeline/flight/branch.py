@@ -1,4 +1,4 @@
-"""A training that branches off another one: it goes on from one of that one's checkpoints with other settings.
+"""A training that branches off another one: it goes on from a checkpoint of it with other settings.
 
 Lightning restores optimizers with the rates, betas and decays they were saved with. In a branch those of its
 own config hold from its first step on; moments, step counts and everything else are the checkpoint's.
@@ -14,7 +14,7 @@ import lightning as L
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import UserError
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.store.checkpoints import DamagedError, read_checkpoint
 
@@ -48,10 +48,8 @@ class OwnSettings(Callback):
             schedule._last_lr = [group["lr"] for group in schedule.optimizer.param_groups]
 
 
-def require_branch(
-    name: str, step: int, steps: int, checkpoint: Path | None, module: StageModule
-) -> None:
-    """Refuse a branch that has nothing to begin with, or whose network is another one than the checkpoint's."""
+def require_branch(name: str, step: int, steps: int, checkpoint: Path | None, module: StageModule) -> None:
+    """Refuse a branch that has nothing to begin with, or another network than the checkpoint's."""
     if checkpoint is None:
         raise UserError(
             f"stage {name} branches off at step {step} (train.branch) and no checkpoint of that training is "

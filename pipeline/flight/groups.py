@@ -1,4 +1,4 @@
-"""Norms by layer group: one for each child of the network a stage saves, one for each other network it trains."""
+"""Norms by layer group: each child of the network that a stage saves, and each other network it trains."""
 
 from __future__ import annotations
 

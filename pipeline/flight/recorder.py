@@ -1,4 +1,4 @@
-"""The flight recorder of a training: what each process notes of its steps, and the end of one that goes wrong.
+"""The flight recorder: what each process of a training notes of its steps, and the end of a lost one.
 
 Every ten steps, where the log waits for the device anyway, a row goes into `flight/rank_N.jsonl`: speed, what
 the process waited for, gradient and weight norms by layer group, memory, and which batches it has read. There
@@ -89,7 +89,8 @@ class FlightRecorder(Callback):
         """Look on, and go on with the log behind the checkpoint."""
         assert isinstance(pl_module, StageModule)
         scaled = getattr(trainer.precision_plugin, "scaler", None) is not None
-        self._watch = pl_module.watcher = Watch(pl_module, keep=self.settings.steps + LOG_EVERY, scaled=scaled)
+        keep = self.settings.steps + LOG_EVERY
+        self._watch = pl_module.watcher = Watch(pl_module, keep=keep, scaled=scaled)
         self.bundles.watch = self._watch
         self._step = self._first = trainer.global_step
         if self.settings.rows:

@@ -85,9 +85,10 @@ class Watch:
 
     @property
     def norms(self) -> dict[str, Tensor]:
-        """Gradient norms by layer group: of a row's last step, of a player that had no turn in it the latest."""
+        """Gradient norms by layer group: of a row's last step; of a player without a turn, the latest."""
         since = self.module.global_step - LOG_EVERY
-        return {name: norm for step, own in self._norms.values() if step > since for name, norm in own.items()}
+        recent = [own for step, own in self._norms.values() if step > since]
+        return {name: norm for own in recent for name, norm in own.items()}
 
     def collect(self) -> Failure | None:
         """Read what was kept; the first failure in it."""

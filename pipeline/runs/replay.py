@@ -1,7 +1,7 @@
 """`motionloom replay`: repeat the step that a crash bundle is about, from the checkpoint before it.
 
-The training runs as it ran, in as many processes, on the same batches and draws, in a folder of its own within
-the bundle; nothing of the run is touched.
+The training runs as it ran, in as many processes, on the same batches and draws, in a folder of its own
+within the bundle; nothing of the run is touched.
 """
 
 from __future__ import annotations
@@ -28,12 +28,11 @@ from motionloom.pipeline.stages.train_config import TrainConfig
 from motionloom.pipeline.store.crash import (
     CHECKPOINT,
     CrashRecord,
-    link_or_copy,
     read_batch,
     read_bundle,
     same_batch,
 )
-from motionloom.pipeline.store.files import remove_tree
+from motionloom.pipeline.store.files import link_or_copy, remove_tree
 from motionloom.pipeline.store.run_folder import require_run
 
 _SCRATCH = "replay"
@@ -94,7 +93,7 @@ def replay_crash(bundle: Path, *, anomaly: bool = False, console: Console | None
 
 
 def _stage_of(bundle: Path, record: CrashRecord) -> tuple[Path, Recipe, Stage]:
-    """The run of a bundle, its recipe on the hardware of the crash, and the stage, which must be as it was."""
+    """The run of a bundle, its recipe on the hardware of the crash, and the stage as it was."""
     run = bundle.resolve().parents[3]
     if record.fingerprint is None:
         raise UserError(f"{bundle}: of a training outside of a run, which `motionloom replay` cannot repeat")
@@ -110,8 +109,8 @@ def _stage_of(bundle: Path, record: CrashRecord) -> tuple[Path, Recipe, Stage]:
     now = next(row.fingerprint for row in make_plan(recipe, run) if row.stage.name == stage.name)
     if now != record.fingerprint:
         raise UserError(
-            f"{bundle}: stage {stage.name} of {run / 'recipe.yaml'} has other settings or inputs now than when "
-            f"it failed; put them back to replay it"
+            f"{bundle}: stage {stage.name} of {run / 'recipe.yaml'} has other settings or inputs now than "
+            f"when it failed; put them back to replay it"
         )
     return run, recipe, stage
 
@@ -136,7 +135,7 @@ def _say(
     if steps.lost:
         say(f"weights that were not finite before it: {', '.join(steps.lost)}", markup=False)
     if last:
-        say(_table("losses and metrics", {name: values for name, values in last.items()}))
+        say(_table("losses and metrics", last))
     if steps.norms:
         say(_table("gradient norms", {name: [norm] for name, norm in steps.norms.items()}))
     if steps.first_layers:
@@ -164,7 +163,7 @@ def _outcome(record: CrashRecord, steps: ReplaySteps, error: Exception | None) -
 def _equal(one: dict[str, list[float]], other: dict[str, list[float]]) -> bool:
     return one.keys() == other.keys() and all(
         len(one[name]) == len(other[name])
-        and all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(one[name], other[name], strict=True))
+        and all(a == b or (a != a and b != b) for a, b in zip(one[name], other[name], strict=True))
         for name in one
     )
 

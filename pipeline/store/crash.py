@@ -7,7 +7,6 @@ takes away. Nothing in it is pickled but the checkpoint, which is only read as w
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from motionloom.datasets.base.files import write_bytes
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.files import link_or_copy, write_json
 
 FOLDER = "crash"
 """Of a stage's folder."""
@@ -154,12 +153,3 @@ def _same(one: Tensor, other: Tensor) -> bool:
     if one.shape != other.shape or one.dtype != other.dtype:
         return False
     return torch.equal(one.reshape(-1).view(torch.uint8), other.reshape(-1).view(torch.uint8))
-
-
-def link_or_copy(path: Path, target: Path) -> None:
-    """The same file under a second name, or a copy where the file system has no links."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(path, target)
-    except OSError:
-        shutil.copy2(path, target)
