@@ -142,6 +142,8 @@ def run(
     if as_json:
         if not dry_run:
             raise UserError("--json is for the plan: give --dry-run too")
+        if from_checkpoint is not None:
+            raise UserError("--json shows the plan without a branch: leave --from-checkpoint out")
         from motionloom.pipeline.runs.plan_record import plan_record
 
         select = Selection(first, until, only, force)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
+from motionloom.models.training.players import PlayersModule
 from motionloom.models.training.stage_module import LOG_EVERY, StageModule
 from motionloom.pipeline.flight.groups import LayerGroups, read_norms
 
@@ -58,6 +59,8 @@ class Watch:
         self.recent: deque[tuple[int, dict[str, list[float]]]] = deque(maxlen=keep)
         """(step, figures of each of its parts), of steps that have been collected."""
         self._norms: dict[int, tuple[int, dict[str, Tensor]]] = {}
+        players = module.players() if isinstance(module, PlayersModule) else ()
+        self._players = {id(player.params()[0]): player for player in players}
         self._figures: list[tuple[int, tuple[str, ...], Tensor]] = []
         self._totals: list[tuple[int, Tensor]] = []
         self._broken: dict[str, Tensor] | None = None
@@ -75,17 +78,22 @@ class Watch:
             self._totals.append((step, norm))
         fails = self._broken is None and self._fails(step, norm)
         who = id(params[0]) if params else 0
-        # A player that never plays in the last step of a row is measured when it does.
-        due = self.module.ends_row or step - self._norms.get(who, (-LOG_EVERY, {}))[0] >= LOG_EVERY
-        if fails or due:
+        if fails or self._last_of_row(who):
             found = self.groups.gradient_norms(params)
             self._norms[who] = step, found
             if fails:
                 self._broken = found
 
+    def _last_of_row(self, who: int) -> bool:
+        """Whether these parameters are stepped for the last time in this row of the log."""
+        player, step = self._players.get(who), self.module.global_step
+        if player is None:
+            return self.module.ends_row
+        return not any(player.plays(later) for later in range(step + 1, step - step % LOG_EVERY + LOG_EVERY))
+
     @property
     def norms(self) -> dict[str, Tensor]:
-        """Gradient norms by layer group: of a row's last step; of a player without a turn, the latest."""
+        """Gradient norms by layer group, each of its last step in the row of the log that has just ended."""
         since = self.module.global_step - LOG_EVERY
         recent = [own for step, own in self._norms.values() if step > since]
         return {name: norm for own in recent for name, norm in own.items()}

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from toy_stages import register_toys
 from torch import Tensor, nn
 from torch.utils.data import Dataset
+from toy_stages import register_toys
 
 from motionloom.datasets.loading.samples import Sample
 from motionloom.models.training.stage_module import StageModule

@@ -1,4 +1,4 @@
-"""A training that branches off a kept checkpoint goes on with other settings, and its records say from where."""
+"""A training that branches off a kept checkpoint goes on with other settings; its records say so."""
 
 from __future__ import annotations
 
@@ -115,7 +115,11 @@ def test_what_cannot_be_branched_is_refused(trained: Path, tmp_path: Path) -> No
     for wanted, sets, said in (
         ("15", [], r"no checkpoint of that step: .*trained has 10, 20, 25, 30; train.keep_every keeps more"),
         ("10", ["toy.train.steps=10"], "toy.train.steps=20"),
-        ("10", ["toy.width=16"], r"another network .*encoder.0.weight is \[8, 6\] in the checkpoint and \[16, 6\]"),
+        (
+            "10",
+            ["toy.width=16"],
+            r"another network .*encoder.0.weight is \[8, 6\] in the checkpoint and \[16, 6\]",
+        ),
         ("nowhere.ckpt", [], "neither a step nor a checkpoint"),
     ):
         with pytest.raises(UserError, match=said):

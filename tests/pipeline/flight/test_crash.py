@@ -24,7 +24,7 @@ from motionloom.pipeline.store.checkpoints import read_checkpoint
 
 Call = Callable[..., Any]
 FAILS = 13
-"""Number of the batch: step 14, between the checkpoints of steps 10 and 15; the next row ends with step 20."""
+"""Number of the batch: of step 14, between the checkpoints of steps 10 and 15."""
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,8 @@ def test_an_error_in_a_step_before_the_first_checkpoint(call: Call, recipe: Path
     bundle = run / "stages/toy/crash/step_00000003"
     done = call("run", recipe, "-o", run, "--set", "toy.fails_at=2", "--set", "toy.failure=error")
     assert done.code == 1 and "ArithmeticError: the toy is broken" in done.err
-    said = f"stage toy: step 3 on rank 0 ended with ArithmeticError: the toy is broken; repeat that step with: {''}"
-    assert f"{said}motionloom replay {bundle}" in done.out
+    said = "stage toy: step 3 on rank 0 ended with ArithmeticError: the toy is broken; repeat that step with"
+    assert f"{said}: motionloom replay {bundle}" in done.out
     record = json.loads((bundle / "crash.json").read_text())
     assert record["kind"] == "exception" and "in losses" in record["traceback"]
     assert record["checkpoint"] is None and (bundle / "batch.safetensors").is_file()
