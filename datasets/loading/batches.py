@@ -20,7 +20,7 @@ from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.loading.crops import Crops, places
 from motionloom.datasets.loading.plan import BatchPlan
-from motionloom.datasets.loading.samples import Sample, listed
+from motionloom.datasets.loading.samples import BatchRow, listed
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
@@ -100,7 +100,7 @@ class WindowBatches(Dataset[MotionBatch]):
     def __len__(self) -> int:
         return ENDLESS
 
-    def samples(self, k: int) -> list[Sample]:
+    def samples(self, k: int) -> list[BatchRow]:
         """Which windows batch `k` holds."""
         clips, starts, length = self._windows(k)
         each = self.windows_per_clip
@@ -265,7 +265,7 @@ class CaptionBatches(Dataset[CaptionBatch]):
             reworded = self.rewordings, uniform(self.seed, _REWORD, turns, clips)
         return self.source.make(clips, spans, uniform(self.seed, _CROP, turns, clips), reworded)
 
-    def samples(self, k: int) -> list[Sample]:
+    def samples(self, k: int) -> list[BatchRow]:
         """Which stretches batch `k` holds."""
         turns, items = self.plan.local(k, self.rank, self.world)
         clips = self.source.clips[items]

@@ -21,7 +21,7 @@ from motionloom.datasets.loading.audio_statistics import AudioStats
 from motionloom.datasets.loading.batches import ENDLESS, MotionBatch
 from motionloom.datasets.loading.crops import Crops, places
 from motionloom.datasets.loading.modalities import KINDS, Balance, Drop, Kind, KindPlan, kinds_of
-from motionloom.datasets.loading.samples import Sample, listed
+from motionloom.datasets.loading.samples import BatchRow, listed
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
@@ -219,7 +219,7 @@ class ConditionBatches(Dataset[ConditionBatch]):
         kinds, spans = self._spans(turns, clips)
         return source.make(clips, kinds, spans, uniform(self.seed, _CROP, turns, clips))
 
-    def samples(self, k: int) -> list[Sample]:
+    def samples(self, k: int) -> list[BatchRow]:
         """Which stretches batch `k` holds."""
         turns, clips = self.plan.local(k, self.rank, self.world)
         _, spans = self._spans(turns, clips)

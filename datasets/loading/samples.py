@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Sample(NamedTuple):
+class BatchRow(NamedTuple):
     """A row of a training batch."""
 
     clip: str
@@ -22,7 +22,7 @@ class Sample(NamedTuple):
 
 def listed(
     ids: Sequence[str], clips: NDArray[np.int64], first: NDArray[np.int64], length: NDArray[np.int64]
-) -> list[Sample]:
+) -> list[BatchRow]:
     """Rows of a batch; all but `ids` are [B]."""
     rows = zip(clips.tolist(), first.tolist(), length.tolist(), strict=True)
-    return [Sample(ids[clip], begin, count) for clip, begin, count in rows]
+    return [BatchRow(ids[clip], begin, count) for clip, begin, count in rows]

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import lightning as L
 import torch
+import torch.distributed as dist
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
@@ -24,8 +25,10 @@ def gathered(trainer: L.Trainer, values: Sequence[float]) -> Tensor:
     own = torch.tensor(values, dtype=torch.float64)
     if trainer.world_size == 1:
         return own[None]
-    found = trainer.strategy.all_gather(own.to(trainer.strategy.root_device))
-    return found.cpu().reshape(trainer.world_size, -1)
+    own = own.to(trainer.strategy.root_device)
+    found = [torch.empty_like(own) for _ in range(trainer.world_size)]
+    dist.all_gather(found, own)
+    return torch.stack(found).cpu()
 
 
 def waited_in_steps(seconds: Tensor, rank: int) -> float:

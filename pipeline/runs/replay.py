@@ -21,6 +21,7 @@ from motionloom.pipeline.contract.stage import Shelf, Stage, StageContext
 from motionloom.pipeline.flight.replay import ReplayDone, ReplaySteps
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.graph import make_plan, perform, stage_inputs
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
@@ -148,6 +149,8 @@ def _say(
 
 
 def _outcome(record: CrashRecord, steps: ReplaySteps, error: Exception | None) -> tuple[bool, str]:
+    if isinstance(error, TeamError):
+        return True, ""  # it came in another process
     before = next((one.figures for one in record.steps if one.step == record.step), {})
     now = steps.figures.get(record.step, {})
     if record.kind == "exception":

@@ -26,7 +26,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.loading.plan import BatchPlan
-from motionloom.datasets.loading.samples import Sample
+from motionloom.datasets.loading.samples import BatchRow
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.order import Source
 from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences, stream_names
@@ -194,13 +194,13 @@ class TokenBatches(Dataset[dict[str, Any]]):
             **more,
         }
 
-    def samples(self, k: int) -> list[Sample]:
+    def samples(self, k: int) -> list[BatchRow]:
         """Which stretches batch `k` of a training holds."""
         turns, items = self._plan.local(k, self.rank, self.world)
         out = []
         for turn, item in zip(turns.tolist(), items.tolist(), strict=True):
             _, first, groups = self._drawn(item, turn)
-            out.append(Sample(self.ids[item] if self.ids else str(item), first, groups))
+            out.append(BatchRow(self.ids[item] if self.ids else str(item), first, groups))
         return out
 
     def _drawn(self, item: int, turn: int) -> tuple[TokenCaption, int, int]:

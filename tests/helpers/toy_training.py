@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 from toy_stages import register_toys
 
-from motionloom.datasets.loading.samples import Sample
+from motionloom.datasets.loading.samples import BatchRow
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.stage import Given
 from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
@@ -76,9 +76,9 @@ class ToyBatches(Dataset[dict[str, Tensor]]):
         broken = torch.full((len(rows),), fails and self.config.failure == "error")
         return {"motion": rows, "length": torch.full((len(rows),), 3), "broken": broken}
 
-    def samples(self, k: int) -> list[Sample]:
+    def samples(self, k: int) -> list[BatchRow]:
         """Rows by their numbers."""
-        return [Sample(f"clip{k}", row, 3) for row in self.rows]
+        return [BatchRow(f"clip{k}", row, 3) for row in self.rows]
 
 
 class ToyTraining(TrainedStage):
