@@ -18,8 +18,9 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.conditions import Condition, Conditions
-from motionloom.datasets.loading.crops import Crops
+from motionloom.datasets.loading.crops import Crops, places
 from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.loading.samples import BatchRow, listed
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
@@ -99,14 +100,25 @@ class WindowBatches(Dataset[MotionBatch]):
     def __len__(self) -> int:
         return ENDLESS
 
-    def __getitem__(self, k: int) -> MotionBatch:
+    def samples(self, k: int) -> list[BatchRow]:
+        """Which windows batch `k` holds."""
+        clips, starts, length = self._windows(k)
+        each = self.windows_per_clip
+        return listed(self.dataset.ids, np.repeat(clips, each), starts.ravel(), np.repeat(length, each))
+
+    def _windows(self, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Clips [n], first frames [n, windows_per_clip] and lengths [n] of batch `k`."""
         turns, items = self.plan.local(k, self.rank, self.world)
         clips = self.clips[items]
-        per_clip = self.windows_per_clip
         frames = self.dataset.frames[clips]
-        draws = uniform(self.seed, _WINDOW, turns[:, None], clips[:, None], np.arange(per_clip)[None])
+        numbers = np.arange(self.windows_per_clip)[None]
+        draws = uniform(self.seed, _WINDOW, turns[:, None], clips[:, None], numbers)
         starts = (draws * (np.maximum(frames - self.window, 0) + 1)[:, None]).astype(np.int64)
-        length = np.minimum(frames, self.window)
+        return clips, starts, np.minimum(frames, self.window)
+
+    def __getitem__(self, k: int) -> MotionBatch:
+        clips, starts, length = self._windows(k)
+        per_clip = self.windows_per_clip
         motion = np.empty((len(clips) * per_clip, self.window, self.crops.width), dtype=np.float32)
         present = self.dataset.present[clips]
         self.dataset.prefetch(clips.tolist(), ("motion.npy",))
@@ -247,15 +259,27 @@ class CaptionBatches(Dataset[CaptionBatch]):
         turns, items = self.plan.local(k, self.rank, self.world)
         clips = self.source.clips[items]
         self.source.prefetch(clips)
-        which = uniform(self.seed, _CAPTION, turns, clips)
-        spans = []
-        for clip, draw in zip(clips.tolist(), which, strict=True):
-            choices = self.source.captions(clip)
-            spans.append(choices[int(draw * len(choices))])
+        spans = self._spans(turns, clips)
         reworded = None
         if self.rewordings is not None:
             reworded = self.rewordings, uniform(self.seed, _REWORD, turns, clips)
         return self.source.make(clips, spans, uniform(self.seed, _CROP, turns, clips), reworded)
+
+    def samples(self, k: int) -> list[BatchRow]:
+        """Which stretches batch `k` holds."""
+        turns, items = self.plan.local(k, self.rank, self.world)
+        clips = self.source.clips[items]
+        crop = uniform(self.seed, _CROP, turns, clips)
+        begin, length, _ = places(self._spans(turns, clips), crop, self.source.max_frames)
+        return listed(self.source.dataset.ids, clips, begin, length)
+
+    def _spans(self, turns: NDArray[np.int64], clips: NDArray[np.int64]) -> list[CaptionSpan]:
+        """One caption of each clip."""
+        spans = []
+        for clip, draw in zip(clips.tolist(), uniform(self.seed, _CAPTION, turns, clips), strict=True):
+            choices = self.source.captions(clip)
+            spans.append(choices[int(draw * len(choices))])
+        return spans
 
 
 class EvalBatches(Dataset[CaptionBatch]):

@@ -19,8 +19,9 @@ from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.conditions import MODALITIES, Condition
 from motionloom.datasets.loading.audio_statistics import AudioStats
 from motionloom.datasets.loading.batches import ENDLESS, MotionBatch
-from motionloom.datasets.loading.crops import Crops
+from motionloom.datasets.loading.crops import Crops, places
 from motionloom.datasets.loading.modalities import KINDS, Balance, Drop, Kind, KindPlan, kinds_of
+from motionloom.datasets.loading.samples import BatchRow, listed
 from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
@@ -215,9 +216,23 @@ class ConditionBatches(Dataset[ConditionBatch]):
         turns, clips = self.plan.local(k, self.rank, self.world)
         source = self.source
         source.prefetch(clips)
-        kinds = self.drop.kinds(source.kinds[clips], uniform(self.seed, _DROP, turns, clips))
-        spans = source.spans(clips, kinds, uniform(self.seed, _CAPTION, turns, clips))
+        kinds, spans = self._spans(turns, clips)
         return source.make(clips, kinds, spans, uniform(self.seed, _CROP, turns, clips))
+
+    def samples(self, k: int) -> list[BatchRow]:
+        """Which stretches batch `k` holds."""
+        turns, clips = self.plan.local(k, self.rank, self.world)
+        _, spans = self._spans(turns, clips)
+        begin, length, _ = places(spans, uniform(self.seed, _CROP, turns, clips), self.source.max_frames)
+        return listed(self.source.dataset.ids, clips, begin, length)
+
+    def _spans(
+        self, turns: NDArray[np.int64], clips: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], list[CaptionSpan]]:
+        """Kind and stretch of each clip."""
+        source = self.source
+        kinds = self.drop.kinds(source.kinds[clips], uniform(self.seed, _DROP, turns, clips))
+        return kinds, source.spans(clips, kinds, uniform(self.seed, _CAPTION, turns, clips))
 
 
 class EvalConditionBatches(Dataset[ConditionBatch]):

@@ -87,16 +87,13 @@ class Crops:
         self, clips: NDArray[np.int64], spans: Sequence[CaptionSpan], at: NDArray[np.float64], most: int
     ) -> Cut:
         """The spans of `clips` [B]; one longer than `most` frames is cropped at `at` [B] in [0, 1)."""
-        whole = np.array([span.frames for span in spans], dtype=np.int64)
-        length = np.minimum(whole, most)
-        begin = np.array([span.first for span in spans], dtype=np.int64)
-        begin += (at * (whole - length + 1)).astype(np.int64)
+        begin, length, closed = places(spans, at, most)
         motion = np.empty((len(clips), padded_length(length), self.width), dtype=np.float32)
         bits = self.dataset.present[clips]
         for row, clip in enumerate(clips.tolist()):
             source = self.dataset.motion(clip)
             self.fill(motion[row], source, int(begin[row]), int(length[row]), int(bits[row]))
-        return Cut(motion, begin, length, length == whole, self.present[bits])
+        return Cut(motion, begin, length, closed, self.present[bits])
 
     def _repeated(self, length: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Mean and scale of `length` frames as one row; kept for the longest length asked for."""
@@ -104,6 +101,17 @@ class Crops:
         if len(self._mean_row) < size:
             self._mean_row, self._scale_row = np.tile(self._mean, length), np.tile(self._scale, length)
         return self._mean_row[:size], self._scale_row[:size]
+
+
+def places(
+    spans: Sequence[CaptionSpan], at: NDArray[np.float64], most: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """First frame, length and whether it is whole, each [B], of spans cropped at `at` [B] to `most`."""
+    whole = np.array([span.frames for span in spans], dtype=np.int64)
+    length = np.minimum(whole, most)
+    begin = np.array([span.first for span in spans], dtype=np.int64)
+    begin += (at * (whole - length + 1)).astype(np.int64)
+    return begin, length, length == whole
 
 
 def _runs(columns: NDArray[np.int64]) -> list[tuple[slice, slice]]:

@@ -11,6 +11,7 @@ every backward pass, and a player's pass reaches its own alone.
 
 from __future__ import annotations
 
+import time
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -153,7 +154,9 @@ class PlayersModule(StageModule):
     def _step(self, player: Player, turn: int, optimizer: Optimizer, scaler: GradScaler | None) -> bool:
         """A player's step with the gradients that it has; False if it has none."""
         params = self._trained[turn]
+        begin = time.perf_counter()
         mean_gradients(params)
+        self.waited += time.perf_counter() - begin
         if all(param.grad is None for param in params):
             return False
         step = self.global_step - player.start_step

@@ -18,6 +18,7 @@ from torch.distributed.tensor import DTensor
 from motionloom.models.training.distributed import alone
 from motionloom.models.training.optim import OptimConfig as OptimConfig
 from motionloom.models.training.sharding import sharded
+from motionloom.models.training.watching import Watcher
 
 LOG_EVERY = 10
 """Steps that a row of the log averages; averaging over ranks costs a collective each."""
@@ -49,6 +50,10 @@ class StageModule(L.LightningModule, ABC):
         """Names of the figures in the newest row of the log."""
         self.gauges: dict[str, float | Tensor] = {}
         """Learning rate and gradient norm of the step that the newest row of the log ends with."""
+        self.watcher: Watcher | None = None
+        """What looks on, if anything does."""
+        self.waited = 0.0
+        """Seconds that this process has waited for other ranks where it averages gradients itself."""
         self.fused = True
         """Whether the optimizer is one kernel. False for "16-mixed": a fused step also removes the scale of
         the gradients, and they could not be clipped before it."""
@@ -100,6 +105,8 @@ class StageModule(L.LightningModule, ABC):
         """Add figures of a step, or of a part of one, to the means of the next row."""
         names = tuple(values)
         figures = torch.stack([v.detach().float() for v in values.values()])
+        if self.watcher is not None:
+            self.watcher.figures(names, figures)
         if names in self._since:
             sums, count = self._since[names]
             self._since[names] = (sums + figures, count + 1)
@@ -156,12 +163,15 @@ class StageModule(L.LightningModule, ABC):
 
     def clip(self, params: list[nn.Parameter], largest: float | None) -> Tensor | None:
         """Clip by the norm of all gradients, if there is a largest one; the norm before, where a row ends."""
-        if largest:
-            norm = torch.nn.utils.clip_grad_norm_(params, largest)
-        elif self.ends_row:
+        norm = None
+        if largest or self.ends_row:
             norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
-        else:
+        if self.watcher is not None:
+            self.watcher.gradients(params, norm)
+        if norm is None:
             return None
+        if largest:
+            torch.nn.utils.clip_grads_with_norm_(params, largest, norm)
         if not self.ends_row:
             return None
         return norm.full_tensor() if isinstance(norm, DTensor) else norm

@@ -26,6 +26,7 @@ from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.json_output import AsJson, print_json
 from motionloom.pipeline.cli.launch import launch
 from motionloom.pipeline.cli.options import Device, ModelFolder, RunFolder, Sets
+from motionloom.pipeline.cli.replay import replay
 from motionloom.pipeline.cli.sweep import sweep
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
 from motionloom.pipeline.launch.process import Interrupted, TeamError, leave, process_rank
@@ -112,6 +113,17 @@ def run(
             help="Go on in this folder even where that replaces finished trainings, or another recipe's run.",
         ),
     ] = False,
+    from_checkpoint: Annotated[
+        str | None,
+        typer.Option(
+            "--from-checkpoint",
+            metavar="STEP",
+            help="With --only: branch off at a kept checkpoint (a step or a file) with other settings.",
+        ),
+    ] = None,
+    profile: Annotated[
+        int, typer.Option("--profile", metavar="STEPS", min=0, help="Profile so many steps of each training.")
+    ] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
@@ -131,6 +143,8 @@ def run(
     if as_json:
         if not dry_run:
             raise UserError("--json is for the plan: give --dry-run too")
+        if from_checkpoint is not None:
+            raise UserError("--json shows the plan without a branch: leave --from-checkpoint out")
         from motionloom.pipeline.runs.plan_record import plan_record
 
         select = Selection(first, until, only, force)
@@ -145,12 +159,15 @@ def run(
         select=Selection(first, until, only, force),
         dry_run=dry_run,
         replace=replace,
+        from_checkpoint=from_checkpoint,
+        profile=profile,
         console=make_console(),
     )
 
 
 app.command()(sweep)
 app.command()(launch)
+app.command()(replay)
 
 
 @app.command()

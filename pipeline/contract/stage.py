@@ -9,7 +9,7 @@ line (`registry.py`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,9 @@ CPU = torch.device("cpu")
 
 RUNTIME: JsonDict = {"runtime": True}
 """Marks a config field that changes how a stage runs, not what it makes: it is not fingerprinted."""
+
+WHERE_SET: JsonDict = {"where_set": True}
+"""Marks a config field that is fingerprinted only where it is not None, as if there were none else."""
 
 GENERATOR = "generator"
 """What a stage gives that makes motion: `StageKind.generator`."""
@@ -220,6 +223,8 @@ class StageContext:
     rank: int = 0
     world: int = 1
     """This process among those that share the stage's work."""
+    watched_by: Sequence[Any] = ()
+    """Lightning callbacks that stand in for a training's flight recorder: those of a replay."""
     again: RunState | None = None
     """How far the whole run is, where a stage is run outside of it (`motionloom report`); then inputs may be
     missing, and times may be shown. Within a run equal stages give equal outputs."""
@@ -377,5 +382,7 @@ def fingerprint_fields(config: BaseModel) -> dict[str, Any]:
         if isinstance(extra, dict) and extra.get("runtime"):
             continue
         value = getattr(config, name)
+        if isinstance(extra, dict) and extra.get("where_set") and value is None:
+            continue
         out[name] = fingerprint_fields(value) if isinstance(value, BaseModel) else value
     return out

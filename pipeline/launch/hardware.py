@@ -43,6 +43,12 @@ class Hardware(Config):
     """CPU threads per process; 0 leaves torch's choice."""
     loggers: tuple[LoggerName, ...] = ("tensorboard", "csv")
     """Where the figures of trainings go, besides `metrics.jsonl`; wandb, mlflow and trackio are extras."""
+    flight_rows: int = Field(1000, ge=0)
+    """Rows of each process's flight log, one every 10 steps; older ones are thinned out. 0: no log."""
+    crash_steps: int = Field(20, ge=1)
+    """Last steps whose samples and figures a crash bundle lists."""
+    profile: int = Field(0, ge=0)
+    """Steps of each training that torch's profiler looks at; 0 = none."""
 
     def resolved_accelerator(self) -> Literal["cpu", "gpu"]:
         """`auto` made concrete."""

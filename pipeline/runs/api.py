@@ -24,6 +24,7 @@ from motionloom.pipeline.inference.requests import caption_list, require_seed, r
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.runs.branch import bring_inputs, find_branch, require_same_network
 from motionloom.pipeline.runs.graph import (
     Selection,
     execute,
@@ -52,23 +53,42 @@ def run_recipe(
     select: Selection | None = None,
     dry_run: bool = False,
     replace: bool = False,
+    from_checkpoint: str | None = None,
+    profile: int = 0,
     console: Console | None = None,
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
+
+    `from_checkpoint` (a step, or a checkpoint's path) has the stage `select.only` branch off (`branch.py`);
+    `profile` steps of each training are profiled.
 
     Without `replace` a run is refused that would make anew what is finished and took long (`replace.py`), or
     that goes on in the folder of another recipe's run.
     """
     console = console or make_console()
-    loaded = load_recipe(recipe, overrides)
-    run = out or Path("runs") / loaded.name
+    loaded = load_recipe(recipe, [*overrides, f"hardware.profile={profile}"] if profile else overrides)
+    run, branch = out or Path("runs") / loaded.name, None
+    if from_checkpoint is not None:
+        branch = find_branch(loaded, recipe, run, select or Selection(), from_checkpoint)
+        loaded = branch.applied(loaded)
+        if waiting := bring_inputs(loaded, run, branch, console, dry_run=dry_run):
+            console.print(
+                f"{', '.join(waiting)} would be taken over from {branch.run}, then {branch.stage} would "
+                f"branch off at step {branch.point.step}",
+                soft_wrap=True,
+            )
+            return run
     try:
         plan = make_plan(loaded, run, select)
     except UserError:
         if dry_run:
             _say_estimate(loaded, console)  # it needs no data, the plan looks at them
         raise
+    if branch is not None:
+        plan = branch.planned(plan, run, replaces=replace or dry_run)
     todo = [row for row in plan if row.action in {"run", "resume"}]
+    if branch is not None and any(row.start for row in todo):
+        require_same_network(loaded, run, branch)
     if dry_run:
         _say_estimate(loaded, console, [row.stage for row in todo])
         console.print(plan_table(loaded, plan))

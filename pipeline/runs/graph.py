@@ -36,11 +36,12 @@ from motionloom.pipeline.contract.stage import (
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.runs.beginning import prepare_folder
 from motionloom.pipeline.runs.extend import extendable, extension
 from motionloom.pipeline.runs.outside import require_elsewhere
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
-from motionloom.pipeline.store.files import fingerprint_of, remove_tree, write_json
+from motionloom.pipeline.store.files import fingerprint_of, write_json
 from motionloom.pipeline.store.outside import identity_of, place_from
 from motionloom.pipeline.store.run_folder import stage_folder
 
@@ -75,6 +76,8 @@ class PlannedStage:
     """What a longer training would be compared with."""
     identities: Mapping[str, str] = field(default_factory=dict)
     """What its inputs from outside were when the plan was made."""
+    start: Path | None = None
+    """A checkpoint that a stage which begins anew begins with."""
 
 
 def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
@@ -347,13 +350,8 @@ def begin(run: Path, row: PlannedStage) -> None:
 
 
 def _prepare(folder: Path, row: PlannedStage) -> None:
-    """An empty folder, or the one a killed run left, marked with what is being made in it."""
-    if row.action == "run":
-        remove_tree(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "started.json", {"fingerprint": row.fingerprint, "extendable": row.extendable})
-    # A training that is made longer is not finished any more.
-    (folder / "artifact.json").unlink(missing_ok=True)
+    started = {"fingerprint": row.fingerprint, "extendable": row.extendable}
+    prepare_folder(folder, started, anew=row.action == "run", start=row.start)
 
 
 def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[PlannedStage]) -> Artifact:

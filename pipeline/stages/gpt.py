@@ -173,6 +173,7 @@ class GptStage(TrainedStage):
                 world,
                 training,
                 clips.sources,
+                ids=clips.ids,
                 latents=latents if config.aligned and config.prior != "tma" else None,
                 present=clips.present,
             )

@@ -38,6 +38,8 @@ class GptClips:
     present: PresentTokens | None
     """Which of their tokens were recorded; None when all were."""
     sources: tuple[Source, ...]
+    ids: tuple[str, ...]
+    """Their names."""
     uncaptioned: int
     """Clips that were left out because they have no caption."""
 
@@ -82,6 +84,7 @@ def gpt_clips(
         None if table.streams[bits].all() else PresentTokens(bits, table.streams, table.columns),
         # Weights count; the order of shards does not, as the tokens are all in memory.
         tuple(replace(source, shards=None) for source in dataset.sources(clips)),
+        tuple(dataset.ids[clip] for clip in clips.tolist()),
         int((usable & ~chosen).sum()),
     )
 

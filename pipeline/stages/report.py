@@ -45,6 +45,7 @@ from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.stages.report_drawings import draw_bars, draw_curves, draw_showings
 from motionloom.pipeline.stages.report_facts import add_run_facts, say_missing
+from motionloom.pipeline.stages.report_flight import draw_flights
 from motionloom.pipeline.store.run_state import RunState
 
 
@@ -103,6 +104,8 @@ class ReportStage(StageKind):
         draw_showings(page, shown)
         draw_curves(page, stages if state is None else _logged(stages, state))
         draw_bars(page, shown)
+        if state is not None:
+            draw_flights(page, state)
         add_run_facts(page, context)
         page.write(context.folder / "report.html")
 

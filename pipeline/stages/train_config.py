@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.contract.stage import RUNTIME, StageConfig
+from motionloom.pipeline.contract.stage import RUNTIME, WHERE_SET, StageConfig
 from motionloom.pipeline.launch.hardware import Hardware, require_loggers
 
 BatchSource = Callable[[int, int, int], Dataset[Any]]
@@ -21,6 +21,14 @@ BatchSource = Callable[[int, int, int], Dataset[Any]]
 
 EvalSource = Callable[[], Dataset[Any]]
 """Sized dataset of all validation batches: every process reads the same, so the figures depend on no rank."""
+
+
+class BranchPoint(Config):
+    """The checkpoint that a training branches off from."""
+
+    step: int = Field(ge=1)
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    """Of the file."""
 
 
 class TrainConfig(Config):
@@ -62,6 +70,12 @@ class TrainConfig(Config):
     """Also keep, for ever, each checkpoint whose step is a multiple of this; 0 keeps none of them."""
     validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
     """Steps between validations, rounded up to checkpoints; 0 turns them off."""
+
+    on_not_finite: Literal["stop", "continue"] = Field("stop", json_schema_extra=RUNTIME)
+    """What becomes of a training whose loss or gradient is not finite any more; a crash bundle is left
+    either way."""
+    branch: BranchPoint | None = Field(None, json_schema_extra=WHERE_SET)
+    """Set by `--from-checkpoint`: the training goes on from this checkpoint of another one."""
 
     def local_batch(self, world: int) -> int:
         """Items a process reads at once; the global batch must divide evenly."""

@@ -27,6 +27,8 @@ from motionloom.models.training.players import PlayersModule
 from motionloom.models.training.sharding import make_whole
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.stage import StageContext
+from motionloom.pipeline.flight.branch import require_branch
+from motionloom.pipeline.flight.callbacks import flight_callbacks
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import environment, lead_finds
@@ -54,6 +56,8 @@ def fit(
     if hardware.threads:
         torch.set_num_threads(hardware.threads)
     newest, chunk, longer = lead_finds(partial(_start, context, config))
+    if config.branch is not None:
+        require_branch(context.name, config.branch.step, config.steps, newest, module)
     waits, folder = Waits(), context.folder / "checkpoints"
     data = TrainingData(train, validation, config, chunk, hardware, waits)
     validate = max(1, -(-config.validate_every // chunk)) if config.validate_every and validation else None
@@ -90,6 +94,17 @@ def fit(
         use_distributed_sampler=False,
         callbacks=[
             checkpoints,  # first: what is being written ends before the loggers do
+            *flight_callbacks(
+                context,
+                train,
+                steps=config.steps,
+                batch_size=config.batch_size,
+                accumulate=config.accumulate,
+                on_not_finite=config.on_not_finite,
+                branched=config.branch is not None,
+                waits=waits,
+                settle=checkpoints.finish,
+            ),
             ResumeBetweenChunks(config, chunk, config.accumulate),
             log,
             StepProgress(context.name, config.steps, context.console, longer=longer),

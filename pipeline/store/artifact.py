@@ -22,7 +22,10 @@ from motionloom.pipeline.store.run_folder import stage_folder
 FILE_NAME = "artifact.json"
 
 # What no result depends on: a stage's own notes, and settings that a later run may change.
-_PRIVATE = {"checkpoints", "logs", "started.json", "timing.json", "reader.json", FILE_NAME}
+_PRIVATE = {
+    *("checkpoints", "logs", "flight", "crash", "started.json", "timing.json", "reader.json"),
+    FILE_NAME,
+}
 
 
 class OutputFile(Config):

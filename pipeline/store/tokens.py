@@ -10,7 +10,7 @@ never recorded: clips that lack nothing are marked (`whole`). Which codes of the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +26,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.loading.samples import BatchRow
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.order import Source
 from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences, stream_names
@@ -149,6 +150,8 @@ class TokenBatches(Dataset[dict[str, Any]]):
     training: bool = True
     sources: tuple[Source, ...] = ()
     """Data sets and their weights, when several are mixed."""
+    ids: Sequence[str] = ()
+    """Names of the clips, for people."""
     latents: Tensor | None = None
     """TMA's embeddings of the same captions [n, Z], for an alignment loss where `prior` is something else."""
     present: PresentTokens | None = None
@@ -172,11 +175,10 @@ class TokenBatches(Dataset[dict[str, Any]]):
             turns = np.zeros(len(items), dtype=np.int64)
         rows, sequences = [], []
         for item, turn in zip(items.tolist(), turns.tolist(), strict=True):
-            rng = np.random.default_rng([self.seed, turn, item])
-            choice = int(rng.integers(len(self.captions[item]))) if self.training else 0
-            caption = self.captions[item][choice]
+            caption, first, groups = self._drawn(item, turn)
             rows.append(caption.row)
-            sequences.append(self._sequence(item, caption, rng))
+            closed = groups == caption.end - caption.first
+            sequences.append(self._row(self.store.clip(item, first, groups), closed=closed))
         batch = pad_sequences(sequences)
         more = {} if self.latents is None else {"tma_text": self.latents[rows]}
         if self.present is not None:
@@ -192,14 +194,28 @@ class TokenBatches(Dataset[dict[str, Any]]):
             **more,
         }
 
-    def _sequence(self, item: int, caption: TokenCaption, rng: np.random.Generator) -> TokenSequence:
-        """One row; a stretch that is longer than the block gives a random part without its end."""
+    def samples(self, k: int) -> list[BatchRow]:
+        """Which stretches batch `k` of a training holds."""
+        turns, items = self._plan.local(k, self.rank, self.world)
+        out = []
+        for turn, item in zip(turns.tolist(), items.tolist(), strict=True):
+            _, first, groups = self._drawn(item, turn)
+            out.append(BatchRow(self.ids[item] if self.ids else str(item), first, groups))
+        return out
+
+    def _drawn(self, item: int, turn: int) -> tuple[TokenCaption, int, int]:
+        """A caption of a clip, and first group and length of the stretch it is about, or of a random part of
+        one that is longer than the block.
+        """
+        rng = np.random.default_rng([self.seed, turn, item])
+        choice = int(rng.integers(len(self.captions[item]))) if self.training else 0
+        caption = self.captions[item][choice]
         first, groups = caption.first, caption.end - caption.first
-        if groups <= self.max_groups:
-            return self._row(self.store.clip(item, first, groups), closed=True)
-        if self.training:
-            first += int(rng.integers(groups - self.max_groups + 1))
-        return self._row(self.store.clip(item, first, self.max_groups), closed=False)
+        if groups > self.max_groups:
+            if self.training:
+                first += int(rng.integers(groups - self.max_groups + 1))
+            groups = self.max_groups
+        return caption, first, groups
 
     def _row(self, codes: Codes, *, closed: bool) -> TokenSequence:
         batched = {name: row[None] for name, row in codes.items()}

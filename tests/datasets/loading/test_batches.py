@@ -286,3 +286,20 @@ def test_mistakes_are_named(train: ShardDataset, stats: FeatureStats, text: Text
     other = MotionLayout.named("body133", fps=30.0)
     with pytest.raises(UserError, match=r"feature statistics: holds layout body133 .exact, 30 fps"):
         WindowBatches(train, FeatureStats(stats.mean, stats.std, other), window=16, batch_size=8)
+
+
+def test_samples_say_which_frames_a_batch_holds(
+    train: ShardDataset, stats: FeatureStats, text: TextCache
+) -> None:
+    """Read again from the data set by what they say, they are the batch."""
+    windows = WindowBatches(
+        train, stats, window=32, batch_size=24, windows_per_clip=4, seed=3, rank=1, world=2
+    )
+    captions = CaptionBatches(train, stats, text, batch_size=12, max_frames=40, min_frames=8, seed=5)
+    for batches in (windows, captions):
+        for k in (0, 7):
+            batch, samples = batches[k], batches.samples(k)
+            assert [sample.length for sample in samples] == batch["length"].tolist()
+            for row, (clip, first, length) in zip(batch["motion"].numpy(), samples, strict=True):
+                frames = train.motion(train.ids.index(clip))[first : first + length]
+                assert np.allclose(stats.normalize(frames), row[:length], atol=1e-5)

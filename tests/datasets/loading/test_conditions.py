@@ -340,3 +340,14 @@ def test_mistakes_are_named(
         batches[0]
     with pytest.raises(UserError, match="of kind audio"):
         EvalConditionBatches(words, stats, text, heard, batch_size=4, max_frames=16, kinds=["audio"])
+
+
+def test_samples_say_which_frames_a_batch_holds(
+    data: ShardDataset, stats: FeatureStats, heard: AudioStats, text: TextCache
+) -> None:
+    batches = ConditionBatches(data, stats, text, heard, batch_size=20, max_frames=24, min_frames=16)
+    batch = batches[3]
+    for row, (clip, first, length) in zip(batch["motion"].numpy(), batches.samples(3), strict=True):
+        frames = data.motion(data.ids.index(clip))[first : first + length]
+        assert np.allclose(stats.normalize(frames), row[:length], atol=1e-5)
+    assert [sample.length for sample in batches.samples(3)] == batch["length"].tolist()

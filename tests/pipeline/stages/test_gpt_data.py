@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -192,3 +192,17 @@ def test_a_tokenizer_without_a_hand_stream_needs_hands(tmp_path: Path) -> None:
     bare = dataset_of(tmp_path / "bare", Convert([[ALL]] * 2, present=(2, 2)))
     with pytest.raises(UserError, match="holds all that the tokenizer models"):
         clips_of(bare, config=VqConfig(width=8, depth=1, code_dim=8, num_codes=8, part="bodyhand"))
+
+
+def test_samples_say_which_groups_a_batch_holds(tmp_path: Path) -> None:
+    clips, store, net = clips_of(dataset_of(tmp_path, Convert([[WALKS, SITS], [ALL]])))
+    batches = replace(batches_of(clips, net, most=10), ids=clips.ids)
+    for k in range(4):
+        batch, samples = batches[k], batches.samples(k)
+        ends = {s.name: s.num_codes for s in net.streams}
+        read = deinterleave(batch["tokens"], net.pattern, ends=ends)
+        assert [sample.length for sample in samples] == read.groups.tolist()
+        for row, (clip, first, count) in enumerate(samples):
+            own = store.clip(clips.ids.index(clip), first, count)
+            for stream in net.streams:
+                assert torch.equal(read.codes[stream.name][row, : count * stream.per_group], own[stream.name])

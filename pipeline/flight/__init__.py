@@ -1,0 +1,1 @@
+"""What a training notes of itself: flight recorder, crash bundles, replays, branches, profiles."""
