@@ -1,0 +1,217 @@
+"""A recipe on the SLURM of two nodes: launched by one command, and preempted while it trains."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from bvh_clips import write_clip, write_map
+from kill_matrix import PAUSE, RECORDS, rows_of
+from slurm_cluster import Cluster
+
+RECIPE = """
+name: preempted
+seed: 5
+hardware: {{accelerator: cpu, threads: 1, loggers: []}}
+stages:
+  data:
+    kind: bvh
+    source: {source}
+    joint_map: {source}/joint_map.json
+    captions: {source}/captions.jsonl
+    licence: CC0
+    fps: 20
+  stats: {{kind: stats}}
+  tokenizer:
+    kind: rvq
+    net: {{part: body, width: 32, depth: 1, code_dim: 16, num_codes: 32, levels: 2}}
+    train: {{steps: {steps}, batch_size: 8, checkpoint_every: 25, validate_every: 50}}
+  evaluate: {{kind: evaluate}}
+"""
+"""Conversion, training and evaluation; no stage wants a text encoder."""
+
+SPLITS = ("train", "train", "train", "train", "val", "test")
+GROUPS = ("1-data-features", "2-data-shards", "3-data", "4-train")
+"""What a launch makes of it."""
+
+ASKED = ("partition=main", "parts=2", "light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=1", "memory_gb_per_gpu=1")
+
+
+def write_recipe(folder: Path, steps: int) -> Path:
+    """The recipe, and twelve BVH files for it."""
+    source = folder / "mocap"
+    rows = []
+    for number in range(12):
+        write_clip(source / f"clip{number:02d}.bvh", number)
+        split = SPLITS[number % len(SPLITS)]
+        rows.append(json.dumps({"id": f"clip{number:02d}", "captions": ["a figure sways"], "split": split}))
+    write_map(source / "joint_map.json")
+    (source / "captions.jsonl").write_text("\n".join(rows))
+    recipe = folder / "preempted.yaml"
+    recipe.write_text(RECIPE.format(steps=steps, source=source.absolute()))
+    return recipe
+
+
+@dataclass
+class Launched:
+    """The jobs of a launch, and what their trainings leave."""
+
+    cluster: Cluster
+    ids: list[str]
+    records: Path
+    run: Path
+
+    @property
+    def training(self) -> str:
+        """The job that trains."""
+        return self.ids[-1]
+
+    def rows(self) -> list[tuple[int, dict[str, Any]]]:
+        """(rank, line) of every step so far, of all starts."""
+        return list(rows_of(self.records))
+
+    def states(self) -> list[str]:
+        """Of the jobs; those of an array are one word where they agree."""
+        shown = self.cluster.ask(
+            "squeue", "--noheader", "--states=all", "--format=%F %T", f"--jobs={','.join(self.ids)}"
+        )
+        found: dict[str, set[str]] = {}
+        for line in shown.splitlines():
+            job, state = line.split()
+            found.setdefault(job, set()).add(state)
+        return ["+".join(sorted(found.get(job, {""}))) for job in self.ids]
+
+    def job(self, key: str) -> str:
+        """A field of the training's job, as `scontrol show job` prints it."""
+        words = self.cluster.ask("scontrol", "show", "job", self.training).split()
+        return dict(word.partition("=")[::2] for word in words).get(key, "")
+
+    def logs(self) -> str:
+        """Output of all jobs."""
+        return "\n".join(path.read_text() for path in sorted(self.run.glob(".slurm/*/*.log")))
+
+    def wait_for_step(self, step: int, start: int, seconds: float = 180) -> None:
+        """Until rank 0 has trained `step` in the start of that number."""
+        self._until(
+            lambda: any(
+                rank == 0 and row["step"] >= step and row["start"] == start for rank, row in self.rows()
+            ),
+            f"step {step} of start {start}",
+            seconds,
+        )
+
+    def wait_for_end(self, seconds: float = 240) -> None:
+        """Until no job waits or runs."""
+        live = {"PENDING", "RUNNING", "COMPLETING", "CONFIGURING", "REQUEUED", ""}
+        self._until(lambda: not any(live & set(s.split("+")) for s in self.states()), "the end", seconds)
+
+    def _until(self, ready: Any, what: str, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while not ready():
+            if time.monotonic() > deadline:
+                raise AssertionError(f"{what} did not come: {self.states()}\n{self.logs()}")
+            time.sleep(0.1)
+
+
+def launch(cluster: Cluster, recipe: Path, run: Path, *, pause: float = 0.0) -> Launched:
+    """`motionloom launch` on both nodes; every step leaves a line beside the run folder."""
+    records = run.with_name(f"{run.name}-records")
+    records.mkdir(parents=True)
+    words = ["motionloom", "launch", str(recipe), "--engine", "slurm", "--nodes", "2", "--gpus-per-node", "0"]
+    words += ["--out", str(run), *(word for asked in ASKED for word in ("--cluster", asked))]
+    path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(Path(__file__).parent)]))
+    watched = {"MOTIONLOOM_STAGES": "watched_steps", RECORDS: str(records), PAUSE: str(pause)}
+    before = {job for job in _jobs(cluster)}
+    # The nodes' names are SLURM's own here and no host's.
+    meet = {"MASTER_ADDR": "127.0.0.1", "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    with _changed(watched | meet), _argv(words):
+        from motionloom.pipeline.cli.main import main as program
+
+        try:
+            program()
+        except SystemExit as end:
+            if end.code:
+                raise AssertionError(f"motionloom launch ended with {end.code}") from None
+    return Launched(cluster, sorted(_jobs(cluster) - before, key=int), records, run)
+
+
+def _jobs(cluster: Cluster) -> set[str]:
+    return set(cluster.ask("squeue", "--noheader", "--states=all", "--format=%F").split())
+
+
+@contextmanager
+def _changed(variables: dict[str, str]) -> Iterator[None]:
+    old = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in old.items():
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+
+
+@contextmanager
+def _argv(words: Sequence[str]) -> Iterator[None]:
+    old, sys.argv = sys.argv, list(words)
+    try:
+        yield
+    finally:
+        sys.argv = old
+
+
+@dataclass
+class Restart:
+    """One preemption of a training."""
+
+    preempted_at: int
+    """The last step that rank 0 had trained when the urgent job was submitted."""
+    last_step: int
+    """The last step that it trained before it stopped."""
+    first_step: int
+    """The first one after it came back."""
+    queued_seconds: float
+    """From its last step to its new start: its own end, the urgent job, SLURM's waiting."""
+    start_seconds: float
+    """From SLURM's start of the job (whole seconds) to the end of its first step."""
+
+
+def preempt(launched: Launched, start: int, after: int) -> None:
+    """Have an urgent job take both nodes once step `after` is trained in the start of that number."""
+    launched.wait_for_step(after, start)
+    launched.cluster.ask(
+        "sbatch", "--partition=urgent", "--nodes=2", "--ntasks-per-node=1", "--cpus-per-task=2",
+        "--output=/dev/null", "--wrap=sleep 1",
+    )  # fmt: skip
+
+
+def restarts(launched: Launched, starts: Sequence[datetime]) -> list[Restart]:
+    """What each preemption cost, by the lines of rank 0; `starts` are SLURM's own times."""
+    rows = [row for rank, row in launched.rows() if rank == 0]
+    found = []
+    for number in range(1, len(starts)):
+        before = [row for row in rows if row["start"] == number - 1]
+        first = next(row for row in rows if row["start"] == number)
+        begun = starts[number].timestamp()
+        found.append(
+            Restart(
+                preempted_at=0,
+                last_step=before[-1]["step"],
+                first_step=first["step"],
+                queued_seconds=round(begun - before[-1]["time"], 1),
+                start_seconds=round(first["time"] - begun, 1),
+            )
+        )
+    return found
+
+
+def started_at(launched: Launched) -> datetime:
+    """When SLURM started the training's job, this time."""
+    return datetime.fromisoformat(launched.job("StartTime"))
