@@ -8,7 +8,7 @@ bit. Codebooks draw by themselves, the same on every rank (`quantize/draws.py`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, TypedDict
 
 import lightning as L
 import torch
@@ -21,6 +21,18 @@ from motionloom.models.training.sharding import sharded
 
 LOG_EVERY = 10
 """Steps that a row of the log averages; averaging over ranks costs a collective each."""
+
+
+class Means(TypedDict):
+    """Figures that were averaged together."""
+
+    names: list[str]
+    sums: Tensor
+    count: int
+
+
+RowMeans = list[Means]
+"""What a rank has added to the means of the log's next row."""
 
 
 class StageModule(L.LightningModule, ABC):
@@ -81,7 +93,7 @@ class StageModule(L.LightningModule, ABC):
         return (self.global_step + 1) % LOG_EVERY == 0
 
     def on_train_epoch_start(self) -> None:
-        """Averages begin anew with a chunk, as they do in a run that goes on from its checkpoint."""
+        """Averages begin anew with a chunk; in the middle of one a run that goes on has those so far."""
         self._since = {}
 
     def average(self, values: dict[str, Tensor]) -> None:
@@ -93,6 +105,17 @@ class StageModule(L.LightningModule, ABC):
             self._since[names] = (sums + figures, count + 1)
         else:
             self._since[names] = (figures, 1)
+
+    def row_means(self) -> RowMeans:
+        """What was added since the last row."""
+        return [
+            {"names": list(names), "sums": sums.cpu(), "count": count}
+            for names, (sums, count) in self._since.items()
+        ]
+
+    def go_on_with_row(self, means: RowMeans) -> None:
+        """Begin with what was added before."""
+        self._since = {tuple(m["names"]): (m["sums"].to(self.device), m["count"]) for m in means}
 
     def log_row(self) -> None:
         """Where a row ends with this step: log the means of what was added since the last one."""

@@ -8,6 +8,7 @@ interrupted; 141 nobody reads the output any more. A bug shows its traceback and
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import traceback
 from importlib import metadata
@@ -26,7 +27,7 @@ from motionloom.pipeline.cli.launch import launch
 from motionloom.pipeline.cli.options import Device, ModelFolder, RunFolder, Sets
 from motionloom.pipeline.cli.sweep import sweep
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
-from motionloom.pipeline.launch.process import TeamError, leave, process_rank
+from motionloom.pipeline.launch.process import Interrupted, TeamError, leave, process_rank
 
 app = typer.Typer(
     name="motionloom",
@@ -339,6 +340,11 @@ def _exit_code() -> int:
     except BrokenPipeError:  # `motionloom info | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return _CLOSED_PIPE
+    except Interrupted as stop:
+        if process_rank() == 0:
+            command = shlex.join(["motionloom", *sys.argv[1:]])
+            errors.print(f"{stop}; the same command goes on: {command}", style="yellow", markup=False)
+        return stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
         code = _INTERRUPTED
     except Exception as error:

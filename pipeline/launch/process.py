@@ -11,6 +11,25 @@ class TeamError(Exception):
     """Another process of this run has stopped; the message is the backend's."""
 
 
+class Interrupted(BaseException):
+    """A signal came while a stage was trained: its last step is saved, and the same command goes on there.
+
+    No `Exception`, as Ctrl-C is none: nothing has failed.
+    """
+
+    def __init__(self, stage: str, step: int, steps: int, signal: str) -> None:
+        super().__init__(f"{signal}: {stage} is saved at step {step} of {steps}")
+        self.stage, self.step, self.steps, self.signal = stage, step, steps, signal
+
+    @property
+    def exit_code(self) -> int:
+        """75: the system's number for "try again later" (`EX_TEMPFAIL`), whatever signal it was.
+
+        0 in processes that Lightning's launcher started: it kills the lead where one of them ends otherwise.
+        """
+        return 0 if _started_by_lead() else 75
+
+
 def process_rank() -> int:
     """0 in the process that leads: the global rank as torchrun or SLURM states it, else as Lightning does.
 
@@ -21,6 +40,10 @@ def process_rank() -> int:
     if srun_tasks() > 1:
         return int(os.environ["SLURM_PROCID"])
     return int(os.environ.get("NODE_RANK", 0)) + int(os.environ.get("LOCAL_RANK", 0))
+
+
+def _started_by_lead() -> bool:
+    return "RANK" not in os.environ and srun_tasks() == 1 and int(os.environ.get("LOCAL_RANK", 0)) > 0
 
 
 def srun_tasks() -> int:

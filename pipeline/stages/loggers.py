@@ -50,12 +50,12 @@ class Loggers:
         if self._servers:
             self._waiting.append((int(row["step"]), row))
 
-    def save(self) -> None:
-        """Bring all up to a checkpoint."""
-        for _, row in self._waiting:
-            for logger in self._servers:
+    def save(self, step: int) -> None:
+        """Bring all up to the checkpoint of a step."""
+        for at, row in self._waiting:
+            for logger in self._servers if at <= step else ():
                 _log(logger, row)
-        self._waiting = []
+        self._waiting = [(at, row) for at, row in self._waiting if at > step]
         for logger in self._files:
             logger.save()
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -74,8 +76,8 @@ class StepProgress(Callback):
 class MetricLog(Callback):
     """`metrics.jsonl`: one row every 10 steps and one per validation; the loggers get the same rows.
 
-    Rows are kept in memory and in the checkpoint, and the file is rewritten at checkpoints, so after a kill
-    the log holds each step once. Loggers also get learning rates, gradient norms and the time of a step; the
+    Rows are in the checkpoint, and the file gets those of a checkpoint that is on disk, so after a kill the
+    log holds each step once. Loggers also get learning rates, gradient norms and the time of a step; the
     file is an output of the stage, and equal runs have equal ones.
     """
 
@@ -83,25 +85,34 @@ class MetricLog(Callback):
         self.path = folder / "metrics.jsonl"
         self.loggers = loggers
         self.rows: list[dict[str, float]] = []
-        self.gauges: list[dict[str, float]] = []
-        """What only the loggers get, for each row."""
+        self._texts: list[tuple[str, str]] = []
+        """Each row and what only the loggers get, as JSON: a checkpoint takes the text as it is."""
+        self._written = 0
+        """Rows in the file."""
         self._since = (0, 0.0)
 
     def state_dict(self) -> dict[str, Any]:
         """Rows so far, as text (plain types only in checkpoints)."""
-        return {"rows": json.dumps(self.rows), "gauges": json.dumps(self.gauges)}
+        rows, gauges = (", ".join(text[place] for text in self._texts) for place in range(2))
+        return {"rows": f"[{rows}]", "gauges": f"[{gauges}]"}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Rows up to the checkpoint."""
         self.rows = json.loads(state_dict["rows"])
-        self.gauges = json.loads(state_dict.get("gauges", "[]")) or [{} for _ in self.rows]
+        gauges = json.loads(state_dict.get("gauges", "[]")) or [{} for _ in self.rows]
+        self._texts = [
+            (json.dumps(row), json.dumps(more)) for row, more in zip(self.rows, gauges, strict=True)
+        ]
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Open the loggers with the rows up to the checkpoint."""
+        """Open the loggers and the file with the rows up to the checkpoint."""
         self._since = (trainer.global_step, time.monotonic())
         if trainer.is_global_zero:
-            rows = [row | more for row, more in zip(self.rows, self.gauges, strict=True)]
+            gauges = (json.loads(more) for _, more in self._texts)
+            rows = [row | more for row, more in zip(self.rows, gauges, strict=True)]
             self.loggers.open(trainer.global_step, rows)
+            if self.rows or self.path.is_file():
+                self._write()
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Validations and checkpoints do not count in the time of a step."""
@@ -125,14 +136,21 @@ class MetricLog(Callback):
         if not trainer.sanity_checking:
             self._take(trainer, [name for name in trainer.callback_metrics if name.startswith("val/")], {})
 
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Bring the file up to the checkpoint."""
-        self._write(trainer)
+    def saved(self, step: int) -> None:
+        """Bring the file up to a checkpoint that is on disk; only the lead has one."""
+        count = len(self.rows)
+        while count > self._written and self.rows[count - 1]["step"] > step:
+            count -= 1
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        _append(self.path, self._lines(self._written, count).encode())
+        self._written = count
+        self.loggers.save(step)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Bring the file up to the end."""
-        self._write(trainer)
+        """Write the file as a whole: an output is complete or absent."""
         if trainer.is_global_zero:
+            self._write()
+            self.loggers.save(trainer.global_step)
             self.loggers.close("success")
 
     def on_exception(
@@ -146,14 +164,25 @@ class MetricLog(Callback):
         values = {name: float(trainer.callback_metrics[name]) for name in names}
         if values:
             self.rows.append({"step": trainer.global_step, **values})
-            self.gauges.append(gauges)
+            self._texts.append((json.dumps(self.rows[-1]), json.dumps(gauges)))
             if trainer.is_global_zero:
                 self.loggers.take(self.rows[-1] | gauges)
 
-    def _write(self, trainer: L.Trainer) -> None:
-        if trainer.is_global_zero:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = self.path.with_name(".metrics.jsonl.tmp")
-            temporary.write_text("".join(json.dumps(row, sort_keys=True) + "\n" for row in self.rows))
-            temporary.replace(self.path)
-            self.loggers.save()
+    def _lines(self, first: int, last: int) -> str:
+        return "".join(json.dumps(row, sort_keys=True) + "\n" for row in self.rows[first:last])
+
+    def _write(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = self.path.with_name(".metrics.jsonl.tmp")
+        temporary.write_text(self._lines(0, len(self.rows)), encoding="utf-8")
+        temporary.replace(self.path)
+        self._written = len(self.rows)
+
+
+def _append(path: Path, lines: bytes) -> None:
+    """All of them or none, for whoever reads meanwhile."""
+    with path.open("ab", buffering=0) as file:
+        size = file.seek(0, 2)
+        if file.write(lines) != len(lines):
+            file.truncate(size)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))

@@ -56,6 +56,10 @@ class TrainConfig(Config):
     less memory, about a third more time, the same figures."""
     checkpoint_every: int = Field(100, ge=1, json_schema_extra=RUNTIME)
     """Steps between checkpoints; what a kill can cost."""
+    keep_checkpoints: int = Field(2, ge=2, json_schema_extra=RUNTIME)
+    """Newest checkpoints that are kept: the newest, and at least one more in case that is torn or damaged."""
+    keep_every: int = Field(0, ge=0, json_schema_extra=RUNTIME)
+    """Also keep, for ever, each checkpoint whose step is a multiple of this; 0 keeps none of them."""
     validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
     """Steps between validations, rounded up to checkpoints; 0 turns them off."""
 

@@ -1,24 +1,24 @@
 """One training run of a stage: Lightning's Trainer, the loader, checkpoints, logs, exact resume.
 
-A Lightning "epoch" is here a *chunk* of `checkpoint_every` steps. Checkpoints are written at chunk ends only,
-the batch of step k is a pure function of (seed, k) and every step seeds its own random draws, so a resumed
-run repeats the undisturbed one bit for bit and the loader's whole state is the step number.
+A Lightning "epoch" is here a *chunk* of `checkpoint_every` steps. Checkpoints are written at chunk ends and
+where a signal interrupts the training, the batch of step k is a pure function of (seed, k) and every step
+seeds its own random draws, so a resumed run repeats the undisturbed one bit for bit and the loader's whole
+state is the step number. Chunks end without a pause: the reader goes on over their borders, and checkpoints
+are written beside the training.
 """
 
 from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterator, Sized
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy, Strategy
-from torch.utils.data import DataLoader, Dataset, Sampler
 
 from motionloom.datasets.base.files import remove_temporaries
 from motionloom.models.layers.transformer import Transformer
@@ -30,27 +30,15 @@ from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import environment, lead_finds
+from motionloom.pipeline.stages.interruption import Interruption, Signals, leave_signals_alone
+from motionloom.pipeline.stages.loading import TrainingData
 from motionloom.pipeline.stages.loggers import Loggers
 from motionloom.pipeline.stages.progress import MetricLog, StepProgress
+from motionloom.pipeline.stages.saving import ROW, Checkpoints, ResumeBetweenChunks, SealedCheckpoints
 from motionloom.pipeline.stages.train_config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.store.checkpoints import SealedCheckpoints, readable
-
-_KEPT = 2
-"""Checkpoints kept: the newest, and one more in case that is torn or damaged."""
-
-
-class ChunkSampler(Sampler[int]):
-    """Batch numbers of one chunk, from the number that `start` tells when the chunk begins."""
-
-    def __init__(self, start: Callable[[], int], count: int) -> None:
-        self.start, self.count = start, count
-
-    def __iter__(self) -> Iterator[int]:
-        first = self.start()
-        return iter(range(first, first + self.count))
-
-    def __len__(self) -> int:
-        return self.count
+from motionloom.pipeline.stages.waits import Waits
+from motionloom.pipeline.store.background import BackgroundWriter, step_of
+from motionloom.pipeline.store.checkpoints import readable
 
 
 def fit(
@@ -66,26 +54,23 @@ def fit(
     if hardware.threads:
         torch.set_num_threads(hardware.threads)
     newest, chunk, longer = lead_finds(partial(_start, context, config))
-    data = _Data(train, validation, config, chunk, hardware)
-    checkpoints = ModelCheckpoint(
-        dirpath=context.folder / "checkpoints",
-        filename="{step:08d}",
-        monitor="step",
-        mode="max",
-        save_top_k=_KEPT,
-        save_on_train_epoch_end=True,
-        enable_version_counter=False,  # a torn file is written again under its own name
-    )
+    waits, folder = Waits(), context.folder / "checkpoints"
+    data = TrainingData(train, validation, config, chunk, hardware, waits)
     validate = max(1, -(-config.validate_every // chunk)) if config.validate_every and validation else None
     players = isinstance(module, PlayersModule)
     average = AveragedWeights(config.ema) if config.ema else None
     loggers = Loggers(hardware.loggers, context.folder, context.recipe, f"{context.recipe}/{context.name}")
+    log = MetricLog(context.folder, loggers)
+    since = step_of(newest) if newest else None
+    writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every, since=since)
+    checkpoints = Checkpoints(folder, writer, waits, log.saved)
+    signals = Signals()
     if hardware.resolved_accelerator() == "gpu":
         hardware.device()  # refuses in one sentence where there is no GPU
     launcher = environment()
     trainer = L.Trainer(
         default_root_dir=context.folder,
-        plugins=[SealedCheckpoints(), *([launcher] if launcher else [])],
+        plugins=[SealedCheckpoints(writer), *([launcher] if launcher else [])],
         accelerator=hardware.lightning_accelerator(),
         devices=hardware.resolved_devices(),
         num_nodes=hardware.nodes,
@@ -99,23 +84,27 @@ def fit(
         limit_val_batches=1.0 if validate else 0,
         num_sanity_val_steps=0,
         logger=False,
+        enable_checkpointing=False,  # Lightning's own; `Checkpoints` saves
         enable_progress_bar=False,
         enable_model_summary=False,
         use_distributed_sampler=False,
         callbacks=[
-            checkpoints,
-            ResumeBetweenChunks(config, chunk),
-            MetricLog(context.folder, loggers),
+            checkpoints,  # first: what is being written ends before the loggers do
+            ResumeBetweenChunks(config, chunk, config.accumulate),
+            log,
             StepProgress(context.name, config.steps, context.console, longer=longer),
             *([average] if average else []),
+            # Last: what all others do at the end of a step is in the checkpoint of an interruption.
+            Interruption(context.name, config.steps, chunk, config.accumulate, signals, checkpoints),
         ],
     )
+    leave_signals_alone(trainer)
     prepare_module(module, config)
     if config.compile:
         module.compile_losses()
     net = module.net
     try:
-        with warnings.catch_warnings():
+        with signals, warnings.catch_warnings():
             # Lightning compares steps with batches, and a step of players takes several.
             warnings.filterwarnings("ignore", ".*ended before the epoch ended.*")
             trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
@@ -123,20 +112,19 @@ def fit(
         raise KeyboardInterrupt from None
     except OSError as error:
         if error.errno is not None and error.filename is None:
-            error.filename = str(context.folder / "checkpoints")  # Lightning writes them without saying so
+            error.filename = str(folder)
         raise
     except RuntimeError as error:
         if "by peer" in str(error):  # how the backends report a connection that broke
             raise TeamError(str(error)) from None
         raise
+    finally:
+        data.close()
     if module.net is not net:  # the strategy has trained a sharded copy
         make_whole(module.net, net)
         module.net = net
     if average is not None:
         average.fill(net)
-    if trainer.is_global_zero:
-        for path in sorted((context.folder / "checkpoints").glob("*.ckpt"))[:-_KEPT]:
-            path.unlink()  # Lightning forgets the checkpoint that a killed run was resumed from
 
 
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
@@ -147,75 +135,6 @@ def prepare_module(module: StageModule, config: TrainConfig) -> None:
     for part in module.modules():
         if isinstance(part, Transformer):
             part.checkpointed = config.checkpoint_activations
-
-
-class ResumeBetweenChunks(Callback):
-    """Makes a resumed run begin the chunk behind its checkpoint.
-
-    Lightning would go back into the finished epoch and, where that did not end with a validation, train one
-    more batch in it: the steps of all later validations and checkpoints would move.
-
-    Keeps in the checkpoint how the training was cut into chunks, for `start_of`.
-    """
-
-    def __init__(self, config: TrainConfig, chunk: int) -> None:
-        self.steps, self.every, self.chunk = config.steps, config.checkpoint_every, chunk
-
-    def state_dict(self) -> dict[str, Any]:
-        """Length of the training, the interval that its config names, and the one in use."""
-        return {"steps": self.steps, "every": self.every, "chunk": self.chunk}
-
-    def on_load_checkpoint(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
-    ) -> None:
-        """Mark the epoch as over and no batch of the next as taken."""
-        loop = checkpoint["loops"]["fit_loop"]
-        for progress in (loop["epoch_progress"]["total"], loop["epoch_progress"]["current"]):
-            progress["completed"] = progress["processed"]
-        batches = loop["epoch_loop.batch_progress"]
-        batches["current"] = dict.fromkeys(batches["current"], 0)
-        batches["is_last_batch"] = False
-
-
-class _Data(L.LightningDataModule):
-    def __init__(
-        self,
-        train: BatchSource,
-        validation: EvalSource | None,
-        config: TrainConfig,
-        chunk: int,
-        hardware: Hardware,
-    ) -> None:
-        super().__init__()
-        self.train, self.validation = train, validation
-        self.config, self.chunk, self.hardware = config, chunk, hardware
-
-    def train_dataloader(self) -> DataLoader[Any]:
-        trainer = cast(L.Trainer, self.trainer)
-        micro = self.config.batch_size // self.config.accumulate
-        dataset = self.train(micro, trainer.global_rank, trainer.world_size)
-        parts = self.config.accumulate
-        sampler = ChunkSampler(lambda: trainer.global_step * parts, self.chunk * parts)
-        return _loader(dataset, sampler, self.hardware)
-
-    def val_dataloader(self) -> DataLoader[Any] | list[Any]:
-        if self.validation is None:
-            return []
-        dataset = self.validation()
-        return _loader(dataset, range(len(cast(Sized, dataset))), self.hardware)
-
-
-def _loader(dataset: Dataset[Any], sampler: Any, hardware: Hardware) -> DataLoader[Any]:
-    workers = hardware.workers
-    return DataLoader(
-        dataset,
-        batch_size=None,
-        sampler=sampler,
-        num_workers=workers,
-        pin_memory=hardware.resolved_accelerator() == "gpu",
-        persistent_workers=workers > 0,  # from chunk to chunk; their start takes seconds
-        multiprocessing_context="spawn" if workers else None,
-    )
 
 
 def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
@@ -260,8 +179,9 @@ def start_of(folder: Path, config: TrainConfig, say: Callable[[str], None] = war
     """Where a training with these checkpoints begins; `say` is given why any was passed over.
 
     It keeps the chunks that it began with as long as `checkpoint_every` is the same, also when `steps` has
-    been raised. Its last chunk may then have been cut short: it is trained again, so that the validations and
-    checkpoints of the longer training lie where they would have without a pause.
+    been raised, so that the validations and checkpoints of the longer training lie where they would have
+    without a pause. A checkpoint in the middle of a chunk that does not say how far the log's next row had
+    come (older versions wrote one where a training's last chunk was cut short) gives way to one at a border.
     """
     chunk = min(config.checkpoint_every, config.steps)
     short: Start | None = None
@@ -269,11 +189,11 @@ def start_of(folder: Path, config: TrainConfig, say: Callable[[str], None] = war
         state = checkpoint.get("callbacks", {}).get(ResumeBetweenChunks.__qualname__)
         if state is None:
             return Start(path, chunk)
-        longer = state["steps"] < config.steps
+        longer, step = state["steps"] < config.steps, checkpoint["global_step"]
         if state["every"] != config.checkpoint_every:
             return Start(path, chunk, longer)
         start = Start(path, state["chunk"], longer)
-        if checkpoint["global_step"] >= config.steps or checkpoint["global_step"] % state["chunk"] == 0:
+        if step >= config.steps or step % state["chunk"] == 0 or ROW in checkpoint:
             return start
         short = short or start
     return short or Start(None, chunk)

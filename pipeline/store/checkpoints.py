@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
 
 import torch
-from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
 from motionloom.datasets.base.files import HashingFile, atomic_file
 from motionloom.datasets.schema import UserError
@@ -39,18 +38,8 @@ class DamagedError(Exception):
     """A checkpoint that must not be used; the message is the reason."""
 
 
-class SealedCheckpoints(TorchCheckpointIO):
-    """Lightning's way to checkpoints, with our writer. `readable` verifies before Lightning loads."""
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
-    ) -> None:
-        """Write it sealed; only the lead is asked to."""
-        write_checkpoint(checkpoint, Path(path))
-
-
-def write_checkpoint(checkpoint: dict[str, Any], path: Path) -> None:
-    """Write `checkpoint` and its seal: hashed on the way, synced, then renamed into place.
+def write_checkpoint(checkpoint: dict[str, Any], path: Path) -> int:
+    """Write `checkpoint` and its seal: hashed on the way, synced, then renamed into place; the file's size.
 
     Raises:
         UserError: The file could not be written (a full disk, most often); nothing half-written stays.
@@ -64,15 +53,39 @@ def write_checkpoint(checkpoint: dict[str, Any], path: Path) -> None:
             finally:
                 failure = sink.failure
             file.write(b"\nmotionloom sha256 %s\n" % sink.hexdigest.encode())
+            return file.tell()
     except (OSError, RuntimeError) as error:
         # torch answers a failed write with an error about its own position in the file.
         cause = error if isinstance(error, OSError) else failure
         if cause is None:
             raise
-        raise UserError(
-            f"{path}: the checkpoint cannot be written ({cause.strerror or cause}); those before it are "
-            f"intact: make room, and start the same command again to go on from the newest"
-        ) from error
+        raise UserError(_unwritten(path, cause.strerror or str(cause))) from error
+
+
+def require_written(path: Path, size: int) -> None:
+    """Refuse a file that was written without an error and yet is not there with its length and its seal.
+
+    A network file system may lose what it has taken. The bytes between are compared before they are used.
+
+    Raises:
+        UserError: It is not there, or shorter, or ends in something else.
+    """
+    try:
+        with path.open("rb") as file:
+            sound = file.seek(0, 2) == size
+            file.seek(max(0, size - _SEAL_BYTES))
+            sound = sound and _SEAL.fullmatch(file.read()) is not None
+    except OSError as error:
+        raise UserError(_unwritten(path, error.strerror or str(error))) from error
+    if not sound:
+        raise UserError(_unwritten(path, "what was written is not there when it is read"))
+
+
+def _unwritten(path: Path, why: str) -> str:
+    return (
+        f"{path}: the checkpoint cannot be written ({why}); those before it are intact: make room, and start "
+        f"the same command again to go on from the newest"
+    )
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -108,7 +108,7 @@ def test_an_average_of_cut_weights_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("short", "every", "first"),
-    [(12, 6, 12), (16, 6, 12), (8, 6, 6)],  # whole chunks, and a last one that was cut short
+    [(12, 6, 12), (16, 6, 16), (8, 6, 8)],  # whole chunks, and a last one that was cut short
 )
 def test_longer_equals_long(short: int, every: int, first: int, tmp_path: Path) -> None:
     settings = {**FULL, "checkpoint_every": every, "validate_every": 6, "module": CONSTANT}
