@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -23,9 +22,9 @@ def sizes(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_size for path in sorted(folder.glob("*"))}
 
 
-@pytest.mark.parametrize("room", [0.02, 0.5, 0.98])
+@pytest.mark.parametrize("room", [0.0, 0.5, 1.5])
 def test_it_goes_on_bit_for_bit_once_there_is_room(room: float, tmp_path: Path) -> None:
-    """`room`: of a checkpoint, what the disk still takes when the second one is to be written."""
+    """`room`: what the disk still takes when the second checkpoint is to be written, in checkpoints."""
     settings = {"steps": STEPS, "checkpoint_every": EVERY}
     whole = train(tmp_path / "whole", **settings)
     checkpoint = max(sizes(tmp_path / "whole/checkpoints").values())
@@ -42,12 +41,13 @@ def test_it_goes_on_bit_for_bit_once_there_is_room(room: float, tmp_path: Path) 
         said = str(error) if isinstance(error, UserError) else sentence_of(error)
         assert "No space left on device" in said or "the disk is full" in said
         assert str(disk.folder) in said and "same command" in said
-        assert sizes(folder / "checkpoints") == before, "nothing half-written stays"
-        path, content = next(readable(folder / "checkpoints"))
-        assert path.name in before and content["global_step"] == EVERY
+        after = sizes(folder / "checkpoints")
+        assert before.items() <= after.items() and len(after) == (2 if room > 1 else 1)
+        said_of: list[str] = []
+        sound = {path.name for path, _ in readable(folder / "checkpoints", said_of.append)}
+        assert sound == set(after) and not said_of, "nothing half-written stays"
         disk.make_room()
         again = train(folder, **settings)
         for name, value in whole.state_dict().items():
             assert torch.equal(value, again.state_dict()[name]), name
         assert read_metrics(folder) == read_metrics(tmp_path / "whole")
-        assert os.statvfs(disk.folder).f_bavail > 0
