@@ -2,8 +2,7 @@
 
 One process imports everything once and forks each try, so a kill falls into the training and not into
 imports, and hundreds of them take minutes. A try is the command line, `motionloom run RECIPE --out RUN
---until STAGE`, in each of its ranks. The fork has two methods of the modules wrapped, so that every step
-leaves one line: a digest of the batch and the bits of every loss. The product knows nothing of it.
+--until STAGE`, in each of its ranks, whose every step leaves a line (`step_records.py`).
 
     python tests/helpers/kill_matrix.py REQUEST.json
 
@@ -25,17 +24,13 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-RECORDS = "KILL_MATRIX_RECORDS"
-"""Where the ranks of a try write their lines: a folder."""
-
-PAUSE = "KILL_MATRIX_PAUSE"
-"""Seconds that a step sleeps, for trainings that are to be met in the middle."""
+from step_records import RECORDS, rows_of, watch_steps
 
 PRELOADED = (
     "motionloom.pipeline.cli.main",
@@ -121,76 +116,6 @@ def read_seen(path: Path) -> Seen:
     return Seen(**{**content, "unequal": tuple(content["unequal"])})
 
 
-# ---- what the forked tries leave behind
-
-
-def watch_steps() -> None:
-    """Have every training step of this process and its forks leave a line in the folder that RECORDS names."""
-    from motionloom.models.training.players import PlayersModule
-    from motionloom.models.training.stage_module import StageModule
-
-    average = StageModule.average
-    figures: dict[str, str] = {}
-
-    def averaged(self: Any, values: Any) -> None:
-        figures.update({name: float(value.detach()).hex() for name, value in values.items()})
-        average(self, values)
-
-    def wrapped(step: Any) -> Any:
-        def training_step(self: Any, batch: Any, batch_idx: int) -> Any:
-            figures.clear()
-            taken, digest = int(self.global_step), _digest(batch)
-            out = step(self, batch, batch_idx)
-            time.sleep(float(os.environ.get(PAUSE, 0)))
-            start = int(os.environ.get("SLURM_RESTART_COUNT", 0))
-            row = {"step": taken, "start": start, "time": time.time(), "batch": digest}
-            _leave(self.global_rank, row | {"figures": dict(figures)})
-            return out
-
-        return training_step
-
-    StageModule.average = averaged  # type: ignore[method-assign]
-    for module in (StageModule, PlayersModule):
-        module.training_step = wrapped(module.training_step)  # type: ignore[method-assign]
-
-
-def _digest(batch: Any) -> str:
-    """sha256 of every tensor and every other value of a batch, by its place in it."""
-    import torch
-
-    found = hashlib.sha256()
-
-    def add(value: Any, where: str) -> None:
-        if isinstance(value, dict):
-            for name in sorted(value):
-                add(value[name], f"{where}.{name}")
-        elif isinstance(value, list | tuple):
-            for number, one in enumerate(value):
-                add(one, f"{where}.{number}")
-        elif dataclasses.is_dataclass(value):
-            add(vars(value), where)
-        else:
-            tensor = isinstance(value, torch.Tensor)
-            raw = value.detach().contiguous().numpy().tobytes() if tensor else repr(value).encode()
-            found.update(f"\n{where} {getattr(value, 'shape', '')}\n".encode() + raw)
-
-    add(batch, "")
-    return found.hexdigest()[:16]
-
-
-def _leave(rank: int, row: dict[str, Any]) -> None:
-    """One write, which SIGKILL cannot take back or tear."""
-    folder = os.environ[RECORDS]
-    handle = os.open(f"{folder}/{rank}.jsonl", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    try:
-        os.write(handle, json.dumps(row).encode() + b"\n")
-    finally:
-        os.close(handle)
-
-
-# ---- tries
-
-
 class Try:
     """The ranks of one start of a command, forked, in a process group of their own."""
 
@@ -200,7 +125,12 @@ class Try:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        job = {"WORLD_SIZE": ranks, "LOCAL_WORLD_SIZE": ranks, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+        job = {
+            "WORLD_SIZE": ranks,
+            "LOCAL_WORLD_SIZE": ranks,
+            "MASTER_ADDR": "127.0.0.1",
+            "MASTER_PORT": port,
+        }
         self.pids: list[int] = []
         for rank in range(ranks):
             place = {RECORDS: records}
@@ -215,7 +145,9 @@ class Try:
 
     def running(self) -> bool:
         """Whether no rank has ended."""
-        return all(os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None for pid in self.pids)
+        return all(
+            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None for pid in self.pids
+        )
 
     def wait(self) -> list[int]:
         """The ranks' exit codes, once all have ended."""
@@ -269,13 +201,6 @@ def _become(words: list[str], group: int, place: dict[str, str], log: Path) -> N
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
-
-
-def rows_of(records: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """(rank, line) of all that a try has left."""
-    for path in sorted(records.glob("*.jsonl")):
-        for line in path.read_text().splitlines():
-            yield int(path.stem), json.loads(line)
 
 
 def finished_files(stage: Path) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -14,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from bvh_clips import write_clip, write_map
-from kill_matrix import PAUSE, RECORDS, rows_of
+from kill_matrix import finished_files
 from slurm_cluster import Cluster
+from step_records import PAUSE, RECORDS, rows_of
 
 RECIPE = """
 name: preempted
@@ -39,10 +41,13 @@ stages:
 """Conversion, training and evaluation; no stage wants a text encoder."""
 
 SPLITS = ("train", "train", "train", "train", "val", "test")
+TRAINED = ("tokenizer", "evaluate")
+"""What is made anew under preemption."""
+
 GROUPS = ("1-data-features", "2-data-shards", "3-data", "4-train")
 """What a launch makes of it."""
 
-ASKED = ("partition=main", "parts=2", "light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=1", "memory_gb_per_gpu=1")
+ASKED = ("partition=main", "light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=1", "memory_gb_per_gpu=1")
 
 
 def write_recipe(folder: Path, steps: int) -> Path:
@@ -89,10 +94,10 @@ class Launched:
             found.setdefault(job, set()).add(state)
         return ["+".join(sorted(found.get(job, {""}))) for job in self.ids]
 
-    def job(self, key: str) -> str:
-        """A field of the training's job, as `scontrol show job` prints it."""
+    def started_at(self) -> datetime:
+        """When SLURM started the job that trains, this time."""
         words = self.cluster.ask("scontrol", "show", "job", self.training).split()
-        return dict(word.partition("=")[::2] for word in words).get(key, "")
+        return datetime.fromisoformat(dict(word.partition("=")[::2] for word in words)["StartTime"])
 
     def logs(self) -> str:
         """Output of all jobs."""
@@ -121,15 +126,19 @@ class Launched:
             time.sleep(0.1)
 
 
-def launch(cluster: Cluster, recipe: Path, run: Path, *, pause: float = 0.0) -> Launched:
+def launch(cluster: Cluster, recipe: Path, run: Path, *, parts: int = 2, pause: float = 0.0) -> Launched:
     """`motionloom launch` on both nodes; every step leaves a line beside the run folder."""
     records = run.with_name(f"{run.name}-records")
     records.mkdir(parents=True)
     words = ["motionloom", "launch", str(recipe), "--engine", "slurm", "--nodes", "2", "--gpus-per-node", "0"]
-    words += ["--out", str(run), *(word for asked in ASKED for word in ("--cluster", asked))]
+    words += [
+        "--out",
+        str(run),
+        *(word for asked in (*ASKED, f"parts={parts}") for word in ("--cluster", asked)),
+    ]
     path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(Path(__file__).parent)]))
     watched = {"MOTIONLOOM_STAGES": "watched_steps", RECORDS: str(records), PAUSE: str(pause)}
-    before = {job for job in _jobs(cluster)}
+    before = _jobs(cluster)
     # The nodes' names are SLURM's own here and no host's.
     meet = {"MASTER_ADDR": "127.0.0.1", "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     with _changed(watched | meet), _argv(words):
@@ -171,47 +180,83 @@ def _argv(words: Sequence[str]) -> Iterator[None]:
 class Restart:
     """One preemption of a training."""
 
-    preempted_at: int
-    """The last step that rank 0 had trained when the urgent job was submitted."""
     last_step: int
-    """The last step that it trained before it stopped."""
+    """The last step that rank 0 trained before it stopped."""
     first_step: int
     """The first one after it came back."""
     queued_seconds: float
-    """From its last step to its new start: its own end, the urgent job, SLURM's waiting."""
+    """From its last step to its new start: saving, the urgent job, SLURM's own waiting."""
     start_seconds: float
-    """From SLURM's start of the job (whole seconds) to the end of its first step."""
+    """From SLURM's start of the job, which is in whole seconds, to the end of its first step."""
 
 
-def preempt(launched: Launched, start: int, after: int) -> None:
-    """Have an urgent job take both nodes once step `after` is trained in the start of that number."""
-    launched.wait_for_step(after, start)
-    launched.cluster.ask(
-        "sbatch", "--partition=urgent", "--nodes=2", "--ntasks-per-node=1", "--cpus-per-task=2",
-        "--output=/dev/null", "--wrap=sleep 1",
-    )  # fmt: skip
+@dataclass
+class Preempted:
+    """A training that urgent jobs have preempted, beside the undisturbed one."""
+
+    restarts: list[Restart]
+    steps: int
+    repeated: int
+    """Steps that rank 0 has trained more than once."""
+    wrong: int
+    """Steps of all ranks with another batch or another bit in a figure."""
+    unequal: list[str]
+    """Files of the stages behind the data with other bytes."""
+
+    @property
+    def exact(self) -> bool:
+        """Nothing differs."""
+        return not (self.wrong or self.unequal)
 
 
-def restarts(launched: Launched, starts: Sequence[datetime]) -> list[Restart]:
-    """What each preemption cost, by the lines of rank 0; `starts` are SLURM's own times."""
-    rows = [row for rank, row in launched.rows() if rank == 0]
-    found = []
+def preempt(calm: Launched, recipe: Path, run: Path, after: Sequence[int]) -> Preempted:
+    """Train anew what `calm` has trained, and have an urgent job take both nodes behind each step of `after`.
+
+    SLURM takes some seconds to act, in which training goes on; a step takes a tenth of a second more here.
+    """
+    shutil.copytree(calm.run, run, ignore=shutil.ignore_patterns(".slurm"))
+    for name in TRAINED:
+        shutil.rmtree(run / "stages" / name)
+    launched = launch(calm.cluster, recipe, run, parts=1, pause=0.1)
+    starts = []
+    for number, step in enumerate(after):
+        launched.wait_for_step(step, number)
+        starts.append(launched.started_at())
+        launched.cluster.ask(
+            "sbatch", "--partition=urgent", "--nodes=2", "--ntasks-per-node=1", "--cpus-per-task=2",
+            "--output=/dev/null", "--wrap=sleep 1",
+        )  # fmt: skip
+    launched.wait_for_step(0, len(after))
+    starts.append(launched.started_at())
+    launched.wait_for_end()
+    if set(launched.states()) != {"COMPLETED"}:
+        raise AssertionError(f"{launched.states()}\n{launched.logs()}")
+    return _compared(calm, launched, starts)
+
+
+def _compared(calm: Launched, launched: Launched, starts: Sequence[datetime]) -> Preempted:
+    expected = {(rank, row["step"]): (row["batch"], row["figures"]) for rank, row in calm.rows()}
+    rows = launched.rows()
+    wrong = sum((row["batch"], row["figures"]) != expected[rank, row["step"]] for rank, row in rows)
+    mine = [row for rank, row in rows if rank == 0]
+    restarts = []
     for number in range(1, len(starts)):
-        before = [row for row in rows if row["start"] == number - 1]
-        first = next(row for row in rows if row["start"] == number)
+        last = [row for row in mine if row["start"] == number - 1][-1]
+        first = next(row for row in mine if row["start"] == number)
         begun = starts[number].timestamp()
-        found.append(
+        restarts.append(
             Restart(
-                preempted_at=0,
-                last_step=before[-1]["step"],
+                last_step=last["step"],
                 first_step=first["step"],
-                queued_seconds=round(begun - before[-1]["time"], 1),
+                queued_seconds=round(begun - last["time"], 1),
                 start_seconds=round(first["time"] - begun, 1),
             )
         )
-    return found
-
-
-def started_at(launched: Launched) -> datetime:
-    """When SLURM started the training's job, this time."""
-    return datetime.fromisoformat(launched.job("StartTime"))
+    steps = {row["step"] for row in mine}
+    unequal = []
+    for name in TRAINED:
+        ours, theirs = (finished_files(one.run / "stages" / name) for one in (launched, calm))
+        names = sorted(set(ours) | set(theirs))
+        unequal += [f"{name}/{file}" for file in names if ours.get(file) != theirs.get(file)]
+    missing = len({step for rank, step in expected if rank == 0} - steps)
+    return Preempted(restarts, len(steps), len(mine) - len(steps), wrong + missing, unequal)

@@ -10,8 +10,8 @@ import os
 import platform
 import shutil
 import subprocess
-from contextlib import ExitStack, contextmanager
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,8 +52,7 @@ def two_networks() -> Iterator[tuple[Node, Node]]:
     """Both nodes, and nothing of them afterwards."""
     mark = f"m{os.getpid() % 10**6}"
     first, second = (
-        Node(f"{mark}{side}", f"{mark}{side}", address)
-        for side, address in zip("ab", ADDRESSES, strict=True)
+        Node(f"{mark}{side}", f"{mark}{side}", address) for side, address in zip("ab", ADDRESSES, strict=True)
     )
     with ExitStack() as left:
         for node in (first, second):

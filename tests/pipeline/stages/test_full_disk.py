@@ -1,4 +1,4 @@
-"""A training on a file system that runs full: it says so, keeps what it has, and goes on once there is room."""
+"""A training whose disk runs full says so, keeps what it has, and goes on once there is room."""
 
 from __future__ import annotations
 

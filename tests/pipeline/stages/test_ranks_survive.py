@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from kill_matrix import RECORDS, Cell, Seen, copy_without, finished_files, rows_of, run_cells
+from kill_matrix import Cell, Seen, copy_without, finished_files, run_cells
 from preempted import write_recipe
 from rich.console import Console
+from step_records import RECORDS, rows_of
 from two_networks import two_networks, why_not
 
 from motionloom.pipeline.runs.api import run_recipe
@@ -61,7 +62,16 @@ def test_two_machines_train_the_same_as_one(tried: Tried, tmp_path: Path) -> Non
     copy_without(tried.base, run, "tokenizer")
     records.mkdir()
     python = (sys.executable, "-P", "-m")
-    program = (*python, "motionloom.pipeline.cli.main", "run", tried.recipe, "--out", run, "--until", "tokenizer")
+    program = (
+        *python,
+        "motionloom.pipeline.cli.main",
+        "run",
+        tried.recipe,
+        "--out",
+        run,
+        "--until",
+        "tokenizer",
+    )
     machines = ("--set", "hardware.nodes=2", "--set", "hardware.devices=1")
     often = ("--set", "tokenizer.train.checkpoint_every=5")
     path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(HELPERS)]))
@@ -71,7 +81,13 @@ def test_two_machines_train_the_same_as_one(tried: Tried, tmp_path: Path) -> Non
         meet += (f"--rdzv-endpoint={nodes[0].address}:29400",)
         ends = []
         for node in nodes:
-            launcher = (*python, "torch.distributed.run", *meet, f"--local-addr={node.address}", "--no-python")
+            launcher = (
+                *python,
+                "torch.distributed.run",
+                *meet,
+                f"--local-addr={node.address}",
+                "--no-python",
+            )
             ends.append(
                 subprocess.Popen(
                     node.words(*launcher, *program, *machines, *often),
