@@ -27,7 +27,7 @@ sys.path.append(str(ROOT / "tests/helpers"))  # the tests do the same on a small
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-from kill_matrix import Cell, read_seen, run_cells  # noqa: E402
+from kill_matrix import Cell, Seen, read_seen, run_cells  # noqa: E402
 from preempted import launch, preempt, write_recipe  # noqa: E402
 from slurm_cluster import Cluster, why_not  # noqa: E402
 
@@ -49,6 +49,7 @@ FAMILIES = {
 
 PREEMPTIONS = 5
 TEARS, FLIPS = 20, 100
+CHECKPOINT_DAMAGE = ("checkpoint, torn", "checkpoint, one bit flipped", "the same, by torch alone")
 
 
 class Asked(NamedTuple):
@@ -93,21 +94,37 @@ def kills(work: Path, asked: Asked) -> None:
 
 
 def kills_table(work: Path) -> list[str]:
-    """Rows of all cells that are done."""
+    """All cells that are done, and their sums."""
     rows = [
-        "| training | ranks | workers | kills | in a write | steps | trained twice | other samples "
-        "| other losses | files |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| training | 1 rank | 2 ranks | 1 rank, 2 workers | 2 ranks, 2 workers each |",
+        "|---|---|---|---|---|",
     ]
+    cells: list[Seen] = []
     for stage, (_, words) in FAMILIES.items():
-        for path in sorted((work / "kills").glob(f"{stage}-?-?.json")):
+        row = [words]
+        for ranks, workers in ((1, 0), (2, 0), (1, 2), (2, 2)):
+            path = work / "kills" / f"{stage}-{ranks}-{workers}.json"
+            if not path.exists():
+                row.append("not run")
+                continue
             seen = read_seen(path)
-            equal = "differs: " + ", ".join(seen.unequal) if seen.unequal else "equal"
-            rows.append(
-                f"| {words} | {seen.ranks} | {seen.workers} | {seen.kills} | {seen.in_a_write} "
-                f"| {seen.steps} | {seen.repeated} | {seen.wrong_samples} | {seen.wrong_losses} | {equal} |"
+            cells.append(seen)
+            row.append(
+                f"{seen.kills} ({seen.in_a_write}), {seen.repeated}" + ("" if seen.exact else " DIFFERS")
             )
-    return rows
+        rows.append(f"| {' | '.join(row)} |")
+    wrong = [
+        sum(getattr(seen, name) for seen in cells) for name in ("wrong_samples", "wrong_losses", "missing")
+    ]
+    trained = sum(seen.ranks * (seen.steps + seen.repeated) for seen in cells)
+    unequal = sum(len(seen.unequal) for seen in cells)
+    return [
+        *rows,
+        "",
+        f"{sum(seen.kills for seen in cells)} kills, {sum(seen.in_a_write for seen in cells)} of them into a "
+        f"half-written checkpoint. Of {trained:,} steps {wrong[0]} had other samples and {wrong[1]} other "
+        f"losses; {wrong[2]} steps are missing; {unequal} files differ.",
+    ]
 
 
 def preemption(work: Path, asked: Asked) -> None:
@@ -164,14 +181,14 @@ def damage(work: Path, asked: Asked) -> None:
 
 def _damaged_checkpoint(run: Path, folder: Path, rng: np.random.Generator) -> dict[str, int]:
     raw = max((run / "stages/gpt/checkpoints").glob("*.ckpt")).read_bytes()
-    path, found = folder / "step=00000001.ckpt", {"torn": 0, "flipped": 0, "flipped, by torch alone": 0}
+    path, found = folder / "step=00000001.ckpt", dict.fromkeys(CHECKPOINT_DAMAGE, 0)
     for size in np.linspace(0, len(raw) - 1, TEARS).astype(int):
         path.write_bytes(raw[:size])
-        found["torn"] += _refused(lambda: read_checkpoint(path), DamagedError)
+        found[CHECKPOINT_DAMAGE[0]] += _refused(lambda: read_checkpoint(path), DamagedError)
     for place in rng.integers(len(raw), size=FLIPS):
         path.write_bytes(_flipped(raw, place, rng))
-        found["flipped"] += _refused(lambda: read_checkpoint(path), DamagedError)
-        found["flipped, by torch alone"] += _refused(lambda: torch.load(path, weights_only=True), Exception)
+        found[CHECKPOINT_DAMAGE[1]] += _refused(lambda: read_checkpoint(path), DamagedError)
+        found[CHECKPOINT_DAMAGE[2]] += _refused(lambda: torch.load(path, weights_only=True), Exception)
     return found
 
 
@@ -183,9 +200,13 @@ def _damaged_shard(run: Path, folder: Path, rng: np.random.Generator) -> dict[st
     raw = path.read_bytes()
     streamed = Reading(mode="streamed", order="streamed")
     ways: dict[str, Callable[[], object]] = {
-        "shard, when it becomes a stage": lambda: ShardDataset.open(folder, "train", verify=True),
-        "shard, streamed": lambda: _read(ShardDataset.open(folder, "train", reading=streamed)),
-        "shard, indexed": lambda: _read(ShardDataset.open(folder, "train")),
+        "shard, one bit flipped: opened with `verify`": lambda: ShardDataset.open(
+            folder, "train", verify=True
+        ),
+        "the same, by the streamed reader": lambda: _read(
+            ShardDataset.open(folder, "train", reading=streamed)
+        ),
+        "the same, by the indexed reader": lambda: _read(ShardDataset.open(folder, "train")),
     }
     found = dict.fromkeys(ways, 0)
     for place in rng.integers(len(raw), size=FLIPS):
@@ -220,7 +241,9 @@ def damage_table(work: Path) -> list[str]:
         return ["not run"]
     found = json.loads((work / "damage.json").read_text())
     rows = ["| damage | noticed |", "|---|---|"]
-    return rows + [f"| {name} | {n} of {TEARS if name == 'torn' else FLIPS} |" for name, n in found.items()]
+    return rows + [
+        f"| {name} | {n} of {TEARS if name == CHECKPOINT_DAMAGE[0] else FLIPS} |" for name, n in found.items()
+    ]
 
 
 PARTS: dict[str, Callable[[Path, Asked], None]] = {"damage": damage, "preemption": preemption, "kills": kills}
