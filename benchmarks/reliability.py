@@ -1,0 +1,274 @@
+"""What a training survives, measured: kills at random moments, preemption on SLURM, damaged files.
+
+    python benchmarks/reliability.py WORK [--parts kills,preemption,...] [--kills 20] [--cells '*-1-0']
+
+Every part leaves what it has seen as JSON in WORK; started again, the command does what is missing, then
+prints all of it as the tables of docs/reliability.md. A SLURM of two nodes needs root and slurm-wlm; without
+them that part says so and is left out. The trainings are those of
+`benchmarks/reliability/*.yaml`: 60 steps each, a checkpoint every third.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "tests/helpers"))  # the tests do the same on a smaller scale
+
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from kill_matrix import Cell, Seen, read_seen, run_cells  # noqa: E402
+from preempted import launch, preempt, write_recipe  # noqa: E402
+from slurm_cluster import Cluster, why_not  # noqa: E402
+
+from motionloom.datasets.schema import UserError  # noqa: E402
+from motionloom.datasets.shards.reader import ShardDataset  # noqa: E402
+from motionloom.datasets.shards.reading import Reading  # noqa: E402
+from motionloom.pipeline.store.checkpoints import DamagedError, read_checkpoint  # noqa: E402
+
+RECIPES = ROOT / "benchmarks/reliability"
+FAMILIES = {
+    "tokenizer": ("humantomato", "tokenizer (H2VQ, codebooks that reset)"),
+    "tma": ("humantomato", "TMA (contrastive, latent draws)"),
+    "gpt": ("humantomato", "GPT"),
+    "face_diffusion": ("humantomato", "diffusion"),
+    "utt": ("ude", "UTT and its critic (two optimizers)"),
+    "dmd": ("ude", "DMD"),
+}
+"""Stage: (recipe, what it stands for)."""
+
+PREEMPTIONS = 5
+TEARS, FLIPS = 20, 100
+CHECKPOINT_DAMAGE = ("checkpoint, torn", "checkpoint, one bit flipped", "the same, by torch alone")
+
+
+class Asked(NamedTuple):
+    """Of the matrix of kills."""
+
+    kills: int
+    """SIGKILLs in each cell."""
+    cells: str
+    """Pattern of the cells' names, which are STAGE-RANKS-WORKERS."""
+
+
+def base_run(recipe: str, work: Path) -> Path:
+    """A finished run of a recipe; the stage under test is taken out of copies of it."""
+    run = work / f"base-{recipe}"
+    words = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "run"]
+    with (work / f"base-{recipe}.log").open("a") as log:
+        words += [str(RECIPES / f"{recipe}.yaml"), "--out", str(run)]
+        subprocess.run(words, check=True, stdout=log, stderr=log)
+    return run
+
+
+def kills(work: Path, asked: Asked) -> None:
+    """SIGKILL at random moments: every family of trainings, loader workers 0 and 2, ranks 1 and 2."""
+    folder = work / "kills"
+    folder.mkdir(parents=True, exist_ok=True)
+    bases = {recipe: base_run(recipe, folder) for recipe, _ in FAMILIES.values()}
+    cells = [
+        Cell(
+            name=f"{stage}-{ranks}-{workers}",
+            recipe=str(RECIPES / f"{recipe}.yaml"),
+            base=str(bases[recipe]),
+            stage=stage,
+            ranks=ranks,
+            workers=workers,
+            kills=asked.kills,
+        )
+        for workers in (0, 2)
+        for ranks in (1, 2)
+        for stage, (recipe, _) in FAMILIES.items()
+    ]
+    run_cells([cell for cell in cells if fnmatch(cell.name, asked.cells)], folder)
+
+
+def kills_table(work: Path) -> list[str]:
+    """All cells that are done, and their sums."""
+    rows = [
+        "| training | 1 rank | 2 ranks | 1 rank, 2 workers | 2 ranks, 2 workers each |",
+        "|---|---|---|---|---|",
+    ]
+    cells: list[Seen] = []
+    for stage, (_, words) in FAMILIES.items():
+        row = [words]
+        for ranks, workers in ((1, 0), (2, 0), (1, 2), (2, 2)):
+            path = work / "kills" / f"{stage}-{ranks}-{workers}.json"
+            if not path.exists():
+                row.append("not run")
+                continue
+            seen = read_seen(path)
+            cells.append(seen)
+            row.append(
+                f"{seen.kills} ({seen.in_a_write}), {seen.repeated}" + ("" if seen.exact else " DIFFERS")
+            )
+        rows.append(f"| {' | '.join(row)} |")
+    wrong = [
+        sum(getattr(seen, name) for seen in cells) for name in ("wrong_samples", "wrong_losses", "missing")
+    ]
+    trained = sum(seen.ranks * (seen.steps + seen.repeated) for seen in cells)
+    unequal = sum(len(seen.unequal) for seen in cells)
+    return [
+        *rows,
+        "",
+        f"{sum(seen.kills for seen in cells)} kills, {sum(seen.in_a_write for seen in cells)} of them into a "
+        f"half-written checkpoint. Of {trained:,} steps {wrong[0]} had other samples and {wrong[1]} other "
+        f"losses; {wrong[2]} steps are missing; {unequal} files differ.",
+    ]
+
+
+def preemption(work: Path, asked: Asked) -> None:
+    """Five urgent jobs on a SLURM of two nodes."""
+    out = work / "preemption.json"
+    if out.exists():
+        return
+    if why_not():
+        print(f"preemption: {why_not()}", file=sys.stderr)
+        return
+    work.mkdir(parents=True, exist_ok=True)
+    after = range(5, 5 + 45 * PREEMPTIONS, 45)
+    with tempfile.TemporaryDirectory(dir=work) as folder, Cluster() as cluster:
+        os.environ.update(cluster.environment)
+        recipe = write_recipe(Path(folder), 45 * PREEMPTIONS + 30)
+        calm = launch(cluster, recipe, Path(folder) / "calm")
+        calm.wait_for_end(600)
+        seen = preempt(calm, recipe, Path(folder) / "preempted", after)
+    out.write_text(json.dumps(dataclasses.asdict(seen)))
+
+
+def preemption_table(work: Path) -> list[str]:
+    """A row for each preemption."""
+    if not (work / "preemption.json").exists():
+        return ["not run"]
+    seen = json.loads((work / "preemption.json").read_text())
+    rows = [
+        "| preemption | last step before | first step after | until SLURM's new start, s "
+        "| from there to the first step, s |",
+        "|---|---|---|---|---|",
+    ]
+    for number, one in enumerate(seen["restarts"], 1):
+        rows.append(f"| {number} | {' | '.join(str(value) for value in one.values())} |")
+    equal = "equal" if not seen["unequal"] else f"differ: {seen['unequal']}"
+    rows += [
+        "",
+        f"{seen['steps']} steps, {seen['repeated']} trained twice, {seen['wrong']} with another sample or "
+        f"loss; files {equal}.",
+    ]
+    return rows
+
+
+def damage(work: Path, asked: Asked) -> None:
+    """Cut and flip a checkpoint and a shard, and count who notices."""
+    out = work / "damage.json"
+    if out.exists():
+        return
+    run = base_run("humantomato", work / "kills")
+    rng = np.random.default_rng(0)
+    with tempfile.TemporaryDirectory(dir=work) as folder:
+        found = _damaged_checkpoint(run, Path(folder), rng) | _damaged_shard(run, Path(folder), rng)
+    out.write_text(json.dumps(found))
+
+
+def _damaged_checkpoint(run: Path, folder: Path, rng: np.random.Generator) -> dict[str, int]:
+    raw = max((run / "stages/gpt/checkpoints").glob("*.ckpt")).read_bytes()
+    path, found = folder / "step=00000001.ckpt", dict.fromkeys(CHECKPOINT_DAMAGE, 0)
+    for size in np.linspace(0, len(raw) - 1, TEARS).astype(int):
+        path.write_bytes(raw[:size])
+        found[CHECKPOINT_DAMAGE[0]] += _refused(lambda: read_checkpoint(path), DamagedError)
+    for place in rng.integers(len(raw), size=FLIPS):
+        path.write_bytes(_flipped(raw, place, rng))
+        found[CHECKPOINT_DAMAGE[1]] += _refused(lambda: read_checkpoint(path), DamagedError)
+        found[CHECKPOINT_DAMAGE[2]] += _refused(lambda: torch.load(path, weights_only=True), Exception)
+    return found
+
+
+def _damaged_shard(run: Path, folder: Path, rng: np.random.Generator) -> dict[str, int]:
+    shards = run / "stages/data/shards"
+    for path in shards.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    path = next(folder.glob("*-train-*.tar"))
+    raw = path.read_bytes()
+    streamed = Reading(mode="streamed", order="streamed")
+    ways: dict[str, Callable[[], object]] = {
+        "shard, one bit flipped: opened with `verify`": lambda: ShardDataset.open(
+            folder, "train", verify=True
+        ),
+        "the same, by the streamed reader": lambda: _read(
+            ShardDataset.open(folder, "train", reading=streamed)
+        ),
+        "the same, by the indexed reader": lambda: _read(ShardDataset.open(folder, "train")),
+    }
+    found = dict.fromkeys(ways, 0)
+    for place in rng.integers(len(raw), size=FLIPS):
+        path.write_bytes(_flipped(raw, place, rng))
+        for name, way in ways.items():
+            found[name] += _refused(way, UserError)
+    return found
+
+
+def _read(data: ShardDataset) -> None:
+    for clip in range(len(data)):
+        data.motion(clip), data.meta(clip), data.texts(clip)
+
+
+def _flipped(raw: bytes, place: int, rng: np.random.Generator) -> bytes:
+    out = bytearray(raw)
+    out[place] ^= 1 << int(rng.integers(8))
+    return bytes(out)
+
+
+def _refused(read: Callable[[], object], error: type[Exception]) -> bool:
+    try:
+        read()
+    except error:
+        return True
+    return False
+
+
+def damage_table(work: Path) -> list[str]:
+    """How many of the damaged files were noticed, by whom."""
+    if not (work / "damage.json").exists():
+        return ["not run"]
+    found = json.loads((work / "damage.json").read_text())
+    rows = ["| damage | noticed |", "|---|---|"]
+    return rows + [
+        f"| {name} | {n} of {TEARS if name == CHECKPOINT_DAMAGE[0] else FLIPS} |" for name, n in found.items()
+    ]
+
+
+PARTS: dict[str, Callable[[Path, Asked], None]] = {"damage": damage, "preemption": preemption, "kills": kills}
+TABLES: dict[str, Callable[[Path], list[str]]] = {
+    "damage": damage_table,
+    "preemption": preemption_table,
+    "kills": kills_table,
+}
+
+
+def main() -> None:
+    """Do what is asked and missing, then print everything."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--parts", default=",".join(PARTS), help=f"of {', '.join(PARTS)}, or none")
+    parser.add_argument("--kills", type=int, default=20, help="SIGKILLs in each cell of the matrix")
+    parser.add_argument("--cells", default="*", help="pattern of the cells' names: STAGE-RANKS-WORKERS")
+    args = parser.parse_args()
+    for name in filter(None, args.parts.split(",")):
+        PARTS[name](args.work, Asked(args.kills, args.cells))
+    for name, table in TABLES.items():
+        print(f"\n{name}\n\n" + "\n".join(table(args.work)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,262 @@
+"""A recipe on the SLURM of two nodes: launched by one command, and preempted while it trains."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from bvh_clips import write_clip, write_map
+from kill_matrix import finished_files
+from slurm_cluster import Cluster
+from step_records import PAUSE, RECORDS, rows_of
+
+RECIPE = """
+name: preempted
+seed: 5
+hardware: {{accelerator: cpu, threads: 1, loggers: []}}
+stages:
+  data:
+    kind: bvh
+    source: {source}
+    joint_map: {source}/joint_map.json
+    captions: {source}/captions.jsonl
+    licence: CC0
+    fps: 20
+  stats: {{kind: stats}}
+  tokenizer:
+    kind: rvq
+    net: {{part: body, width: 32, depth: 1, code_dim: 16, num_codes: 32, levels: 2}}
+    train: {{steps: {steps}, batch_size: 8, checkpoint_every: 25, validate_every: 50}}
+  evaluate: {{kind: evaluate}}
+"""
+"""Conversion, training and evaluation; no stage wants a text encoder."""
+
+SPLITS = ("train", "train", "train", "train", "val", "test")
+TRAINED = ("tokenizer", "evaluate")
+"""What is made anew under preemption."""
+
+GROUPS = ("1-data-features", "2-data-shards", "3-data", "4-train")
+"""What a launch makes of it."""
+
+ASKED = ("partition=main", "light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=1", "memory_gb_per_gpu=1")
+
+
+def write_recipe(folder: Path, steps: int) -> Path:
+    """The recipe, and twelve BVH files for it."""
+    source = folder / "mocap"
+    rows = []
+    for number in range(12):
+        write_clip(source / f"clip{number:02d}.bvh", number)
+        split = SPLITS[number % len(SPLITS)]
+        rows.append(json.dumps({"id": f"clip{number:02d}", "captions": ["a figure sways"], "split": split}))
+    write_map(source / "joint_map.json")
+    (source / "captions.jsonl").write_text("\n".join(rows))
+    recipe = folder / "preempted.yaml"
+    recipe.write_text(RECIPE.format(steps=steps, source=source.absolute()))
+    return recipe
+
+
+@dataclass
+class Launched:
+    """The jobs of a launch, and what their trainings leave."""
+
+    cluster: Cluster
+    ids: list[str]
+    records: Path
+    run: Path
+
+    @property
+    def training(self) -> str:
+        """The job that trains."""
+        return self.ids[-1]
+
+    def rows(self) -> list[tuple[int, dict[str, Any]]]:
+        """(rank, line) of every step so far, of all starts."""
+        return list(rows_of(self.records))
+
+    def states(self) -> list[str]:
+        """Of the jobs; those of an array are one word where they agree."""
+        shown = self.cluster.ask(
+            "squeue", "--noheader", "--states=all", "--format=%F %T", f"--jobs={','.join(self.ids)}"
+        )
+        found: dict[str, set[str]] = {}
+        for line in shown.splitlines():
+            job, state = line.split()
+            found.setdefault(job, set()).add(state)
+        return ["+".join(sorted(found.get(job, {""}))) for job in self.ids]
+
+    def started_at(self) -> datetime:
+        """When SLURM started the job that trains, this time."""
+        words = self.cluster.ask("scontrol", "show", "job", self.training).split()
+        return datetime.fromisoformat(dict(word.partition("=")[::2] for word in words)["StartTime"])
+
+    def logs(self) -> str:
+        """Output of all jobs."""
+        return "\n".join(path.read_text() for path in sorted(self.run.glob(".slurm/*/*.log")))
+
+    def wait_for_step(self, step: int, start: int, seconds: float = 180) -> None:
+        """Until rank 0 has trained `step` in the start of that number."""
+        self._until(
+            lambda: any(
+                rank == 0 and row["step"] >= step and row["start"] == start for rank, row in self.rows()
+            ),
+            f"step {step} of start {start}",
+            seconds,
+        )
+
+    def wait_for_end(self, seconds: float = 240) -> None:
+        """Until no job waits or runs."""
+        live = {"PENDING", "RUNNING", "COMPLETING", "CONFIGURING", "REQUEUED", ""}
+        self._until(lambda: not any(live & set(s.split("+")) for s in self.states()), "the end", seconds)
+
+    def _until(self, ready: Any, what: str, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while not ready():
+            if time.monotonic() > deadline:
+                raise AssertionError(f"{what} did not come: {self.states()}\n{self.logs()}")
+            time.sleep(0.1)
+
+
+def launch(cluster: Cluster, recipe: Path, run: Path, *, parts: int = 2, pause: float = 0.0) -> Launched:
+    """`motionloom launch` on both nodes; every step leaves a line beside the run folder."""
+    records = run.with_name(f"{run.name}-records")
+    records.mkdir(parents=True)
+    words = ["motionloom", "launch", str(recipe), "--engine", "slurm", "--nodes", "2", "--gpus-per-node", "0"]
+    words += [
+        "--out",
+        str(run),
+        *(word for asked in (*ASKED, f"parts={parts}") for word in ("--cluster", asked)),
+    ]
+    path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(Path(__file__).parent)]))
+    watched = {"MOTIONLOOM_STAGES": "watched_steps", RECORDS: str(records), PAUSE: str(pause)}
+    before = _jobs(cluster)
+    # The nodes' names are SLURM's own here and no host's.
+    meet = {"MASTER_ADDR": "127.0.0.1", "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    with _changed(watched | meet), _argv(words):
+        from motionloom.pipeline.cli.main import main as program
+
+        try:
+            program()
+        except SystemExit as end:
+            if end.code:
+                raise AssertionError(f"motionloom launch ended with {end.code}") from None
+    return Launched(cluster, sorted(_jobs(cluster) - before, key=int), records, run)
+
+
+def _jobs(cluster: Cluster) -> set[str]:
+    return set(cluster.ask("squeue", "--noheader", "--states=all", "--format=%F").split())
+
+
+@contextmanager
+def _changed(variables: dict[str, str]) -> Iterator[None]:
+    old = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in old.items():
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+
+
+@contextmanager
+def _argv(words: Sequence[str]) -> Iterator[None]:
+    old, sys.argv = sys.argv, list(words)
+    try:
+        yield
+    finally:
+        sys.argv = old
+
+
+@dataclass
+class Restart:
+    """One preemption of a training."""
+
+    last_step: int
+    """The last step that rank 0 trained before it stopped."""
+    first_step: int
+    """The first one after it came back."""
+    queued_seconds: float
+    """From its last step to its new start: saving, the urgent job, SLURM's own waiting."""
+    start_seconds: float
+    """From SLURM's start of the job, which is in whole seconds, to the end of its first step."""
+
+
+@dataclass
+class Preempted:
+    """A training that urgent jobs have preempted, beside the undisturbed one."""
+
+    restarts: list[Restart]
+    steps: int
+    repeated: int
+    """Steps that rank 0 has trained more than once."""
+    wrong: int
+    """Steps of all ranks with another batch or another bit in a figure."""
+    unequal: list[str]
+    """Files of the stages behind the data with other bytes."""
+
+    @property
+    def exact(self) -> bool:
+        """Nothing differs."""
+        return not (self.wrong or self.unequal)
+
+
+def preempt(calm: Launched, recipe: Path, run: Path, after: Sequence[int]) -> Preempted:
+    """Train anew what `calm` has trained, and have an urgent job take both nodes behind each step of `after`.
+
+    SLURM takes some seconds to act, in which training goes on; a step takes a tenth of a second more here.
+    """
+    shutil.copytree(calm.run, run, ignore=shutil.ignore_patterns(".slurm"))
+    for name in TRAINED:
+        shutil.rmtree(run / "stages" / name)
+    launched = launch(calm.cluster, recipe, run, parts=1, pause=0.1)
+    starts = []
+    for number, step in enumerate(after):
+        launched.wait_for_step(step, number)
+        starts.append(launched.started_at())
+        launched.cluster.ask(
+            "sbatch", "--partition=urgent", "--nodes=2", "--ntasks-per-node=1", "--cpus-per-task=2",
+            "--output=/dev/null", "--wrap=sleep 1",
+        )  # fmt: skip
+    launched.wait_for_step(0, len(after))
+    starts.append(launched.started_at())
+    launched.wait_for_end()
+    if set(launched.states()) != {"COMPLETED"}:
+        raise AssertionError(f"{launched.states()}\n{launched.logs()}")
+    return _compared(calm, launched, starts)
+
+
+def _compared(calm: Launched, launched: Launched, starts: Sequence[datetime]) -> Preempted:
+    expected = {(rank, row["step"]): (row["batch"], row["figures"]) for rank, row in calm.rows()}
+    rows = launched.rows()
+    wrong = sum((row["batch"], row["figures"]) != expected[rank, row["step"]] for rank, row in rows)
+    mine = [row for rank, row in rows if rank == 0]
+    restarts = []
+    for number in range(1, len(starts)):
+        last = [row for row in mine if row["start"] == number - 1][-1]
+        first = next(row for row in mine if row["start"] == number)
+        begun = starts[number].timestamp()
+        restarts.append(
+            Restart(
+                last_step=last["step"],
+                first_step=first["step"],
+                queued_seconds=round(begun - last["time"], 1),
+                start_seconds=round(first["time"] - begun, 1),
+            )
+        )
+    steps = {row["step"] for row in mine}
+    unequal = []
+    for name in TRAINED:
+        ours, theirs = (finished_files(one.run / "stages" / name) for one in (launched, calm))
+        names = sorted(set(ours) | set(theirs))
+        unequal += [f"{name}/{file}" for file in names if ours.get(file) != theirs.get(file)]
+    missing = len({step for rank, step in expected if rank == 0} - steps)
+    return Preempted(restarts, len(steps), len(mine) - len(steps), wrong + missing, unequal)
