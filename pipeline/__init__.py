@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from motionloom.pipeline.contract.registry import register
     from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.contract.stage import StageKind
-    from motionloom.pipeline.inference.bundle import GeneratedMotion
+    from motionloom.pipeline.inference.motion import GeneratedMotion
     from motionloom.pipeline.inference.outputs import write_motions
     from motionloom.pipeline.inference.pretrained import MotionModel
     from motionloom.pipeline.published.compare import compare_with_paper
@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "GeneratedMotion": "pipeline.inference.bundle",
+    "GeneratedMotion": "pipeline.inference.motion",
     "MotionModel": "pipeline.inference.pretrained",
     "Prompt": "pipeline.contract.generation",
     "Recipe": "pipeline.runs.recipe",

@@ -94,9 +94,9 @@ class Spy(TokenTimeline):
         super().__init__(*args, **settings)
         self.windows: list[tuple[Any, ...]] = []
 
-    def _window(self, *args: Any) -> Codes:
+    def window(self, *args: Any) -> Codes:
         self.windows.append(args)
-        return super()._window(*args)
+        return super().window(*args)
 
 
 def spy_on(net: ConditionedUtt) -> Spy:
