@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from contextlib import closing
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
 import uvicorn
 from rich.console import Console
 
+from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.streaming import StreamingGenerator
 from motionloom.pipeline.inference.pretrained import MotionModel
@@ -57,7 +60,7 @@ def listen(config: ServeConfig) -> socket.socket:
         kind = socket.getaddrinfo(config.host, config.port, type=socket.SOCK_STREAM)[0][0]
         place = socket.create_server((config.host, config.port), family=kind, backlog=1024)
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
+        reason = (os.strerror(error.errno) if error.errno and error.errno > 0 else str(error)).lower()
         raise UserError(f"{where}: {reason}; choose another --port, or 0 for a free one") from None
     place.setblocking(False)
     return place
@@ -71,6 +74,10 @@ def warm(model: MotionModel) -> None:
             next(model.stream("a person stands", seconds=1.0))
         else:
             model.generate(["a person stands"])
+    if "audio" in generator.modalities:
+        rate = 22_050
+        clicks = (np.arange(4 * rate) % (rate // 2) < 100).astype(np.float32)
+        beats(clicks, rate)
 
 
 def server_of(site: Site, worker: Worker) -> uvicorn.Server:
