@@ -115,6 +115,8 @@ for (const name of ["dragover", "drop", "dragleave"]) {
   });
 }
 
+one("more").open = window.innerWidth > 620;
+
 (async () => {
   try {
     info = await (await ask("/api/info")).json();
