@@ -1,9 +1,9 @@
 """`TokenStream`: tokens of an `InterleavedGPT` group by group, without an end, under texts that may change.
 
-The network reads [text, token 0, token 1, ...] and holds one block of them. When the block is full, or another
-text comes, a new block begins with the text and the last `context` groups [ours]: the network goes on from
-them as from the beginning of a clip. Its cache is one block, whatever the length of the motion. End tokens are
-never drawn.
+The network reads [text, token 0, token 1, ...], as many as its block has room for. When the block is full,
+or another text comes, a new block begins with the text and the last `context` groups [ours]: the network goes
+on from them as from the beginning of a clip. Its cache is one block, whatever the length of the motion. End
+tokens are never drawn.
 
 Draws are those of `drawing.py`, in the same order as `sampling.generate`: as long as the text stays and one
 block is not full, the tokens are those of a motion of a requested length.

@@ -1,9 +1,9 @@
 """`StreamDecoder`: motion of tokens that arrive group by group, in bounded memory.
 
-A convolutional decoder makes a frame from the tokens within its reach alone (`Tokenizer.reach`), so a frame is
-final as soon as the tokens that far behind it are known. Each chunk is decoded from a window that begins that
-far before it: the frames are those of decoding all tokens at once, up to the order in which sums of another
-length are added (1e-12 relative in float64).
+A convolutional decoder makes a frame from the tokens within its reach alone (`Tokenizer.reach`), so a frame
+is final as soon as the tokens that far behind it are known. Each chunk is decoded from a window that begins
+that far before it: the frames are those of decoding all tokens at once, up to the order in which sums of
+another length are added.
 
 Legend: B batch, G groups, T = 4 G frames.
 """

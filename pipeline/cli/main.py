@@ -175,7 +175,9 @@ def generate(
     ] = None,
     stream: Annotated[
         bool,
-        typer.Option("--stream", help="One motion as JSON lines, written while it is made; - reads captions."),
+        typer.Option(
+            "--stream", help="One motion as JSON lines, written while it is made; - reads captions."
+        ),
     ] = False,
     formats: Annotated[
         str | None,
@@ -215,7 +217,7 @@ def generate(
 
     Example: `motionloom generate runs/ude-tiny --audio song.ogg --samples 3 -o dances`
 
-    Example: `motionloom generate runs/humantomato-tiny --stream "a person walks forward" --seconds 60 -o walk.jsonl`
+    Example: `motionloom generate runs/humantomato-tiny --stream "a person walks" --seconds 60 -o walk.jsonl`
     """
     of_models = {
         "face_cfg_scale": face_cfg_scale,

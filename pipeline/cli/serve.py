@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,7 +13,9 @@ from motionloom.pipeline.launch.console import make_console
 
 def serve(
     run_folder: ModelFolder,
-    host: Annotated[str, typer.Option(help="Address to listen at; others can reach all but loopback.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="Address to listen at; others can reach all but loopback.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port; 0 takes a free one.")] = 8000,
     allow_host: Annotated[
         list[str] | None,

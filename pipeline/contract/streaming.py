@@ -24,8 +24,9 @@ class StreamConfig(Config):
     """Frames that a GPT goes on from where its block is full or another caption comes. UDE's own is its
     stage's `context_frames`."""
     hop_frames: int = Field(20, ge=1)
-    """Frames that UDE draws at a time while nobody has said how long a caption lasts: another one is heard
-    after them."""
+    """Frames that UDE draws at a time: another caption is heard after them."""
+    ahead_seconds: float = Field(0.5, ge=0)
+    """How far a stream whose captions come from a keyboard runs ahead of the clock."""
 
 
 class TokenFlow(Protocol):

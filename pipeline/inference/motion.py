@@ -73,7 +73,9 @@ class GeneratedMotion:
         if write is None:
             known = ", ".join(WRITERS)
             ending = f"'{path.suffix}'" if path.suffix else "no ending"
-            raise UserError(f"{path}: a motion cannot be saved with {ending}; name a file that ends in {known}")
+            raise UserError(
+                f"{path}: a motion cannot be saved with {ending}; name a file that ends in {known}"
+            )
         write(path, self)
         return path
 

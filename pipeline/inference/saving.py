@@ -43,9 +43,10 @@ def page_of(motion: GeneratedMotion) -> str:
 
 def frame_of(motion: GeneratedMotion, height: int = 480) -> str:
     """The page within an `iframe` whose script runs apart from all around it."""
+    title, page = escape(motion.caption), escape(page_of(motion))
     return (
-        f'<iframe sandbox="allow-scripts" srcdoc="{escape(page_of(motion))}" title="{escape(motion.caption)}" '
-        f'style="width: 100%; height: {height}px; border: 0" loading="lazy"></iframe>'
+        f'<iframe sandbox="allow-scripts" title="{title}" loading="lazy" srcdoc="{page}" '
+        f'style="width: 100%; height: {height}px; border: 0"></iframe>'
     )
 
 

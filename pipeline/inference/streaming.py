@@ -131,7 +131,7 @@ class MotionStream(Iterator[MotionChunk]):
         """Go on with another caption from the next tokens on; what is left of the present one is left out.
 
         It lasts `seconds`, then the next segment comes; without them, until `say`. Frames that are drawn
-        already still come: those that the decoder looks ahead, and of a UDE at most one window.
+        already still come: those that the decoder looks ahead, and of a UDE at most `hop_frames` more.
         """
         if not caption.strip():
             raise UserError("the caption is empty; say what the person does")
@@ -220,15 +220,13 @@ class _Maker:
         generator = bundle.of(stage)
         if not isinstance(generator, StreamingGenerator):
             raise UserError(
-                f"this model ({generator.method}) makes a motion as a whole; streams need a GPT or a UDE model"
+                f"this model ({generator.method}) makes a motion as a whole; streams need a GPT or a UDE"
             )
         self.generator = generator
         self._encoder, self._fps = bundle.encoder(stage), bundle.layout.fps
         self._flow = generator.flow(seed, sampling, config)
         self._tokenizer = generator.tokenizer
-        self._decoder = StreamDecoder(
-            self._tokenizer.net, -(-config.chunk_frames // generator.unit_frames)
-        )
+        self._decoder = StreamDecoder(self._tokenizer.net, -(-config.chunk_frames // generator.unit_frames))
         self._frames: NDArray[np.float32] = np.zeros((0, len(self._tokenizer.columns)), np.float32)
         self.groups = 0
         """Groups drawn."""
@@ -240,9 +238,7 @@ class _Maker:
 
     def condition(self, prompt: Prompt, words: str) -> None:
         """What is drawn from now on is conditioned on this."""
-        self._flow.condition(
-            self._encoder.encode([prompt], [words], self.generator.modalities, self._fps)
-        )
+        self._flow.condition(self._encoder.encode([prompt], [words], self.generator.modalities, self._fps))
 
     def draw(self, left: int | None) -> None:
         """Some groups more, at most `left`."""

@@ -112,8 +112,9 @@ class TokenTimeline:
         groups: Tensor | None,
         seeds: Sequence[int],
         sampling: SamplingConfig,
+        drawn: int = 0,
     ) -> Codes:
-        """New codes that follow `before`."""
+        """New codes that follow `before`, whose last `drawn` groups are of this window already."""
         count = len(seeds)
         encoded = self.net.mate(conditions, count)
         audio = conditions.get("audio")
@@ -127,7 +128,7 @@ class TokenTimeline:
             inject_z=self.inject_z,
             z=z,
             start=before,
-            context=self.context,
+            context=self.context + drawn,
             max_groups=min(self.window_groups, self.net.utt.max_groups) if groups is None else None,
             groups=groups,
             temperature=sampling.temperature,
@@ -135,6 +136,7 @@ class TokenTimeline:
             top_p=sampling.top_p,
             cfg_scale=scales,
             seed=list(seeds),
+            drawn=drawn,
         )
 
     def normalised(self, conditions: Conditions) -> dict[str, Condition]:

@@ -27,7 +27,7 @@ class TimelineFlow:
         timeline: What makes a window.
         seed: Of the motion.
         sampling: How tokens are drawn.
-        hop: Groups that are drawn at a time while the length of a stretch is not known.
+        hop: Groups that are drawn at a time; also a window's length while that of its stretch is not known.
     """
 
     def __init__(self, timeline: TokenTimeline, seed: int, sampling: SamplingConfig, hop: int) -> None:
@@ -41,28 +41,41 @@ class TimelineFlow:
         self._conditions: Conditions = {}
         self._number, self._turn, self._done = -1, 0, 0
         """Which stretch this is, and the windows and groups of it that there are."""
+        self._inside: Conditions = {}
+        self._open = self._drawn = 0
+        """Groups that this window has yet to come, and those that it has; its conditions are `_inside`."""
 
     def condition(self, conditions: Conditions) -> None:
         """A new stretch."""
         self._conditions = self._line.normalised(conditions)
-        self._number, self._turn, self._done = self._number + 1, 0, 0
+        self._number, self._turn, self._done, self._open = self._number + 1, -1, 0, 0
 
     @torch.no_grad()
     def draw(self, left: int | None) -> Mapping[str, Tensor]:
-        """One window."""
-        line = self._line
+        """A piece of a window, drawn as the whole window would be."""
+        if not self._open:
+            self._begin(left)
+        new = min(self._hop, self._open)
+        seeds = window_seeds([self._seed], self._number, self._turn)
+        more = self._line.window(
+            self._inside, self._before, self._z, self._count(new), seeds, self._sampling, self._drawn
+        )
+        self._before = join(self._before, more, self._line.net.utt.pattern)
+        self._open, self._drawn, self._done = self._open - new, self._drawn + new, self._done + new
+        return more.codes
+
+    def _begin(self, left: int | None) -> None:
+        """The next window, and what of the conditions lies in it."""
+        self._before, self._turn, self._drawn = self._last(self._before), self._turn + 1, 0
         seen = int(self._before.groups[0])
-        new = min(self._hop if left is None else left, line.window_groups - seen)
-        first, frames = self._count((self._done - seen) * GROUP_FRAMES), self._count((seen + new) * GROUP_FRAMES)
-        inside = {
-            name: cut(condition, first, frames) if MODALITIES[name].timed else condition
+        self._open = min(self._hop if left is None else left, self._line.window_groups - seen)
+        first, frames = (self._done - seen) * GROUP_FRAMES, (seen + self._open) * GROUP_FRAMES
+        self._inside = {
+            name: cut(condition, self._count(first), self._count(frames))
+            if MODALITIES[name].timed
+            else condition
             for name, condition in self._conditions.items()
         }
-        seeds = window_seeds([self._seed], self._number, self._turn)
-        more = line.window(inside, self._before, self._z, self._count(new), seeds, self._sampling)
-        self._turn, self._done = self._turn + 1, self._done + new
-        self._before = self._last(join(self._before, more, line.net.utt.pattern))
-        return more.codes
 
     def _last(self, codes: Codes) -> Codes:
         """What the next window sees."""

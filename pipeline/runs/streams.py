@@ -46,7 +46,8 @@ def stream_motion(
     """Write JSON lines (`inference/stream_lines.py`) as frames come; ends with the last segment or Ctrl-C.
 
     Several captions follow each other, each `seconds` long. The caption "-" is the lines of `given`, by
-    default standard input: with `seconds` each lasts so long, without each takes over from the one before.
+    default standard input: with `seconds` each lasts so long, without each takes over from the one before,
+    and frames come no faster than they are watched.
     `out` is a file, None is standard output. What is said to people goes to `console`.
     """
     from motionloom.pipeline.inference.bundle import Bundle
@@ -73,9 +74,9 @@ def stream_motion(
     sound = read_music(audio[0]) if audio else None
     opened = None if script is None else Script.read(script).open(script.parent, str(script))
     bundle = Bundle.open(folder, choose_device(device))
-    words = face[0] if face else ""
+    config, words = StreamConfig(), face[0] if face else ""
+    live = list(captions) == [STDIN] and seconds is None
     if opened is not None:
-        config = StreamConfig()
         stream = MotionStream(bundle, iter(opened), seed=seed, sampling=drawing, config=config)
     elif list(captions) == [STDIN]:
         stream = _of_lines(bundle, given or sys.stdin, seconds, seed, drawing, console)
@@ -96,6 +97,11 @@ def stream_motion(
                 file.flush()
                 first = time.perf_counter() - started if not frames else first
                 frames += len(chunk.joints)
+                if live:
+                    early = (
+                        frames / chunk.fps - config.ahead_seconds - (time.perf_counter() - started - first)
+                    )
+                    time.sleep(max(0.0, early))
         except KeyboardInterrupt:  # how a stream without an end is ended
             console.print("ended")
     took, length = time.perf_counter() - started, frames / bundle.layout.fps
@@ -106,7 +112,12 @@ def stream_motion(
 
 
 def _of_lines(
-    bundle: Bundle, given: TextIO, seconds: float | None, seed: int, sampling: SamplingConfig, console: Console
+    bundle: Bundle,
+    given: TextIO,
+    seconds: float | None,
+    seed: int,
+    sampling: SamplingConfig,
+    console: Console,
 ) -> MotionStream:
     """A stream whose captions are lines, read as they come."""
     from motionloom.pipeline.inference.stream_request import stream_of

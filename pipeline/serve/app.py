@@ -234,12 +234,16 @@ async def _body(request: Request, most: int, patience: float) -> bytes:
         async for piece in request.stream():
             data.extend(piece)
             if len(data) > most:
-                raise HTTPException(413, f"too large: this takes at most {most} bytes", {"connection": "close"})
+                raise HTTPException(
+                    413, f"too large: this takes at most {most} bytes", {"connection": "close"}
+                )
 
     try:
         await asyncio.wait_for(read(), patience)
     except TimeoutError:
-        raise HTTPException(408, f"not all of it came within {patience:g} s", {"connection": "close"}) from None
+        raise HTTPException(
+            408, f"not all of it came within {patience:g} s", {"connection": "close"}
+        ) from None
     return bytes(data)
 
 

@@ -54,7 +54,9 @@ class MotionRequest(Config):
         for name in ("caption", "face"):
             length = len(getattr(self, name))
             if length > limits.max_caption:
-                raise UserError(f"{name} has {length} letters; this server takes at most {limits.max_caption}")
+                raise UserError(
+                    f"{name} has {length} letters; this server takes at most {limits.max_caption}"
+                )
         if self.seconds is not None and self.seconds > limits.max_seconds:
             raise UserError(
                 f"{self.seconds:g} s were asked for; this server makes at most {limits.max_seconds:g} s"
@@ -112,9 +114,13 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
     return Answer(json.dumps(said, separators=(",", ":"), allow_nan=False).encode(), "application/json")
 
 
-def stream(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> MotionStream:
+def stream(
+    model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
+) -> MotionStream:
     """The stream that is asked for, at most as long as the server allows."""
-    seconds = asked.seconds or (limits.max_seconds if sound is None else min(sound.seconds, limits.max_seconds))
+    seconds = asked.seconds or (
+        limits.max_seconds if sound is None else min(sound.seconds, limits.max_seconds)
+    )
     caption = asked.caption if asked.caption.strip() else None
     return model.stream(
         caption, face=asked.face, sound=sound, seconds=seconds, seed=asked.seed, sampling=asked.sampling

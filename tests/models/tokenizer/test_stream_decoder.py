@@ -82,9 +82,7 @@ def test_chunks_are_the_whole(net: Tokenizer, least: int) -> None:
     assert sum(pieces) == GROUPS
     decoder, at, made = StreamDecoder(net, least), 0, []
     for count in pieces:
-        chunk = {
-            s.name: codes[s.name][:, at * s.per_group : (at + count) * s.per_group] for s in net.streams
-        }
+        chunk = {s.name: codes[s.name][:, at * s.per_group : (at + count) * s.per_group] for s in net.streams}
         at += count
         found = decoder.push(chunk)
         final = sum(frames.shape[1] for frames in made) + (0 if found is None else found.shape[1])

@@ -118,7 +118,10 @@ def test_what_is_no_request(served: Any) -> None:
 
 
 def test_a_slow_request_is_let_go(run_server: Callable[..., Any], quick: Any) -> None:
-    with run_server(quick, patience=0.3) as served, socket.create_connection(("127.0.0.1", served.port)) as raw:
+    with (
+        run_server(quick, patience=0.3) as served,
+        socket.create_connection(("127.0.0.1", served.port)) as raw,
+    ):
         raw.settimeout(20)
         raw.sendall(
             b"POST /api/generate HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
@@ -150,7 +153,11 @@ def test_a_bug_is_a_sentence_and_the_server_goes_on(served: Any, capsys: Any) ->
 )
 def test_other_sites_are_refused(served: Any, quick: Any, headers: dict[str, str]) -> None:
     for got in (served.post("/api/generate", WAVE, **headers), served.ask("GET", "/", headers=headers)):
-        assert got.status == 403 and got.json["error"] and "default-src" in got.headers["content-security-policy"]
+        assert (
+            got.status == 403
+            and got.json["error"]
+            and "default-src" in got.headers["content-security-policy"]
+        )
     assert not quick.asked
 
 
@@ -207,7 +214,12 @@ def test_two_hundred_at_once(run_server: Callable[..., Any], quick: Any) -> None
     """Every answer is that of its own request, by name, caption, seed and content."""
 
     def ask(number: int) -> None:
-        asked = {"caption": f"a person waves {number}", "seconds": 0.2, "seed": number, "request": f"r{number}"}
+        asked = {
+            "caption": f"a person waves {number}",
+            "seconds": 0.2,
+            "seed": number,
+            "request": f"r{number}",
+        }
         got = served.post("/api/generate", asked)
         said = got.json
         assert got.status == 200 and got.headers["x-request"] == said["request"] == f"r{number}"
@@ -273,6 +285,8 @@ def test_the_end_answers_everybody(run_server: Callable[..., Any], quick: Any) -
 
 
 def test_a_taken_port_is_one_sentence() -> None:
-    with listen(ServeConfig(port=0)) as first:
-        with pytest.raises(UserError, match=r"127.0.0.1 port \d+: address already in use; choose another --port"):
-            listen(ServeConfig(port=first.getsockname()[1]))
+    with (
+        listen(ServeConfig(port=0)) as first,
+        pytest.raises(UserError, match=r"127.0.0.1 port \d+: address already in use; choose another --port"),
+    ):
+        listen(ServeConfig(port=first.getsockname()[1]))
