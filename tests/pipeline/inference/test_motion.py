@@ -98,3 +98,8 @@ def test_it_plays_in_the_frame(motion: GeneratedMotion, browser: Any, until: Any
         page.screenshot(path=str(tmp_path / "notebook.png"))
     finally:
         page.close()
+
+
+def test_every_ending_is_documented() -> None:
+    text = (Path(__file__).resolve().parents[3] / "docs" / "python.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `(\.\w+)` \|", text, re.M) == list(WRITERS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import json
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -241,3 +242,30 @@ def test_what_a_stream_is_not(
 ) -> None:
     done = call("generate", tmp_path, "--stream", *words)
     assert done.code == 2 and sentence in done.err
+
+
+# ---- the documented examples
+
+
+def examples(document: str, heading: str) -> list[str]:
+    """Python blocks below a heading of a document."""
+    text = (Path(__file__).resolve().parents[3] / "docs" / document).read_text(encoding="utf-8")
+    section = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    return re.findall(r"^```python\n(.*?)^```$", section, re.M | re.S)
+
+
+@pytest.mark.parametrize(
+    ("document", "heading"),
+    [("python.md", "One motion, and notebooks"), ("generating.md", "Watched while it is made")],
+)
+def test_examples_run(
+    document: str, heading: str, small_run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = examples(document, heading)
+    assert blocks
+    for block in blocks:
+        assert "runs/humantomato-tiny" in block
+        exec(block.replace("runs/humantomato-tiny", str(small_run.folder)), {})
+    made = {path.name for path in tmp_path.iterdir()}
+    assert made == ({"wave.bvh", "wave.html"} if document == "python.md" else {"walk_and_wave.html"})
