@@ -250,7 +250,7 @@ def generate(
         return
     from motionloom.pipeline.runs.api import generate_motions
 
-    files = {} if formats is None else {"formats": formats}
+    files: dict[str, Any] = {} if formats is None else {"formats": formats}
     folder = out or Path("motions")
     generate_motions(
         run_folder, captions or [], samples=samples, out=folder, console=make_console(), **files, **asked

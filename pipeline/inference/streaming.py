@@ -32,7 +32,7 @@ from motionloom.pipeline.inference.bundle import Bundle, split_columns
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import require_driven, require_seed
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames
-from motionloom.pipeline.render.score import Segment
+from motionloom.pipeline.render.score import Driver, Segment
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,8 @@ def joined(chunks: Sequence[MotionChunk], seed: int | None = None) -> GeneratedM
     begin = chunks[0].start
     for chunk in chunks:
         at = (chunk.start - begin) / chunk.fps
-        end, kind = at + len(chunk.joints) / chunk.fps, "text" if chunk.prompt.sound is None else "music"
+        end = at + len(chunk.joints) / chunk.fps
+        kind: Driver = "text" if chunk.prompt.sound is None else "music"
         if spans and spans[-1].label == chunk.caption:
             spans[-1] = Segment(spans[-1].start, end, chunk.caption, kind)
         else:

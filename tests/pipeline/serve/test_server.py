@@ -7,6 +7,7 @@ import io
 import json
 import signal
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -290,3 +291,17 @@ def test_a_taken_port_is_one_sentence() -> None:
         pytest.raises(UserError, match=r"127.0.0.1 port \d+: address already in use; choose another --port"),
     ):
         listen(ServeConfig(port=first.getsockname()[1]))
+
+
+def test_without_the_extra_it_says_so(
+    monkeypatch: pytest.MonkeyPatch, call: Callable[..., Any], tmp_path: Path
+) -> None:
+    monkeypatch.delitem(sys.modules, "motionloom.pipeline.serve.command")
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    done = call("serve", tmp_path)
+    assert done.code == 2 and "serve needs uvicorn: pip install 'motionloom[serve]'" in done.err
+
+
+def test_wrong_options_are_one_sentence(call: Callable[..., Any], tmp_path: Path) -> None:
+    assert "'waiting' = 0" in call("serve", tmp_path, "--waiting", "0").err
+    assert "no such folder" in call("serve", tmp_path / "missing").err
