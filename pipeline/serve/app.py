@@ -33,6 +33,9 @@ T = TypeVar("T")
 
 _BROKEN = "something broke here; the server's log says what"
 
+_UPLOADS = 4
+"""Sounds that are received at a time; others wait unread."""
+
 _LOOK = 0.25
 """Seconds after which a waiting request looks whether its client is still there."""
 
@@ -43,6 +46,7 @@ class Site:
     def __init__(self, model: MotionModel, config: ServeConfig, worker: Worker, name: str) -> None:
         self.model, self.config, self.worker, self.name = model, config, worker, name
         self.sounds = Sounds(config)
+        self._uploads = asyncio.Semaphore(_UPLOADS)
         self.assets = {
             "serve.css": (resource("viewer.css") + own("serve.css"), "text/css; charset=utf-8"),
             "viewer.js": (viewer_script(), "text/javascript; charset=utf-8"),
@@ -160,7 +164,8 @@ class Site:
         """Keep the sound file that the body is, under a name for later requests."""
         if "audio" not in self.model.modalities:
             raise HTTPException(400, "this model knows no music; give it captions")
-        data = await _body(request, _bytes(self.config), self.config.patience)
+        async with self._uploads:
+            data = await _body(request, _bytes(self.config), self.config.patience)
         try:
             name, sound = await asyncio.to_thread(self.sounds.add, data)
         except UserError as error:

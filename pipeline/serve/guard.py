@@ -58,13 +58,13 @@ class Guard:
             await send(message)
 
         headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        refused = self.refusal(headers)
+        refused = self.refusal(headers, scope["method"])
         if refused:
             await JSONResponse({"error": refused}, 403)(scope, receive, send_with_headers)
             return
         await self.app(scope, receive, send_with_headers)
 
-    def refusal(self, headers: dict[str, str]) -> str:
+    def refusal(self, headers: dict[str, str], method: str) -> str:
         """Why a request with these headers is refused; empty where it is not."""
         host = headers.get("host", "")
         if not self.knows(host):
@@ -72,7 +72,8 @@ class Guard:
         origin = headers.get("origin")
         if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
             return f"a page of {origin[:80]!r} asks; only this server's own page may"
-        if headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
+        followed = method == "GET" and headers.get("sec-fetch-mode") == "navigate"  # a link to here
+        if headers.get("sec-fetch-site", "none") not in ("none", "same-origin") and not followed:
             return "a page of another site asks; only this server's own page may"
         return ""
 

@@ -25,27 +25,31 @@ class Sounds:
     def __init__(self, config: ServeConfig) -> None:
         self._config = config
         self._kept: OrderedDict[str, Sound] = OrderedDict()
-        self._lock = threading.Lock()
+        self._lock, self._decoding = threading.Lock(), threading.Lock()
 
     def add(self, data: bytes) -> tuple[str, Sound]:
         """Decode a file's bytes and keep them; `UserError` for what is no sound, silent or too long."""
         if not data:
             raise UserError(f"{_NAME}: empty (0 bytes)")
         name = hashlib.sha256(data).hexdigest()[:24]
-        with self._lock:  # one at a time: a sound takes several times its file's memory
-            if name not in self._kept:
-                self._kept[name] = self._decode(data)
-            while len(self._kept) > self._config.sounds:
-                self._kept.popitem(last=False)
-            return name, self._kept[name]
+        with self._decoding:  # one at a time: a sound takes several times its file's memory
+            with self._lock:
+                sound = self._kept.pop(name, None)
+            sound = self._decode(data) if sound is None else sound
+            with self._lock:
+                self._kept[name] = sound
+                while len(self._kept) > self._config.sounds:
+                    self._kept.popitem(last=False)
+        return name, sound
 
     def get(self, name: str) -> Sound:
         """A sound by its name."""
-        sound = self._kept.get(name)
-        if sound is None:
-            raise UserError("the sound is not here any more; send it again")
-        self._kept.move_to_end(name)
-        return sound
+        with self._lock:
+            sound = self._kept.get(name)
+            if sound is None:
+                raise UserError("the sound is not here any more; send it again")
+            self._kept.move_to_end(name)
+            return sound
 
     def _decode(self, data: bytes) -> Sound:
         longest = self._config.max_sound_seconds

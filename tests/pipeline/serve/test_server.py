@@ -168,6 +168,12 @@ def test_its_own_page_may_ask(served: Any) -> None:
     assert served.post("/api/generate", WAVE, **headers).status == 200
 
 
+def test_a_link_from_elsewhere_may_be_followed(served: Any) -> None:
+    followed = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
+    assert served.ask("GET", "/", headers=followed).status == 200
+    assert served.post("/api/generate", WAVE, **followed).status == 403
+
+
 def test_names_that_are_allowed(run_server: Callable[..., Any], quick: Any) -> None:
     with run_server(quick, host="0.0.0.0", allow_hosts=("studio.lan",)) as served:
         for host, status in (("studio.lan", 200), ("192.168.1.5:80", 200), ("evil.example", 403)):
