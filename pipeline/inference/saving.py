@@ -11,7 +11,7 @@ from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import score_of, viewer_motion, write_bvh_of, write_npz
 from motionloom.pipeline.inference.page_words import page_title
 from motionloom.pipeline.render.video import write_mp4
-from motionloom.pipeline.render.viewer import viewer_page
+from motionloom.pipeline.render.viewer import ViewerMotion, viewer_page
 
 
 def save_npz(path: Path, motion: GeneratedMotion) -> None:
@@ -37,8 +37,12 @@ def save_html(path: Path, motion: GeneratedMotion) -> None:
 
 def page_of(motion: GeneratedMotion) -> str:
     """The viewer page as text."""
-    shown = viewer_motion(motion, "generated", score=score_of(motion))
-    return viewer_page([shown], page_title([motion.caption]))
+    return viewer_page([cell_of(motion)], page_title([motion.caption]))
+
+
+def cell_of(motion: GeneratedMotion) -> ViewerMotion:
+    """What the viewer shows of it."""
+    return viewer_motion(motion, "generated", score=score_of(motion))
 
 
 def frame_of(motion: GeneratedMotion, height: int = 480) -> str:

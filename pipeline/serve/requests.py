@@ -15,8 +15,9 @@ from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import file_stem, score_of, viewer_motion
+from motionloom.pipeline.inference.outputs import file_stem
 from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.saving import cell_of
 from motionloom.pipeline.inference.stream_lines import frame_lines, heading, rounded
 from motionloom.pipeline.inference.streaming import MotionStream
 from motionloom.pipeline.render.viewer import viewer_data
@@ -103,7 +104,7 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
         return _file(motion, asked)
     said = _facts(motion, asked)
     if asked.format == "viewer":
-        said["viewer"] = viewer_data([viewer_motion(motion, "generated", score=score_of(motion))])
+        said["viewer"] = viewer_data([cell_of(motion)])
     else:
         said |= {
             "joint_names": list(motion.joint_names),

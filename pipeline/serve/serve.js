@@ -115,7 +115,7 @@ for (const name of ["dragover", "drop", "dragleave"]) {
   });
 }
 
-one("more").open = window.innerWidth > 620;
+one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
 
 (async () => {
   try {

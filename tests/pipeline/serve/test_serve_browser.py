@@ -151,3 +151,21 @@ def test_music_is_chosen_and_heard(visit: Any, until: Any, monkeypatch: pytest.M
     page.locator("#sound").set_input_files({**music, "buffer": b"no music"})
     until(page, "document.getElementById('status').className.includes('wrong')")
     assert status(page).startswith("the sound: ")
+
+
+def test_music_is_dropped_anywhere(visit: Any, until: Any) -> None:
+    song = io.BytesIO()
+    soundfile.write(song, 0.4 * np.sin(np.arange(24_000) / 8).astype(np.float32), 16_000, format="WAV")
+    page = visit()
+    page.evaluate(
+        """(bytes) => {
+        const given = new DataTransfer();
+        given.items.add(new File([new Uint8Array(bytes)], "dropped.wav", { type: "audio/wav" }));
+        for (const name of ["dragover", "drop"]) {
+            const how = { dataTransfer: given, bubbles: true, cancelable: true };
+            document.body.dispatchEvent(new DragEvent(name, how));
+        }
+    }""",
+        list(song.getvalue()),
+    )
+    until(page, "document.getElementById('status').textContent === 'dropped.wav: 1.5 s of music'")

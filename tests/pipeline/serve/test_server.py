@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 import soundfile
+from rich.console import Console
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.serve import command
 from motionloom.pipeline.serve.command import listen
 from motionloom.pipeline.serve.config import ServeConfig
 
@@ -311,3 +313,22 @@ def test_without_the_extra_it_says_so(
 def test_wrong_options_are_one_sentence(call: Callable[..., Any], tmp_path: Path) -> None:
     assert "'waiting' = 0" in call("serve", tmp_path, "--waiting", "0").err
     assert "no such folder" in call("serve", tmp_path / "missing").err
+
+
+@pytest.mark.parametrize(("host", "warned"), [("127.0.0.1", False), ("0.0.0.0", True)])
+def test_the_command_says_where_and_who_can_reach_it(
+    host: str, warned: bool, quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Interrupted:
+        def run(self, places: list[socket.socket]) -> None:
+            assert places[0].getsockname()[0] == host
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(command.MotionModel, "from_pretrained", lambda *_, **options: quick)
+    monkeypatch.setattr(command, "warm", lambda model: None)
+    monkeypatch.setattr(command, "server_of", lambda site, worker: Interrupted())
+    said = Console(file=io.StringIO(), width=200)
+    command.serve(tmp_path, ServeConfig(host=host, port=0), console=said)
+    text = said.file.getvalue()  # type: ignore[attr-defined]
+    assert f": http://{host}:" in text and text.endswith("stopped\n")
+    assert ("others can reach this server" in text) == warned
