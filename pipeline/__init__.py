@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     from motionloom.pipeline.contract.registry import register
     from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.contract.stage import StageKind
-    from motionloom.pipeline.inference.bundle import GeneratedMotion
+    from motionloom.pipeline.contract.streaming import StreamConfig
+    from motionloom.pipeline.inference.motion import GeneratedMotion
     from motionloom.pipeline.inference.outputs import write_motions
     from motionloom.pipeline.inference.pretrained import MotionModel
+    from motionloom.pipeline.inference.streaming import MotionChunk, MotionStream, joined
     from motionloom.pipeline.published.compare import compare_with_paper
     from motionloom.pipeline.runs.api import evaluate_run, export_run, report_run, run_recipe
     from motionloom.pipeline.runs.recipe import Recipe, load_recipe
@@ -28,18 +30,22 @@ if TYPE_CHECKING:
 
 __all__ = [
     "GeneratedMotion",
+    "MotionChunk",
     "MotionModel",
+    "MotionStream",
     "Prompt",
     "Recipe",
     "SamplingConfig",
     "Sound",
     "StageKind",
+    "StreamConfig",
     "TrainedStage",
     "UserError",
     "compare_runs",
     "compare_with_paper",
     "evaluate_run",
     "export_run",
+    "joined",
     "load_recipe",
     "register",
     "report_run",
@@ -49,19 +55,23 @@ __all__ = [
 ]
 
 _HOMES = {
-    "GeneratedMotion": "pipeline.inference.bundle",
+    "GeneratedMotion": "pipeline.inference.motion",
+    "MotionChunk": "pipeline.inference.streaming",
     "MotionModel": "pipeline.inference.pretrained",
+    "MotionStream": "pipeline.inference.streaming",
     "Prompt": "pipeline.contract.generation",
     "Recipe": "pipeline.runs.recipe",
     "SamplingConfig": "pipeline.contract.sampling",
     "Sound": "datasets.audio.sound",
     "StageKind": "pipeline.contract.stage",
+    "StreamConfig": "pipeline.contract.streaming",
     "TrainedStage": "pipeline.stages.trained",
     "UserError": "datasets.schema",
     "compare_runs": "pipeline.compare.command",
     "compare_with_paper": "pipeline.published.compare",
     "evaluate_run": "pipeline.runs.api",
     "export_run": "pipeline.runs.api",
+    "joined": "pipeline.inference.streaming",
     "load_recipe": "pipeline.runs.recipe",
     "register": "pipeline.contract.registry",
     "report_run": "pipeline.runs.api",

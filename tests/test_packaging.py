@@ -67,6 +67,10 @@ class Imports(ast.NodeVisitor):
         self.generic_visit(node)
 
 
+BEHIND_AN_EXTRA = ("pipeline/serve",)
+"""Rooms that a function imports, which says in a sentence which extra is missing: all in them is optional."""
+
+
 def uses() -> dict[tuple[str, bool], set[str]]:
     """(distribution, inside a function) -> files."""
     owners = packages_distributions()
@@ -74,7 +78,9 @@ def uses() -> dict[tuple[str, bool], set[str]]:
     for path in sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
         visitor = Imports()
         visitor.visit(ast.parse(path.read_text(encoding="utf-8")))
-        for name, inside in visitor.found:
+        behind = path.parent.relative_to(ROOT).as_posix() in BEHIND_AN_EXTRA
+        for name, own in visitor.found:
+            inside = own or behind
             if name == "motionloom" or name in sys.stdlib_module_names:
                 continue
             for owner in owners.get(name, [name]):
@@ -87,6 +93,17 @@ def test_every_import_is_declared() -> None:
         allowed = REQUIRED | OPTIONAL if inside else REQUIRED
         where = "in a function" if inside else "at the top of the file"
         assert owner in allowed, f"{owner} is imported {where} by {sorted(files)}, but not declared for that"
+
+
+@pytest.mark.parametrize("room", BEHIND_AN_EXTRA)
+def test_rooms_behind_an_extra_are_imported_in_functions(room: str) -> None:
+    module = f"motionloom.{room.replace('/', '.')}"
+    for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
+        if path.parent == ROOT / room:
+            continue
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            names = [getattr(node, "module", None) or "", *(a.name for a in getattr(node, "names", ()))]
+            assert not any(name.startswith(module) for name in names), f"{path} imports {room} at its top"
 
 
 def test_everything_declared_is_imported() -> None:

@@ -66,6 +66,8 @@ class ResidualStack(nn.Module):
         super().__init__()
         dilations = [dilation_growth**i for i in reversed(range(depth))]
         self.blocks = nn.ModuleList(ResidualBlock(width, dilation) for dilation in dilations)
+        self.reach = sum(dilations)
+        """Positions to either side that one of its outputs looks at."""
 
     def forward(self, x: Tensor, padding: Tensor | None) -> Tensor:
         """[B, C, T] -> [B, C, T]."""
@@ -105,6 +107,8 @@ class ConvDecoder(nn.Module):
         self, dim: int, out_dim: int, *, width: int, doublings: int, depth: int, dilation_growth: int
     ) -> None:
         super().__init__()
+        self.stride = 2**doublings
+        """Frames of one latent."""
         self.enter = nn.Conv1d(dim, width, 3, padding=1)
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(doublings))
         self.up = nn.ModuleList(nn.Conv1d(width, width, 3, padding=1) for _ in range(doublings))
@@ -126,3 +130,11 @@ class ConvDecoder(nn.Module):
             hidden = up(_zero(hidden, padding[level - 1]))
         hidden = functional.relu(self.refine(_zero(hidden, padding[0])))
         return _zero(self.leave(_zero(hidden, padding[0])), padding[0]).transpose(1, 2)
+
+    def needs(self, first: int, last: int) -> tuple[int, int]:
+        """First and last of the latents that frames `first` to `last` are made of; no others play a role."""
+        first, last = first - 2, last + 2  # refine, leave
+        for stack in reversed(self.stacks):
+            assert isinstance(stack, ResidualStack)
+            first, last = (first - 1) // 2 - stack.reach, (last + 1) // 2 + stack.reach
+        return first - 1, last + 1

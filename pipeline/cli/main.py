@@ -14,7 +14,7 @@ import sys
 import traceback
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -27,6 +27,7 @@ from motionloom.pipeline.cli.json_output import AsJson, print_json
 from motionloom.pipeline.cli.launch import launch
 from motionloom.pipeline.cli.options import Device, ModelFolder, RunFolder, Sets
 from motionloom.pipeline.cli.replay import replay
+from motionloom.pipeline.cli.serve import serve
 from motionloom.pipeline.cli.sweep import sweep
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
 from motionloom.pipeline.launch.process import Interrupted, TeamError, leave, process_rank
@@ -187,10 +188,20 @@ def generate(
         Path | None, typer.Option("--script", help="YAML: segments of text and music, one motion.")
     ] = None,
     samples: Annotated[int, typer.Option(help="Motions of each caption, sound or script.")] = 1,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("motions"),
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for the files, default motions; a file with --stream."),
+    ] = None,
+    stream: Annotated[
+        bool,
+        typer.Option(
+            "--stream", help="One motion as JSON lines, written while it is made; - reads captions."
+        ),
+    ] = False,
     formats: Annotated[
-        str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html.")
-    ] = "npz,bvh,mp4,html",
+        str | None,
+        typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html; default all of them."),
+    ] = None,
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
     temperature: Annotated[
@@ -224,27 +235,22 @@ def generate(
     Example: `motionloom generate runs/humantomato-tiny "a person waves" --face "a happy face" -o out`
 
     Example: `motionloom generate runs/ude-tiny --audio song.ogg --samples 3 -o dances`
-    """
-    from motionloom.pipeline.runs.api import generate_motions
 
+    Example: `motionloom generate runs/humantomato-tiny --stream "a person walks" --seconds 60 -o walk.jsonl`
+    """
     of_models = {
         "face_cfg_scale": face_cfg_scale,
         "music_cfg_scale": music_cfg_scale,
         "sampler": sampler,
         "denoising_steps": denoising_steps,
     }
-    generate_motions(
-        run_folder,
-        captions or [],
-        face=face,
-        audio=audio or [],
-        script=script,
-        samples=samples,
-        out=out,
-        formats=formats,
-        seconds=seconds,
-        seed=seed,
-        sampling={
+    asked: dict[str, Any] = {
+        "face": face,
+        "audio": audio or [],
+        "script": script,
+        "seconds": seconds,
+        "seed": seed,
+        "sampling": {
             "temperature": temperature,
             "top_k": top_k,
             "top_p": top_p,
@@ -252,11 +258,25 @@ def generate(
             "face_model": face_model,
             **{name: value for name, value in of_models.items() if value is not None},
         },
-        device=device,
-        console=make_console(),
-    )
+        "device": device,
+    }
+    if stream:
+        from motionloom.pipeline.runs.streams import stream_motion
+
+        if samples != 1 or formats is not None:
+            raise UserError("--stream writes one motion as JSON lines: leave --samples and --format out")
+        stream_motion(run_folder, captions or [], out=out, console=make_console(aside=True), **asked)
+        return
+    from motionloom.pipeline.runs.api import generate_motions
+
+    files: dict[str, Any] = {} if formats is None else {"formats": formats}
+    folder = out or Path("motions")
+    generate_motions(
+        run_folder, captions or [], samples=samples, out=folder, console=make_console(), **files, **asked
+    )  # fmt: skip
 
 
+app.command()(serve)
 app.command()(evaluate)
 
 

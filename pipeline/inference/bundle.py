@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +35,7 @@ from motionloom.pipeline.contract.lookup import generators_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CPU, Finished, Shelf
 from motionloom.pipeline.inference.conditions import PromptEncoder
+from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
     caption_list,
     prompts_of,
@@ -44,7 +45,7 @@ from motionloom.pipeline.inference.requests import (
     require_words,
     sampling_of,
 )
-from motionloom.pipeline.inference.script import DrivenSegment, sound_of
+from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
 from motionloom.pipeline.render.score import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.outside import BUNDLE_FILE, owner_of
@@ -57,32 +58,6 @@ _AT_ONCE = 64
 
 _BEYOND = 0.5
 """Seconds that a motion may be longer than its music."""
-
-
-@dataclass(frozen=True)
-class GeneratedMotion:
-    """One generated clip."""
-
-    prompt: Prompt
-    features: NDArray[np.float32]
-    """Body-hand features [T, D]."""
-    joints: NDArray[np.float64]
-    """Positions [T, N, 3] in metres."""
-    face: NDArray[np.float32] | None
-    """Expression [T, 50], or None where the model makes no face."""
-    layout: MotionLayout
-    segments: tuple[Segment, ...] = ()
-    """What drove which seconds, of a motion made from a script."""
-
-    @property
-    def caption(self) -> str:
-        """What the person does, in words; empty without."""
-        return self.prompt.text
-
-    @property
-    def face_caption(self) -> str:
-        """What the face does, in words."""
-        return self.prompt.words
 
 
 class Bundle:
@@ -144,7 +119,8 @@ class Bundle:
             self._generators[stage.folder] = self.shelf.generator(stage)
         return self._generators[stage.folder]
 
-    def _encoder(self, stage: Finished) -> PromptEncoder:
+    def encoder(self, stage: Finished) -> PromptEncoder:
+        """What encodes prompts for a stage."""
         if stage.folder not in self._encoders:
             self._encoders[stage.folder] = PromptEncoder(self.of(stage).text, self.shelf.device)
         return self._encoders[stage.folder]
@@ -233,7 +209,7 @@ class Bundle:
         for rows in _alike(frames, batch):
             both = [seeds[row] for row in rows], [seeds[len(prompts) + row] for row in rows]
             made = self._batch([prompts[row] for row in rows], [frames[row] for row in rows], both, sampling)
-            out.update(zip(rows, made, strict=True))
+            out.update((row, replace(one, seed=seed)) for row, one in zip(rows, made, strict=True))
         return [out[row] for row in range(len(prompts))]
 
     def perform(
@@ -252,15 +228,7 @@ class Bundle:
                 f"this model ({generator.method}) makes a motion of one prompt; scripts need a UDE model"
             )
         require_driven(generator, [segment.prompt for segment in segments])
-        frames = []
-        for number, segment in enumerate(segments):
-            units = round(segment.seconds * fps / generator.unit_frames)
-            if units < 1:
-                raise UserError(
-                    f"segments.{number} ('{segment.label}') lasts {segment.seconds:g} s; the shortest this "
-                    f"model makes is {generator.unit_frames / fps:.2g} s"
-                )
-            frames.append(units * generator.unit_frames)
+        frames = [segment_frames(generator, segment, number) for number, segment in enumerate(segments)]
         seeds = sample_seeds(seed, 2 * samples)
         stretches = [
             Stretch(
@@ -278,13 +246,13 @@ class Bundle:
         sound = sound_of(list(zip(segments, frames, strict=True)), fps)
         words = "; ".join(segment.label for segment in segments)
         return [
-            self._motion(Prompt(text=words, sound=sound), motion, face, bands)
+            replace(self._motion(Prompt(text=words, sound=sound), motion, face, bands), seed=seed)
             for motion, face in zip(body, faces, strict=True)
         ]
 
     def _repeated(self, stage: Finished, prompt: Prompt, words: str, count: int) -> Conditions:
         """The conditions of one prompt, encoded once, for `count` rows."""
-        once = self._encoder(stage).encode([prompt], [words], self.of(stage).modalities, self.layout.fps)
+        once = self.encoder(stage).encode([prompt], [words], self.of(stage).modalities, self.layout.fps)
         return {
             name: Condition(
                 features.expand(count, -1, -1),
@@ -319,7 +287,7 @@ class Bundle:
         face: NDArray[np.float32] | None,
         segments: tuple[Segment, ...] = (),
     ) -> GeneratedMotion:
-        features, with_it = _split(motion, self.generator, self.layout)
+        features, with_it = split_columns(motion, self.generator, self.layout)
         joints = joints_of(features, self.layout)
         expression = with_it if face is None else face
         return GeneratedMotion(prompt, features, joints, expression, self.layout, segments)
@@ -332,7 +300,7 @@ class Bundle:
         sampling: SamplingConfig,
     ) -> list[GeneratedMotion]:
         generator, layout = self.generator, self.layout
-        conditions = self._encoder(self.main).encode(
+        conditions = self.encoder(self.main).encode(
             prompts, [p.text for p in prompts], generator.modalities, layout.fps
         )
         lengths = None if None in frames else [n for n in frames if n is not None]
@@ -341,7 +309,7 @@ class Bundle:
         stage = self.choose_face(sampling.face_model)
         if stage is not None:
             maker = self.of(stage)
-            words = self._encoder(stage).encode(
+            words = self.encoder(stage).encode(
                 prompts, [p.words for p in prompts], maker.modalities, layout.fps
             )
             # The face takes the body's length, so that both share one time line.
@@ -376,7 +344,7 @@ class Bundle:
         return out
 
 
-def _split(
+def split_columns(
     motion: NDArray[np.float32], generator: MotionGenerator, layout: MotionLayout
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Body-hand features and, of a generator that makes all columns, the expression."""

@@ -15,8 +15,8 @@ from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.kinematics import joints_to_rotations
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.formats import Format
+from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.video import write_mp4
@@ -101,7 +101,7 @@ def viewer_motion(
     )
 
 
-def write_npz(path: Path, motion: GeneratedMotion, seed: int) -> Path:
+def write_npz(path: Path, motion: GeneratedMotion, seed: int | None) -> Path:
     """Joints [T, N, 3] in metres, features, expression, and the facts as one JSON text (no pickle)."""
     facts = {
         "caption": motion.caption,

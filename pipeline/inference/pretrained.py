@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +23,14 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntry
 from motionloom.datasets.base.places import hub_is_away, no_such_folder, require_hub_name
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
+from motionloom.pipeline.contract.streaming import StreamConfig
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.exported import write_exported
+from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import caption_list
 from motionloom.pipeline.inference.script import Script
+from motionloom.pipeline.inference.stream_request import stream_of
+from motionloom.pipeline.inference.streaming import MotionStream
 from motionloom.pipeline.inference.unknown import unknown_captions
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.files import write_json
@@ -119,6 +123,52 @@ class MotionModel(
         else:
             segments = Script.read(Path(script)).open(Path(script).parent, str(script))
         return self.bundle.perform(segments, samples=samples, seed=seed, sampling=sampling)
+
+    def stream(
+        self,
+        captions: str | Iterable[str | tuple[str, float]] | Script | None = None,
+        *,
+        face: str = "",
+        sound: Sound | None = None,
+        seconds: float | None = None,
+        seed: int = 0,
+        sampling: SamplingConfig | Mapping[str, Any] | None = None,
+        streaming: StreamConfig | Mapping[str, Any] | None = None,
+    ) -> MotionStream:
+        """One motion as an iterator of chunks, each there as soon as its frames are final.
+
+        Args:
+            captions: One caption; or several, one after another, each as (caption, seconds) or all `seconds`
+                long, which may be made while the stream runs; or a `Script`. `say` of the stream changes the
+                caption on the way.
+            face: What the face does, while one caption lasts.
+            sound: Music to move to, beside one caption or alone.
+            seconds: Length of one caption, or of each that does not come with its own. Without it one caption
+                goes on until `say` or `close`, and music to its end.
+            seed: Equal arguments give equal motions. The frames of one caption are those of `generate` with
+                the same seed and length, as far as the network's block goes.
+            sampling: As of `generate`.
+            streaming: How much at a time: a `StreamConfig` or a mapping like `{"chunk_frames": 4}`.
+        """
+        return stream_of(
+            self.bundle, captions, face=face, sound=sound, seconds=seconds, seed=seed,
+            sampling=sampling, streaming=streaming,
+        )  # fmt: skip
+
+    @property
+    def fps(self) -> float:
+        """Frames a second of its motions."""
+        return self.bundle.layout.fps
+
+    @property
+    def modalities(self) -> frozenset[str]:
+        """What it can be conditioned on: "text", "audio" or both."""
+        return self.bundle.generator.modalities
+
+    @property
+    def max_seconds(self) -> float:
+        """Its longest motion; infinite where there is no limit. Streams have none."""
+        return self.bundle.max_seconds
 
     def _save_pretrained(self, save_directory: Path) -> None:
         """Copy all that `generate` needs into the folder."""

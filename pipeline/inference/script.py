@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 
 from motionloom.datasets.audio.sound import Sound, require_audible
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.store.yaml import read_yaml
 
 
@@ -101,6 +101,18 @@ class DrivenSegment:
     prompt: Prompt
     seconds: float
     label: str
+
+
+def segment_frames(generator: MotionGenerator, segment: DrivenSegment, number: int) -> int:
+    """Its length in frames, in whole units of the generator; `number` stands in errors."""
+    unit, fps = generator.unit_frames, generator.layout.fps
+    units = round(segment.seconds * fps / unit)
+    if units < 1:
+        raise UserError(
+            f"segments.{number} ('{segment.label}') lasts {segment.seconds:g} s; the shortest this "
+            f"model makes is {unit / fps:.2g} s"
+        )
+    return units * unit
 
 
 def read_music(path: Path) -> Sound:

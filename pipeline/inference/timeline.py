@@ -48,7 +48,7 @@ class TokenTimeline:
         audio: AudioStats | None,
         inject_z: bool,
     ) -> None:
-        self.net, self.window, self.context = net, window, context
+        self.net, self.window_groups, self.context = net, window, context
         self.audio, self.inject_z = audio, inject_z
 
     @torch.no_grad()
@@ -60,13 +60,13 @@ class TokenTimeline:
         made = Codes(dict.fromkeys(utt.names, empty), torch.zeros(count, dtype=torch.int64, device=device))
         z = draw_z(seeds, utt.config.z_dim).to(device) if self.inject_z and utt.config.z_dim else None
         for number, stretch in enumerate(stretches):
-            conditions = self._normalised(stretch.conditions)
+            conditions = self.normalised(stretch.conditions)
             if stretch.frames is None:
                 if len(stretches) > 1:
                     raise UserError(
                         "a stretch without a length stands alone; give the length of each in seconds"
                     )
-                return self._window(conditions, made, z, None, _seeds(seeds, 0, 0), sampling)
+                return self.window(conditions, made, z, None, window_seeds(seeds, 0, 0), sampling)
             wanted = torch.tensor([-(-n // GROUP_FRAMES) for n in stretch.frames], device=device)
             made = self._stretch(conditions, made, z, wanted, seeds, number, sampling)
         return made
@@ -87,24 +87,24 @@ class TokenTimeline:
             rows = torch.nonzero(done < wanted)[:, 0]
             here = _rows(made, rows)
             seen = here.groups.clamp(max=self.context)
-            new = torch.minimum(wanted[rows] - done[rows], self.window - seen)
+            new = torch.minimum(wanted[rows] - done[rows], self.window_groups - seen)
             first = (done[rows] - seen) * GROUP_FRAMES
             frames = (seen + new) * GROUP_FRAMES
             part = {
-                name: _cut(_rows_of(condition, rows), first, frames)
+                name: cut(_rows_of(condition, rows), first, frames)
                 if MODALITIES[name].timed
                 else _rows_of(condition, rows)
                 for name, condition in conditions.items()
             }
             own = [seeds[row] for row in rows.tolist()]
             noise = None if z is None else z[rows]
-            more = self._window(part, here, noise, new, _seeds(own, number, turn), sampling)
+            more = self.window(part, here, noise, new, window_seeds(own, number, turn), sampling)
             made = _with(made, rows, join(here, more, self.net.utt.pattern))
             done[rows] += more.groups
             turn += 1
         return made
 
-    def _window(
+    def window(
         self,
         conditions: Conditions,
         before: Codes,
@@ -112,8 +112,9 @@ class TokenTimeline:
         groups: Tensor | None,
         seeds: Sequence[int],
         sampling: SamplingConfig,
+        drawn: int = 0,
     ) -> Codes:
-        """New codes that follow `before`."""
+        """New codes that follow `before`, whose last `drawn` groups are of this window already."""
         count = len(seeds)
         encoded = self.net.mate(conditions, count)
         audio = conditions.get("audio")
@@ -127,17 +128,18 @@ class TokenTimeline:
             inject_z=self.inject_z,
             z=z,
             start=before,
-            context=self.context,
-            max_groups=min(self.window, self.net.utt.max_groups) if groups is None else None,
+            context=self.context + drawn,
+            max_groups=min(self.window_groups, self.net.utt.max_groups) if groups is None else None,
             groups=groups,
             temperature=sampling.temperature,
             top_k=sampling.top_k or None,
             top_p=sampling.top_p,
             cfg_scale=scales,
             seed=list(seeds),
+            drawn=drawn,
         )
 
-    def _normalised(self, conditions: Conditions) -> dict[str, Condition]:
+    def normalised(self, conditions: Conditions) -> dict[str, Condition]:
         """Audio features as training saw them."""
         out = dict(conditions)
         if "audio" in out:
@@ -151,7 +153,7 @@ class TokenTimeline:
         return out
 
 
-def _seeds(seeds: Sequence[int], stretch: int, turn: int) -> list[int]:
+def window_seeds(seeds: Sequence[int], stretch: int, turn: int) -> list[int]:
     """Seeds of one window's draws; those of the first window are the motions' own."""
     if stretch == turn == 0:
         return list(seeds)
@@ -165,7 +167,7 @@ def _rows_of(condition: Condition, rows: Tensor) -> Condition:
     return Condition(features[rows], mask[rows], None if pooled is None else pooled[rows])
 
 
-def _cut(condition: Condition, first: Tensor, frames: Tensor) -> Condition:
+def cut(condition: Condition, first: Tensor, frames: Tensor) -> Condition:
     """Positions first [B] .. first + frames [B] of a timed modality; those outside of it are masked."""
     features, mask, pooled = condition
     order = torch.arange(int(frames.max()), device=first.device)

@@ -69,17 +69,20 @@ class ViewerMotion:
 
 def write_viewer(path: Path, motions: Sequence[ViewerMotion], title: str, note: str = "") -> None:
     """Write the viewer page; `UserError` for motions that cannot be drawn."""
-    template = resource("viewer.html")
+    write_text(path, viewer_page(motions, title, note))
+
+
+def viewer_page(motions: Sequence[ViewerMotion], title: str, note: str = "") -> str:
+    """The viewer page as text."""
     data = viewer_data(motions, title, note)
-    page = fill(
-        template,
+    return fill(
+        resource("viewer.html"),
         MEDIA=media_policy("sounds" in data),
         TITLE=escape(title),
         STYLE=resource("viewer.css"),
         DATA=safe_json(data),
         SCRIPT=viewer_script(),
     )
-    write_text(path, page)
 
 
 def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = "") -> dict[str, Any]:

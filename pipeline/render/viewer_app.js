@@ -37,6 +37,7 @@ function mountViewer(root, data, options) {
   const state = { time: 0, playing: !calm, speed: 1, follow: true, loop: false, draws: 0, close: false };
   const camera = { yaw: 0, pitch: 0, zoom: 1, panX: 0, panY: 0 };
   let theme, stale = true, dragging = 0, printing = false;
+  const life = new AbortController(), whileHere = { signal: life.signal };
   const refresh = () => { stale = true; };
 
   // ---- page furniture: on a page of its own the bar is the window's lower edge, in a report it stands above the figures
@@ -163,6 +164,7 @@ function mountViewer(root, data, options) {
   };
   let before = 0;
   const tick = (now) => {
+    if (life.signal.aborted) return;
     const passed = Math.min((now - before) / 1000, 0.1);
     before = now;
     if (state.playing && !dragging && duration > 0) {
@@ -232,13 +234,13 @@ function mountViewer(root, data, options) {
     if (!act || (event.shiftKey && !turns[event.key] && event.key !== "+")) return;
     act();
     event.preventDefault();
-  });
+  }, whileHere);
   const wheelAllowed = () => page || root.contains(document.activeElement);
   for (const cell of cells) {
     watchPointer(cell.canvas, { turn, pan, zoom, wheelAllowed, reset: () => bar["view 3/4"].click() });
   }
   bar.scrub.addEventListener("pointerdown", () => { dragging += 1; });
-  window.addEventListener("pointerup", () => { dragging = 0; });
+  window.addEventListener("pointerup", () => { dragging = 0; }, whileHere);
 
   // Paper is white and has every figure: also those out of sight, and in light colours whatever the screen has.
   window.addEventListener("beforeprint", () => {
@@ -248,11 +250,12 @@ function mountViewer(root, data, options) {
     theme = readTheme(root);
     cells.forEach(paint);
     if (chosen === undefined) delete set.theme; else set.theme = chosen;
-  });
-  window.addEventListener("afterprint", () => { printing = false; rethemed(); });
+  }, whileHere);
+  window.addEventListener("afterprint", () => { printing = false; rethemed(); }, whileHere);
   const rethemed = () => { if (!printing) { theme = readTheme(root); refresh(); } };
-  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", rethemed);
-  new MutationObserver(rethemed).observe(document.documentElement, { attributes: true, attributeFilter: ["data-theme"] });
+  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", rethemed, whileHere);
+  const themes = new MutationObserver(rethemed);
+  themes.observe(document.documentElement, { attributes: true, attributeFilter: ["data-theme"] });
   const sizes = new ResizeObserver(refresh);
   const sight = new IntersectionObserver((entries) => {
     for (const entry of entries) cells.find((c) => c.canvas === entry.target).visible = entry.isIntersecting;
@@ -260,11 +263,20 @@ function mountViewer(root, data, options) {
   }, { rootMargin: "80px" });
   for (const cell of cells) { sizes.observe(cell.canvas); sight.observe(cell.canvas); }
 
+  /* Leaves nothing behind: for pages that show one motion after another. */
+  const remove = () => {
+    life.abort();
+    setSound(false);
+    for (const observer of [themes, sizes, sight]) observer.disconnect();
+    root.replaceChildren();
+    window.__viewers.splice(window.__viewers.indexOf(handle), 1);
+    window.__viewer = window.__viewers[0];
+  };
   const handle = {
     get frame() { return frame(); }, get time() { return state.time; }, get playing() { return state.playing; },
     get draws() { return state.draws; }, get frames() { return last + 1; }, get camera() { return { ...camera }; },
     get follow() { return state.follow; }, get loop() { return state.loop; },
-    play, setFrame, setView, zoom, turn, toggle: (name) => toggle(name, name),
+    remove, play, setFrame, setView, zoom, turn, toggle: (name) => toggle(name, name),
     get sound() { return player.on; }, get audio() { return player.audio; },
     get segment() { return lead && segmentAt(lead.score, localTime(lead)); },
     setSpeed, setSound, listen: (k) => follow(clips[k]),

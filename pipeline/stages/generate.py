@@ -11,9 +11,9 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import GENERATOR, Every, StageConfig, StageContext, StageKind
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of, with_music
 from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
-from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.inference.formats import FORMATS, Format
+from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.page_words import page_note
 from motionloom.pipeline.render.score import Score
 

@@ -16,14 +16,19 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.drawing import Drawing
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.sampling import generate
+from motionloom.models.gpt.streaming import TokenStream
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage
+from motionloom.pipeline.contract.streaming import StreamConfig, TokenFlow
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
+from motionloom.pipeline.stages.gpt_flow import GptFlow
 from motionloom.pipeline.stages.same_text import same_encoder
 from motionloom.pipeline.stages.streams import require_streams, stream_facts
 from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
@@ -307,6 +312,17 @@ class GptGenerator:
         if request.frames is None:
             return motions
         return [motion[:count] for motion, count in zip(motions, request.frames, strict=True)]
+
+    def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
+        """Tokens as they come; a full block, or another text, goes on from the last frames."""
+        tokens = TokenStream(
+            self.gpt.net,
+            how=Drawing(sampling.temperature, sampling.top_k or None, sampling.top_p),
+            context=streaming.context_frames // self.unit_frames,
+            cfg_scale=sampling.face_guidance if self.face else sampling.cfg_scale,
+            seed=seed,
+        )
+        return GptFlow(tokens, lambda conditions: self.prior(GenerationRequest(conditions, None, [seed])))
 
 
 def _check_text(stage: Stage, others: Mapping[str, Stage]) -> None:

@@ -37,8 +37,9 @@ from motionloom.pipeline.evaluation.truth import (
     truth_at,
     truth_of,
 )
-from motionloom.pipeline.inference.bundle import Bundle, GeneratedMotion
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
+from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.score import Score

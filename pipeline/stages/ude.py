@@ -35,7 +35,9 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
     StageKind,
 )
+from motionloom.pipeline.contract.streaming import StreamConfig, TokenFlow
 from motionloom.pipeline.inference.timeline import TokenTimeline
+from motionloom.pipeline.inference.timeline_flow import TimelineFlow
 from motionloom.pipeline.stages.dmd import LoadedDmd
 from motionloom.pipeline.stages.utt import LoadedUtt
 from motionloom.pipeline.store.files import write_json
@@ -191,6 +193,10 @@ class UdeGenerator:
         motions = self.decode(codes, seeds, sampling, hidden)
         totals = lengths.sum(0).tolist()
         return [motion[:count] for motion, count in zip(motions, totals, strict=True)]
+
+    def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
+        """Tokens as they come, those of `drive` where the lengths of all stretches are known."""
+        return TimelineFlow(self.timeline, seed, sampling, hop=max(1, streaming.hop_frames // GROUP_FRAMES))
 
     def decode(
         self, codes: Codes, seeds: Sequence[int], sampling: SamplingConfig, hidden: Tensor | None = None

@@ -22,6 +22,7 @@ from motionloom.models.utt.sampling import draw_z, generate
 from motionloom.pipeline.contract.generation import Stretch
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.timeline import TokenTimeline
+from motionloom.pipeline.inference.timeline_flow import TimelineFlow
 
 PATTERN = ("body", "body", "hand")
 STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
@@ -94,9 +95,9 @@ class Spy(TokenTimeline):
         super().__init__(*args, **settings)
         self.windows: list[tuple[Any, ...]] = []
 
-    def _window(self, *args: Any) -> Codes:
+    def window(self, *args: Any) -> Codes:
         self.windows.append(args)
-        return super()._window(*args)
+        return super().window(*args)
 
 
 def spy_on(net: ConditionedUtt) -> Spy:
@@ -332,3 +333,35 @@ def test_networks_are_left_as_they_were(net: ConditionedUtt) -> None:
     net.utt.train()
     assert codes_of(made(), 0) == before and net.utt.training
     net.eval()
+
+
+# ---- the same as it comes
+
+
+@pytest.mark.parametrize("hop", [1, 4, 99])
+@pytest.mark.parametrize("sampling", [GREEDY, SamplingConfig(top_k=3, cfg_scale=1.5)])
+def test_pieces_are_the_whole(timeline: TokenTimeline, hop: int, sampling: SamplingConfig) -> None:
+    """Words, music, and both, of lengths within one window and over several."""
+    drives = [text(1), music(1, [76]), {**text(1, seed=3), **music(1, [20])}]
+    groups = [8, 19, 5]
+    stretches = [Stretch(drive, [4 * n]) for drive, n in zip(drives, groups, strict=True)]
+    whole = timeline.tokens(stretches, SEEDS[1:2], sampling)
+    flow = TimelineFlow(timeline, SEEDS[1], sampling, hop)
+    pieces = []
+    for drive, count in zip(drives, groups, strict=True):
+        flow.condition(drive)
+        while count:
+            pieces.append(flow.draw(count))
+            count -= pieces[-1]["hand"].shape[1]
+            assert 1 <= pieces[-1]["hand"].shape[1] <= min(hop, WINDOW)
+        assert count == 0
+    assert int(whole.groups[0]) == sum(groups)
+    for stream in STREAMS:
+        assert torch.equal(torch.cat([piece[stream.name] for piece in pieces], 1), whole.codes[stream.name])
+
+
+def test_without_an_end_it_listens_after_each_hop(timeline: TokenTimeline) -> None:
+    flow = TimelineFlow(timeline, SEEDS[0], GREEDY, 2)
+    flow.condition(text(1))
+    assert [flow.draw(None)["hand"].shape[1] for _ in range(20)] == [2] * 20
+    assert int(flow._before.groups[0]) <= CONTEXT + 2  # and keeps no more than a window sees

@@ -22,7 +22,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.inference.bundle import GeneratedMotion
+from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import score_of, write_motions
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.score import Score, Segment, score_data

@@ -1,0 +1,94 @@
+"""`TokenStream`: tokens of an `InterleavedGPT` group by group, without an end, under texts that may change.
+
+The network reads [text, token 0, token 1, ...], as many as its block has room for. When the block is full,
+or another text comes, a new block begins with the text and the last `context` groups [ours]: the network goes
+on from them as from the beginning of a clip. Its cache is one block, whatever the length of the motion. End
+tokens are never drawn.
+
+Draws are those of `drawing.py`, in the same order as `sampling.generate`: as long as the text stays and one
+block is not full, the tokens are those of a motion of a requested length.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.drawing import Drawing, guide
+from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.layers.transformer import KVCache
+
+
+class TokenStream:
+    """One motion's tokens.
+
+    Args:
+        gpt: The model, in evaluation mode.
+        how: How a token is taken.
+        context: Groups that a new block goes on from; at most one less than a block has.
+        cfg_scale: Guidance; 1 is off. Needs a model trained with condition dropout.
+        seed: Of all draws.
+    """
+
+    def __init__(
+        self, gpt: InterleavedGPT, *, how: Drawing, context: int, cfg_scale: float = 1.0, seed: int = 0
+    ) -> None:
+        if cfg_scale != 1 and gpt.config.condition_dropout == 0:
+            raise UserError(
+                "guidance needs a GPT trained with condition_dropout > 0; set cfg_scale to 1, for the face's "
+                "GPT face_cfg_scale"
+            )
+        self.gpt, self.how = gpt.eval(), how
+        self.context = min(context, gpt.max_groups - 1)
+        self._scale = cfg_scale
+        self._numbers = np.random.Generator(np.random.Philox(key=seed))
+        self._text: Tensor | None = None
+        self._cache: KVCache | None = None
+        self._inputs = gpt.null_text.new_zeros(1, 0, gpt.config.dim)
+        """What the network has not read yet, [1 or 2, L, D]."""
+        self._block = torch.zeros(1, 0, dtype=torch.int64, device=gpt.null_text.device)
+        """Tokens of this block, those that it goes on from included, [1, L]."""
+
+    def condition(self, text: Tensor) -> None:
+        """The text prior [1, E] of all that is drawn from now on."""
+        self._text, self._cache = text, None
+
+    @torch.no_grad()
+    def draw(self) -> Tensor:
+        """The tokens of one more group, int64 [1, P]."""
+        gpt, size = self.gpt, len(self.gpt.pattern)
+        if self._cache is None or self._block.shape[1] >= gpt.max_groups * size:
+            self._begin()
+        device = self._block.device
+        uniform = torch.from_numpy(self._numbers.random(size)).to(device)
+        no = torch.zeros(1, dtype=torch.bool, device=device)
+        drawn = []
+        for slot in range(size):
+            legal = gpt.legal_at(gpt.ends[gpt.slots[slot]].expand(1), no, no)
+            hidden = gpt.hidden(self._inputs, self._cache)[:, -1:]
+            rows = legal.expand(len(hidden), -1)
+            logits = gpt.logits(hidden, gpt.slots[slot].expand(len(hidden), 1), rows[:, None])[:, 0]
+            if len(hidden) == 2:
+                logits = guide(logits, legal, logits.new_full((1,), self._scale))
+            token = self.how(logits, uniform[slot : slot + 1])[:, None]
+            drawn.append(token)
+            self._inputs = gpt.embed(token, gpt.slots[slot].expand(1, 1)).expand(len(hidden), -1, -1)
+        group = torch.cat(drawn, dim=1)
+        self._block = torch.cat([self._block, group], dim=1)
+        return group
+
+    def _begin(self) -> None:
+        """A new block: the text, and the last groups of the one before."""
+        if self._text is None:
+            raise ValueError("nothing to draw from: give a text by `condition` first")
+        gpt, size = self.gpt, len(self.gpt.pattern)
+        kept = min(self.context, self._block.shape[1] // size)
+        self._block = self._block[:, self._block.shape[1] - kept * size :]
+        first = gpt.embed_text(self._text)
+        if self._scale != 1:
+            first = torch.cat([first, gpt.embed_text(self._text, first.new_ones(1, dtype=torch.bool))])
+        before = gpt.embed(self._block, gpt.slots.repeat(kept)[None])
+        self._inputs = torch.cat([first, before.expand(len(first), -1, -1)], dim=1)
+        self._cache = gpt.stack.cache(gpt.max_groups * size)

@@ -1,0 +1,56 @@
+"""A stream as JSON lines: one that says what follows, then one a frame.
+
+    {"format": "motionloom stream", "version": 1, "fps": 20.0, "joint_names": [...], "parents": [...], ...}
+    {"frame": 0, "caption": "a person waves", "joints": [[x, y, z], ...], "face": [...]}
+
+Metres, Y up, to a hundredth of a millimetre; `face` only where the model makes one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.pipeline.inference.streaming import MotionChunk
+
+DIGITS = 5
+
+
+def heading(layout: MotionLayout, seed: int, model: str) -> str:
+    """The first line."""
+    facts = {
+        "format": "motionloom stream",
+        "version": 1,
+        "model": model,
+        "seed": seed,
+        "fps": layout.fps,
+        "skeleton": layout.skeleton_name,
+        "joint_names": list(layout.skeleton.joints),
+        "parents": [int(parent) for parent in layout.skeleton.parents],
+        "unit": "m",
+        "up": "y",
+    }
+    return json.dumps(facts) + "\n"
+
+
+def frame_lines(chunk: MotionChunk) -> Iterator[str]:
+    """A line for each frame."""
+    for number, joints in enumerate(chunk.joints):
+        frame: dict[str, Any] = {
+            "frame": chunk.start + number,
+            "caption": chunk.caption,
+            "joints": rounded(joints),
+        }
+        if chunk.face is not None:
+            frame["face"] = rounded(chunk.face[number])
+        yield json.dumps(frame, separators=(",", ":"), ensure_ascii=False) + "\n"
+
+
+def rounded(values: NDArray[Any]) -> Any:
+    """Numbers as lists, short in writing."""
+    return np.round(np.asarray(values, np.float64), DIGITS).tolist()

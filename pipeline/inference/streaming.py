@@ -1,0 +1,273 @@
+"""`MotionStream`: motion that is watched while it is made, under captions that may change on the way.
+
+Tokens are drawn group by group and decoded as soon as the groups that a frame's decoding looks at are known
+(`models/tokenizer/streaming.py`); the root goes on from chunk to chunk (`datasets/motion/flow.py`). So every
+frame is final: it is the one that decoding all tokens at once would give. What is kept is one block of the
+networks and the decoder's window, whatever the length of the motion.
+
+A diffusion decoder denoises long windows as a whole; a stream of a UDE that has one is decoded by the
+tokenizer's own decoder instead [ours].
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.flow import JointFlow
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.drawing import sample_seeds
+from motionloom.models.tokenizer.streaming import StreamDecoder
+from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.contract.streaming import StreamConfig, StreamingGenerator
+from motionloom.pipeline.inference.bundle import Bundle, split_columns
+from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.requests import require_driven, require_seed
+from motionloom.pipeline.inference.script import DrivenSegment, segment_frames
+from motionloom.pipeline.render.score import Driver, Segment
+
+
+@dataclass(frozen=True)
+class MotionChunk:
+    """Some frames of a stream, final, all driven by one caption."""
+
+    start: int
+    """Number of its first frame, counted from the stream's."""
+    prompt: Prompt
+    features: NDArray[np.float32]
+    """Body-hand features [T, D]."""
+    joints: NDArray[np.float64]
+    """Positions [T, N, 3] in metres; they go on where the chunk before ends."""
+    face: NDArray[np.float32] | None
+    """Expression [T, 50], or None where the model makes no face."""
+    layout: MotionLayout
+
+    @property
+    def caption(self) -> str:
+        """What the person does, in words."""
+        return self.prompt.text
+
+    @property
+    def fps(self) -> float:
+        """Frames a second."""
+        return self.layout.fps
+
+
+def joined(chunks: Sequence[MotionChunk], seed: int | None = None) -> GeneratedMotion:
+    """Chunks that follow each other as one motion."""
+    if not chunks:
+        raise UserError("no chunks to join; take at least one from the stream")
+    spans: list[Segment] = []
+    begin = chunks[0].start
+    for chunk in chunks:
+        at = (chunk.start - begin) / chunk.fps
+        end = at + len(chunk.joints) / chunk.fps
+        kind: Driver = "text" if chunk.prompt.sound is None else "music"
+        if spans and spans[-1].label == chunk.caption:
+            spans[-1] = Segment(spans[-1].start, end, chunk.caption, kind)
+        else:
+            spans.append(Segment(at, end, chunk.caption, kind))
+    several = len(spans) > 1
+    faces = [chunk.face for chunk in chunks if chunk.face is not None]
+    return GeneratedMotion(
+        Prompt("; ".join(span.label for span in spans)) if several else chunks[0].prompt,
+        np.concatenate([chunk.features for chunk in chunks]),
+        np.concatenate([chunk.joints for chunk in chunks]),
+        np.concatenate(faces) if len(faces) == len(chunks) else None,
+        chunks[0].layout,
+        tuple(spans) if several else (),
+        seed,
+    )
+
+
+class MotionStream(Iterator[MotionChunk]):
+    """Chunks of one motion, made as they are asked for.
+
+    `say` may be called at any time, also from another thread; the rest belongs to one thread.
+
+    Args:
+        bundle: The model.
+        segments: What drives the motion, one after another; taken when its time comes, so it may be endless
+            itself. A segment of infinite length goes on until `say`.
+        seed: Equal seeds, segments and settings give equal motions.
+        sampling: How tokens are drawn.
+        config: How much at a time.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        segments: Iterator[DrivenSegment],
+        *,
+        seed: int,
+        sampling: SamplingConfig,
+        config: StreamConfig,
+    ) -> None:
+        require_seed(seed)
+        self.layout, self.seed = bundle.layout, seed
+        seeds = sample_seeds(seed, 2)
+        self._segments, self._said = segments, deque[DrivenSegment]()
+        self._body = _Maker(bundle, bundle.main, seeds[0], sampling, config)
+        face = _streaming_face(bundle, sampling)
+        self._face = None if face is None else _Maker(bundle, face, seeds[1], sampling, config)
+        self._joints = JointFlow(bundle.layout)
+        self._least = config.chunk_frames
+        self._bounds: deque[tuple[int, Prompt]] = deque()
+        """First frames of segments that were begun, and what drives them."""
+        self._left: int | None = 0
+        """Groups that are left of the segment; None = without an end."""
+        self._given = self._number = 0
+        """Frames given, segments begun."""
+        self._ended = False
+
+    def say(self, caption: str, *, seconds: float | None = None, face: str = "") -> None:
+        """Go on with another caption from the next tokens on; what is left of the present one is left out.
+
+        It lasts `seconds`, then the next segment comes; without them, until `say`. Frames that are drawn
+        already still come: those that the decoder looks ahead, and of a UDE at most `hop_frames` more.
+        """
+        if not caption.strip():
+            raise UserError("the caption is empty; say what the person does")
+        length = math.inf if seconds is None else seconds
+        segment = DrivenSegment(Prompt(caption, face), length, caption)
+        self._check(segment, self._number)
+        self._said.append(segment)
+
+    def close(self) -> None:
+        """No more tokens are drawn; what is drawn already still comes."""
+        self._segments, self._left = iter(()), 0
+        self._said.clear()
+
+    def __iter__(self) -> MotionStream:
+        return self
+
+    def __next__(self) -> MotionChunk:
+        """The next frames; raises `StopIteration` after the last ones."""
+        while not self._ended and self._ready() < self._least:
+            self._draw()
+        count = self._ready()
+        if not count:
+            raise StopIteration
+        while len(self._bounds) > 1 and self._bounds[1][0] <= self._given:
+            self._bounds.popleft()
+        if len(self._bounds) > 1:
+            count = min(count, self._bounds[1][0] - self._given)
+        body = self._body.take(count)
+        features, with_it = split_columns(body, self._body.generator, self.layout)
+        face = with_it if self._face is None else self._face.take(count)
+        chunk = MotionChunk(
+            self._given, self._bounds[0][1], features, self._joints(features), face, self.layout
+        )
+        self._given += count
+        return chunk
+
+    def _ready(self) -> int:
+        makers = [self._body, *filter(None, [self._face])]
+        return min(maker.ready for maker in makers)
+
+    def _draw(self) -> None:
+        """More tokens, of the next segment where this one is over or another one is called for."""
+        if self._said or self._left == 0:
+            segment = self._said.popleft() if self._said else next(self._segments, None)
+            if segment is None:
+                self._ended = True
+                self._body.finish()
+                if self._face is not None:
+                    self._face.finish()
+                return
+            self._begin(segment)
+        before = self._body.groups
+        self._body.draw(self._left)
+        if self._face is not None:
+            while self._face.groups < self._body.groups:
+                self._face.draw(self._body.groups - self._face.groups)
+        if self._left is not None:
+            self._left -= self._body.groups - before
+
+    def _begin(self, segment: DrivenSegment) -> None:
+        frames = self._check(segment, self._number)
+        unit = self._body.generator.unit_frames
+        self._left = None if frames is None else frames // unit
+        self._number += 1
+        self._bounds.append((self._body.groups * unit, segment.prompt))
+        self._body.condition(segment.prompt, segment.prompt.text)
+        if self._face is not None:
+            self._face.condition(segment.prompt, segment.prompt.words)
+
+    def _check(self, segment: DrivenSegment, number: int) -> int | None:
+        """Its frames; None without an end."""
+        require_driven(self._body.generator, [segment.prompt])
+        if segment.seconds == math.inf:
+            return None
+        if not segment.seconds > 0:
+            raise UserError(f"segments.{number} lasts {segment.seconds:g} s; give a length above 0")
+        return segment_frames(self._body.generator, segment, number)
+
+
+class _Maker:
+    """One generator's side of a stream: its conditions, its tokens, its frames."""
+
+    def __init__(
+        self, bundle: Bundle, stage: Finished, seed: int, sampling: SamplingConfig, config: StreamConfig
+    ) -> None:
+        generator = bundle.of(stage)
+        if not isinstance(generator, StreamingGenerator):
+            raise UserError(
+                f"this model ({generator.method}) makes a motion as a whole; streams need a GPT or a UDE"
+            )
+        self.generator = generator
+        self._encoder, self._fps = bundle.encoder(stage), bundle.layout.fps
+        self._flow = generator.flow(seed, sampling, config)
+        self._tokenizer = generator.tokenizer
+        self._decoder = StreamDecoder(self._tokenizer.net, -(-config.chunk_frames // generator.unit_frames))
+        self._frames: NDArray[np.float32] = np.zeros((0, len(self._tokenizer.columns)), np.float32)
+        self.groups = 0
+        """Groups drawn."""
+
+    @property
+    def ready(self) -> int:
+        """Frames that are final and not taken."""
+        return len(self._frames)
+
+    def condition(self, prompt: Prompt, words: str) -> None:
+        """What is drawn from now on is conditioned on this."""
+        self._flow.condition(self._encoder.encode([prompt], [words], self.generator.modalities, self._fps))
+
+    def draw(self, left: int | None) -> None:
+        """Some groups more, at most `left`."""
+        codes = self._flow.draw(left)
+        stream = self._tokenizer.net.streams[0]
+        self.groups += codes[stream.name].shape[1] // stream.per_group
+        made = self._decoder.push(codes)
+        if made is not None:
+            self._add(self._tokenizer.own_units(made[0]))
+
+    def finish(self) -> None:
+        """No tokens follow."""
+        made = self._decoder.finish()
+        if made is not None:
+            self._add(self._tokenizer.own_units(made[0]))
+
+    def take(self, count: int) -> NDArray[np.float32]:
+        """The next frames [T, C]."""
+        out, self._frames = self._frames[:count], self._frames[count:].copy()
+        return out
+
+    def _add(self, frames: NDArray[np.float32]) -> None:
+        self._frames = np.concatenate([self._frames, frames])
+
+
+def _streaming_face(bundle: Bundle, sampling: SamplingConfig) -> Finished | None:
+    """The face generator that was asked for, or the first that can stream; None where there is none."""
+    if sampling.face_model is not None:
+        return bundle.choose_face(sampling.face_model)
+    found = (stage for stage in bundle.faces.values() if isinstance(bundle.of(stage), StreamingGenerator))
+    return next(found, None)

@@ -1,0 +1,137 @@
+/* The page of `motionloom serve`: asks for a motion and shows it. Everything that is shown goes through `textContent`. */
+(function () {
+"use strict";
+
+const one = (id) => document.getElementById(id);
+const form = one("ask"), status = one("status"), go = one("go"), save = one("save");
+let info = null, shown = null, asked = null, music = null, turn = 0;
+
+function say(words, wrong) {
+  status.textContent = words;
+  status.classList.toggle("serve-wrong", Boolean(wrong));
+}
+
+/* The answer's JSON; what a server refuses, or a network that fails, becomes an error of one sentence. */
+async function ask(path, options) {
+  let answer;
+  try {
+    answer = await fetch(path, options);
+  } catch (error) {
+    throw new Error("the server does not answer; is it still running?");
+  }
+  if (!answer.ok) {
+    let words = `the server answered ${answer.status}`;
+    try { words = (await answer.json()).error || words; } catch (error) { /* no sentence in it */ }
+    throw new Error(words);
+  }
+  return answer;
+}
+
+const post = (path, body) => ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+
+function wanted() {
+  const body = { caption: one("caption").value.trim(), seed: Number(one("seed").value) || 0 };
+  if (one("seconds").value) body.seconds = Number(one("seconds").value);
+  if (Number(one("cfg_scale").value) > 1) body.cfg_scale = Number(one("cfg_scale").value);
+  if (info.face && one("face").value.trim()) body.face = one("face").value.trim();
+  if (music) body.sound = music.sound;
+  return body;
+}
+
+async function generate() {
+  const mine = ++turn, body = { ...wanted(), format: "viewer", request: `page-${Date.now()}-${turn}` };
+  if (!body.caption && !body.sound) {
+    say(info.modalities.includes("audio") ? "Say what the person does, or choose music." : "Say what the person does.", true);
+    one("caption").focus();
+    return;
+  }
+  go.disabled = true;
+  say("Generating…");
+  const began = performance.now();
+  try {
+    const answer = await (await post("/api/generate", body)).json();
+    if (mine !== turn) return;
+    if (answer.request !== body.request) throw new Error("this answer belongs to another request; try again");
+    show(answer, body);
+    say(`${answer.seconds.toFixed(1)} s of motion, made in ${((performance.now() - began) / 1000).toFixed(1)} s, seed ${answer.seed}`);
+  } catch (error) {
+    if (mine === turn) say(error.message, true);
+  } finally {
+    if (mine === turn) go.disabled = false;
+  }
+}
+
+function show(answer, body) {
+  if (shown) shown.remove();
+  shown = window.motionloomViewer(one("viewer"), answer.viewer, { page: false });
+  asked = body;
+  save.hidden = false;
+}
+
+async function keep(format) {
+  try {
+    const answer = await post("/api/generate", { ...asked, format });
+    const name = /filename="([^"]+)"/.exec(answer.headers.get("content-disposition") || "");
+    const address = URL.createObjectURL(await answer.blob());
+    const link = document.createElement("a");
+    link.href = address;
+    link.download = name ? name[1] : `motion.${format}`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(address), 10000);
+    say(`Saved ${link.download}`);
+  } catch (error) {
+    say(error.message, true);
+  }
+}
+
+async function take(file) {
+  music = null;
+  if (!file) return;
+  if (file.size > info.limits.sound_bytes) {
+    say(`${file.name} is too large: at most ${Math.round(info.limits.sound_bytes / 2 ** 20)} MB`, true);
+    return;
+  }
+  say(`Sending ${file.name}…`);
+  try {
+    music = await (await ask("/api/sounds", { method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: file })).json();
+    say(`${file.name}: ${music.seconds.toFixed(1)} s of music`);
+  } catch (error) {
+    say(error.message, true);
+  }
+}
+
+form.addEventListener("submit", (event) => { event.preventDefault(); generate(); });
+for (const button of save.querySelectorAll("button")) button.addEventListener("click", () => keep(button.dataset.format));
+one("sound").addEventListener("change", () => take(one("sound").files[0]));
+for (const name of ["dragover", "drop", "dragleave"]) {
+  document.addEventListener(name, (event) => {
+    if (!info || !info.modalities.includes("audio")) return;
+    event.preventDefault();
+    form.classList.toggle("serve-over", name === "dragover");
+    if (name === "drop" && event.dataTransfer.files.length) {
+      one("sound").files = event.dataTransfer.files;
+      take(event.dataTransfer.files[0]);
+    }
+  });
+}
+
+one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
+
+(async () => {
+  try {
+    info = await (await ask("/api/info")).json();
+  } catch (error) {
+    say(error.message, true);
+    return;
+  }
+  document.title = `${info.model} · motionloom`;
+  one("caption").maxLength = one("face").maxLength = info.limits.caption;
+  one("seconds").max = info.limits.seconds;
+  one("face-field").hidden = !info.face;
+  one("caption-field").hidden = !info.modalities.includes("text");
+  one("sound-field").hidden = !info.modalities.includes("audio");
+  const drivers = info.modalities.map((name) => (name === "audio" ? "music" : name)).join(" or ");
+  say(`${info.model}: ${drivers} to motion, at most ${info.limits.seconds} s`);
+  one("caption").focus();
+})();
+})();

@@ -1,0 +1,271 @@
+"""Streams of trained models beside the whole motions of the same seeds; captions on the way; JSON lines."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.script import Script, ScriptSegment
+from motionloom.pipeline.inference.streaming import MotionChunk, joined
+from motionloom.pipeline.runs.streams import stream_motion
+
+pytestmark = pytest.mark.slow
+
+NEAR = 2e-5
+"""float32 networks: a few hundred roundings of 6e-8 on values of about one, in another order for windows of
+another length. In float64 the decoders agree to 1e-11 (tests/models/tokenizer/test_stream_decoder.py)."""
+
+
+@pytest.fixture(scope="module")
+def model(small_run: Any) -> MotionModel:
+    return MotionModel.from_pretrained(small_run.folder, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def ude(ude_run: Any) -> MotionModel:
+    """Without its diffusion decoder, which streams do not use."""
+    made = MotionModel.from_pretrained(ude_run.folder, device="cpu")
+    bundle = made.bundle
+    bundle._generators[bundle.main.folder] = replace(bundle.generator, dmd=None)  # type: ignore[type-var]
+    return made
+
+
+def whole(chunks: list[MotionChunk]) -> Any:
+    """One motion of chunks that follow each other."""
+    ends = list(itertools.accumulate(len(chunk.joints) for chunk in chunks))
+    assert [chunk.start for chunk in chunks] == [0, *ends[:-1]]
+    return joined(chunks)
+
+
+def same(made: Any, wanted: Any) -> None:
+    np.testing.assert_allclose(made.features, wanted.features, rtol=0, atol=NEAR)
+    # The root's way adds up the roundings of all frames before.
+    np.testing.assert_allclose(made.joints, wanted.joints, rtol=0, atol=NEAR * len(made.joints))
+    if wanted.face is None:
+        assert made.face is None
+    else:
+        np.testing.assert_allclose(made.face, wanted.face, rtol=0, atol=NEAR)
+
+
+@pytest.mark.parametrize("chunk_frames", [4, 17])
+def test_one_caption_is_what_generate_makes(model: MotionModel, chunk_frames: int) -> None:
+    sampling = {"cfg_scale": 2.0, "temperature": 0.8}
+    stream = model.stream(
+        "a person waves", face="a person looks sad", seconds=4.0, seed=5, sampling=sampling,
+        streaming={"chunk_frames": chunk_frames},
+    )  # fmt: skip
+    chunks = list(stream)
+    assert len(chunks) > 2 and all(len(chunk.joints) >= chunk_frames for chunk in chunks[:-1])
+    wanted = model.generate(
+        ["a person waves"], face=["a person looks sad"], seconds=4.0, seed=5, sampling=sampling
+    )
+    same(whole(chunks), wanted[0])
+    assert chunks[0].caption == "a person waves" and chunks[0].prompt.words == "a person looks sad"
+
+
+def test_frames_are_those_of_all_tokens_at_once(model: MotionModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the network's block and across captions: its own tokens, decoded in one piece."""
+    tokenizer = model.bundle.generator.tokenizer  # type: ignore[attr-defined]
+    stream, drawn = model.stream([("a person walks", 14.0), ("a person sits", 3.0)], seed=2), []
+    draw = stream._body._flow.draw
+    stream._body._flow.draw = lambda left: drawn.append(draw(left)) or drawn[-1]  # type: ignore[method-assign]
+    made = whole(list(stream))
+    import torch
+
+    codes = {name: torch.cat([group[name] for group in drawn], 1) for name in drawn[0]}
+    np.testing.assert_allclose(tokenizer.decode(codes, [85])[0], made.features, rtol=0, atol=NEAR)
+    assert [tuple(span[:3]) for span in made.segments] == [
+        (0.0, 14.0, "a person walks"),
+        (14.0, 17.0, "a person sits"),
+    ]
+    assert model.max_seconds < 14.0
+
+
+def test_another_caption_on_the_way(model: MotionModel) -> None:
+    stream = model.stream("a person walks", seed=1)
+    before = [next(stream) for _ in range(3)]
+    stream.say("a person jumps", seconds=2.0)
+    after = list(itertools.islice(stream, 40))  # ends after the two seconds
+    chunks = [*before, *after]
+    motion = whole(chunks)
+    assert [span.label for span in motion.segments] == ["a person walks", "a person jumps"]
+    assert motion.segments[1].end - motion.segments[1].start == pytest.approx(2.0)
+    plain = whole(list(model.stream("a person walks", seed=1, seconds=motion.segments[0].end)))
+    reach = model.bundle.generator.tokenizer.net.reach * 4  # type: ignore[attr-defined]
+    kept = round(motion.segments[0].end * motion.fps) - reach
+    assert kept > 0  # up to what the decoder looks ahead, nothing has changed
+    np.testing.assert_allclose(motion.features[:kept], plain.features[:kept], rtol=0, atol=NEAR)
+    assert next(stream, None) is None
+
+
+def test_it_goes_on_until_it_is_closed(model: MotionModel) -> None:
+    stream = model.stream("a person walks")
+    frames = sum(len(next(stream).joints) for _ in range(30))
+    stream.close()
+    rest = sum(len(chunk.joints) for chunk in stream)
+    reach = max(maker._tokenizer.net.reach for maker in (stream._body, stream._face) if maker) * 4
+    assert frames > 200 and 0 < rest <= reach + 16
+    assert stream._body._frames.nbytes < 100_000 and len(stream._bounds) == 1
+
+
+def test_captions_may_be_made_while_it_runs(model: MotionModel) -> None:
+    given: list[int] = []
+
+    def captions() -> Iterator[tuple[str, float]]:
+        for number in itertools.count():
+            given.append(number)
+            yield f"a person waves {number}", 1.0
+
+    chunks = list(itertools.islice(model.stream(captions()), 12))
+    assert chunks[-1].caption == f"a person waves {chunks[-1].start // 20}" and len(given) < 12
+
+
+def test_refusals(model: MotionModel, ude: MotionModel) -> None:
+    sound = Sound(np.ones(100, np.float32) * 0.1, 100)
+    for arguments, words in (
+        (("",), "captions[0] is empty"),
+        ((["a"],), "captions[0] ('a') says not how long it lasts"),
+        (([("a", 0.01)],), "the shortest this model makes is"),
+        (([("a", -1.0)],), "give a length above 0"),
+        ((["a", "b"], "x"), "face and sound go with one caption"),
+    ):
+        with pytest.raises(UserError) as error:
+            next(model.stream(arguments[0], face="".join(arguments[1:])))
+        assert words in str(error.value)
+    for options, words in (
+        ({"seconds": 0.0}, "above 0"),
+        ({"sound": sound}, "conditioned on text only"),
+        ({"seed": -1}, "a seed is a whole number"),
+        ({"sampling": {"face_model": "diffusion"}}, "makes a motion as a whole"),
+        ({"streaming": {"chunk": 1}}, "unknown key 'chunk'"),
+    ):
+        with pytest.raises(UserError) as error:
+            model.stream("a person waves", **options)  # type: ignore[arg-type]
+        assert words in str(error.value)
+    with pytest.raises(UserError, match="caption is empty"):
+        model.stream("a person waves").say(" ")
+
+
+def song(seconds: float) -> Sound:
+    t = np.arange(round(seconds * 22_050)) / 22_050
+    click = 0.7 * np.sin(2 * np.pi * 1500 * (t % 0.5)) * np.exp(-(t % 0.5) * 400)
+    return Sound((0.1 * np.sin(2 * np.pi * 220 * t) + click).astype(np.float32), 22_050)
+
+
+def test_a_script_of_text_and_music_is_what_perform_makes(ude: MotionModel, tmp_path: Path) -> None:
+    import soundfile
+
+    soundfile.write(tmp_path / "song.wav", song(6.0).samples, 22_050)
+    music = str(tmp_path / "song.wav")
+    script = Script(
+        segments=[
+            ScriptSegment(text="a person walks", seconds=5),
+            ScriptSegment(music=music, start=1, end=5.6),
+            ScriptSegment(text="a person waves", music=music, seconds=2),
+        ]
+    )
+    chunks = list(ude.stream(script, seed=4))
+    same(whole(chunks), ude.perform(script, seed=4)[0])
+    assert {chunk.prompt.modalities for chunk in chunks} == {
+        frozenset({"text"}),
+        frozenset({"audio"}),
+        frozenset({"text", "audio"}),
+    }
+
+
+def test_a_dance_without_an_end_of_its_own(ude: MotionModel) -> None:
+    same(whole(list(ude.stream(sound=song(5.0), seed=3))), ude.generate(sounds=[song(5.0)], seed=3)[0])
+    stream = ude.stream("a person walks", seed=3, streaming={"hop_frames": 8})
+    first = next(stream)
+    stream.say("a person waves")
+    after = list(itertools.islice(stream, 8))
+    assert first.caption == "a person walks" and after[-1].caption == "a person waves"
+
+
+# ---- JSON lines
+
+
+def read(text: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    lines = [json.loads(line) for line in text.splitlines()]
+    return lines[0], lines[1:]
+
+
+def test_json_lines_of_the_command(
+    model: MotionModel, small_run: Any, call: Callable[..., Any], tmp_path: Path
+) -> None:
+    out = tmp_path / "made.jsonl"
+    words = ["a person waves", "a person walks", "--seconds", "1.2", "--seed", "3"]
+    done = call("generate", small_run.folder, "--stream", *words, "-o", out)
+    assert done.code == 0 and not done.out and "48 frames, 2.4 s of motion" in done.err
+    head, frames = read(out.read_text())
+    assert head["fps"] == 20.0 and len(head["joint_names"]) == len(head["parents"]) == 52
+    assert [frame["frame"] for frame in frames] == list(range(48))
+    assert [frame["caption"] for frame in frames] == ["a person waves"] * 24 + ["a person walks"] * 24
+    made = whole(list(model.stream(["a person waves", "a person walks"], seconds=1.2, seed=3)))
+    np.testing.assert_allclose([frame["joints"] for frame in frames], made.joints, rtol=0, atol=1.1e-5)
+    np.testing.assert_allclose([frame["face"] for frame in frames], made.face, rtol=0, atol=1.1e-5)
+
+
+def test_captions_from_standard_input(small_run: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = io.StringIO("a person waves\n\na person walks\n")
+    said = Console(file=io.StringIO())
+    stream_motion(small_run.folder, ["-"], seconds=1.0, device="cpu", console=said, given=lines)
+    _, frames = read(capsys.readouterr().out)
+    assert [frame["caption"] for frame in frames] == ["a person waves"] * 20 + ["a person walks"] * 20
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ((), "give a caption"),
+        (("a", "b"), "give --seconds, the length of each"),
+        (("a", "--samples", "2"), "leave --samples and --format out"),
+        (("a", "--format", "npz"), "leave --samples and --format out"),
+        (("a", "--script", "x.yaml"), "--script says everything"),
+    ],
+)
+def test_what_a_stream_is_not(
+    words: tuple[str, ...], sentence: str, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    done = call("generate", tmp_path, "--stream", *words)
+    assert done.code == 2 and sentence in done.err
+
+
+# ---- the documented examples
+
+
+def examples(document: str, heading: str) -> list[str]:
+    """Python blocks below a heading of a document."""
+    text = (Path(__file__).resolve().parents[3] / "docs" / document).read_text(encoding="utf-8")
+    section = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    return re.findall(r"^```python\n(.*?)^```$", section, re.M | re.S)
+
+
+@pytest.mark.parametrize(
+    ("document", "heading"),
+    [("python.md", "One motion, and notebooks"), ("generating.md", "Watched while it is made")],
+)
+def test_examples_run(
+    document: str, heading: str, small_run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = examples(document, heading)
+    assert blocks
+    for block in blocks:
+        assert "runs/humantomato-tiny" in block
+        exec(block.replace("runs/humantomato-tiny", str(small_run.folder)), {})
+    made = {path.name for path in tmp_path.iterdir()}
+    assert made == ({"wave.bvh", "wave.html"} if document == "python.md" else {"walk_and_wave.html"})

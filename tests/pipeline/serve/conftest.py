@@ -1,0 +1,136 @@
+"""A server in this process, with a model that is quick and says in its motions which request they are of."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.serve.app import Site
+from motionloom.pipeline.serve.command import listen, server_of
+from motionloom.pipeline.serve.config import ServeConfig
+from motionloom.pipeline.serve.work import Worker
+
+LAYOUT = MotionLayout.named("wholebody363", fps=20.0)
+
+
+class QuickModel:
+    """Answers at once, or when `open` is set; the root of a motion stands at x = seed / 1000."""
+
+    modalities = frozenset({"text", "audio"})
+    fps, max_seconds = LAYOUT.fps, 10.0
+
+    def __init__(self, walk: Callable[..., Any]) -> None:
+        self.walk = walk
+        self.open = threading.Event()
+        self.open.set()
+        self.asked: list[str] = []
+        generator = SimpleNamespace(modalities=self.modalities, settings=frozenset({"cfg_scale"}))
+        self.bundle = SimpleNamespace(layout=LAYOUT, faces={"gpt": None}, generator=generator)
+
+    def generate(
+        self,
+        captions: Sequence[str] | None = None,
+        *,
+        face: Sequence[str] | None = None,
+        sounds: Sequence[Sound] | None = None,
+        seconds: float | None = None,
+        seed: int = 0,
+        sampling: Any = None,
+    ) -> list[GeneratedMotion]:
+        caption = (captions or [""])[0]
+        self.asked.append(caption)
+        if caption == "break":
+            raise ZeroDivisionError
+        assert self.open.wait(20)
+        joints = self.walk(round((seconds or 2.0) * LAYOUT.fps))
+        joints[..., 0] += seed / 1000 - joints[:1, :1, 0]
+        prompt = Prompt(caption, (face or [""])[0], (sounds or [None])[0])
+        features = np.zeros((len(joints), 313), np.float32)
+        return [GeneratedMotion(prompt, features, joints, None, LAYOUT, seed=seed)]
+
+
+@dataclass(frozen=True)
+class Reply:
+    """An answer."""
+
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+@dataclass(frozen=True)
+class Served:
+    """A server that runs."""
+
+    port: int
+    server: Any
+    worker: Worker
+    thread: threading.Thread
+
+    def ask(self, method: str, path: str, body: bytes = b"", headers: dict[str, str] | None = None) -> Reply:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        try:
+            connection.request(method, path, body or None, headers or {})
+            got = connection.getresponse()
+            return Reply(got.status, {k.lower(): v for k, v in got.getheaders()}, got.read())
+        finally:
+            connection.close()
+
+    def post(self, path: str, data: Any, **headers: str) -> Reply:
+        kind = {"Content-Type": "application/json", **headers}
+        return self.ask("POST", path, json.dumps(data).encode(), kind)
+
+    def wait_for(self, what: Callable[[], bool], seconds: float = 20.0) -> None:
+        end = time.monotonic() + seconds
+        while not what():
+            assert time.monotonic() < end
+            time.sleep(0.01)
+
+
+@contextmanager
+def _run(model: Any, **settings: Any) -> Iterator[Served]:
+    config = ServeConfig(port=0, **settings)
+    place, worker = listen(config), Worker(config.waiting)
+    server = server_of(Site(model, config, worker, "quick"), worker)
+    thread = threading.Thread(target=server.run, args=([place],), daemon=True)
+    thread.start()
+    made = Served(place.getsockname()[1], server, worker, thread)
+    made.wait_for(lambda: server.started)
+    try:
+        yield made
+    finally:
+        worker.stop()
+        server.should_exit = True
+        thread.join(20)
+        place.close()
+    assert not thread.is_alive()
+
+
+@pytest.fixture(scope="session")
+def run_server() -> Callable[..., Any]:
+    """`with run_server(model, waiting=4) as served`."""
+    return _run
+
+
+@pytest.fixture
+def quick(walk: Callable[..., Any]) -> QuickModel:
+    """The model."""
+    return QuickModel(walk)

@@ -1,0 +1,171 @@
+"""The page of `motionloom serve` in a real headless Chromium: type, generate, watch, save, drop music."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+
+pytestmark = pytest.mark.browser
+
+DRAWN = "window.__viewer && window.__viewer.draws > 0"
+SIZES = {"desktop": (1200, 800), "phone": (390, 780)}
+
+
+@pytest.fixture
+def visit(browser: Any, until: Callable[..., None], run_server: Any, quick: Any) -> Iterator[Any]:
+    """Opens the page of a server with the quick model; fails if the page complains or asks elsewhere."""
+    trouble: list[str] = []
+    with run_server(quick, max_seconds=6.0) as served:
+        own = f"http://127.0.0.1:{served.port}/"
+        pages = []
+
+        def go(width: int = 1200, height: int = 800) -> Any:
+            page = browser.new_page(viewport={"width": width, "height": height}, accept_downloads=True)
+            page.on("pageerror", lambda error: trouble.append(str(error)))
+            page.on("console", lambda m: trouble.append(m.text) if "Content Security" in m.text else None)
+            page.on(
+                "request",
+                lambda r: trouble.append(r.url) if not r.url.startswith((own, "blob:", "data:")) else None,
+            )
+            page.goto(own)
+            until(page, "document.getElementById('status').textContent.startsWith('quick')")
+            pages.append(page)
+            return page
+
+        yield go
+        for page in pages:
+            page.close()
+    assert not trouble
+
+
+def status(page: Any) -> str:
+    return str(page.locator("#status").text_content())
+
+
+def colours(page: Any) -> int:
+    """Strongly coloured pixels on the canvas: limbs."""
+    return int(
+        page.evaluate(
+            """() => {
+        const canvas = document.querySelector("canvas"), {width, height} = canvas;
+        const copy = Object.assign(document.createElement("canvas"), {width, height});
+        const ctx = copy.getContext("2d");
+        ctx.drawImage(canvas, 0, 0);
+        const data = ctx.getImageData(0, 0, width, height).data;
+        let found = 0;
+        for (let k = 0; k < data.length; k += 4) {
+            const three = [data[k], data[k + 1], data[k + 2]];
+            if (data[k + 3] > 250 && Math.max(...three) - Math.min(...three) > 90) found += 1;
+        }
+        return found;
+    }"""
+        )
+    )
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_type_and_watch(visit: Any, until: Any, quick: Any, size: str, tmp_path: Path) -> None:
+    page = visit(*SIZES[size])
+    page.get_by_label("What the person does").fill("a person waves <b>&")
+    if size == "phone":
+        page.get_by_text("Settings").click()
+    page.get_by_label("Seconds").fill("1.5")
+    page.get_by_label("Seed").fill("4")
+    if size == "phone":
+        page.get_by_text("Settings").click()
+    page.get_by_role("button", name="Generate").click()
+    until(page, DRAWN)
+    until(page, "!document.getElementById('go').disabled")
+    assert quick.asked == ["a person waves <b>&"] and status(page).startswith("1.5 s of motion, made in")
+    assert page.evaluate("__viewer.frames") == 30
+    assert page.locator("figcaption").text_content() == "a person waves <b>&"
+    first = page.evaluate("__viewer.frame")
+    until(page, f"__viewer.frame !== {first}")
+    assert colours(page) > 400
+    page.screenshot(path=str(tmp_path / f"{size}.png"), full_page=True)
+    wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    assert wide[0] <= wide[1], "nothing hangs over the window's side"
+    figure = page.locator("canvas").bounding_box()
+    assert figure["height"] >= 250 and figure["y"] + figure["height"] <= SIZES[size][1]
+
+
+def test_one_motion_after_another_leaves_nothing(visit: Any, until: Any) -> None:
+    page = visit()
+    for number in range(3):
+        page.get_by_label("What the person does").fill(f"a person waves {number}")
+        page.get_by_role("button", name="Generate").click()
+        until(page, f"document.querySelector('figcaption')?.textContent === 'a person waves {number}'")
+        until(page, DRAWN)
+    assert page.evaluate("[__viewers.length, document.querySelectorAll('canvas').length]") == [1, 1]
+    page.get_by_label("What the person does").press("Space")  # goes into the text, not to the player
+    assert page.evaluate("__viewer.playing") and page.locator("#caption").input_value() == " a person waves 2"
+
+
+def test_what_is_refused_is_said(visit: Any, until: Any, quick: Any) -> None:
+    page = visit()
+    page.get_by_role("button", name="Generate").click()
+    until(page, "document.getElementById('status').className.includes('wrong')")
+    assert status(page) == "Say what the person does, or choose music." and not quick.asked
+    page.get_by_label("What the person does").fill("break")
+    page.keyboard.press("Enter")
+    until(page, "document.getElementById('status').textContent.startsWith('something broke')")
+    assert page.get_by_role("button", name="Generate").is_enabled()
+
+
+def test_saving_asks_for_the_same_motion(visit: Any, until: Any, quick: Any) -> None:
+    page = visit()
+    page.get_by_label("What the person does").fill("a person bows")
+    page.get_by_label("Seed").fill("12")
+    page.keyboard.press("Enter")
+    until(page, DRAWN)
+    page.get_by_label("What the person does").fill("something else")
+    with page.expect_download() as found:
+        page.get_by_role("button", name="npz").click()
+    assert found.value.suggested_filename == "12-a-person-bows.npz"
+    with np.load(found.value.path(), allow_pickle=False) as file:
+        assert json.loads(str(file["metadata"]))["caption"] == "a person bows"
+    assert quick.asked == ["a person bows"] * 2
+
+
+def test_music_is_chosen_and_heard(visit: Any, until: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("motionloom.pipeline.inference.outputs.beats", lambda samples, rate: np.array([0.5]))
+    song = io.BytesIO()
+    wave = 0.4 * np.sin(2 * np.pi * 220 * np.arange(40_000) / 16_000)
+    soundfile.write(song, wave.astype(np.float32), 16_000, format="WAV")
+    page = visit()
+    music = {"name": "tone.wav", "mimeType": "audio/wav", "buffer": song.getvalue()}
+    page.locator("#sound").set_input_files(music)
+    until(page, "document.getElementById('status').textContent === 'tone.wav: 2.5 s of music'")
+    page.get_by_role("button", name="Generate").click()
+    until(page, DRAWN)
+    assert page.evaluate("__viewer.frames") == 50
+    page.get_by_role("button", name="Sound on (M)").click()
+    until(page, "__viewer.sound && __viewer.audio && __viewer.audio.currentTime > 0.05")
+    page.locator("#sound").set_input_files({**music, "buffer": b"no music"})
+    until(page, "document.getElementById('status').className.includes('wrong')")
+    assert status(page).startswith("the sound: ")
+
+
+def test_music_is_dropped_anywhere(visit: Any, until: Any) -> None:
+    song = io.BytesIO()
+    soundfile.write(song, 0.4 * np.sin(np.arange(24_000) / 8).astype(np.float32), 16_000, format="WAV")
+    page = visit()
+    page.evaluate(
+        """(bytes) => {
+        const given = new DataTransfer();
+        given.items.add(new File([new Uint8Array(bytes)], "dropped.wav", { type: "audio/wav" }));
+        for (const name of ["dragover", "drop"]) {
+            const how = { dataTransfer: given, bubbles: true, cancelable: true };
+            document.body.dispatchEvent(new DragEvent(name, how));
+        }
+    }""",
+        list(song.getvalue()),
+    )
+    until(page, "document.getElementById('status').textContent === 'dropped.wav: 1.5 s of music'")

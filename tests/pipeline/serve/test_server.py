@@ -1,0 +1,334 @@
+"""`motionloom serve` over HTTP: answers, refusals, who may ask, many at once, and its end."""
+
+from __future__ import annotations
+
+import http.client
+import io
+import json
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+from rich.console import Console
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.serve import command
+from motionloom.pipeline.serve.command import listen
+from motionloom.pipeline.serve.config import ServeConfig
+
+WAVE = {"caption": "a person waves", "seconds": 1.0}
+
+
+@pytest.fixture
+def served(run_server: Callable[..., Any], quick: Any) -> Iterator[Any]:
+    with run_server(quick, max_seconds=5.0, max_sound_mb=1.0) as made:
+        yield made
+
+
+def tone(seconds: float, loud: float = 0.5, kind: str = "WAV") -> bytes:
+    out = io.BytesIO()
+    wave = loud * np.sin(2 * np.pi * 220 * np.arange(round(seconds * 16_000)) / 16_000)
+    soundfile.write(out, wave.astype(np.float32), 16_000, format=kind)
+    return out.getvalue()
+
+
+def test_a_motion_and_its_name(served: Any) -> None:
+    got = served.post("/api/generate", {**WAVE, "seed": 7, "request": "mine"})
+    said = got.json
+    assert got.status == 200 and got.headers["x-request"] == said["request"] == "mine"
+    assert (said["caption"], said["seed"], said["frames"], said["fps"]) == ("a person waves", 7, 20, 20.0)
+    joints = np.array(said["joints"])
+    assert joints.shape == (20, len(said["joint_names"]), 3) and joints[0, 0, 0] == pytest.approx(0.007)
+    assert said["parents"][0] == -1 and len(said["parents"]) == len(said["joint_names"])
+    unnamed = [served.post("/api/generate", WAVE).json["request"] for _ in range(2)]
+    assert len({*unnamed, ""}) == 3
+
+
+def test_the_viewers_data_and_files(served: Any, tmp_path: Path) -> None:
+    data = served.post("/api/generate", {**WAVE, "format": "viewer"}).json["viewer"]
+    assert data["motions"][0]["frames"] == 20 and data["motions"][0]["caption"] == "a person waves"
+    bvh = served.post("/api/generate", {**WAVE, "format": "bvh"})
+    assert bvh.body.startswith(b"HIERARCHY")
+    assert bvh.headers["content-disposition"] == 'attachment; filename="00-a-person-waves.bvh"'
+    path = tmp_path / "made.npz"
+    path.write_bytes(served.post("/api/generate", {**WAVE, "format": "npz", "seed": 3}).body)
+    with np.load(path, allow_pickle=False) as file:
+        assert file["joints"].shape == (20, 52, 3) and json.loads(str(file["metadata"]))["seed"] == 3
+    page = served.post("/api/generate", {**WAVE, "format": "html"}).body.decode()
+    assert page.startswith("<!doctype html>") and "a person waves" in page
+
+
+def test_info_and_page(served: Any) -> None:
+    info = served.ask("GET", "/api/info").json
+    assert info["model"] == "quick" and info["modalities"] == ["audio", "text"] and info["face"] is True
+    assert info["limits"]["seconds"] == 5.0 and info["limits"]["waiting"] == 32
+    page = served.ask("GET", "/")
+    assert page.status == 200 and page.headers["content-type"].startswith("text/html")
+    for name in ("serve.css", "viewer.js", "serve.js"):
+        assert f"/assets/{name}" in page.body.decode()
+        assert served.ask("GET", f"/assets/{name}").status == 200
+    policy = page.headers["content-security-policy"]
+    assert "default-src 'none'" in policy and "unsafe-inline" not in policy
+    assert "<script>" not in page.body.decode() and "style=" not in page.body.decode()
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"captoin": "x"}, "unknown key 'captoin'; did you mean 'caption'?"),
+        ({"caption": "  "}, "caption is empty"),
+        ({**WAVE, "seconds": 5.1}, "5.1 s were asked for; this server makes at most 5 s"),
+        ({**WAVE, "seconds": -1}, "seconds"),
+        ({**WAVE, "seconds": 1e400}, "seconds"),
+        ({**WAVE, "seed": -1}, "seed"),
+        ({**WAVE, "cfg_scale": 21}, "cfg_scale"),
+        ({"caption": "w" * 301}, "caption has 301 letters; this server takes at most 300"),
+        ({**WAVE, "format": "exe"}, "format"),
+        ({**WAVE, "request": "r" * 65}, "request"),
+        ({**WAVE, "sound": "../../etc/passwd"}, "the sound is not here any more"),
+        (["a person waves"], "not a JSON object"),
+    ],
+)
+def test_bad_input_is_one_sentence(served: Any, quick: Any, body: Any, words: str) -> None:
+    got = served.post("/api/generate", body)
+    assert got.status == 400 and words in got.json["error"] and "\n" not in got.json["error"]
+    assert not quick.asked
+
+
+def test_bad_input_bears_its_name(served: Any) -> None:
+    got = served.post("/api/generate", {"caption": "", "request": "né\r\nX: y"})
+    assert got.status == 400 and got.json["request"] == got.headers["x-request"] == "nX: y"
+
+
+def test_what_is_no_request(served: Any) -> None:
+    assert served.ask("POST", "/api/generate", b"{", {"Content-Type": "application/json"}).status == 400
+    deep = b"[" * 10_000
+    assert served.ask("POST", "/api/generate", deep, {"Content-Type": "application/json"}).status == 400
+    assert served.ask("POST", "/api/generate", b"caption=x", {"Content-Type": "text/plain"}).status == 415
+    assert served.ask("GET", "/api/generate").status == 405
+    assert served.ask("GET", "/assets/../../pyproject.toml").status == 404
+    assert served.ask("GET", "/assets/%2e%2e%2fapp.py").status == 404
+    large = served.post("/api/generate", {"caption": "x" * 20_000})
+    assert large.status == 413 and "at most 16384 bytes" in large.json["error"]
+
+
+def test_a_slow_request_is_let_go(run_server: Callable[..., Any], quick: Any) -> None:
+    with (
+        run_server(quick, patience=0.3) as served,
+        socket.create_connection(("127.0.0.1", served.port)) as raw,
+    ):
+        raw.settimeout(20)
+        raw.sendall(
+            b"POST /api/generate HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+            b"Content-Length: 100\r\n\r\n{"
+        )
+        assert raw.recv(64).startswith(b"HTTP/1.1 408")
+
+
+def test_a_bug_is_a_sentence_and_the_server_goes_on(served: Any, capsys: Any) -> None:
+    got = served.post("/api/generate", {"caption": "break"})
+    assert got.status == 500 and got.json == {"error": "something broke here; the server's log says what"}
+    assert "default-src 'none'" in got.headers["content-security-policy"]
+    assert served.post("/api/generate", WAVE).status == 200
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "evil.example:8000"},
+        {"Host": "localhost.evil.example"},
+        {"Host": "192.168.1.5"},
+        {"Host": "[::1"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Sec-Fetch-Site": "cross-site"},
+    ],
+    ids=str,
+)
+def test_other_sites_are_refused(served: Any, quick: Any, headers: dict[str, str]) -> None:
+    for got in (served.post("/api/generate", WAVE, **headers), served.ask("GET", "/", headers=headers)):
+        assert (
+            got.status == 403
+            and got.json["error"]
+            and "default-src" in got.headers["content-security-policy"]
+        )
+    assert not quick.asked
+
+
+def test_its_own_page_may_ask(served: Any) -> None:
+    own = f"localhost:{served.port}"
+    headers = {"Host": own, "Origin": f"http://{own}", "Sec-Fetch-Site": "same-origin"}
+    assert served.post("/api/generate", WAVE, **headers).status == 200
+
+
+def test_a_link_from_elsewhere_may_be_followed(served: Any) -> None:
+    followed = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
+    assert served.ask("GET", "/", headers=followed).status == 200
+    assert served.post("/api/generate", WAVE, **followed).status == 403
+
+
+def test_names_that_are_allowed(run_server: Callable[..., Any], quick: Any) -> None:
+    with run_server(quick, host="0.0.0.0", allow_hosts=("studio.lan",)) as served:
+        for host, status in (("studio.lan", 200), ("192.168.1.5:80", 200), ("evil.example", 403)):
+            assert served.ask("GET", "/api/info", headers={"Host": host}).status == status
+
+
+def test_music_is_sent_and_driven_by(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    # librosa's functions are compiled when they are first used, which takes longer than all tests here.
+    monkeypatch.setattr("motionloom.pipeline.inference.outputs.beats", lambda samples, rate: np.array([0.5]))
+    name = served.ask("POST", "/api/sounds", tone(3.0)).json
+    assert name["seconds"] == 3.0
+    assert served.ask("POST", "/api/sounds", tone(3.0)).json == name
+    said = served.post("/api/generate", {"sound": name["sound"], "format": "viewer"}).json
+    assert said["frames"] == 60 and said["viewer"]["sounds"][0]["mime"] == "audio/mpeg"
+    assert said["viewer"]["scores"][0]["beats"] == [0.5]
+    said = served.post("/api/generate", {**WAVE, "sound": name["sound"]}).json
+    assert said["frames"] == 20 and said["caption"] == "a person waves"
+    long = served.ask("POST", "/api/sounds", tone(8.0, kind="OGG")).json["sound"]
+    assert served.post("/api/generate", {"sound": long}).json["frames"] == 100  # the server's longest
+
+
+@pytest.mark.parametrize(
+    ("data", "status", "words"),
+    [
+        (b"", 400, "empty"),
+        (b"no sound at all", 400, "the sound: "),
+        (tone(1.0)[:9000], 400, "the sound: "),
+        (tone(1.0, loud=0.0), 400, "silent"),
+        (tone(40.0), 413, "at most 1048576 bytes"),
+    ],
+)
+def test_what_is_no_music(served: Any, data: bytes, status: int, words: str) -> None:
+    got = served.ask("POST", "/api/sounds", data)
+    assert got.status == status and words in got.json["error"] and "/tmp" not in got.json["error"]
+
+
+def test_the_oldest_sound_makes_room(run_server: Callable[..., Any], quick: Any) -> None:
+    with run_server(quick, sounds=2) as served:
+        names = [served.ask("POST", "/api/sounds", tone(length)).json["sound"] for length in (1.0, 1.1, 1.2)]
+        status = [served.post("/api/generate", {"sound": name}).status for name in names]
+    assert status == [400, 200, 200]
+
+
+def test_two_hundred_at_once(run_server: Callable[..., Any], quick: Any) -> None:
+    """Every answer is that of its own request, by name, caption, seed and content."""
+
+    def ask(number: int) -> None:
+        asked = {
+            "caption": f"a person waves {number}",
+            "seconds": 0.2,
+            "seed": number,
+            "request": f"r{number}",
+        }
+        got = served.post("/api/generate", asked)
+        said = got.json
+        assert got.status == 200 and got.headers["x-request"] == said["request"] == f"r{number}"
+        assert (said["caption"], said["seed"]) == (f"a person waves {number}", number)
+        assert said["joints"][0][0][0] == pytest.approx(number / 1000)
+
+    with run_server(quick, waiting=200) as served, ThreadPoolExecutor(200) as clients:
+        list(clients.map(ask, range(200)))
+    assert len(quick.asked) == len(set(quick.asked)) == 200
+
+
+def test_more_than_may_wait_are_refused(run_server: Callable[..., Any], quick: Any) -> None:
+    """Of 200 at once one runs and eight wait; the others hear so at once, and none is without an answer."""
+    quick.open.clear()
+
+    def ask(number: int) -> tuple[int, int, Any]:
+        got = served.post("/api/generate", {**WAVE, "seed": number, "request": f"r{number}"})
+        return number, got.status, got
+
+    with run_server(quick, waiting=8) as served, ThreadPoolExecutor(200) as clients:
+        answers = [clients.submit(ask, number) for number in range(200)]
+        served.wait_for(lambda: sum(answer.done() for answer in answers) >= 191)
+        quick.open.set()
+        results = [answer.result() for answer in answers]
+    made = [(number, got) for number, status, got in results if status == 200]
+    refused = [(number, got) for number, status, got in results if status == 429]
+    assert len(made) == 9 and len(refused) == 191
+    assert all(got.json["joints"][0][0][0] == pytest.approx(number / 1000) for number, got in made)
+    assert all(got.json["request"] == f"r{number}" and got.headers["retry-after"] for number, got in refused)
+    assert refused[0][1].json["error"] == "8 requests are waiting already; try again in a moment"
+
+
+def test_who_goes_away_is_not_served(run_server: Callable[..., Any], quick: Any) -> None:
+    quick.open.clear()
+    with run_server(quick) as served, ThreadPoolExecutor(1) as clients:
+        first = clients.submit(served.post, "/api/generate", WAVE)
+        served.wait_for(lambda: bool(quick.asked))
+        gone = http.client.HTTPConnection("127.0.0.1", served.port)
+        body = json.dumps({"caption": "a person who has left"})
+        gone.request("POST", "/api/generate", body, {"Content-Type": "application/json"})
+        served.wait_for(lambda: served.worker.length == 1)
+        gone.close()
+        time.sleep(0.8)  # it looks every quarter of a second
+        quick.open.set()
+        assert first.result().status == 200 and served.post("/api/generate", WAVE).status == 200
+    assert quick.asked == ["a person waves", "a person waves"]
+
+
+def test_the_end_answers_everybody(run_server: Callable[..., Any], quick: Any) -> None:
+    quick.open.clear()
+    with run_server(quick) as served, ThreadPoolExecutor(4) as clients:
+        runs = clients.submit(served.post, "/api/generate", WAVE)
+        served.wait_for(lambda: bool(quick.asked))
+        wait = [clients.submit(served.post, "/api/generate", {**WAVE, "request": f"{n}"}) for n in range(3)]
+        served.wait_for(lambda: served.worker.length == 3)
+        served.server.handle_exit(signal.SIGINT, None)
+        quick.open.set()
+        assert runs.result().status == 200
+        said = [answer.result() for answer in wait]
+        served.thread.join(20)
+    assert [got.status for got in said] == [503] * 3
+    assert said[2].json == {"error": "the server is stopping", "request": "2"}
+
+
+def test_a_taken_port_is_one_sentence() -> None:
+    with (
+        listen(ServeConfig(port=0)) as first,
+        pytest.raises(UserError, match=r"127.0.0.1 port \d+: address already in use; choose another --port"),
+    ):
+        listen(ServeConfig(port=first.getsockname()[1]))
+
+
+def test_without_the_extra_it_says_so(
+    monkeypatch: pytest.MonkeyPatch, call: Callable[..., Any], tmp_path: Path
+) -> None:
+    monkeypatch.delitem(sys.modules, "motionloom.pipeline.serve.command")
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    done = call("serve", tmp_path)
+    assert done.code == 2 and "serve needs uvicorn: pip install 'motionloom[serve]'" in done.err
+
+
+def test_wrong_options_are_one_sentence(call: Callable[..., Any], tmp_path: Path) -> None:
+    assert "'waiting' = 0" in call("serve", tmp_path, "--waiting", "0").err
+    assert "no such folder" in call("serve", tmp_path / "missing").err
+
+
+@pytest.mark.parametrize(("host", "warned"), [("127.0.0.1", False), ("0.0.0.0", True)])
+def test_the_command_says_where_and_who_can_reach_it(
+    host: str, warned: bool, quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Interrupted:
+        def run(self, places: list[socket.socket]) -> None:
+            assert places[0].getsockname()[0] == host
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(command.MotionModel, "from_pretrained", lambda *_, **options: quick)
+    monkeypatch.setattr(command, "warm", lambda model: None)
+    monkeypatch.setattr(command, "server_of", lambda site, worker: Interrupted())
+    said = Console(file=io.StringIO(), width=200)
+    command.serve(tmp_path, ServeConfig(host=host, port=0), console=said)
+    text = said.file.getvalue()  # type: ignore[attr-defined]
+    assert f": http://{host}:" in text and text.endswith("stopped\n")
+    assert ("others can reach this server" in text) == warned
