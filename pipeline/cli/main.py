@@ -198,6 +198,12 @@ def generate(
         int | None,
         typer.Option(help="Denoising steps of diffusion models, default 50, at most those trained (1000)."),
     ] = None,
+    rigid: Annotated[
+        bool, typer.Option(help="Show bones of constant length; without, the generated joints as they are.")
+    ] = True,
+    plant_feet: Annotated[
+        bool, typer.Option("--plant-feet", help="Hold feet still where they stand; says what that changes.")
+    ] = False,
     device: Device = "auto",
 ) -> None:
     """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch.
@@ -233,6 +239,7 @@ def generate(
             "face_model": face_model,
             **{name: value for name, value in of_models.items() if value is not None},
         },
+        figure={"rigid": rigid, "plant_feet": plant_feet},
         device=device,
         console=make_console(),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,10 @@ import numpy as np
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.bvh import write_bvh
-from motionloom.datasets.motion.kinematics import joints_to_rotations
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.formats import Format
+from motionloom.pipeline.inference.shown import FigureOptions, ShownMotion, shown
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.video import write_mp4
@@ -39,11 +39,14 @@ def write_motions(
     note: str = "",
     seed: int,
     scores: Sequence[Score] | None = None,
+    figure: FigureOptions | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Write every motion in every format; the page holds all of them. Returns the paths.
 
     `title` and `note` are the page's. `scores`, one for each motion: sound for the film and the page, beats
-    and segments for the page. Without them each motion comes with what drove it.
+    and segments for the page. Without them each motion comes with what drove it. `figure` says how the shown
+    figure follows the generated joints, and `say` is given a line a motion on how far it is from them.
     """
     require_folder(folder)
     scores = [score_of(motion) for motion in motions] if scores is None else scores
@@ -51,21 +54,26 @@ def write_motions(
         raise UserError(f"{len(scores)} scores for {len(motions)} motions; give one for each")
     folder.mkdir(parents=True, exist_ok=True)
     out: list[Path] = []
+    figures: list[ShownMotion] = []
     for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
-        stem = folder / file_stem(number, motion.caption)
+        name = file_stem(number, motion.caption)
+        stem = folder / name
+        figures.append(shown(motion, figure))
+        if say is not None:
+            say(f"{name}: {figures[-1].sentence}")
         if "npz" in formats:
-            out.append(write_npz(stem.with_suffix(".npz"), motion, seed))
+            out.append(write_npz(stem.with_suffix(".npz"), figures[-1], seed))
         if "bvh" in formats:
-            out.append(write_bvh_of(stem.with_suffix(".bvh"), motion))
+            out.append(write_bvh_of(stem.with_suffix(".bvh"), figures[-1]))
         if "mp4" in formats:
             path = stem.with_suffix(".mp4")
             skeleton, fps = motion.layout.skeleton, motion.layout.fps
-            write_mp4(path, motion.joints, skeleton, fps, motion.caption, sound=score.sound)
+            write_mp4(path, figures[-1].joints, skeleton, fps, motion.caption, sound=score.sound)
             out.append(path)
     if "html" in formats:
         page = folder / "index.html"
-        shown = [viewer_motion(m, "generated", score=s) for m, s in zip(motions, scores, strict=True)]
-        write_viewer(page, shown, title, note)
+        cells = [viewer_motion(f, "generated", score=s) for f, s in zip(figures, scores, strict=True)]
+        write_viewer(page, cells, title, note)
         out.append(page)
     return out
 
@@ -83,12 +91,12 @@ def score_of(motion: GeneratedMotion) -> Score:
 
 
 def viewer_motion(
-    motion: GeneratedMotion, label: str, group: str = "", score: Score | None = None
+    figure: ShownMotion, label: str, group: str = "", score: Score | None = None
 ) -> ViewerMotion:
-    """A generated motion as the viewer takes it, with its sound, beats and segments."""
-    score = score or Score()
+    """A generated motion's figure as the viewer takes it, with its sound, beats and segments."""
+    motion, score = figure.motion, score or Score()
     return ViewerMotion(
-        joints=motion.joints,
+        joints=figure.joints,
         fps=motion.layout.fps,
         parents=motion.layout.skeleton.parents,
         label=label,
@@ -101,8 +109,9 @@ def viewer_motion(
     )
 
 
-def write_npz(path: Path, motion: GeneratedMotion, seed: int) -> Path:
-    """Joints [T, N, 3] in metres, features, expression, and the facts as one JSON text (no pickle)."""
+def write_npz(path: Path, figure: ShownMotion, seed: int) -> Path:
+    """Joints [T, N, 3] in metres, features, expression, bones, and the facts as one JSON text (no pickle)."""
+    motion = figure.motion
     facts = {
         "caption": motion.caption,
         "face_caption": motion.face_caption,
@@ -114,8 +123,15 @@ def write_npz(path: Path, motion: GeneratedMotion, seed: int) -> Path:
         "up": "y",
         "unit": "m",
         "seed": seed,
+        "figure": figure.facts(),
     }
-    arrays: dict[str, Any] = {"joints": motion.joints.astype(np.float32), "features": motion.features}
+    arrays: dict[str, Any] = {
+        "joints": figure.joints.astype(np.float32),
+        "features": motion.features,
+        "rotations": figure.figure.rotations.astype(np.float32),
+        "offsets": figure.figure.skeleton.offsets.astype(np.float32),
+        "root": figure.figure.root.astype(np.float32),
+    }
     if motion.face is not None:
         arrays["face"] = motion.face
     with atomic_file(path) as file:
@@ -123,9 +139,8 @@ def write_npz(path: Path, motion: GeneratedMotion, seed: int) -> Path:
     return path
 
 
-def write_bvh_of(path: Path, motion: GeneratedMotion) -> Path:
-    """Bone rotations fitted to the generated joints, on a skeleton with the motion's own bone lengths."""
-    skeleton = motion.layout.skeleton.with_lengths_of(motion.joints)
-    rotations = joints_to_rotations(motion.joints, skeleton)
-    write_bvh(path, skeleton, rotations, motion.joints[:, 0], motion.layout.fps)
+def write_bvh_of(path: Path, figure: ShownMotion) -> Path:
+    """The figure's bones and rotations."""
+    fitted = figure.figure
+    write_bvh(path, fitted.skeleton, fitted.rotations, fitted.root, figure.fps)
     return path
