@@ -36,8 +36,8 @@ class FeetOptions(Config):
     """When a foot stands, and how its correction comes and goes."""
 
     height: float = Field(0.05, gt=0, allow_inf_nan=False)
-    """Metres above the floor below which a ball of the foot may stand; the floor is the balls' lowest place, 2
-    percent of the frames left out."""
+    """Metres above the floor below which a ball of the foot may stand; the floor is the balls' lowest place,
+    2 percent of the frames left out."""
     speed: float = Field(0.8, gt=0, allow_inf_nan=False)
     """Metres a second along the floor below which it may stand; sliding feet of small models reach 0.6."""
     shortest: float = Field(0.1, ge=0, allow_inf_nan=False)
@@ -128,7 +128,7 @@ def _balls(skeleton: Skeleton) -> list[int]:
 
 
 def _speeds(points: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
-    """Speed along the floor [T, ...] of points [T, ..., 3] in metres a second, over two steps where possible."""
+    """Speed along the floor [T, ...] of points [T, ..., 3] in m/s, over two steps where possible."""
     if len(points) < 2:
         return np.zeros(points.shape[:-1])
     way = np.gradient(points[..., [0, 2]], axis=0) * fps

@@ -147,7 +147,7 @@ def share_twist(rotations: Floats, skeleton: Skeleton) -> Floats:
         axis = bone / np.linalg.norm(bone)
         x, y, z, w = Rotation.from_matrix(out[:, wrist]).as_quat().T
         twist = 2 * np.arctan2(np.stack([x, y, z], -1) @ axis, w)
-        # The angle is known but for whole turns: the one nearest to the frame before, else forearms would spin.
+        # The angle is known but for whole turns: the nearest to the frame before, else forearms would spin.
         twist = np.unwrap(np.remainder(twist + np.pi, 2 * np.pi) - np.pi)
         twist -= 2 * np.pi * np.round(np.median(twist) / (2 * np.pi))
         share = Rotation.from_rotvec(_FOREARM_SHARE * twist[:, None] * axis).as_matrix()

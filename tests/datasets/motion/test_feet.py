@@ -19,7 +19,7 @@ BALLS = [SKELETON.index("left_foot"), SKELETON.index("right_foot")]
 
 
 def standing_and_sliding(frames: int = 60, slide: float = 0.2) -> NDArray[np.float64]:
-    """The rest pose on the floor with bent knees; from frame 20 to 40 it is in the air, and it drifts ahead."""
+    """The rest pose on the floor with bent knees, in the air from frame 20 to 40, and it drifts ahead."""
     joints = np.repeat(SKELETON.rest_joints[None], frames, axis=0)
     joints[..., 1] -= joints[..., 1].min()
     for side in ("left", "right"):
