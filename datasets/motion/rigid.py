@@ -17,6 +17,7 @@ by the smallest turn (h3d.py), so they would add nothing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -153,6 +154,21 @@ def share_twist(rotations: Floats, skeleton: Skeleton) -> Floats:
         share = Rotation.from_rotvec(_FOREARM_SHARE * twist[:, None] * axis).as_matrix()
         out[:, elbow] = out[:, elbow] @ share
         out[:, wrist] = share.swapaxes(-1, -2) @ out[:, wrist]
+    return out
+
+
+def on_one_skeleton(motions: Sequence[RigidMotion]) -> list[RigidMotion]:
+    """The same motions on one skeleton of their mean bones; errors are against the given figures."""
+    own = [motion.skeleton for motion in motions]
+    if all(skeleton == own[0] for skeleton in own):
+        return list(motions)
+    if any(skeleton.joints != own[0].joints for skeleton in own):
+        raise UserError("motions of different joints have no skeleton in common; write one file for each")
+    mean = with_offsets(own[0], np.mean([skeleton.offsets for skeleton in own], axis=0))
+    out = []
+    for motion in motions:
+        turned, root = solve_poses(motion.joints, mean.offsets, mean.parents, motion.rotations, motion.root)
+        out.append(RigidMotion.posed(mean, turned, root, motion.joints))
     return out
 
 

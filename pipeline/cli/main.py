@@ -170,7 +170,7 @@ def generate(
     samples: Annotated[int, typer.Option(help="Motions of each caption, sound or script.")] = 1,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("motions"),
     formats: Annotated[
-        str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html.")
+        str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html, glb.")
     ] = "npz,bvh,mp4,html",
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,

@@ -1,4 +1,4 @@
-"""Writing motions for people and tools: npz, BVH, MP4 and the viewer page."""
+"""Writing motions for people and tools: npz, BVH, GLB, MP4 and the viewer page."""
 
 from __future__ import annotations
 
@@ -17,11 +17,16 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.formats import Format
 from motionloom.pipeline.inference.shown import FigureOptions, ShownMotion, shown
+from motionloom.pipeline.render.body.face import expression_weights
 from motionloom.pipeline.render.face import synthetic_face_controls
+from motionloom.pipeline.render.glb import GlbClip, write_glb
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 from motionloom.pipeline.store.files import require_folder
+
+ALL_GLB = "motions.glb"
+"""The file with all motions, each an animation of one figure."""
 
 
 def file_stem(number: int, caption: str) -> str:
@@ -70,6 +75,12 @@ def write_motions(
             skeleton, fps = motion.layout.skeleton, motion.layout.fps
             write_mp4(path, figures[-1].joints, skeleton, fps, motion.caption, sound=score.sound)
             out.append(path)
+        if "glb" in formats:
+            out.append(stem.with_suffix(".glb"))
+            write_glb(out[-1], [glb_clip(figures[-1])])
+    if "glb" in formats and len(figures) > 1:
+        out.append(folder / ALL_GLB)
+        write_glb(out[-1], [glb_clip(one) for one in figures])
     if "html" in formats:
         page = folder / "index.html"
         cells = [viewer_motion(f, "generated", score=s) for f, s in zip(figures, scores, strict=True)]
@@ -106,6 +117,18 @@ def viewer_motion(
         sound=score.sound,
         beats=score.beats,
         segments=score.segments,
+    )
+
+
+def glb_clip(figure: ShownMotion) -> GlbClip:
+    """A generated motion's figure as one animation of a GLB file, with its face."""
+    face = figure.motion.face
+    return GlbClip(
+        name=figure.motion.caption or "motion",
+        figure=figure.figure,
+        fps=figure.fps,
+        expression=None if face is None else expression_weights(face),
+        facts=figure.facts(),
     )
 
 

@@ -167,7 +167,7 @@ def generate_motions(
         if name not in get_args(Format):
             raise UserError(f"--format {name}: no such format{nearest(name, get_args(Format))}")
     if not wanted:
-        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4 or html")
+        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4, html or glb")
     # All that needs no model is checked before one is opened.
     require_words(caption_list(captions))
     require_seed(seed)
