@@ -19,7 +19,7 @@ from pydantic import Field
 
 from motionloom.datasets.motion.chain_solver import solve_poses
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.rigid import RigidMotion
+from motionloom.datasets.motion.rigid import FitError, RigidMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config
 
@@ -55,11 +55,14 @@ class FeetReport:
     slide_after: float
     contact: float
     """Share of the frames in which a foot stands, the mean of both feet."""
+    unplanted: FitError
+    """How far the figure was from the joints before its feet were planted."""
 
     def __str__(self) -> str:
         if not self.contact:
             return "no foot stands in this motion, nothing was planted"
-        return f"feet slide {self.slide_after:.1f} cm/s where they slid {self.slide_before:.1f}"
+        slide = f"feet slide {self.slide_after:.1f} cm/s where they slid {self.slide_before:.1f}"
+        return f"{slide}, at the cost of the way from {self.unplanted}"
 
 
 def foot_contacts(
@@ -105,7 +108,7 @@ def plant_feet(
     skeleton, balls = motion.skeleton, _balls(motion.skeleton)
     before = _slide(motion.joints[:, balls], contacts, fps)
     if not contacts.any():
-        return motion, FeetReport(before, before, 0.0)
+        return motion, FeetReport(before, before, 0.0, motion.error)
     targets = motion.joints.copy()
     weights = np.ones(len(skeleton))
     blend = max(1, round(options.blend * fps))
@@ -120,7 +123,7 @@ def plant_feet(
     )
     planted = RigidMotion.posed(skeleton, turned, root, unfitted)
     after = _slide(planted.joints[:, balls], contacts, fps)
-    return planted, FeetReport(before, after, float(contacts.mean()))
+    return planted, FeetReport(before, after, float(contacts.mean()), motion.error)
 
 
 def _balls(skeleton: Skeleton) -> list[int]:

@@ -70,6 +70,8 @@ class ShownMotion:
             "fit_max_mm": round(error.max_mm, 3),
         }
         if self.feet is not None:
+            out["fit_unplanted_mean_mm"] = round(self.feet.unplanted.mean_mm, 3)
+            out["fit_unplanted_max_mm"] = round(self.feet.unplanted.max_mm, 3)
             out["slide_before_cm_s"] = round(self.feet.slide_before, 3)
             out["slide_after_cm_s"] = round(self.feet.slide_after, 3)
         return out
