@@ -170,7 +170,7 @@ def generate(
     samples: Annotated[int, typer.Option(help="Motions of each caption, sound or script.")] = 1,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("motions"),
     formats: Annotated[
-        str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html, glb.")
+        str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html, glb, smplx.")
     ] = "npz,bvh,mp4,html",
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
@@ -204,6 +204,9 @@ def generate(
     plant_feet: Annotated[
         bool, typer.Option("--plant-feet", help="Hold feet still where they stand; says what that changes.")
     ] = False,
+    body_model: Annotated[
+        Path | None, typer.Option(help="Your SMPL-X model (.npz), for --format smplx.")
+    ] = None,
     device: Device = "auto",
 ) -> None:
     """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch.
@@ -239,7 +242,7 @@ def generate(
             "face_model": face_model,
             **{name: value for name, value in of_models.items() if value is not None},
         },
-        figure={"rigid": rigid, "plant_feet": plant_feet},
+        figure={"rigid": rigid, "plant_feet": plant_feet, "body_model": body_model},
         device=device,
         console=make_console(),
     )

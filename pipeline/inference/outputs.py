@@ -13,6 +13,8 @@ import numpy as np
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.bvh import write_bvh
+from motionloom.datasets.motion.smpl import BodyModel
+from motionloom.datasets.motion.smplx_file import write_smplx
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.formats import Format
@@ -58,6 +60,9 @@ def write_motions(
     if len(scores) != len(motions):
         raise UserError(f"{len(scores)} scores for {len(motions)} motions; give one for each")
     folder.mkdir(parents=True, exist_ok=True)
+    body = None
+    if figure is not None and figure.body_model is not None:
+        body = BodyModel.load(figure.body_model, "smplx52")
     out: list[Path] = []
     figures: list[ShownMotion] = []
     for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
@@ -78,6 +83,9 @@ def write_motions(
         if "glb" in formats:
             out.append(stem.with_suffix(".glb"))
             write_glb(out[-1], [glb_clip(figures[-1])])
+        if "smplx" in formats:
+            out.append(folder / f"{name}_smplx.npz")
+            write_smplx(out[-1], figures[-1].figure, motion.layout.fps, body)
     if "glb" in formats and len(figures) > 1:
         out.append(folder / ALL_GLB)
         write_glb(out[-1], [glb_clip(one) for one in figures])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,8 @@ class FigureOptions(Config):
     plant_feet: bool = False
     """Hold feet still where they stand (`datasets/motion/feet.py`)."""
     feet: FeetOptions = FeetOptions()
+    body_model: Path | None = None
+    """Your SMPL-X model (.npz), which the files of format smplx are made for."""
 
     @model_validator(mode="after")
     def _feet_on_bones(self) -> FigureOptions:
