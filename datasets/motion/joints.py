@@ -60,7 +60,8 @@ def rotations_of(features: NDArray[Any], layout: MotionLayout) -> NDArray[np.flo
     from scipy.spatial.transform import Rotation
 
     vectors = _rotation_vectors(features, layout)
-    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+    turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    return np.asarray(turns.reshape(*vectors.shape, 3), dtype=np.float64)
 
 
 def _posed(motion: NDArray[Any], layout: MotionLayout) -> NDArray[np.float64]:

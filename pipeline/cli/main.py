@@ -209,11 +209,13 @@ def generate(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch.
+    """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch; also GLB.
 
     Example: `motionloom generate runs/humantomato-tiny "a person waves" --face "a happy face" -o out`
 
     Example: `motionloom generate runs/ude-tiny --audio song.ogg --samples 3 -o dances`
+
+    Example: `motionloom generate runs/humantomato-tiny "a person bows" --format glb,html --plant-feet`
     """
     from motionloom.pipeline.runs.api import generate_motions
 

@@ -20,8 +20,8 @@ from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.formats import Format
 from motionloom.pipeline.inference.shown import FigureOptions, ShownMotion, shown
 from motionloom.pipeline.render.body.face import expression_weights
+from motionloom.pipeline.render.body.glb import GlbClip, write_glb
 from motionloom.pipeline.render.face import synthetic_face_controls
-from motionloom.pipeline.render.glb import GlbClip, write_glb
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer

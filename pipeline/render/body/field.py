@@ -55,12 +55,14 @@ class Field:
         """The smooth minimum [M] at points [M, 3]."""
         distances = self.distances(points)
         least = distances.min(axis=-1)
-        return least - self.k * np.log(np.exp((least[:, None] - distances) / self.k).sum(axis=-1))
+        share = np.exp((least[:, None] - distances) / self.k).sum(axis=-1)
+        return np.asarray(least - self.k * np.log(share), dtype=np.float64)
 
     def normals(self, points: Floats) -> Floats:
         """Unit gradients [M, 3]: outward on the surface."""
         slope = self._both(points)[1]
-        return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
+        size = np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
+        return np.asarray(slope / size, dtype=np.float64)
 
     def onto(self, points: Floats, steps: int = 3) -> Floats:
         """Points [M, 3] near the surface moved onto it along the gradient."""

@@ -24,8 +24,8 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.face import APEX, BASIS
 from motionloom.pipeline.render.body.face import EXPRESSIONS, expression_weights
+from motionloom.pipeline.render.body.glb import GlbClip, write_glb
 from motionloom.pipeline.render.body.mesh import body_for
-from motionloom.pipeline.render.glb import GlbClip, write_glb
 
 SKELETON = Skeleton.named("smplx52")
 FPS = 20.0
