@@ -170,7 +170,7 @@ def generate(
     samples: Annotated[int, typer.Option(help="Motions of each caption, sound or script.")] = 1,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("motions"),
     formats: Annotated[
-        str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html, glb, smplx.")
+        str, typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html, glb, smplx, arkit.")
     ] = "npz,bvh,mp4,html",
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
@@ -206,6 +206,10 @@ def generate(
     ] = False,
     body_model: Annotated[
         Path | None, typer.Option(help="Your SMPL-X model (.npz), for --format smplx.")
+    ] = None,
+    arkit_bases: Annotated[
+        Path | None,
+        typer.Option(help="Your expression and ARKit bases (.npz: source, arkit), for --format arkit."),
     ] = None,
     device: Device = "auto",
 ) -> None:
@@ -244,7 +248,12 @@ def generate(
             "face_model": face_model,
             **{name: value for name, value in of_models.items() if value is not None},
         },
-        figure={"rigid": rigid, "plant_feet": plant_feet, "body_model": body_model},
+        figure={
+            "rigid": rigid,
+            "plant_feet": plant_feet,
+            "body_model": body_model,
+            "arkit_bases": arkit_bases,
+        },
         device=device,
         console=make_console(),
     )

@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.base.files import atomic_file
+from motionloom.datasets.motion.arkit import ArkitBases, write_arkit_csv
 from motionloom.datasets.motion.bvh import write_bvh
 from motionloom.datasets.motion.smpl import BodyModel
 from motionloom.datasets.motion.smplx_file import write_smplx
@@ -19,13 +21,18 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.bundle import GeneratedMotion
 from motionloom.pipeline.inference.formats import Format
 from motionloom.pipeline.inference.shown import FigureOptions, ShownMotion, shown
+from motionloom.pipeline.render.body.arkit_face import synthetic_arkit
 from motionloom.pipeline.render.body.face import expression_weights
 from motionloom.pipeline.render.body.glb import GlbClip, write_glb
+from motionloom.pipeline.render.body.mesh import Faces
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 from motionloom.pipeline.store.files import require_folder
+
+FaceReader = Callable[[NDArray[Any]], NDArray[np.float64]]
+"""Expression values [T, 50] -> weights [T, E] of a face's shapes."""
 
 ALL_GLB = "motions.glb"
 """The file with all motions, each an animation of one figure."""
@@ -63,6 +70,8 @@ def write_motions(
     body = None
     if figure is not None and figure.body_model is not None:
         body = BodyModel.load(figure.body_model, "smplx52")
+    arkit = _arkit_reader(motions, formats, figure)
+    faces: Faces = "expressions" if arkit is None else "arkit"
     out: list[Path] = []
     figures: list[ShownMotion] = []
     for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
@@ -82,13 +91,16 @@ def write_motions(
             out.append(path)
         if "glb" in formats:
             out.append(stem.with_suffix(".glb"))
-            write_glb(out[-1], [glb_clip(figures[-1])])
+            write_glb(out[-1], [glb_clip(figures[-1], arkit)], faces)
+        if arkit is not None and motion.face is not None:
+            out.append(folder / f"{name}_arkit.csv")
+            write_arkit_csv(out[-1], arkit(motion.face), motion.layout.fps)
         if "smplx" in formats:
             out.append(folder / f"{name}_smplx.npz")
             write_smplx(out[-1], figures[-1].figure, motion.layout.fps, body)
     if "glb" in formats and len(figures) > 1:
         out.append(folder / ALL_GLB)
-        write_glb(out[-1], [glb_clip(one) for one in figures])
+        write_glb(out[-1], [glb_clip(one, arkit) for one in figures], faces)
     if "html" in formats:
         page = folder / "index.html"
         cells = [viewer_motion(f, "generated", score=s) for f, s in zip(figures, scores, strict=True)]
@@ -128,14 +140,30 @@ def viewer_motion(
     )
 
 
-def glb_clip(figure: ShownMotion) -> GlbClip:
-    """A generated motion's figure as one animation of a GLB file, with its face."""
+def _arkit_reader(
+    motions: Sequence[GeneratedMotion], formats: Sequence[Format], figure: FigureOptions | None
+) -> FaceReader | None:
+    """What turns expression values into ARKit weights, where these are wanted."""
+    if "arkit" not in formats:
+        return None
+    if any(motion.face is None for motion in motions):
+        raise UserError("this model makes no face: leave the format arkit out")
+    if figure is None or figure.arkit_bases is None:
+        return synthetic_arkit
+    return ArkitBases.read(figure.arkit_bases).weights
+
+
+def glb_clip(figure: ShownMotion, reader: FaceReader | None = None) -> GlbClip:
+    """A generated motion's figure as one animation of a GLB file, with its face.
+
+    `reader` makes the weights of the face's shapes of expression values; without, the synthetic face's.
+    """
     face = figure.motion.face
     return GlbClip(
         name=figure.motion.caption or "motion",
         figure=figure.figure,
         fps=figure.fps,
-        expression=None if face is None else expression_weights(face),
+        expression=None if face is None else (reader or expression_weights)(face),
         facts=figure.facts(),
     )
 

@@ -35,6 +35,9 @@ class FigureOptions(Config):
     feet: FeetOptions = FeetOptions()
     body_model: Path | None = None
     """Your SMPL-X model (.npz), which the files of format smplx are made for."""
+    arkit_bases: Path | None = None
+    """Your two bases (.npz with `source` and `arkit`), which expressions become ARKit weights by; without,
+    expressions are those of the synthetic face."""
 
     @model_validator(mode="after")
     def _feet_on_bones(self) -> FigureOptions:

@@ -167,7 +167,7 @@ def generate_motions(
         if name not in get_args(Format):
             raise UserError(f"--format {name}: no such format{nearest(name, get_args(Format))}")
     if not wanted:
-        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4, html, glb or smplx")
+        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4, html, glb, smplx or arkit")
     # All that needs no model is checked before one is opened.
     require_words(caption_list(captions))
     require_seed(seed)
@@ -176,6 +176,8 @@ def generate_motions(
     posing = FigureOptions.parse(figure or {}, "figure")
     if posing.body_model is not None and "smplx" not in wanted:
         raise UserError("--body-model is what --format smplx is made for: name that format too")
+    if posing.arkit_bases is not None and "arkit" not in wanted:
+        raise UserError("--arkit-bases is what --format arkit is made by: name that format too")
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     bundle = Bundle.open(folder, choose_device(device))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.rigid import RigidMotion, on_one_skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body.mesh import Body, body_for, colour_strip
+from motionloom.pipeline.render.body.mesh import Body, Faces, body_for, colour_strip, neutral_body
 
 _FLOAT, _SHORT, _BYTE = 5126, 5123, 5121
 _VERTICES, _INDICES = 34962, 34963
@@ -35,22 +35,24 @@ class GlbClip:
     figure: RigidMotion
     fps: float
     expression: NDArray[Any] | None = None
-    """Weights [T, E] of the body's expressions (`body.face.expression_weights`)."""
+    """Weights [T, E] of the face's shapes: `face.expression_weights` [T, 8], or of ARKit's [T, 52]."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Goes into the animation's `extras`, plain JSON."""
 
 
-def write_glb(path: Path, clips: Sequence[GlbClip]) -> list[RigidMotion]:
+def write_glb(path: Path, clips: Sequence[GlbClip], faces: Faces = "expressions") -> list[RigidMotion]:
     """Write the clips as animations of one body; returns the figures as written.
 
-    Clips of different bone lengths are posed on their mean skeleton. The file appears whole or not at all.
+    `faces` chooses the head's morph targets, which the clips' expressions are weights of. Clips of different
+    bone lengths are posed on their mean skeleton. The file appears whole or not at all.
     """
     if not clips:
         raise UserError(f"{path}: a GLB needs at least one motion")
+    shapes = len(neutral_body("smplx52", faces).expressions)
     for clip in clips:
-        _check(path, clip)
+        _check(path, clip, shapes)
     figures = on_one_skeleton([clip.figure for clip in clips])
-    body = body_for(figures[0].skeleton)
+    body = body_for(figures[0].skeleton, faces)
     data = b"".join(_Scene(body, clips, figures).gltf.save_to_bytes())
     with atomic_file(path) as file:
         file.write(data)
@@ -133,8 +135,9 @@ class _Scene:
         mesh = Mesh(name=name, primitives=[primitive])
         if expressions:
             moves = body.expressions
+            still = self._zeros(int(chosen.sum()))
             primitive.targets = [
-                {"POSITION": self._add(move[chosen], target=_VERTICES, bounds=True)}
+                {"POSITION": self._add(move[chosen], target=_VERTICES, bounds=True) if move.any() else still}
                 for move in moves.values()
             ]
             mesh.weights = [0.0] * len(moves)
@@ -190,6 +193,16 @@ class _Scene:
         self.gltf.accessors.append(accessor)
         return len(self.gltf.accessors) - 1
 
+    def _zeros(self, count: int) -> int:
+        """Number of an accessor of `count` vectors of zeros, which takes no room in the file."""
+        from pygltflib import Accessor
+
+        zero = [0.0, 0.0, 0.0]
+        self.gltf.accessors.append(
+            Accessor(componentType=_FLOAT, count=count, type="VEC3", min=zero, max=zero)
+        )
+        return len(self.gltf.accessors) - 1
+
     def _view(self, data: bytes, target: int | None) -> int:
         from pygltflib import BufferView
 
@@ -236,14 +249,12 @@ def _distinct(names: Sequence[str]) -> list[str]:
     return out
 
 
-def _check(path: Path, clip: GlbClip) -> None:
+def _check(path: Path, clip: GlbClip, shapes: int) -> None:
     if not clip.fps > 0:
         raise UserError(f"{path}: '{clip.name}' has fps {clip.fps}; it must be above 0")
     if not np.isfinite(clip.figure.rotations).all() or not np.isfinite(clip.figure.root).all():
         raise UserError(f"{path}: '{clip.name}' holds NaN or infinite values; a GLB file cannot")
-    from motionloom.pipeline.render.body.face import EXPRESSIONS
-
-    wanted = [len(clip.figure.root), len(EXPRESSIONS)]
+    wanted = [len(clip.figure.root), shapes]
     if clip.expression is not None and list(clip.expression.shape) != wanted:
         raise UserError(
             f"{path}: '{clip.name}' has expression weights {list(clip.expression.shape)}, expected {wanted}"

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.body.arkit import ARKIT_SHAPES, Shape
 from motionloom.pipeline.render.body.face import EXPRESSIONS, Look, features, on_skin, skin_shift
 from motionloom.pipeline.render.body.field import Field, skin_weights
 from motionloom.pipeline.render.body.shapes import hand, head, head_centre, nose, trunk_and_limbs
@@ -23,6 +24,8 @@ from motionloom.pipeline.render.body.surface import mesh_of
 from motionloom.pipeline.render.raster import HAIR, PALETTE
 
 Floats = NDArray[np.float64]
+Faces = Literal["expressions", "arkit"]
+"""Which shapes a body's face has: those of the synthetic basis, or ARKit's 52."""
 
 _BODY, _HAND, _HEAD, _NOSE = (0.019, 0.02), (0.0056, 0.004), (0.0095, 0.012), (0.005, 0.01)
 """Of each mesh: the grid's spacing, and over how many metres weights fall off."""
@@ -57,7 +60,7 @@ class Body:
     uv: Floats
     """Place in the colour strip [V, 2]."""
     expressions: dict[str, Floats]
-    """Displacement [V, 3] of every vertex for each expression at its apex."""
+    """Displacement [V, 3] of every vertex for each of its face's shapes at weight 1."""
 
     def posed(self, rotations: NDArray[Any], root: NDArray[Any], face: NDArray[Any] | None = None) -> Floats:
         """Vertices [T, V, 3] of local rotations [T, N, 3, 3], root [T, 3] and expression weights [T, E]."""
@@ -73,7 +76,7 @@ class Body:
         return np.asarray(turned + np.einsum("vn,tni->tvi", self.weights, shift), dtype=np.float64)
 
 
-def body_for(skeleton: Skeleton) -> Body:
+def body_for(skeleton: Skeleton, faces: Faces = "expressions") -> Body:
     """The body on a skeleton with the joints of `smplx52` or `smpl22`, whatever its bone lengths.
 
     Bones are stretched along themselves, and girth goes with the whole figure's size, that of the hands with
@@ -82,14 +85,14 @@ def body_for(skeleton: Skeleton) -> Body:
     for name in ("smplx52", "smpl22"):
         known = Skeleton.named(name)
         if skeleton.joints == known.joints and skeleton.parents == known.parents:
-            return _on(neutral_body(name), skeleton)
+            return _on(neutral_body(name, faces), skeleton)
     raise UserError(f"skeleton {skeleton.name}: there is a body for smplx52 and smpl22 only")
 
 
 @cache
-def neutral_body(name: str = "smplx52") -> Body:
+def neutral_body(name: str = "smplx52", faces: Faces = "expressions") -> Body:
     """The body on a skeleton that ships with the package."""
-    whole = _whole_body()
+    whole = _whole_body(faces)
     if name == "smplx52":
         return whole
     skeleton = Skeleton.named(name)
@@ -117,7 +120,8 @@ def colour_strip() -> NDArray[np.uint8]:
 
 
 @cache
-def _whole_body() -> Body:
+def _whole_body(faces: Faces = "expressions") -> Body:
+    shapes = ARKIT_SHAPES if faces == "arkit" else {name: Shape(look) for name, look in EXPRESSIONS.items()}
     skeleton = Skeleton.named("smplx52")
     pieces = []
     field = trunk_and_limbs(skeleton)
@@ -132,21 +136,26 @@ def _whole_body() -> Body:
     # Skin moves as far as it is the head's: the neck's stays.
     turn = skeleton.index("head")
     looks = {
-        name: [skin_shift(points - centre, look) * weights[:, [turn]] for points, _, _, weights, _ in pieces]
-        for name, look in EXPRESSIONS.items()
+        name: [
+            skin_shift(points - centre, shape.look)
+            * (shape.mask(points - centre) * weights[:, turn])[:, None]
+            for points, _, _, weights, _ in pieces
+        ]
+        for name, shape in shapes.items()
     }
     names = list(_SWATCHES)
     parts = features()
-    wanted = [Look(), *EXPRESSIONS.values()]
-    laid = _laid([[part.outline(look) for part in parts] for look in wanted], wanted, skin, centre)
+    wanted = list(dict.fromkeys([Look(), *(shape.look for shape in shapes.values())]))
+    outlines = [[part.outline(look) for part in parts] for look in wanted]
+    laid = dict(zip(wanted, _laid(outlines, wanted, skin, centre), strict=True))
     for k, part in enumerate(parts):
-        still = laid[0][k]
+        still = laid[Look()][k]
         column = (names.index(part.swatch) + 0.5) / len(names)
         weights = np.zeros((len(still), len(skeleton)))
         weights[:, skeleton.index("head")] = 1.0
         pieces.append((still, skin.normals(still), part.triangles, weights, _flat(still, column, 2)))
-        for name, moved in zip(EXPRESSIONS, laid[1:], strict=True):
-            looks[name].append(moved[k] - still)
+        for name, shape in shapes.items():
+            looks[name].append((laid[shape.look][k] - still) * shape.mask(still - centre)[:, None])
     starts = np.cumsum([0, *(len(piece[0]) for piece in pieces)])
     return Body(
         skeleton=skeleton,

@@ -13,6 +13,7 @@ import numpy as np
 import pygltflib
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.features import encode
@@ -107,6 +108,28 @@ def test_without_rigid_page_and_npz_show_the_generated_joints(
         np.testing.assert_allclose(file["joints"], motions[0].joints, atol=1e-6)
         assert json.loads(str(file["metadata"]))["figure"]["rigid"] is False
     np.testing.assert_allclose(page_joints(paths[-1], 0), motions[0].joints, atol=1e-4)
+
+
+def test_faces_are_written_as_arkit_weights_by_the_users_bases(
+    motions: list[GeneratedMotion], tmp_path: Path
+) -> None:
+    """A basis whose 50 values are the first 50 shapes: weights are the values, cut to 0..1."""
+    arkit = np.random.default_rng(0).normal(size=(52, 70, 3))
+    np.savez(tmp_path / "bases.npz", source=arkit[:50], arkit=arkit)
+    options = FigureOptions(arkit_bases=tmp_path / "bases.npz")
+    paths = write_motions(
+        tmp_path / "out", motions[:1], ["arkit", "glb"], title="t", seed=0, figure=options
+    )  # fmt: skip
+    assert [path.name for path in paths] == ["00-a-person-walks.glb", "00-a-person-walks_arkit.csv"]
+    rows = np.loadtxt(paths[1], delimiter=",", skiprows=1)
+    assert rows.shape == (24, 53)
+    assert motions[0].face is not None
+    meant = motions[0].face[0] @ arkit[:50].reshape(50, -1)
+    reference = lsq_linear(arkit.reshape(52, -1).T, meant, bounds=(0, 1)).x
+    np.testing.assert_allclose(rows[0, 1:], reference, atol=1e-3)
+    assert len(pygltflib.GLTF2().load(paths[0]).meshes[1].primitives[0].targets) == 52
+    with pytest.raises(UserError, match="makes no face"):
+        write_motions(tmp_path / "no", motions, ["arkit"], title="t", seed=0)
 
 
 def test_planted_feet_say_what_they_cost(motions: list[GeneratedMotion]) -> None:
