@@ -135,10 +135,11 @@ class _Scene:
         mesh = Mesh(name=name, primitives=[primitive])
         if expressions:
             moves = body.expressions
-            still = self._zeros(int(chosen.sum()))
+            at_rest = [not move.any() for move in moves.values()]
+            still = self._zeros(int(chosen.sum())) if any(at_rest) else 0
             primitive.targets = [
-                {"POSITION": self._add(move[chosen], target=_VERTICES, bounds=True) if move.any() else still}
-                for move in moves.values()
+                {"POSITION": still if rest else self._add(move[chosen], target=_VERTICES, bounds=True)}
+                for rest, move in zip(at_rest, moves.values(), strict=True)
             ]
             mesh.weights = [0.0] * len(moves)
             # Blender, three.js and engines read the targets' names from here.
@@ -199,7 +200,7 @@ class _Scene:
 
         zero = [0.0, 0.0, 0.0]
         self.gltf.accessors.append(
-            Accessor(componentType=_FLOAT, count=count, type="VEC3", min=zero, max=zero)
+            Accessor(byteOffset=None, componentType=_FLOAT, count=count, type="VEC3", min=zero, max=zero)
         )
         return len(self.gltf.accessors) - 1
 

@@ -155,20 +155,35 @@ def node_package(name: str, main: str) -> Path:
     return path
 
 
-@pytest.mark.browser
-def test_khronos_validator_finds_nothing(written: tuple[Path, list[RigidMotion]]) -> None:
+def validated(path: Path) -> dict[str, Any]:
+    """The validator's report."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("no node on this machine")
     module = node_package("gltf-validator", "index.js")
     done = subprocess.run(
-        [node, "--input-type=module", "-e", VALIDATE, str(module), str(written[0])],
+        [node, "--input-type=module", "-e", VALIDATE, str(module), str(path)],
         capture_output=True, text=True, timeout=120, check=True,
     )  # fmt: skip
-    report = json.loads(done.stdout)
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
+
+
+@pytest.mark.browser
+def test_khronos_validator_finds_nothing(
+    written: tuple[Path, list[RigidMotion]], clips: list[GlbClip], tmp_path: Path
+) -> None:
+    report = validated(written[0])
     assert report["issues"]["messages"] == []
     assert report["info"]["animationCount"] == 2
     assert report["info"]["hasMorphTargets"] and report["info"]["hasSkins"]
+    weights = np.linspace(0, 1, 40 * 52).reshape(40, 52)
+    write_glb(tmp_path / "arkit.glb", [GlbClip("faces", clips[0].figure, FPS, weights)], "arkit")
+    assert validated(tmp_path / "arkit.glb")["issues"]["messages"] == []
+    body = Skeleton.named("smpl22")
+    small = fit_rigid(clips[0].figure.joints[:, :22], body)
+    write_glb(tmp_path / "small.glb", [GlbClip("no fingers", small, FPS)])
+    assert validated(tmp_path / "small.glb")["issues"]["messages"] == []
 
 
 @pytest.fixture(scope="module")
