@@ -200,7 +200,11 @@ def generate(
     ] = False,
     formats: Annotated[
         str | None,
-        typer.Option("--format", "-f", help="Comma-separated: npz, bvh, mp4, html; default all of them."),
+        typer.Option(
+            "--format",
+            "-f",
+            help="Comma-separated: npz, bvh, mp4, html (the default), glb, smplx, arkit.",
+        ),
     ] = None,
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
@@ -228,13 +232,28 @@ def generate(
         int | None,
         typer.Option(help="Denoising steps of diffusion models, default 50, at most those trained (1000)."),
     ] = None,
+    rigid: Annotated[
+        bool, typer.Option(help="Show bones of constant length; without, the generated joints as they are.")
+    ] = True,
+    plant_feet: Annotated[
+        bool, typer.Option("--plant-feet", help="Hold feet still where they stand; says what that changes.")
+    ] = False,
+    body_model: Annotated[
+        Path | None, typer.Option(help="Your SMPL-X model (.npz), for --format smplx.")
+    ] = None,
+    arkit_bases: Annotated[
+        Path | None,
+        typer.Option(help="Your expression and ARKit bases (.npz: source, arkit), for --format arkit."),
+    ] = None,
     device: Device = "auto",
 ) -> None:
-    """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch.
+    """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch; also GLB.
 
     Example: `motionloom generate runs/humantomato-tiny "a person waves" --face "a happy face" -o out`
 
     Example: `motionloom generate runs/ude-tiny --audio song.ogg --samples 3 -o dances`
+
+    Example: `motionloom generate runs/humantomato-tiny "a person bows" --format glb,html --plant-feet`
 
     Example: `motionloom generate runs/humantomato-tiny --stream "a person walks" --seconds 60 -o walk.jsonl`
     """
@@ -260,6 +279,7 @@ def generate(
         },
         "device": device,
     }
+    figure = {"rigid": rigid, "plant_feet": plant_feet, "body_model": body_model, "arkit_bases": arkit_bases}
     if stream:
         from motionloom.pipeline.runs.streams import stream_motion
 
@@ -270,10 +290,16 @@ def generate(
     from motionloom.pipeline.runs.api import generate_motions
 
     files: dict[str, Any] = {} if formats is None else {"formats": formats}
-    folder = out or Path("motions")
     generate_motions(
-        run_folder, captions or [], samples=samples, out=folder, console=make_console(), **files, **asked
-    )  # fmt: skip
+        run_folder,
+        captions or [],
+        samples=samples,
+        out=out or Path("motions"),
+        figure=figure,
+        console=make_console(),
+        **files,
+        **asked,
+    )
 
 
 app.command()(serve)

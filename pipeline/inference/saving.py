@@ -8,8 +8,10 @@ from pathlib import Path
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import score_of, viewer_motion, write_bvh_of, write_npz
+from motionloom.pipeline.inference.outputs import glb_clip, score_of, viewer_motion, write_bvh_of, write_npz
 from motionloom.pipeline.inference.page_words import page_title
+from motionloom.pipeline.inference.shown import shown
+from motionloom.pipeline.render.body.glb import write_glb
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, viewer_page
 
@@ -27,12 +29,17 @@ def save_bvh(path: Path, motion: GeneratedMotion) -> None:
 def save_mp4(path: Path, motion: GeneratedMotion) -> None:
     """A film, with its music."""
     skeleton, sound = motion.layout.skeleton, motion.prompt.sound
-    write_mp4(_place(path), motion.joints, skeleton, motion.fps, motion.caption, sound=sound)
+    write_mp4(_place(path), shown(motion).joints, skeleton, motion.fps, motion.caption, sound=sound)
 
 
 def save_html(path: Path, motion: GeneratedMotion) -> None:
     """The viewer page."""
     write_text(_place(path), page_of(motion))
+
+
+def save_glb(path: Path, motion: GeneratedMotion) -> None:
+    """The skinned body with the motion, for Blender and engines."""
+    write_glb(_place(path), [glb_clip(motion)])
 
 
 def page_of(motion: GeneratedMotion) -> str:
