@@ -74,6 +74,19 @@ def test_small_sets_are_easier_and_seeded(golden: dict[str, torch.Tensor]) -> No
     assert recall(text[:20], motion[:20], batch=256, seed=0) == recall(text[:20], motion[:20])
 
 
+def test_latents_as_they_are_are_compared_by_distance(golden: dict[str, torch.Tensor]) -> None:
+    """Against sorting; by cosine the order is another one."""
+    text, motion = golden["text"][:60], golden["pred"][:60]
+    found = recall(text, motion, recalls=(1, 5), distance="euclidean")
+    near = (text.double()[:, None] - motion.double()[None]).square().sum(-1)
+    places = [near[i].argsort().tolist().index(i) for i in range(60)]
+    back = [near[:, i].argsort().tolist().index(i) for i in range(60)]
+    for way, order in (("t2m", places), ("m2t", back)):
+        for k in (1, 5):
+            assert found[f"{way}/R@{k}"] == pytest.approx(sum(place < k for place in order) / 60)
+    assert found != recall(text, motion, recalls=(1, 5))
+
+
 @settings(max_examples=30, deadline=None)
 @given(n=st.integers(1, 12), seed=st.integers(0, 999))
 def test_ranks_equal_sorting(n: int, seed: int) -> None:
