@@ -251,7 +251,7 @@ def retrieval(
     seed: Annotated[int, typer.Option(help="Shuffles the batches of protocols C and D.")] = 0,
     device: Device = "auto",
 ) -> None:
-    """Text-motion retrieval by the run's TMA, by TEMOS or by an evaluator, under the paper's protocols A to D.
+    """Text-motion retrieval by a run's TMA, TEMOS or evaluator, under the paper's protocols A to D.
 
     Example: `motionloom retrieval runs/humantomato-tiny`
 

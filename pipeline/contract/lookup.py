@@ -43,7 +43,7 @@ def preview_of_finished(stage: Finished) -> Any:
 
 
 def stages_giving(run: Path, what: str) -> list[str]:
-    """Stages of a run's recipe, finished or not, that give `what` to others or are of the kind of this name."""
+    """Stages of a run's recipe, finished or not, that give `what`, or are of the kind of this name."""
     out = []
     for name, entry in stages_of(run).items():
         where = f"{run / 'recipe.yaml'}: stages.{name}"

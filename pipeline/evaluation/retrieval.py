@@ -179,12 +179,14 @@ def retrieval_command(
     device: str = "auto",
     console: Console,
 ) -> Path:
-    """Print the table and write RUN/retrieval.json; of another `stage` than the default, RUN/retrieval-STAGE.json."""
+    """Print the table and write RUN/retrieval.json; of a `stage` other than the default,
+    RUN/retrieval-STAGE.json.
+    """
     found = retrieve(run, stage, split=split, seed=seed, device=device)
     main, stage = _judges(run)[0], found.facts["stage"]
     title = "TMA retrieval" if stage == "tma" else f"Retrieval of stage {stage}"
     console.print(retrieval_table(found.protocols, title))
     path = run / ("retrieval.json" if stage == main else f"retrieval-{stage}.json")
     write_json(path, {**found.facts, "protocols": [asdict(row) for row in found.protocols]})
-    console.print(str(path), soft_wrap=True)
+    console.print(str(path), markup=False, soft_wrap=True)
     return path
