@@ -23,12 +23,13 @@ COMMANDS = sorted(
         found.strip("` ").removeprefix("python benchmarks/")
         for page in DOCS
         for found in re.findall(
-            r"^python benchmarks/.*|`python benchmarks/\S* [^`]*`", page.read_text(), re.MULTILINE
+            r"^python benchmarks/.*|`python benchmarks/\S* [^`\n]*`", page.read_text(), re.MULTILINE
         )
     }
 )
-"""Every command of a benchmark that the documents give, without `python benchmarks/`; in a sentence a script's
-name alone is none.
+"""Every command of a benchmark that the documents give, without `python benchmarks/`.
+
+In a sentence a script's name alone is none.
 """
 
 
