@@ -42,6 +42,12 @@ def test_r_precision_and_matching_equal_public_ones(golden: dict[str, torch.Tens
         )
 
 
+def test_ranks_of_the_public_distances(golden: dict[str, torch.Tensor]) -> None:
+    rank = ranks(golden["dist32"].double())
+    mine = r_precision(golden["text"][:32], golden["pred"][:32], batch=32)
+    close(mine, torch.stack([(rank < k).double().mean() for k in (1, 2, 3)]))
+
+
 @pytest.mark.parametrize("threshold", [None, 0.9])
 def test_recall_equals_tmr(golden: dict[str, torch.Tensor], threshold: float | None) -> None:
     """TMR's threshold 0.95 is the cosine 2 * 0.95 - 1 = 0.9; it reports percent."""
