@@ -224,7 +224,9 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=10_000, help="test clips to generate for, at most")
     parser.add_argument("--temperature", type=float, default=1.0)
     parser.add_argument("--top-p", type=float, default=0.95)
-    parser.add_argument("--cfg", type=float, default=1.0, help="classifier-free guidance of body and hands")
+    parser.add_argument(
+        "--cfg-scale", type=float, default=1.0, help="classifier-free guidance of body and hands"
+    )
     args = parser.parse_args()
     if not finished(args.run, "tma"):
         raise SystemExit(f"{args.run}: the proofs start with a trained TMA; run the stage `tma` first")
@@ -242,7 +244,7 @@ def main() -> None:
     console.print(table)
     if finished(run, "gpt"):
         hold_out = json.loads((run / "stages/data/artifact.json").read_text())["config"]["hold_out"]
-        sampling = SamplingConfig(temperature=args.temperature, top_p=args.top_p, cfg_scale=args.cfg)
+        sampling = SamplingConfig(temperature=args.temperature, top_p=args.top_p, cfg_scale=args.cfg_scale)
         some = [truths[k] for k in np.random.default_rng(0).permutation(len(truths))[: args.clips]]
         found["generated"], found["sampling"] = len(some), sampling.dump()
         shares, found["precision"] = generation(run, some, hold_out, sampling, args.draws)

@@ -246,14 +246,14 @@ def main() -> None:
     parser.add_argument("--gpt", type=int, default=1800, help="steps of a GPT on tokens")
     parser.add_argument("--last", type=int, default=150, help="steps of a GPT in each form")
     parser.add_argument("--top-p", type=float, default=0.9)
-    parser.add_argument("--cfg", type=float, default=1.5, help="classifier-free guidance")
+    parser.add_argument("--cfg-scale", type=float, default=1.5, help="classifier-free guidance")
     args = parser.parse_args()
     console, base = Console(), args.work / "base"
     run(base_recipe(args), base, console)
     shards = finished_stages(base)["data"].folder / "shards"
     truths = test_truths(base)
     truths = [truths[k] for k in np.random.default_rng(0).permutation(len(truths))[: args.tested]]
-    sampling = SamplingConfig(top_p=args.top_p, cfg_scale=args.cfg)
+    sampling = SamplingConfig(top_p=args.top_p, cfg_scale=args.cfg_scale)
     results: dict[str, list[dict[str, Any]]] = {}
     for seed in args.seeds:
         for setting in SETTINGS:

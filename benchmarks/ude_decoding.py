@@ -145,7 +145,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--temperature", type=float, default=1.0, help="of scripts")
     parser.add_argument("--top-p", type=float, default=0.9)
-    parser.add_argument("--cfg", type=float, default=1.0)
+    parser.add_argument("--cfg-scale", type=float, default=1.0)
     args = parser.parse_args()
     console, path = Console(width=160), args.run / "decoding.json"
     found: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
@@ -158,7 +158,7 @@ def main() -> None:
             table.add_row(title, *(f"{np.mean(c):.3f} ± {np.std(c):.3f}" if c else "" for c in cells))
         console.print(table)
     if args.transitions:
-        sampling = SamplingConfig(temperature=args.temperature, top_p=args.top_p, cfg_scale=args.cfg)
+        sampling = SamplingConfig(temperature=args.temperature, top_p=args.top_p, cfg_scale=args.cfg_scale)
         found["transitions"] = transitions(args.run, args.clips, sampling)
         keys = [key for key in next(iter(found["transitions"].values())) if key != "skating"]
         table = Table("", *keys, "foot skating", title="mean percentile, share within the 95th")

@@ -209,8 +209,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--temperature", type=float, default=1.0)
     parser.add_argument("--top-p", type=float, default=0.9)
-    parser.add_argument("--cfg", type=float, default=1.0)
-    parser.add_argument("--music-cfg", type=float, help="guidance of dances (default: --cfg)")
+    parser.add_argument("--cfg-scale", type=float, default=1.0)
+    parser.add_argument("--music-cfg-scale", type=float, help="guidance of dances (default: --cfg-scale)")
     parser.add_argument("--split", default="test")
     parser.add_argument("--out", default="stations.json")
     parser.add_argument("--no-dances", action="store_true", help="for models of words alone")
@@ -224,7 +224,10 @@ def main() -> None:
     dataset = shelf.get(stages["data"]).split(args.split)
     layout, fps = dataset.layout, dataset.layout.fps
     sampling = SamplingConfig(
-        temperature=args.temperature, top_p=args.top_p, cfg_scale=args.cfg, music_cfg_scale=args.music_cfg
+        temperature=args.temperature,
+        top_p=args.top_p,
+        cfg_scale=args.cfg_scale,
+        music_cfg_scale=args.music_cfg_scale,
     )
     out: dict[str, Any] = {"arguments": {k: str(v) for k, v in vars(args).items()}}
     if not args.no_dances:

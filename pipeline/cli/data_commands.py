@@ -42,7 +42,8 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
     say_left_out(manifest, out, console)
     console.print(
         f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), "
-        f"{manifest.fps:g} fps, {', '.join(manifest.licences) or manifest.licence}"
+        f"{manifest.fps:g} fps, {', '.join(manifest.licences) or manifest.licence}",
+        markup=False,
     )
 
 
@@ -311,4 +312,4 @@ def stats_command(root: Path, *, group: bool, out: Path | None, console: Console
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         stats.save(out)
-        console.print(str(out))
+        console.print(str(out), markup=False)

@@ -310,13 +310,13 @@ app.command()(evaluate)
 def retrieval(
     run_folder: RunFolder,
     stage: Annotated[
-        str | None, typer.Option(help="The alignment stage, for example temos; default: tma.")
+        str | None, typer.Option(help="What judges, for example temos or evaluator; default: tma.")
     ] = None,
     split: Annotated[str | None, typer.Option(help="train, val or test; default: the test split.")] = None,
     seed: Annotated[int, typer.Option(help="Shuffles the batches of protocols C and D.")] = 0,
     device: Device = "auto",
 ) -> None:
-    """Text-motion retrieval by the run's TMA, or by TEMOS, under the paper's protocols A to D.
+    """Text-motion retrieval by a run's TMA, TEMOS or evaluator, under the paper's protocols A to D.
 
     Example: `motionloom retrieval runs/humantomato-tiny`
 

@@ -43,13 +43,13 @@ def preview_of_finished(stage: Finished) -> Any:
 
 
 def stages_giving(run: Path, what: str) -> list[str]:
-    """Stages of a run's recipe, finished or not, that give `what` to others."""
+    """Stages of a run's recipe, finished or not, that give `what`, or are of the kind of this name."""
     out = []
     for name, entry in stages_of(run).items():
         where = f"{run / 'recipe.yaml'}: stages.{name}"
         kind = stage_kind(str(entry["kind"]), where)
         fields = {key: value for key, value in entry.items() if key not in ("kind", "inputs")}
-        if what in kind.gives(kind.config.parse(fields, where)):
+        if what == kind.name or what in kind.gives(kind.config.parse(fields, where)):
             out.append(name)
     return out
 

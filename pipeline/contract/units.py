@@ -12,11 +12,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
+from zlib import error as ZlibError
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.files import remove_tree
 
 Arrays = dict[str, NDArray[Any]]
@@ -58,10 +61,18 @@ class Units:
                 done(index)
 
     def read(self, name: str, count: int) -> Iterator[Arrays]:
-        """The results, in order."""
+        """The results, in order; a `UserError` names a file that is damaged."""
         for index in range(count):
-            with np.load(self._path(name, index), allow_pickle=False) as file:
-                yield {key: file[key] for key in file.files}
+            path = self._path(name, index)
+            try:
+                with np.load(path, allow_pickle=False) as file:
+                    found = {key: file[key] for key in file.files}
+            except (ValueError, TypeError, EOFError, KeyError, BadZipFile, ZlibError) as error:
+                raise UserError(
+                    f"{path}: damaged ({' '.join(str(error).split())[:100]}); delete it and run the same "
+                    f"command again, which makes it anew"
+                ) from None
+            yield found
 
     def mine(self, sizes: Sequence[int]) -> int:
         """Sum of the sizes of this process's units, for a progress bar."""

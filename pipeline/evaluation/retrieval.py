@@ -1,23 +1,29 @@
-"""Text-motion retrieval by a trained TMA, or by TEMOS, under the paper's four protocols (HumanTOMATO D.2)."""
+"""Text-motion retrieval by a trained TMA, by TEMOS or by an evaluator, under the paper's four protocols
+(HumanTOMATO D.2).
+"""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
-from motionloom.models.metrics.retrieval import RECALLS, recall
+from motionloom.models.metrics.retrieval import RECALLS, Distance, recall
 from motionloom.pipeline.contract.lookup import finished_stages, stages_giving
-from motionloom.pipeline.contract.stage import ALIGNMENT, Finished, Shelf
-from motionloom.pipeline.evaluation.figures import embed_motions
-from motionloom.pipeline.evaluation.truth import truth_of
+from motionloom.pipeline.contract.stage import ALIGNMENT, Finished, Role, Shelf
+from motionloom.pipeline.evaluation.judges import Judge
+from motionloom.pipeline.evaluation.truth import digest_of, truth_of
 from motionloom.pipeline.launch.hardware import choose_device
-from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.artifact import fingerprint_now, require_consistent
+from motionloom.pipeline.store.evaluator import LoadedEvaluator
 from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.weights import MODEL_FILES
 
 THRESHOLD = 0.9
 """Protocol B: captions with a higher sentence cosine count as the same."""
@@ -37,17 +43,29 @@ class ProtocolResult:
     """"t2m/R@1" ..., "t2m/MedR", and the same for "m2t"."""
 
 
+@dataclass(frozen=True)
+class RetrievalResult:
+    """All protocols, and what tells this measurement from others."""
+
+    protocols: list[ProtocolResult]
+    facts: dict[str, Any]
+    """What judged which clips, as `retrieval.json` has it."""
+
+
 def retrieve(
     run: Path, stage: str | None = None, *, split: str | None = None, seed: int = 0, device: str = "auto"
-) -> list[ProtocolResult]:
-    """All four protocols for one alignment stage of a run, on a split of its data.
+) -> RetrievalResult:
+    """All protocols for one judge of a run, on a split of its data; B where captions can be compared.
 
-    By default its stage `tma`, or else its first, on its test split or else another one held out.
+    By default its stage `tma`, or else its first, on its test split or else another one held out. An
+    evaluator's latents are compared by Euclidean distance, as its training and its figures have it; those
+    of TMA and TEMOS by cosine.
     """
     found = alignment_stage(run, stage)
     shelf = Shelf(choose_device(device))
-    tma, given = shelf.get(found), shelf.given_to(found)
-    data, cache = given["data"], given["text"].cache
+    model, inputs = shelf.get(found), _sources(run, found)
+    data = shelf.get(inputs["data"])
+    judge, distance = _judge(model, found, data)
     dataset = data.split(split) if split else data.held_out(prefer="test")
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
     truths = [t for t in truths if t.caption and len(t.features) >= 4]
@@ -55,40 +73,81 @@ def retrieve(
         raise UserError(
             f"{run}: split '{dataset.split}' has {len(truths)} captioned clips; retrieval needs 2"
         )
-    captions = [t.caption for t in truths]
-    text = tma.embed_captions(captions, cache)
-    motion = embed_motions(tma, [t.features for t in truths], [t.present for t in truths])
-    sentence = torch.as_tensor(cache.similarity(captions))
-    rows = [
-        _result("A", "whole split", recall(text, motion)),
-        _result(
-            "B",
-            f"same meaning counts (cosine {THRESHOLD:g})",
-            recall(text, motion, sentence=sentence, threshold=THRESHOLD),
-        ),
-    ]
+    text, motion = judge.texts(truths), judge.recorded(truths)
+    rows = [_result("A", "whole split", recall(text, motion, distance=distance))]
+    if "text" in inputs:
+        sentence = torch.as_tensor(shelf.get(inputs["text"]).cache.similarity([t.caption for t in truths]))
+        same = {"sentence": sentence, "threshold": THRESHOLD}
+        meaning = f"same meaning counts (cosine {THRESHOLD:g})"
+        rows.append(_result("B", meaning, recall(text, motion, **same, distance=distance)))
     for name, size in BATCHES.items():
-        rows.append(_result(name, f"batches of {size}", recall(text, motion, batch=size, seed=seed)))
-    return rows
+        found_in = recall(text, motion, batch=size, seed=seed, distance=distance)
+        rows.append(_result(name, f"batches of {size}", found_in))
+    facts = {
+        "stage": found.name,
+        "kind": found.kind.name,
+        "fingerprint": fingerprint_now(found.folder),
+        "sha256": sha256_of(found.folder / MODEL_FILES[0]),
+        "distance": distance,
+        "split": dataset.split,
+        "clips": len(truths),
+        "clips_sha256": digest_of(truths),
+        "threshold": THRESHOLD,
+        "seed": seed,
+    }
+    if isinstance(model, LoadedEvaluator):
+        facts |= model.facts
+    return RetrievalResult(rows, facts)
+
+
+def _judge(model: Any, found: Finished, data: Any) -> tuple[Judge, Distance]:
+    """A loaded stage as a judge, and how its latents are compared."""
+    if not isinstance(model, LoadedEvaluator):
+        return Judge.tma(model), "cosine"
+    model.require_layout(data.layout, found.name)
+    return Judge.evaluator(model), "euclidean"
 
 
 def alignment_stage(run: Path, name: str | None = None) -> Finished:
-    """A finished stage that aligns text with motion: by name, else `tma`, else the recipe's first."""
-    aligned = stages_giving(run, ALIGNMENT)
-    if name is None:
-        name = "tma" if "tma" in aligned or not aligned else aligned[0]
-    if name not in aligned:
-        known = f"this run has {', '.join(aligned)}" if aligned else "this run has none"
-        raise UserError(f"{run}: no stage '{name}' that aligns text with body and hands; {known}")
+    """A finished stage that aligns text with motion, or an evaluator: by name, else `tma`, else the recipe's
+    first, evaluators last.
+    """
+    known = _judges(run)
+    name = name or (known or ["tma"])[0]
+    if name not in known:
+        have = f"this run has {', '.join(known)}" if known else "this run has none"
+        raise UserError(f"{run}: no stage '{name}' that aligns text with body and hands; {have}")
     found = finished_stages(run).get(name)
     if found is None:
         raise UserError(f"{run}: no finished '{name}' stage; run the recipe up to it first")
-    missing = [role for role in ("data", "stats", "text") if role not in found.inputs]
+    needed = [role.name for role in found.kind.roles() if isinstance(role, Role) and not role.optional]
+    missing = [role for role in needed if role not in found.inputs]
     if missing:
         said = f"{run}: no finished '{missing[0]}' stage; run the recipe up to it first"
         raise UserError(found.gone.get(missing[0], said))
     require_consistent(run, [name])
     return found
+
+
+def _judges(run: Path) -> list[str]:
+    """Names of the stages of a run's recipe that can judge, the one that does by default first."""
+    known = [*stages_giving(run, ALIGNMENT), *stages_giving(run, "evaluator")]
+    return sorted(known, key=lambda name: name != "tma")
+
+
+def _sources(run: Path, found: Finished) -> dict[str, Finished]:
+    """The stages of the clips and of the captions' meaning: a judge's own, else the run's first of each.
+
+    The published evaluator was made from no stage of the run.
+    """
+    out, finished = {}, finished_stages(run)
+    for what in ("data", "text"):
+        own = [stage for stage in finished.values() if stage.kind.name == what or stage.gives(what)]
+        if what in found.inputs or own:
+            out[what] = found.inputs.get(what) or own[0]
+    if "data" not in out:
+        raise UserError(f"{run}: no finished 'data' stage; run the recipe up to it first")
+    return out
 
 
 def _result(protocol: str, meaning: str, figures: dict[str, float]) -> ProtocolResult:
@@ -120,13 +179,14 @@ def retrieval_command(
     device: str = "auto",
     console: Console,
 ) -> Path:
-    """Print the table and write RUN/retrieval.json; of another `stage` than TMA, RUN/retrieval-STAGE.json."""
-    main = alignment_stage(run).name
-    stage = stage or main
-    rows = retrieve(run, stage, split=split, seed=seed, device=device)
-    console.print(retrieval_table(rows, "TMA retrieval" if stage == main else f"Retrieval of stage {stage}"))
+    """Print the table and write RUN/retrieval.json; of a `stage` other than the default,
+    RUN/retrieval-STAGE.json.
+    """
+    found = retrieve(run, stage, split=split, seed=seed, device=device)
+    main, stage = _judges(run)[0], found.facts["stage"]
+    title = "TMA retrieval" if stage == "tma" else f"Retrieval of stage {stage}"
+    console.print(retrieval_table(found.protocols, title))
     path = run / ("retrieval.json" if stage == main else f"retrieval-{stage}.json")
-    facts = {"stage": stage, "threshold": THRESHOLD, "seed": seed}
-    write_json(path, {**facts, "protocols": [asdict(row) for row in rows]})
-    console.print(str(path), soft_wrap=True)
+    write_json(path, {**found.facts, "protocols": [asdict(row) for row in found.protocols]})
+    console.print(str(path), markup=False, soft_wrap=True)
     return path

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from motionloom.pipeline.evaluation.figures import Interval
@@ -36,7 +37,7 @@ def _number(value: float) -> str:
 def print_tables(console: Console, tables: Iterable[tuple[str, list[str], list[list[str]]]]) -> None:
     """(title, columns, rows) of each table."""
     for title, columns, rows in tables:
-        table = Table(*columns, title=title, title_justify="left")
+        table = Table(*map(escape, columns), title=escape(title), title_justify="left")
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*map(escape, row))
         console.print(table)

@@ -121,7 +121,12 @@ def _retrieval(path: Path, run: Path, stages: Mapping[str, RunStage]) -> Evaluat
     protocols, stage = data.get("protocols"), stages.get(str(data.get("stage")))
     if not isinstance(protocols, list) or stage is None:
         raise UserError(f"{path}: not a record of motionloom retrieval on this run; run it again")
-    figures: dict[str, Any] = {}
+    if data.get("fingerprint") != stage.fingerprint:
+        raise UserError(
+            f"{path}: measured by another '{stage.name}' than is there now; measure again: "
+            f"motionloom retrieval {run} --stage {stage.name}"
+        )
+    figures: dict[str, Any] = {key: data[key] for key in ("split", "clips_sha256", "sha256") if key in data}
     for row in protocols:
         values, size = value_at(row, "figures", None), value_at(row, "size", None)
         if not isinstance(values, dict) or not isinstance(size, int) or size < 1:

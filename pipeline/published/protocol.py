@@ -54,7 +54,7 @@ def measured_like(evaluation: Evaluation, figure: str) -> str:
     found, data = evaluation.figures, evaluation.data
     keys = ["split", "reconstructed_clips"]
     if evaluation.measure == "retrieval":
-        keys = [f"{figure.split('.')[0]}.size"]
+        keys = ["split", "clips_sha256", f"{figure.split('.')[0]}.size"]
     elif evaluation.measure == "evaluate_dances":
         keys = ["split", "clips", "songs", "feature_fps"]
     elif figure.startswith("reconstruction_latents"):
@@ -106,7 +106,7 @@ def _reconstructs(columns: list[Column]) -> bool:
 
 def _clips(evaluation: Evaluation, columns: list[Column]) -> int | None:
     if evaluation.measure == "retrieval":
-        sizes = [value_at(row, "size", 0) for row in evaluation.figures.values()]
+        sizes = [row["size"] for row in evaluation.figures.values() if isinstance(row, dict)]
         return max(sizes, default=None)
     key = "reconstructed_clips" if _reconstructs(columns) else "clips"
     found = value_at(evaluation.figures, key, None)

@@ -105,19 +105,21 @@ def run_recipe(
     if started := started_trainings(run, plan):
         console.print(f"[yellow]replaces unfinished trainings: {', '.join(started)}[/]")
     if dry_run:
-        console.print(f"{len(todo)} of {len(plan)} stages would run in {run}")
+        console.print(f"{len(todo)} of {len(plan)} stages would run in {run}", markup=False)
         return run
     chosen = selected(loaded, select or Selection())
     if not todo and len(chosen) < len(plan):
         console.print(
-            f"{run}: the selected stages are finished ({len(chosen)} of {len(plan)}), nothing to do"
+            f"{run}: the selected stages are finished ({len(chosen)} of {len(plan)}), nothing to do",
+            markup=False,
         )
     elif not todo:
-        console.print(f"{run}: all {len(plan)} stages are finished, nothing to do")
+        console.print(f"{run}: all {len(plan)} stages are finished, nothing to do", markup=False)
     else:
         console.print(
             f"{loaded.name} in {run}: {len(todo)} of {len(plan)} stages to run "
-            f"on {loaded.hardware.describe()}"
+            f"on {loaded.hardware.describe()}",
+            markup=False,
         )
     if todo or not (run / "recipe.yaml").is_file():  # all may have been taken over from another run
         execute(loaded, run, plan, console)
@@ -125,7 +127,7 @@ def run_recipe(
         page = stage_folder(run, row.stage.name) / "report.html"
         # Not the page of an earlier run with other settings.
         if "page" in row.stage.kind.gives(row.stage.config) and row.action != "leave" and page.is_file():
-            console.print(f"watch it: {page.resolve()}", soft_wrap=True)
+            console.print(f"watch it: {page.resolve()}", markup=False, soft_wrap=True)
     return run
 
 
@@ -143,7 +145,7 @@ def _say_estimate(recipe: Recipe, console: Console, todo: Sequence[Stage] | None
         try:
             preview_of(stage, {**stages, **recipe.outside})
         except UserError as error:
-            console.print(str(error))
+            console.print(str(error), markup=False)
             return
     console.print(estimate_table(estimate(recipe, {stage.name for stage in todo})))
 
@@ -230,7 +232,7 @@ def generate_motions(
         say=lambda line: console.print(line, soft_wrap=True, markup=False, highlight=False),
     )
     for path in paths:
-        console.print(str(path), soft_wrap=True)
+        console.print(str(path), markup=False, soft_wrap=True)
     return paths
 
 
@@ -362,7 +364,7 @@ def report_run(
         with atomic_path(out) as whole:
             shutil.copyfile(page, whole)
         page = out
-    console.print(str(page.resolve()), soft_wrap=True)
+    console.print(str(page.resolve()), markup=False, soft_wrap=True)
     return page
 
 
@@ -378,7 +380,9 @@ def export_run(folder: Path, out: Path, *, half: bool = False, console: Console 
         write_bundle(folder, whole, half=half)
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     console.print(
-        f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"', soft_wrap=True
+        f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"',
+        markup=False,
+        soft_wrap=True,
     )
     return out
 

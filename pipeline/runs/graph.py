@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from motionloom.datasets.base.files import write_text
@@ -243,14 +244,15 @@ def _descendants(recipe: Recipe, name: str) -> set[str]:
 
 def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
     """The plan as a table for people."""
-    table = Table(title=f"{recipe.name}: {len(plan)} stages", title_justify="left")
+    table = Table(title=escape(f"{recipe.name}: {len(plan)} stages"), title_justify="left")
     for column in ("stage", "kind", "action", "why", "from"):
         table.add_column(column, overflow="fold")
     colours = {"run": "yellow", "resume": "cyan", "skip": "green", "leave": "dim"}
     for row in plan:
         colour = colours[row.action]
         inputs = ", ".join(dict.fromkeys(row.stage.inputs.values()))
-        table.add_row(row.stage.name, row.stage.kind.name, f"[{colour}]{row.action}[/]", row.reason, inputs)
+        cells = (row.stage.name, row.stage.kind.name, f"[{colour}]{row.action}[/]")
+        table.add_row(*cells, escape(row.reason), escape(inputs))
     return table
 
 

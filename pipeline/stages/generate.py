@@ -73,7 +73,8 @@ class GenerateStage(StageKind):
         )
         titles = [motion.caption for motion in said] + [f"dance to {clip.title}" for _, clip in danced]
         for motion, title in zip(motions, titles, strict=True):
-            context.console.print(f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {title}")
+            line = f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {title}"
+            context.console.print(line, markup=False)
 
 
 def _performed(context: StageContext) -> list[GeneratedMotion]:

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.markup import escape
 from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
@@ -112,7 +113,7 @@ class Look:
             head = f"{seen.upright} of {seen.clips}, along {seen.head} of the files"
             back = f", {seen.backwards} backwards" if seen.backwards else ""
             table.add_row(
-                seen.name or ".",
+                escape(seen.name) or ".",
                 str(seen.clips) + (f", {seen.unreadable} unreadable" if seen.unreadable else ""),
                 "" if seen.height is None else f"{seen.height:.3g} m",
                 head if seen.clips else "",

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
+from rich.markup import escape
 from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
@@ -95,25 +96,25 @@ class ConversionPlan(Generic[C]):
 
     def table(self) -> Table:
         """The plan for a terminal."""
-        table = Table("what", "clips", "frames", "detail", title=f"plan: {self.name}")
+        table = Table("what", "clips", "frames", "detail", title=escape(f"plan: {self.name}"))
         counts = self.counts()
         table.add_row("found in the source", str(self.found), "", f"{self.ignored} other files ignored")
         for split in SPLITS:
             table.add_row(split, str(counts[split]), str(self.frames.get(split, 0)), "")
-        table.add_row("without captions", str(len(self.uncaptioned)), "", _some(self.uncaptioned))
+        table.add_row("without captions", str(len(self.uncaptioned)), "", escape(_some(self.uncaptioned)))
         kinds = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
         for title, drops in kinds:
-            table.add_row(title, str(len(drops)), "", _some(grouped(drops)))
+            table.add_row(title, str(len(drops)), "", escape(_some(grouped(drops))))
         for licence, count in sorted(self.licences.items()):
-            table.add_row("licence", str(count), "", licence)
+            table.add_row("licence", str(count), "", escape(licence))
         if self.bytes_needed is not None:
             table.add_row("disk", "", "", f"{self.bytes_needed / 2**20:,.1f} MiB")
         if self.seconds_needed is not None:
             table.add_row("time", "", "", _duration(self.seconds_needed))
         for note in grouped_notes(self.notes):
-            table.add_row("note", "", "", note)
+            table.add_row("note", "", "", escape(note))
         if self.stop:
-            table.add_row("stops here", "", "", self.stop)
+            table.add_row("stops here", "", "", escape(self.stop))
         return table
 
     def dump(self) -> dict[str, Any]:
@@ -147,7 +148,7 @@ class ConversionPlan(Generic[C]):
         table = Table("subset", "found", "to convert", "missing", "official release", title="subsets")
         for name, subset in sorted(self.subsets.items()):
             expected = "" if subset.expected is None else str(subset.expected)
-            table.add_row(name, str(subset.found), str(subset.used), str(subset.missing), expected)
+            table.add_row(escape(name), str(subset.found), str(subset.used), str(subset.missing), expected)
         return table
 
     def left_out(self) -> list[Dropped]:

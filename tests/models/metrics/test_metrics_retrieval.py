@@ -42,6 +42,12 @@ def test_r_precision_and_matching_equal_public_ones(golden: dict[str, torch.Tens
         )
 
 
+def test_ranks_of_the_public_distances(golden: dict[str, torch.Tensor]) -> None:
+    rank = ranks(golden["dist32"].double())
+    mine = r_precision(golden["text"][:32], golden["pred"][:32], batch=32)
+    close(mine, torch.stack([(rank < k).double().mean() for k in (1, 2, 3)]))
+
+
 @pytest.mark.parametrize("threshold", [None, 0.9])
 def test_recall_equals_tmr(golden: dict[str, torch.Tensor], threshold: float | None) -> None:
     """TMR's threshold 0.95 is the cosine 2 * 0.95 - 1 = 0.9; it reports percent."""
@@ -72,6 +78,19 @@ def test_small_sets_are_easier_and_seeded(golden: dict[str, torch.Tensor]) -> No
     assert recall(text, motion, batch=32, seed=1) == d
     assert recall(text, motion, batch=32, seed=2) != d
     assert recall(text[:20], motion[:20], batch=256, seed=0) == recall(text[:20], motion[:20])
+
+
+def test_latents_as_they_are_are_compared_by_distance(golden: dict[str, torch.Tensor]) -> None:
+    """Against sorting; by cosine the order is another one."""
+    text, motion = golden["text"][:60], golden["pred"][:60]
+    found = recall(text, motion, recalls=(1, 5), distance="euclidean")
+    near = (text.double()[:, None] - motion.double()[None]).square().sum(-1)
+    places = [near[i].argsort().tolist().index(i) for i in range(60)]
+    back = [near[:, i].argsort().tolist().index(i) for i in range(60)]
+    for way, order in (("t2m", places), ("m2t", back)):
+        for k in (1, 5):
+            assert found[f"{way}/R@{k}"] == pytest.approx(sum(place < k for place in order) / 60)
+    assert found != recall(text, motion, recalls=(1, 5))
 
 
 @settings(max_examples=30, deadline=None)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.units import Arrays, Units, as_rows, as_table, even_slices
 
 
@@ -53,6 +54,25 @@ def test_a_unit_of_objects_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="allow_pickle"):
         units.make("a", 1, lambda _: {"value": np.array([{}], dtype=object)})
     assert not any((tmp_path / "work").glob("a-*.npz"))
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "other bytes", "one array alone"])
+def test_a_damaged_unit_is_named_and_made_anew_once_deleted(damage: str, tmp_path: Path) -> None:
+    units = Units(tmp_path / "work")
+    units.make("a", 3, lambda index: {"value": np.arange(1000.0) + index})
+    path = tmp_path / "work" / "a-000001.npz"
+    whole = path.read_bytes()
+    if damage == "one array alone":
+        with path.open("wb") as file:
+            np.save(file, np.ones(3))
+    else:
+        middle = whole[:2000] + bytes(8) + whole[2008:]
+        path.write_bytes({"empty": b"", "cut": whole[:500], "other bytes": middle}[damage])
+    with pytest.raises(UserError, match=r"a-000001\.npz: damaged \(.*delete it and run the same command"):
+        list(units.read("a", 3))
+    path.unlink()
+    units.make("a", 3, lambda index: {"value": np.arange(1000.0) + index})
+    assert [unit["value"][0] for unit in units.read("a", 3)] == [0, 1, 2] and path.read_bytes() == whole
 
 
 @pytest.mark.parametrize(("count", "most"), [(0, 4), (1, 4), (4, 4), (97, 64), (400, 64)])

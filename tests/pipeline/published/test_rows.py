@@ -16,7 +16,7 @@ from motionloom.pipeline.published.conditions import StageMatch
 from motionloom.pipeline.published.fill import fill
 from motionloom.pipeline.published.filled import FilledRow, FilledTable
 from motionloom.pipeline.published.shipped import paper_table
-from motionloom.pipeline.published.stages import RunStage
+from motionloom.pipeline.published.stages import RunStage, run_stages
 
 Make = Callable[..., Path]
 
@@ -273,14 +273,20 @@ RETRIEVAL = {
 
 def test_retrieval_fills_by_protocol(baselines: Make) -> None:
     run = baselines()
-    (run / "retrieval.json").write_text(json.dumps(RETRIEVAL))
-    (run / "retrieval-temos.json").write_text(json.dumps(RETRIEVAL | {"stage": "temos"}))
+    known = {name: stage.fingerprint for name, stage in run_stages(run).items()}
+    for name, file in (("tma", "retrieval.json"), ("temos", "retrieval-temos.json")):
+        record = RETRIEVAL | {"stage": name, "fingerprint": known[name], "split": "test"}
+        (run / file).write_text(json.dumps(record))
     table = filled("humantomato/12", run)
     found = [(row.method, row.label) for row in table.rows if row.source == "ours"]
     assert found == [(f"{p}, {m}", f"bl {m.lower()}") for p in "ABCD" for m in ("TEMOS", "TMA")]
     chance = [texts(row) for row in table.rows if row.label.startswith("chance")]
     assert chance[0] == ["0.025", "", "", "", "0.250"] * 2  # protocol A, among 40
     assert chance[-1] == ["0.031", "", "", "", "0.312"] * 2  # protocol D, among 32
+    for old in (RETRIEVAL, RETRIEVAL | {"fingerprint": "of another TMA"}):
+        (run / "retrieval.json").write_text(json.dumps(old))
+        with pytest.raises(UserError, match=r"retrieval\.json: measured by another 'tma' than is there now"):
+            filled("humantomato/12", run)
     (run / "retrieval.json").write_text(json.dumps({"stage": "gone", "protocols": []}))
     with pytest.raises(UserError, match=r"retrieval\.json: not a record of motionloom retrieval on this run"):
         filled("humantomato/12", run)

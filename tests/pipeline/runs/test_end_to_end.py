@@ -228,7 +228,11 @@ def test_from_pretrained_needs_the_saved_folder_alone(
 def test_retrieval_under_four_protocols(copy: Path, call: Callable[..., Any]) -> None:
     done = call("retrieval", copy)
     assert done.code == 0
-    rows = json.loads((copy / "retrieval.json").read_text())["protocols"]
+    record = json.loads((copy / "retrieval.json").read_text())
+    artifact = json.loads((copy / "stages/tma/artifact.json").read_text())
+    assert record["fingerprint"] == artifact["fingerprint"] and record["split"] == "test"
+    assert record["sha256"] == artifact["outputs"]["model.safetensors"]["sha256"]
+    rows = record["protocols"]
     assert [row["protocol"] for row in rows] == list("ABCD")
     whole, threshold = rows[0]["figures"], rows[1]["figures"]
     for k in (1, 2, 3, 5, 10):

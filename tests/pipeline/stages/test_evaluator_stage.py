@@ -24,6 +24,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Given, Shelf
 from motionloom.pipeline.evaluation.judges import Judge
+from motionloom.pipeline.evaluation.retrieval import retrieve
 from motionloom.pipeline.evaluation.text_motion import matching
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.api import run_recipe
@@ -210,6 +211,13 @@ def test_an_evaluation_is_judged_by_it(judge: Path, call: Callable[..., Any], tm
     assert 0 < rows["training"]["fid"]["mean"] < rows["mean_pose"]["fid"]["mean"]
     assert rows["generated"]["fid"]["mean"] > 0 and data.layout == evaluator.layout
     assert "R-Precision among 8 by the evaluator, 24 clips" in done.out
+    retrieved = retrieve(tmp_path / "run", "evaluator")
+    truths = [t for t in (truth_of(data.split("test"), i) for i in range(60)) if t.caption]
+    judge_ = Judge.evaluator(evaluator)
+    text, motion = judge_.texts(truths), judge_.recorded(truths)
+    closest = torch.cdist(text.double(), motion.double()).argmin(1) == torch.arange(len(truths))
+    assert retrieved.protocols[0].figures["t2m/R@1"] == pytest.approx(closest.double().mean().item())
+    assert retrieved.facts["sha256"] == weights and retrieved.facts["clips"] == len(truths) == 60
 
 
 @pytest.mark.slow

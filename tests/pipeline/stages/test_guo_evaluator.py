@@ -315,6 +315,12 @@ def test_a_run_is_judged_by_it(
     assert found["distribution"]["rows"]["generated"]["multimodality"]["mean"] > 0
     assert "R-Precision among 4 by the evaluator, 10 clips" in done.out
     assert "The evaluator's latents: FID to 10 recorded motions" in done.out
+    done = call("retrieval", tmp_path / "run", "--stage", "guo")
+    assert done.code == 0 and "Retrieval of stage guo" in done.out, done.err
+    record = json.loads((tmp_path / "run/retrieval-guo.json").read_text())
+    assert (record["kind"], record["sha256"], record["untagged"]) == ("guo_evaluator", weights, "refuse")
+    assert (record["split"], record["clips"], record["distance"]) == ("test", 10, "euclidean")
+    assert [row["protocol"] for row in record["protocols"]] == list("ABCD"), "the run has a text stage"
     done = call("run", tmp_path / "plain.yaml", "--out", tmp_path / "plain-run")
     assert done.code == 2 and "has no word/POS tags" in done.err
     other = ("--set", "guo.untagged=other")

@@ -60,5 +60,5 @@ def test_tma_tells_apart_what_the_sentence_encoder_does_not(tmp_path: Path) -> N
         assert sentence > 0.8, "to the sentence encoder they are nearly the same"
         assert aligned < sentence - 0.5, f"{pair}: TMA {aligned:.2f}, sentence encoder {sentence:.2f}"
     # Twelve kinds of walk among 32 clips: a guess finds 3 % (10 % within three).
-    figures = next(row for row in retrieve(run) if row.protocol == "D").figures
+    figures = next(row for row in retrieve(run).protocols if row.protocol == "D").figures
     assert figures["t2m/R@3"] > 0.4 and figures["m2t/R@3"] > 0.4
