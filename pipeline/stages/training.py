@@ -8,6 +8,7 @@ run repeats the undisturbed one bit for bit and the loader's whole state is the 
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections.abc import Callable, Iterator, Sized
 from functools import partial
@@ -27,9 +28,11 @@ from motionloom.models.training.players import PlayersModule
 from motionloom.models.training.sharding import make_whole
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.stage import StageContext
+from motionloom.pipeline.launch.ending import end_with_parent
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import environment, lead_finds
+from motionloom.pipeline.stages.heartbeat import Heartbeat
 from motionloom.pipeline.stages.loggers import Loggers
 from motionloom.pipeline.stages.progress import MetricLog, StepProgress
 from motionloom.pipeline.stages.train_config import BatchSource, EvalSource, TrainConfig
@@ -105,6 +108,7 @@ def fit(
         callbacks=[
             checkpoints,
             ResumeBetweenChunks(config, chunk),
+            Heartbeat(context.name, context.folder, hardware.stall_seconds),
             MetricLog(context.folder, loggers),
             StepProgress(context.name, config.steps, context.console, longer=longer),
             *([average] if average else []),
@@ -215,6 +219,7 @@ def _loader(dataset: Dataset[Any], sampler: Any, hardware: Hardware) -> DataLoad
         pin_memory=hardware.resolved_accelerator() == "gpu",
         persistent_workers=workers > 0,  # from chunk to chunk; their start takes seconds
         multiprocessing_context="spawn" if workers else None,
+        worker_init_fn=partial(end_with_parent, os.getpid()) if workers else None,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -37,8 +38,10 @@ class Vectors(Dataset[dict[str, Tensor]]):
         size: int = 10**6,
         dtype: Any = None,
         dies_at: int | None = None,
+        hangs_at: int | None = None,
     ) -> None:
-        self.batch, self.parts, self.size, self.dtype, self.dies_at = batch, parts, size, dtype, dies_at
+        self.batch, self.parts, self.size, self.dtype = batch, parts, size, dtype
+        self.dies_at, self.hangs_at = dies_at, hangs_at
         self.rows = slice(rank * batch // world, (rank + 1) * batch // world)
 
     def __len__(self) -> int:
@@ -50,6 +53,8 @@ class Vectors(Dataset[dict[str, Tensor]]):
         step, part = divmod(index, self.parts)
         if step == self.dies_at:
             raise ConnectionResetError("killed")
+        if step == self.hangs_at:
+            time.sleep(3600)
         generator = torch.Generator().manual_seed(step)
         # The same rows whether they come at once or in parts.
         rows = torch.randn(self.parts * self.batch, DIM, generator=generator, dtype=torch.float64)
