@@ -2,8 +2,9 @@
 
 Exit codes: 0 done; 1 the check found problems; 2 a mistake in the call, the recipe or the data (one sentence
 on standard error says which and how to fix it), or what the system refuses: a full disk, no permission; 75
-a signal has stopped a training, which is saved and goes on with the same command; 130 interrupted; 141 nobody
-reads the output any more. A bug shows its traceback and gives 1.
+a signal has stopped a training, which is saved and goes on with the same command; 76 another process of the
+run has died, or one has stalled; 130 interrupted; 141 nobody reads the output any more. A bug shows its
+traceback and gives 1.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from motionloom.pipeline.cli.options import Device, ModelFolder, RunFolder, Sets
 from motionloom.pipeline.cli.replay import replay
 from motionloom.pipeline.cli.serve import serve
 from motionloom.pipeline.cli.sweep import sweep
+from motionloom.pipeline.launch import watch
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
 from motionloom.pipeline.launch.process import Interrupted, TeamError, leave, process_rank
 
@@ -399,9 +401,12 @@ def _exit_code() -> int:
         errors.print(f"error: {error}", style="red", markup=False)
         return 2
     except TeamError as error:
+        mine = watch.current()
+        known = mine is not None and mine.explanation() is not None  # then it is said, once for all processes
+        watch.end(victim=True)
         where = f"process {process_rank()}: another process of this run has stopped"
-        errors.print(f"{where} ({error})", style="red", markup=False)
-        return 1
+        errors.print(where if known else f"{where} ({error})", style="red", markup=False)
+        return watch.ENDED
     except BrokenPipeError:  # `motionloom info | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return _CLOSED_PIPE

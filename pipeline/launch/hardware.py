@@ -41,6 +41,9 @@ class Hardware(Config):
     """Processes that convert or synthesise shards."""
     threads: int = Field(0, ge=0)
     """CPU threads per process; 0 leaves torch's choice."""
+    stall_seconds: int = Field(600, ge=0)
+    """Seconds without a step, a validation batch or a word of one of the processes after which a training
+    counts as stalled and the run ends; 0 = never. Compiling counts, so it must be longer than that takes."""
     loggers: tuple[LoggerName, ...] = ("tensorboard", "csv")
     """Where the figures of trainings go, besides `metrics.jsonl`; wandb, mlflow and trackio are extras."""
     flight_rows: int = Field(1000, ge=0)

@@ -73,7 +73,12 @@ def leave(code: int) -> NoReturn:
 
     torch's gloo group may be destroyed while the interpreter lock is held and then waits for a thread that
     wants that lock: the process would hang after its work is done. Every file is written by then.
+
+    Processes that still wait for this one get the code first.
     """
+    watch = sys.modules.get("motionloom.pipeline.launch.watch")
+    if watch is not None:
+        watch.end(code)
     torch = sys.modules.get("torch")
     if torch is not None and torch.distributed.is_available() and torch.distributed.is_initialized():
         sys.stdout.flush()

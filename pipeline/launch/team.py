@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import torch.distributed as dist
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch import watch
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError, srun_tasks
 
@@ -26,6 +27,10 @@ Found = TypeVar("Found")
 
 _PATIENCE = timedelta(days=30)
 """How long the others wait for a stage that only the lead runs; a dead lead ends the wait at once."""
+
+_COLLECTIVE = 1800
+"""Seconds after which a collective of a training fails, at least; twice `hardware.stall_seconds` where that
+is more, so that the message names who stalls and not who waits."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +56,16 @@ class Team:
             accelerator=hardware.lightning_accelerator(),
             devices=hardware.resolved_devices(),
             num_nodes=hardware.nodes,
-            strategy=DDPStrategy(process_group_backend=hardware.backend()),
+            strategy=DDPStrategy(
+                process_group_backend=hardware.backend(),
+                timeout=timedelta(seconds=max(_COLLECTIVE, 2 * hardware.stall_seconds)),
+            ),
             plugins=[launcher] if launcher else None,
         )
         fabric.launch()
-        return Team(fabric.global_rank, fabric.world_size, dist.new_group(backend="gloo", timeout=_PATIENCE))
+        waiting = dist.new_group(backend="gloo", timeout=_PATIENCE)
+        _watch(fabric.global_rank, hardware.stall_seconds, waiting)
+        return Team(fabric.global_rank, fabric.world_size, waiting)
 
     @property
     def leads(self) -> bool:
@@ -70,6 +80,22 @@ class Team:
             dist.barrier(self.waiting)
         except RuntimeError as error:
             raise TeamError(str(error)) from None
+
+    def part(self) -> None:
+        """This process has done all that the others need it for."""
+        watch.end()
+
+
+def _watch(rank: int, stall_seconds: float, group: dist.ProcessGroup | None) -> None:
+    """Have every process notice when another one dies or stalls."""
+    mine = watch.Watch(rank, stall_seconds)
+    address: list[tuple[str, int, str] | None] = [None]
+    if rank == 0:
+        address = [mine.listen(os.environ.get("MASTER_ADDR", "127.0.0.1"))]
+    dist.broadcast_object_list(address, src=0, group=group)
+    if rank and address[0] is not None:
+        mine.connect(*address[0])
+    watch.begin(mine)
 
 
 def lead_finds(find: Callable[[], Found]) -> Found:

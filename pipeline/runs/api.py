@@ -262,6 +262,7 @@ def _stages_again(
     for number, stage in enumerate(stages):
         out = folder / target / stage.name if number else folder / target
         _stage_again(folder, recipe, stage, out, target, changes, shelf, console, team, state)
+    team.part()
     return folder / target
 
 

@@ -37,6 +37,7 @@ from motionloom.pipeline.contract.stage import (
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.launch.watch import current
 from motionloom.pipeline.runs.beginning import prepare_folder
 from motionloom.pipeline.runs.extend import extendable, extension
 from motionloom.pipeline.runs.outside import require_elsewhere
@@ -311,11 +312,15 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 write_json(folder / "timing.json", took)
                 _artifact(recipe, run, row, plan).finish(folder)
                 console.print(f"    finished in {seconds:.1f} s")
+        team.part()
     return [row.stage.name for row in todo]
 
 
 def perform(kind: StageKind, context: StageContext, team: Team) -> None:
     """One stage, by all processes that take part in its kind."""
+    watch = current()
+    if watch is not None:
+        watch.enter_stage(context.name, context.folder, "before its first step")
     if kind.trains:
         team.meet()
         kind.run(context)

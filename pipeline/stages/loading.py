@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sized
+from functools import partial
 from multiprocessing import resource_tracker
 from typing import Any, cast
 
 import lightning as L
 from torch.utils.data import DataLoader, Dataset
 
+from motionloom.pipeline.launch.ending import end_with_parent
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.interruption import unsignalled
 from motionloom.pipeline.stages.train_config import BatchSource, EvalSource, TrainConfig
@@ -114,4 +117,5 @@ def _loader(dataset: Dataset[Any], numbers: range, hardware: Hardware) -> DataLo
         pin_memory=hardware.resolved_accelerator() == "gpu",
         persistent_workers=workers > 0,  # from validation to validation; their start takes seconds
         multiprocessing_context="spawn" if workers else None,
+        worker_init_fn=partial(end_with_parent, os.getpid()) if workers else None,
     )

@@ -32,6 +32,7 @@ from motionloom.pipeline.flight.callbacks import flight_callbacks
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import environment, lead_finds
+from motionloom.pipeline.stages.heartbeat import Heartbeat
 from motionloom.pipeline.stages.interruption import Interruption, Signals, leave_signals_alone
 from motionloom.pipeline.stages.loading import TrainingData
 from motionloom.pipeline.stages.loggers import Loggers
@@ -106,6 +107,7 @@ def fit(
                 settle=checkpoints.finish,
             ),
             ResumeBetweenChunks(config, chunk, config.accumulate),
+            Heartbeat(context.name, context.folder, hardware.stall_seconds),
             log,
             StepProgress(context.name, config.steps, context.console, longer=longer),
             *([average] if average else []),

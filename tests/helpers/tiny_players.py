@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -39,9 +40,10 @@ class Vectors(Dataset[dict[str, Tensor]]):
         dtype: Any = None,
         dies_at: int | None = None,
         signalled: dict[int, signal.Signals] | None = None,
+        hangs_at: int | None = None,
     ) -> None:
-        self.batch, self.parts, self.size, self.dtype, self.dies_at = batch, parts, size, dtype, dies_at
-        self.signalled = signalled or {}
+        self.batch, self.parts, self.size, self.dtype = batch, parts, size, dtype
+        self.dies_at, self.hangs_at, self.signalled = dies_at, hangs_at, signalled or {}
         self.rows = slice(rank * batch // world, (rank + 1) * batch // world)
 
     def __len__(self) -> int:
@@ -55,6 +57,8 @@ class Vectors(Dataset[dict[str, Tensor]]):
             raise ConnectionResetError("killed")
         if part == 0 and step in self.signalled:
             os.kill(os.getpid(), self.signalled[step])
+        if step == self.hangs_at:
+            time.sleep(3600)
         generator = torch.Generator().manual_seed(step)
         # The same rows whether they come at once or in parts.
         rows = torch.randn(self.parts * self.batch, DIM, generator=generator, dtype=torch.float64)
