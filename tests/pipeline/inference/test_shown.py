@@ -23,7 +23,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.face import APEX, BASIS
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.bundle import GeneratedMotion
-from motionloom.pipeline.inference.outputs import ALL_GLB, write_motions
+from motionloom.pipeline.inference.outputs import ALL_GLB, write_glb_of, write_motions
 from motionloom.pipeline.inference.shown import FigureOptions, shown
 
 LAYOUT = MotionLayout.named("wholebody363")
@@ -93,6 +93,9 @@ def test_all_files_show_one_figure_of_constant_bones(motions: list[GeneratedMoti
         order = [bvh.joints.index(name) for name in LAYOUT.skeleton.joints]
         np.testing.assert_allclose(bvh.positions()[:, order] / 100, joints, atol=2e-5)
         np.testing.assert_allclose(page_joints(paths[-1], number), joints, atol=1e-4)
+    alone = write_glb_of(tmp_path / "alone.glb", motions[0])
+    a, b = (pygltflib.GLTF2().load(path) for path in (alone, paths[2]))
+    assert a.binary_blob() == b.binary_blob()
     together = pygltflib.GLTF2().load(tmp_path / "out" / ALL_GLB)
     assert [animation.name for animation in together.animations] == ["a person walks", "a person waves"]
     paths_of = [[c.target.path for c in animation.channels] for animation in together.animations]
