@@ -170,6 +170,12 @@ def glb_clip(motion: GeneratedMotion | ShownMotion, reader: FaceReader | None = 
     )
 
 
+def write_glb_of(path: Path, motion: GeneratedMotion | ShownMotion) -> Path:
+    """The skinned body, moved by the figure, with its face."""
+    write_glb(path, [glb_clip(motion)])
+    return path
+
+
 def write_npz(path: Path, motion: GeneratedMotion | ShownMotion, seed: int | None) -> Path:
     """Joints [T, N, 3] in metres, features, expression, bones, and the facts as one JSON text (no pickle)."""
     figure = shown(motion)

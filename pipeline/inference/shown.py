@@ -96,8 +96,8 @@ def shown(motion: GeneratedMotion | ShownMotion, options: FigureOptions | None =
     )
     feet = None
     if options.plant_feet:
-        contacts = foot_contacts(
-            figure.joints, layout.skeleton, layout.fps, options.feet, motion.features, layout.without_face()
-        )
+        # Only the h3d family has contact columns; others are judged by height and speed.
+        columns = motion.features if layout.family == "h3d" else None
+        contacts = foot_contacts(figure.joints, layout.skeleton, layout.fps, options.feet, columns, layout)
         figure, feet = plant_feet(figure, motion.joints, contacts, layout.fps, options.feet)
     return ShownMotion(motion, figure, figure.joints if options.rigid else motion.joints, feet)
