@@ -8,10 +8,15 @@ from pathlib import Path
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import glb_clip, score_of, viewer_motion, write_bvh_of, write_npz
+from motionloom.pipeline.inference.outputs import (
+    score_of,
+    viewer_motion,
+    write_bvh_of,
+    write_glb_of,
+    write_npz,
+)
 from motionloom.pipeline.inference.page_words import page_title
 from motionloom.pipeline.inference.shown import shown
-from motionloom.pipeline.render.body.glb import write_glb
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, viewer_page
 
@@ -39,7 +44,7 @@ def save_html(path: Path, motion: GeneratedMotion) -> None:
 
 def save_glb(path: Path, motion: GeneratedMotion) -> None:
     """The skinned body with the motion, for Blender and engines."""
-    write_glb(_place(path), [glb_clip(motion)])
+    write_glb_of(_place(path), motion)
 
 
 def page_of(motion: GeneratedMotion) -> str:
