@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, UntypedStorage
 
+_UNCHANGING = frozenset({bool, int, float, str, bytes})
+
 
 class Snapshot:
     """Plain containers and tensors, copied to the memory of the host.
@@ -37,6 +39,8 @@ class Snapshot:
         return self._content
 
     def _copy(self, value: Any) -> Any:
+        if value is None or type(value) in _UNCHANGING:
+            return value
         if isinstance(value, Tensor):
             return self._tensor(value.detach())
         if isinstance(value, dict):
