@@ -26,7 +26,7 @@ class Snapshot:
         self._devices: set[torch.device] = set()
         self._content: dict[str, Any] = self._copy(state)
         for device in self._devices:
-            event = torch.cuda.Event()
+            event = torch.cuda.Event()  # type: ignore[no-untyped-call]
             event.record(torch.cuda.current_stream(device))
             self._copied.append(event.synchronize)
         self._storages = {}
