@@ -1,8 +1,9 @@
 """The command line: a thin layer on the Python API.
 
 Exit codes: 0 done; 1 the check found problems; 2 a mistake in the call, the recipe or the data (one sentence
-on standard error says which and how to fix it), or what the system refuses: a full disk, no permission; 130
-interrupted; 141 nobody reads the output any more. A bug shows its traceback and gives 1.
+on standard error says which and how to fix it), or what the system refuses: a full disk, no permission; 75
+a signal has stopped a training, which is saved and goes on with the same command; 130 interrupted; 141 nobody
+reads the output any more. A bug shows its traceback and gives 1.
 """
 
 from __future__ import annotations

@@ -6,8 +6,9 @@
   is cancelled when that can no longer happen. A job that is queued again keeps its id, so what waits for it
   goes on waiting.
 - Preemption and broken nodes queue a job again (`--requeue`). A time limit would not: the batch script is
-  warned before it and queues itself again. Nothing needs saving then: a run may be killed at any moment and
-  goes on from its newest checkpoint, so `train.checkpoint_every` steps are the most that is made twice.
+  warned before it, passes the warning on, and queues itself again once the command has ended. A training
+  saves the step that it is at, so none is made twice. A node that breaks costs at most
+  `train.checkpoint_every` steps.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cluster.plan import Group, LaunchPlan
 from motionloom.pipeline.launch.options import SlurmOptions
+from motionloom.pipeline.launch.process import SAVED
 from motionloom.pipeline.launch.slurm_convert import LOG_FOLDER, cancel_jobs, new_folder
 
 PYTHON = (sys.executable, "-P")
@@ -36,23 +38,39 @@ PROGRAM = (*PYTHON, "-m", "motionloom.pipeline.cli.main")
 RECIPE_FILE = "recipe.yaml"
 """The resolved recipe of a launch, beside its scripts."""
 
-_AGAIN = """\
-again() {{
-  if [ "${{SLURM_RESTART_COUNT:-0}}" -lt {requeues} ] && scontrol requeue {job}; then
-    echo "the time limit is near: queued again, goes on from the newest checkpoint"
-    sleep 3600  # SLURM ends this try
-  fi
+_SIGNALS = """\
+child= warned= came= early=
+pass_on() {{  # to the command: a training saves the step it is at, and ends
+  came=1
+  if [ -n "$child" ]; then kill -s "$1" "$child" 2> /dev/null || true; else early=$1; fi
 }}
-trap again USR1
+warn() {{
+  came=1
+  [ "${{SLURM_RESTART_COUNT:-0}}" -lt {requeues} ] || return 0  # it may still finish
+  warned=1
+  pass_on USR1
+}}
+trap warn USR1
+trap 'pass_on TERM' TERM
 """
-"""Runs when SLURM warns the batch script."""
+"""SLURM warns the script with USR1, and ends all with TERM: a preemption, a time limit or a scancel."""
 
 _WAIT = """\
+child=$!
+[ -z "$early" ] || pass_on "$early"
 code=0
 wait "$child" || code=$?
-if [ "$code" -eq 138 ]; then  # the warning ended the wait, not the command
-  code=0
-  wait "$child" || code=$?
+while [ -n "$came" ]; do  # a signal ended the wait, not the command
+  came=
+  ended=0
+  wait "$child" || ended=$?
+  [ "$ended" -eq 127 ] || code=$ended
+done
+# {saved}: a training is saved. 138: the warning ended a command that has nothing to save.
+if [ -n "$warned" ] && {{ [ "$code" -eq {saved} ] || [ "$code" -eq 138 ]; }} && scontrol requeue {job}; then
+  echo "the time limit is near: queued again, goes on from there"
+  trap - TERM
+  sleep 3600  # SLURM ends this try
 fi
 exit "$code"
 """
@@ -112,8 +130,9 @@ def _text(plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, c
     job = '"$SLURM_JOB_ID"'
     if group.parts is not None:
         job = '"${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"'
-    lines += [_AGAIN.format(requeues=options.requeues, job=job).rstrip()]
-    lines += [f"{shlex.join(_command(plan, group, folder))} &", "child=$!", _WAIT.rstrip()]
+    lines += [_SIGNALS.format(requeues=options.requeues).rstrip()]
+    lines += [f"{shlex.join(_command(plan, group, folder))} &"]
+    lines += [_WAIT.format(job=job, saved=SAVED).rstrip()]
     return "\n".join(lines) + "\n"
 
 

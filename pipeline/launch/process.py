@@ -6,6 +6,12 @@ import os
 import sys
 from typing import NoReturn
 
+SAVED = 75
+"""Exit code of a run that a signal has ended with all its steps saved, whatever signal it was.
+
+The system's number for "try again later" (`EX_TEMPFAIL`): the same command goes on.
+"""
+
 
 class TeamError(Exception):
     """Another process of this run has stopped; the message is the backend's."""
@@ -23,11 +29,8 @@ class Interrupted(BaseException):
 
     @property
     def exit_code(self) -> int:
-        """75: the system's number for "try again later" (`EX_TEMPFAIL`), whatever signal it was.
-
-        0 in processes that Lightning's launcher started: it kills the lead where one of them ends otherwise.
-        """
-        return 0 if _started_by_lead() else 75
+        """`SAVED`; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise."""
+        return 0 if _started_by_lead() else SAVED
 
 
 def process_rank() -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sized
+from multiprocessing import resource_tracker
 from typing import Any, cast
 
 import lightning as L
@@ -96,6 +97,9 @@ class TrainingData(L.LightningDataModule):
 
 class _Loader(DataLoader[Any]):
     def __iter__(self) -> Any:
+        if self.num_workers:
+            # Started with the first process of all, it would let SIGTERM through to that one.
+            resource_tracker.ensure_running()
         with unsignalled():
             return super().__iter__()
 

@@ -2,7 +2,8 @@
 
 All of them get the same names. Those that write files get a row when it is taken, and after a kill the files
 show every step once: the CSV file is written anew from the rows in the checkpoint, and TensorBoard is told to
-drop what lies behind it. Those with a server cannot take rows back, so they get them with the checkpoint.
+drop what lies behind it. Those with a server cannot take rows back, so they get them once the checkpoint is
+on disk.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from motionloom.pipeline.store.files import write_json
 FOLDER = "logs"
 """Of a stage's folder; no result depends on it."""
 
+_SENT = "sent.json"
+"""In that folder: what the servers have. A kill may come between a checkpoint and the sending of its rows."""
+
 
 class Loggers:
     """The loggers of one training; made when its first row comes, so that an import costs nothing before."""
@@ -42,6 +46,9 @@ class Loggers:
             if name == "csv":
                 for row in rows:
                     _log(logger, row)
+        if self._servers:
+            sent = self._sent(step)
+            self._waiting = [(int(row["step"]), row) for row in rows if row["step"] > sent]
 
     def take(self, row: dict[str, float]) -> None:
         """A row: "step" and figures."""
@@ -56,6 +63,8 @@ class Loggers:
             for logger in self._servers if at <= step else ():
                 _log(logger, row)
         self._waiting = [(at, row) for at, row in self._waiting if at > step]
+        if self._servers:
+            write_json(self.folder / _SENT, {"step": step})
         for logger in self._files:
             logger.save()
 
@@ -64,6 +73,11 @@ class Loggers:
         for logger in (*self._files, *self._servers):
             logger.finalize(status)
         self._files, self._servers = [], []
+
+    def _sent(self, step: int) -> int:
+        """Step that the servers have the rows up to; `step` where an older version did not write it down."""
+        path = self.folder / _SENT
+        return int(json.loads(path.read_text())["step"]) if path.is_file() else step
 
     def identity(self, server: str) -> dict[str, str]:
         """What a server knows this training by; the same when it goes on after a kill."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -37,8 +38,10 @@ class Vectors(Dataset[dict[str, Tensor]]):
         size: int = 10**6,
         dtype: Any = None,
         dies_at: int | None = None,
+        signalled: dict[int, signal.Signals] | None = None,
     ) -> None:
         self.batch, self.parts, self.size, self.dtype, self.dies_at = batch, parts, size, dtype, dies_at
+        self.signalled = signalled or {}
         self.rows = slice(rank * batch // world, (rank + 1) * batch // world)
 
     def __len__(self) -> int:
@@ -50,6 +53,8 @@ class Vectors(Dataset[dict[str, Tensor]]):
         step, part = divmod(index, self.parts)
         if step == self.dies_at:
             raise ConnectionResetError("killed")
+        if part == 0 and step in self.signalled:
+            os.kill(os.getpid(), self.signalled[step])
         generator = torch.Generator().manual_seed(step)
         # The same rows whether they come at once or in parts.
         rows = torch.randn(self.parts * self.batch, DIM, generator=generator, dtype=torch.float64)
@@ -112,10 +117,14 @@ def train(
     dtype: torch.dtype = torch.float32,
     module: dict[str, Any] | None = None,
     dies_at: int | None = None,
+    signalled: dict[int, signal.Signals] | None = None,
     console: Console | None = None,
     **settings: Any,
 ) -> Duel:
-    """Train a duel in `folder`, from its newest checkpoint; `dies_at` a step all ends with an error."""
+    """Train a duel in `folder`, from its newest checkpoint.
+
+    `dies_at` a step all ends with an error; while a step of `signalled` is taken, that signal comes.
+    """
     given: dict[str, Any] = {
         "steps": 24, "batch_size": 8, "checkpoint_every": 6, "validate_every": 12, **settings
     }  # fmt: skip
@@ -126,7 +135,7 @@ def train(
         duel,
         config,
         lambda batch, rank, world: Vectors(
-            batch, rank, world, parts=config.accumulate, dtype=dtype, dies_at=dies_at
+            batch, rank, world, parts=config.accumulate, dtype=dtype, dies_at=dies_at, signalled=signalled
         ),
         lambda: Vectors(8, size=2, dtype=dtype),
         0.0,

@@ -261,7 +261,8 @@ def run_script(text: str, folder: Path, scontrol: str) -> subprocess.Popen[str]:
     program.chmod(0o755)
     path = folder / "job.sbatch"
     path.write_text(text)
-    env = {"PATH": f"{folder}:{os.environ['PATH']}", "SLURM_JOB_ID": "7"}
+    count = os.environ.get("SLURM_RESTART_COUNT", "0")
+    env = {"PATH": f"{folder}:{os.environ['PATH']}", "SLURM_JOB_ID": "7", "SLURM_RESTART_COUNT": count}
     return subprocess.Popen(["bash", str(path)], env=env, text=True, cwd=folder, start_new_session=True)
 
 
@@ -272,30 +273,63 @@ def test_a_job_ends_as_its_command(paper: Recipe, tmp_path: Path, code: int, mon
     assert run_script(first.text, tmp_path, "exit 1").wait(30) == code
 
 
-def test_a_warned_job_is_queued_again_or_goes_on(paper: Recipe, tmp_path: Path, monkeypatch: Any) -> None:
-    go = tmp_path / "go"
-    waiting = f"touch started; while [ ! -e {shlex.quote(str(go))} ]; do sleep 0.05; done; exit 4"
+@pytest.mark.parametrize(
+    ("answer", "count", "scontrol", "code"),
+    [
+        ("exit 75", 0, "exit 0", None),  # a training that saves
+        ("", 0, "exit 0", None),  # a command that the signal ends
+        ("exit 75", 0, "exit 1", 75),  # SLURM refuses
+        ("exit 3", 0, "exit 0", 3),  # it has failed meanwhile
+        ("exit 0", 0, "exit 0", 0),  # it was done
+        ("exit 75", 100, "exit 0", 4),  # often enough: it may still finish
+    ],
+)
+def test_a_warning_reaches_the_command(
+    paper: Recipe,
+    tmp_path: Path,
+    monkeypatch: Any,
+    answer: str,
+    count: int,
+    scontrol: str,
+    code: int | None,
+) -> None:
+    """Then its job is queued again, where it has ended as one that is to go on."""
+    trap = f"trap {shlex.quote(answer)} USR1; " if answer else ""
+    waiting = f"{trap}touch started; while [ ! -e go ]; do sleep 0.02; done; exit 4"
     monkeypatch.setattr(slurm_run, "PROGRAM", ("sh", "-c", waiting, "motionloom"))
+    monkeypatch.setenv("SLURM_RESTART_COUNT", str(count))
     first = scripts(paper, tmp_path)[0]
-
-    def warned(scontrol: str) -> subprocess.Popen[str]:
-        for name in ("started", "asked", "go"):
-            (tmp_path / name).unlink(missing_ok=True)
-        job = run_script(first.text, tmp_path, f'echo "$@" > asked; {scontrol}')
+    job = run_script(first.text, tmp_path, f'echo "$@" > asked; {scontrol}')
+    try:
         wait_until(lambda: (tmp_path / "started").exists())
         job.send_signal(signal.SIGUSR1)
-        wait_until(lambda: (tmp_path / "asked").exists() and (tmp_path / "asked").read_text() != "")
-        assert (tmp_path / "asked").read_text() == "requeue 7\n"
-        return job
+        if code == 4:
+            (tmp_path / "go").touch()
+        if code is not None:
+            assert job.wait(30) == code
+        if code in (None, 75):
+            wait_until(lambda: (tmp_path / "asked").exists() and (tmp_path / "asked").read_text() != "")
+            assert (tmp_path / "asked").read_text() == "requeue 7\n"
+        else:
+            assert not (tmp_path / "asked").exists()
+        if code is None:
+            time.sleep(0.1)
+            assert job.poll() is None  # it waits for SLURM to end it
+    finally:
+        if job.poll() is None:
+            os.killpg(job.pid, signal.SIGKILL)
+        job.wait(30)
 
-    job = warned("exit 0")
-    time.sleep(0.2)
-    assert job.poll() is None  # it waits for SLURM to end it
-    os.killpg(job.pid, signal.SIGKILL)
-    job.wait(30)
-    job = warned("exit 1")  # SLURM refuses: the command may still finish
-    go.touch()
-    assert job.wait(30) == 4
+
+def test_the_end_of_a_job_reaches_the_command(paper: Recipe, tmp_path: Path, monkeypatch: Any) -> None:
+    """A preemption: SLURM queues the job again by itself."""
+    waiting = "trap 'touch saved; exit 75' TERM; touch started; while :; do sleep 0.02; done"
+    monkeypatch.setattr(slurm_run, "PROGRAM", ("sh", "-c", waiting, "motionloom"))
+    job = run_script(scripts(paper, tmp_path)[0].text, tmp_path, 'echo "$@" > asked')
+    wait_until(lambda: (tmp_path / "started").exists())
+    job.send_signal(signal.SIGTERM)
+    assert job.wait(30) == 75
+    assert (tmp_path / "saved").exists() and not (tmp_path / "asked").exists()
 
 
 def wait_until(ready: Any) -> None:

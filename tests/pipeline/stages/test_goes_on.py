@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,13 @@ from typing import Any
 import pytest
 import torch
 from rich.console import Console
+from same_stage import assert_equal, assert_same_stage, newest
 from tiny_players import Duel, train
-from torch import Tensor
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import Interrupted
 from motionloom.pipeline.launch.team import lead_finds
 from motionloom.pipeline.stages.gpt import GptStageConfig
 from motionloom.pipeline.stages.train_config import TrainConfig
@@ -29,38 +31,6 @@ from motionloom.pipeline.stages.training import Start, read_metrics, start_of
 # A constant schedule for both: a cosine would depend on the number of steps.
 CONSTANT: dict[str, Any] = {"critic": Duel(seed=0, max_steps=1).optim_config}
 FULL: dict[str, Any] = {"ema": 0.9, "accumulate": 2}
-
-
-def newest(folder: Path) -> dict[str, Any]:
-    """What training goes on from, without the clock and the paths in it."""
-    path = max((folder / "checkpoints").iterdir())
-    checkpoint: dict[str, Any] = torch.load(path, weights_only=True)
-    kept = {name: checkpoint[name] for name in ("global_step", "epoch", "state_dict", "optimizer_states")}
-    average = checkpoint["callbacks"].get("AveragedWeights")
-    return {**kept, "average": average, "rows": checkpoint["callbacks"]["MetricLog"]["rows"]}
-
-
-def assert_equal(one: Any, two: Any, where: str = "") -> None:
-    """Bit for bit, through all levels."""
-    if isinstance(one, Tensor):
-        assert torch.equal(one, two), where
-    elif isinstance(one, dict):
-        assert one.keys() == two.keys(), where
-        for name in one:
-            assert_equal(one[name], two[name], f"{where}.{name}")
-    elif isinstance(one, list | tuple):
-        assert len(one) == len(two), where
-        for index, pair in enumerate(zip(one, two, strict=True)):
-            assert_equal(*pair, f"{where}[{index}]")
-    else:
-        assert one == two, where
-
-
-def assert_same_stage(one: Path, two: Path, first: Duel, second: Duel) -> None:
-    """The same saved weights, checkpoint and log."""
-    assert_equal(first.state_dict(), second.state_dict())
-    assert_equal(newest(one), newest(two))
-    assert read_metrics(one) == read_metrics(two)
 
 
 @pytest.mark.parametrize("settings", [FULL, {**FULL, "precision": "bf16-mixed", "accumulate": 1}])
@@ -158,12 +128,29 @@ def test_longer_than_a_training_of_less_than_a_chunk(tmp_path: Path) -> None:
 
 
 def test_workers_change_nothing(tmp_path: Path) -> None:
-    """They live from chunk to chunk, and each chunk begins at its own batch."""
+    """They live from chunk to chunk, each chunk begins at its own batch, and no signal ends them."""
     settings = {"steps": 8, "checkpoint_every": 2, "validate_every": 0}
     alone = train(tmp_path / "alone", **settings)
-    other = train(tmp_path / "other", hardware={"workers": 1}, **settings)
+    # It reaches the reader: a worker, as one to the whole group of processes does.
+    reached = {3: signal.SIGTERM}
+    other = train(tmp_path / "other", hardware={"workers": 1}, signalled=reached, **settings)
     assert_same_stage(tmp_path / "alone", tmp_path / "other", alone, other)
     assert alone.readers == {os.getpid()} and len(other.readers - alone.readers) == 1
+
+
+def interrupt(out: Path, rank: int, hardware: dict[str, Any]) -> None:
+    """One rank gets the signal, or the other, or both; all stop at the same step and go on from there."""
+    settings = {**FULL, "checkpoint_every": 7, "validate_every": 7, "hardware": hardware}
+    whole = train(out / "whole", **settings)
+    stops = []
+    for step, ranks in ((1, (1,)), (9, (0,)), (17, (0, 1))):
+        signalled = {step: signal.SIGTERM} if rank in ranks else None
+        with pytest.raises(Interrupted) as stopped:
+            train(out / "interrupted", signalled=signalled, **settings)
+        stops.append(stopped.value.step)
+    again = train(out / "interrupted", **settings)
+    assert_equal(whole.state_dict(), again.state_dict())
+    (out / f"stops-{rank}.json").write_text(json.dumps(stops))
 
 
 def worker(out: Path) -> None:
@@ -172,6 +159,7 @@ def worker(out: Path) -> None:
     for name, settings in PAIRS.items():
         duel = train(out / name, **pair, **settings)
         torch.save(duel.state_dict(), out / f"{name}-{os.environ['RANK']}.pt")
+    interrupt(out, int(os.environ["RANK"]), pair["hardware"])
     # Which checkpoint a training goes on from is found once, also where the ranks see different files.
     assert lead_finds(lambda: Start(out / os.environ["RANK"], 6)) == Start(out / "0", 6)
     torch.distributed.barrier()
@@ -205,6 +193,16 @@ def test_two_ranks_equal_one_with_two_optimizers(name: str, pair: Path, tmp_path
     assert json.dumps([sorted(r) for r in rows[0]]) == json.dumps([sorted(r) for r in rows[1]])
     for row, other in zip(*rows, strict=True):
         assert other == pytest.approx(row, rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.timeout(240)
+def test_two_ranks_agree_on_the_step_of_a_signal(pair: Path) -> None:
+    first, second = (json.loads((pair / f"stops-{rank}.json").read_text()) for rank in range(2))
+    assert first == second
+    for step, signalled in zip(first, (2, 10, 18), strict=True):
+        assert signalled <= step <= -(-signalled // 7) * 7  # at the latest where the chunk ends
+    assert_equal(newest(pair / "whole"), newest(pair / "interrupted"))
+    assert read_metrics(pair / "whole") == read_metrics(pair / "interrupted")
 
 
 if __name__ == "__main__":

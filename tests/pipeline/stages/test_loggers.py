@@ -112,8 +112,10 @@ def test_a_server_gets_rows_with_their_checkpoint(tmp_path: Path, monkeypatch: p
     with pytest.raises(ConnectionResetError):
         train(tmp_path, hardware=server, dies_at=23, **STEPS)
     assert sent == [10, 12]
+    # As if the kill had come when the checkpoint was on disk and its last row not yet sent.
+    (tmp_path / "logs/sent.json").write_text('{"step": 10}')
     train(tmp_path, hardware=server, **STEPS)
-    assert sent == [10, 12, 20, 24, 30]
+    assert sent == [10, 12, 12, 20, 24, 30]
 
 
 def test_a_server_knows_a_training_that_goes_on(tmp_path: Path) -> None:

@@ -1,0 +1,205 @@
+"""A signal in the middle of a training: it saves the step that it is at, and goes on as if nothing had been.
+
+`test_goes_on.py` has the same on two ranks.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+from same_stage import assert_equal, assert_same_stage, newest
+from tiny_players import context, train
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import H2VQConfig
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.optim import OptimConfig
+from motionloom.models.training.stage_module import StageModule
+from motionloom.pipeline.cli import main as program
+from motionloom.pipeline.launch.process import SAVED, Interrupted
+from motionloom.pipeline.stages import interruption
+from motionloom.pipeline.stages.interruption import SIGNALS, Agreement, Signals, unsignalled
+from motionloom.pipeline.stages.train_config import TrainConfig
+from motionloom.pipeline.stages.training import fit, read_metrics
+
+# Rows end with every tenth step, so none of these borders and interruptions lies where a row does.
+FULL: dict[str, Any] = {"ema": 0.9, "accumulate": 2, "checkpoint_every": 7, "validate_every": 7}
+TERM, USR1, USR2 = signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2
+
+
+class Waves(Dataset[dict[str, Tensor]]):
+    """Item k is batch k; while a step of `signalled` is taken, a signal comes."""
+
+    def __init__(self, width: int, parts: int, signalled: dict[int, signal.Signals], size: int) -> None:
+        self.width, self.parts, self.signalled, self.size = width, parts, signalled, size
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        if index >= self.size:
+            raise IndexError(index)
+        if index % self.parts == 0 and index // self.parts in self.signalled:
+            os.kill(os.getpid(), self.signalled[index // self.parts])
+        generator = torch.Generator().manual_seed(index)
+        motion = torch.randn(4, 16, self.width, generator=generator)
+        return {"motion": motion, "length": torch.tensor([16, 12, 16, 8])}
+
+
+def train_tokenizer(
+    folder: Path, *, signalled: dict[int, signal.Signals] | None = None, **settings: Any
+) -> StageModule:
+    """A tokenizer with learnt codebooks, whose idle codes are drawn anew."""
+    given: dict[str, Any] = {"steps": 24, "batch_size": 8, **settings}
+    config = TrainConfig(**given)
+    torch.manual_seed(5)
+    kind = H2VQConfig(width=8, depth=1, code_dim=8, velocity_weight=0.5)
+    net = build_tokenizer(kind, MotionLayout.named("wholebody313"))
+    optim = OptimConfig(lr=1e-3, warmup_steps=5, schedule="cosine")
+    module = TokenizerModule(net, optim, seed=5, max_steps=config.steps, **kind.loss_terms())
+    parts = config.accumulate
+    fit(
+        context(folder, Console(quiet=True)),
+        module,
+        config,
+        lambda *_: Waves(net.dim, parts, signalled or {}, 10**6),
+        lambda: Waves(net.dim, 1, {}, 2),
+        0.5,
+    )
+    return module
+
+
+Train = Callable[..., Any]
+
+
+@pytest.mark.parametrize("training", [train, train_tokenizer], ids=["two optimizers", "codebooks"])
+def test_interrupted_equals_undisturbed(training: Train, tmp_path: Path) -> None:
+    """In the middle of chunks, of rows of the log, and where the last chunk is cut short."""
+    whole = training(tmp_path / "whole", **FULL)
+    for at, number in ((8, TERM), (11, USR1), (16, USR2), (22, TERM)):
+        with pytest.raises(Interrupted) as stopped:
+            training(tmp_path / "hit", signalled={at: number}, **FULL)
+        stop = stopped.value
+        assert (stop.step, stop.steps, stop.signal) == (at + 1, 24, number.name)
+        assert max((tmp_path / "hit/checkpoints").iterdir()).name == f"step={at + 1:08d}.ckpt"
+        steps = [row["step"] for row in read_metrics(tmp_path / "hit")]
+        assert steps == [row["step"] for row in read_metrics(tmp_path / "whole") if row["step"] <= at + 1]
+    again = training(tmp_path / "hit", **FULL)
+    assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
+
+
+def test_the_end_of_a_chunk_is_validated_before_it_is_left(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", **FULL)
+    for at in (6, 23):  # the last steps of a chunk and of the training
+        with pytest.raises(Interrupted, match=f"duel is saved at step {at + 1} of 24"):
+            train(tmp_path / "hit", signalled={at: TERM}, **FULL)
+        rows = read_metrics(tmp_path / "hit")
+        assert rows == read_metrics(tmp_path / "whole")[: len(rows)]
+        assert rows[-1]["step"] == (7 if at == 6 else 21) and "val/loss" in rows[-1]
+    again = train(tmp_path / "hit", **FULL)
+    assert_equal(whole.net.state_dict(), again.net.state_dict())
+    assert_equal(newest(tmp_path / "whole"), newest(tmp_path / "hit"))
+
+
+def test_signals_are_noted_and_the_first_counts() -> None:
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    with Signals() as signals:
+        assert signals.number == 0
+        for number in (USR1, TERM):
+            signal.raise_signal(number)
+        assert signals.number == USR1
+        signals.answered = True
+    assert {number: signal.getsignal(number) for number in SIGNALS} == before
+
+
+def test_a_signal_that_comes_too_late_is_passed_on() -> None:
+    seen: list[int] = []
+    before = signal.signal(USR2, lambda number, _: seen.append(number))
+    try:
+        with Signals():
+            signal.raise_signal(USR2)
+            assert seen == []
+        assert seen == [USR2]
+        with pytest.raises(ValueError), Signals():  # an error says more
+            signal.raise_signal(USR2)
+            raise ValueError
+        assert seen == [USR2]
+    finally:
+        signal.signal(USR2, before)
+
+
+def test_processes_started_unsignalled_outlive_their_group() -> None:
+    with Signals() as signals:
+        with unsignalled():
+            child = subprocess.Popen(["sleep", "60"], stdin=subprocess.DEVNULL)
+            signal.raise_signal(USR1)
+            assert signals.number == 0
+        assert signals.number == USR1  # what came meanwhile is delivered behind it
+        signals.answered = True
+    try:
+        for number in SIGNALS:
+            child.send_signal(number)
+        with pytest.raises(subprocess.TimeoutExpired):
+            child.wait(0.2)
+    finally:
+        child.kill()
+        child.wait()
+
+
+def test_ranks_ask_each_other_about_twice_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At steps that follow from the slowest rank's clock alone."""
+    clock = [0.0]
+    asked: list[tuple[int, float]] = []
+
+    def all_reduce(both: Tensor, *_: Any) -> None:
+        both[1] = both[1] * 2  # another rank is twice as slow
+        both[0] = max(float(both[0]), 15.0 if step >= 400 else 0.0)
+
+    monkeypatch.setattr(interruption.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(interruption.dist, "new_group", lambda **_: object())
+    monkeypatch.setattr(interruption.dist, "all_reduce", all_reduce)
+    agreement = Agreement(Signals(), world=2)
+    for step in range(1, 1000):
+        clock[0] += 1 / 256
+        before = agreement._last
+        number = agreement.at(step)
+        if agreement._last != before:
+            asked.append((step, clock[0]))
+        if number:
+            break
+    assert number == 15 and 400 <= step <= 450
+    gaps = [later[0] - sooner[0] for sooner, later in pairwise(asked)]
+    assert gaps[:3] == [4, 16, 64] and set(gaps[2:]) == {64}  # half a second of 1/128 each
+
+
+def test_the_program_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(**_: Any) -> None:
+        raise Interrupted("tokenizer", 37, 100, "SIGTERM")
+
+    monkeypatch.setattr(program, "app", stop)
+    monkeypatch.setattr(sys, "argv", ["/bin/motionloom", "run", "a recipe.yaml"])
+    assert program._exit_code() == SAVED == 75
+    said = capsys.readouterr().err
+    assert said == (
+        "SIGTERM: tokenizer is saved at step 37 of 100; the same command goes on: "
+        "motionloom run 'a recipe.yaml'\n"
+    )
+    monkeypatch.setenv("LOCAL_RANK", "1")  # a process of Lightning's launcher
+    assert program._exit_code() == 0 and capsys.readouterr().err == ""
+    monkeypatch.setenv("RANK", "1")  # one of torchrun's
+    assert program._exit_code() == SAVED
