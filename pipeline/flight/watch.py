@@ -130,15 +130,15 @@ class Watch:
         """Whether this step has failed, where that can be seen without waiting."""
         if self.module.device.type != "cpu":
             return False
-        losses = [
-            float(value)
-            for at, names, values in self._figures
-            if at == step
-            for name, value in zip(names, values, strict=True)
-            if is_loss(name)
-        ]
-        total = 0.0 if norm is None or self.scaled else float(norm)
-        return not all(map(math.isfinite, (*losses, total)))
+        if norm is not None and not self.scaled and not math.isfinite(float(norm)):
+            return True
+        for at, names, values in reversed(self._figures):
+            if at != step:
+                return False
+            losses = zip(names, values.tolist(), strict=True)
+            if not all(math.isfinite(value) for name, value in losses if is_loss(name)):
+                return True
+        return False
 
 
 def is_loss(name: str) -> bool:
