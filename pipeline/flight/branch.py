@@ -24,7 +24,7 @@ class OwnSettings(Callback):
 
     def __init__(self) -> None:
         self._groups: list[list[dict[str, Any]]] = []
-        self._rates: list[list[float]] = []
+        self._rates: list[list[Any]] = []
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Note them while the optimizers are new."""
@@ -40,7 +40,7 @@ class OwnSettings(Callback):
             for group, own in zip(optimizer.param_groups, groups, strict=True):
                 group.update(own)
         for config, rates in zip(trainer.lr_scheduler_configs, self._rates, strict=True):
-            schedule = config.scheduler
+            schedule: Any = config.scheduler
             schedule.base_lrs = list(rates)
             factors = [own(schedule.last_epoch) for own in schedule.lr_lambdas]
             for group, rate, factor in zip(schedule.optimizer.param_groups, rates, factors, strict=True):

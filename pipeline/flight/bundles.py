@@ -77,7 +77,7 @@ class Bundles:
         if other or self.watch is None or trainer.validating or "by peer" in str(error):
             return
         try:
-            self.watch.collect()
+            self.watch.read()
         except Exception:  # a device that is lost cannot be read any more
             self.watch.recent.clear()
         step = trainer.global_step + 1

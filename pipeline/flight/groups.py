@@ -36,10 +36,11 @@ class LayerGroups:
         for param, tensor in pairs:
             if tensor is not None:
                 tensors.setdefault(self._groups.get(id(param), "net"), []).append(tensor)
-        return {name: _whole(torch.nn.utils.get_total_norm(own)) for name, own in tensors.items()}
+        return {name: whole(torch.nn.utils.get_total_norm(own)) for name, own in tensors.items()}
 
 
-def _whole(norm: Tensor) -> Tensor:
+def whole(norm: Tensor) -> Tensor:
+    """The norm of something that may be cut over ranks; then a collective."""
     return norm.full_tensor() if isinstance(norm, DTensor) else norm
 
 

@@ -9,7 +9,8 @@ the second. What a rank waits within FSDP's gathering is not seen.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import lightning as L
 import torch
@@ -48,7 +49,8 @@ class GradientWaits:
         model = trainer.strategy.model
         if not isinstance(model, DistributedDataParallel) or not module.automatic_optimization:
             return module.waited - before
-        figures = model._get_ddp_logging_data()  # torch keeps these; it measures one step in a hundred
+        read: Callable[[], dict[str, Any]] = model._get_ddp_logging_data
+        figures = read()  # torch keeps these; it measures one step in a hundred
         whole = float(figures.get("avg_backward_comm_time", 0))
         hidden = float(figures.get("avg_backward_compute_comm_overlap_time", 0))
         return max(0.0, whole - hidden) * 1e-9 * steps

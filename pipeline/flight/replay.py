@@ -78,7 +78,7 @@ class ReplaySteps(Callback):
             hook.remove()
         self._hooks = []
         if self._watch is not None:
-            self._watch.collect()
+            self._watch.read()
             self.figures = dict(self._watch.recent)
             self.norms = read_norms(self._watch.all_norms)
 

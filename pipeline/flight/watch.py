@@ -18,7 +18,7 @@ from torch.distributed.tensor import DTensor
 
 from motionloom.models.training.players import PlayersModule
 from motionloom.models.training.stage_module import LOG_EVERY, StageModule
-from motionloom.pipeline.flight.groups import LayerGroups, read_norms
+from motionloom.pipeline.flight.groups import LayerGroups, read_norms, whole
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Failure:
         more = [", ".join(f"{name} = {value}" for name, value in self.terms.items())]
         if self.groups:
             more.append(f"gradients of {', '.join(self.groups)}")
-        whole = "; ".join(part for part in more if part)
-        return f"{said} not finite" + (f" ({whole})" if whole else "")
+        details = "; ".join(part for part in more if part)
+        return f"{said} not finite" + (f" ({details})" if details else "")
 
 
 class Watch:
@@ -72,11 +72,11 @@ class Watch:
     def gradients(self, params: Sequence[nn.Parameter], norm: Tensor | None) -> None:
         """Keep the norm, and those of the layer groups at a row's end and where something fails."""
         step = self.module.global_step + 1
-        if isinstance(norm, DTensor):
-            norm = norm.full_tensor()
         if norm is not None:
             self._totals.append((step, norm))
-        fails = self._broken is None and self._fails(step, norm)
+        # Reading what is cut over ranks is a collective, and one rank may see a failure alone.
+        cut = bool(params) and isinstance(params[0], DTensor)
+        fails = self._broken is None and not cut and self._fails(step, norm)
         who = id(params[0]) if params else 0
         if fails or self._last_of_row(who):
             found = self.groups.gradient_norms(params)
@@ -99,12 +99,12 @@ class Watch:
         return {name: norm for own in recent for name, norm in own.items()}
 
     def collect(self) -> Failure | None:
-        """Read what was kept; the first failure in it."""
+        """Read what was kept; the first failure in it. Every process calls this at the same step."""
         totals, self._totals = self._totals, []
-        losses = self._read()
+        losses = self.read()
         failure = next(iter(sorted(losses, key=lambda found: found.step)), None)
         if totals and not self.scaled:
-            values = torch.stack([norm.float() for _, norm in totals]).tolist()
+            values = torch.stack([whole(norm).float() for _, norm in totals]).tolist()
             step = next((s for (s, _), v in zip(totals, values, strict=True) if not math.isfinite(v)), None)
             if step is not None and (failure is None or step < failure.step):
                 failure = Failure(step, loss=False)
@@ -113,8 +113,8 @@ class Watch:
         bad = tuple(name for name, norm in read_norms(self._broken).items() if not math.isfinite(norm))
         return Failure(failure.step, failure.loss, failure.terms, bad)
 
-    def _read(self) -> list[Failure]:
-        """Move what was kept into `recent`; the steps whose loss was not finite."""
+    def read(self) -> list[Failure]:
+        """Move the figures that were kept into `recent`; the steps whose loss was not finite."""
         kept, self._figures = self._figures, []
         names = dict.fromkeys(own for _, own, _ in kept)
         read = {own: iter(torch.stack([v for _, n, v in kept if n == own]).tolist()) for own in names}
@@ -130,15 +130,15 @@ class Watch:
         """Whether this step has failed, where that can be seen without waiting."""
         if self.module.device.type != "cpu":
             return False
-        losses = [
-            float(value)
-            for at, names, values in self._figures
-            if at == step
-            for name, value in zip(names, values, strict=True)
-            if is_loss(name)
-        ]
-        total = 0.0 if norm is None or self.scaled else float(norm)
-        return not all(map(math.isfinite, (*losses, total)))
+        if norm is not None and not self.scaled and not math.isfinite(float(norm)):
+            return True
+        for at, names, values in reversed(self._figures):
+            if at != step:
+                return False
+            losses = zip(names, values.tolist(), strict=True)
+            if not all(math.isfinite(value) for name, value in losses if is_loss(name)):
+                return True
+        return False
 
 
 def is_loss(name: str) -> bool:

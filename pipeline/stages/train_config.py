@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.contract.stage import RUNTIME, WHERE_SET, StageConfig
+from motionloom.pipeline.contract.stage import LATER, RUNTIME, StageConfig
 from motionloom.pipeline.launch.hardware import Hardware, require_loggers
 
 BatchSource = Callable[[int, int, int], Dataset[Any]]
@@ -74,7 +74,7 @@ class TrainConfig(Config):
     on_not_finite: Literal["stop", "continue"] = Field("stop", json_schema_extra=RUNTIME)
     """What becomes of a training whose loss or gradient is not finite any more; a crash bundle is left
     either way."""
-    branch: BranchPoint | None = Field(None, json_schema_extra=WHERE_SET)
+    branch: BranchPoint | None = Field(None, json_schema_extra=LATER)
     """Set by `--from-checkpoint`: the training goes on from this checkpoint of another one."""
 
     def local_batch(self, world: int) -> int:

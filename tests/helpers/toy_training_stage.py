@@ -1,0 +1,9 @@
+"""Registers the toy that trains, for programs started with `MOTIONLOOM_STAGES=toy_training_stage`."""
+
+from __future__ import annotations
+
+from toy_training import ToyTraining
+
+from motionloom.pipeline.contract.registry import register
+
+register(ToyTraining())
