@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, UntypedStorage
 
+_UNCHANGING = frozenset({bool, int, float, str, bytes})
+
 
 class Snapshot:
     """Plain containers and tensors, copied to the memory of the host.
@@ -24,7 +26,7 @@ class Snapshot:
         self._devices: set[torch.device] = set()
         self._content: dict[str, Any] = self._copy(state)
         for device in self._devices:
-            event = torch.cuda.Event()
+            event = torch.cuda.Event()  # type: ignore[no-untyped-call]
             event.record(torch.cuda.current_stream(device))
             self._copied.append(event.synchronize)
         self._storages = {}
@@ -37,6 +39,8 @@ class Snapshot:
         return self._content
 
     def _copy(self, value: Any) -> Any:
+        if value is None or type(value) in _UNCHANGING:
+            return value
         if isinstance(value, Tensor):
             return self._tensor(value.detach())
         if isinstance(value, dict):
