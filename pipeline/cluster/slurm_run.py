@@ -71,11 +71,13 @@ while [ -n "$came" ]; do  # a signal ended the wait, not the command
   [ "$ended" -eq 127 ] || code=$ended
 done
 # {saved}: a training is saved. 138: the warning ended a command that has nothing to save.
+# A job that was cancelled is not RUNNING any more; queued again it would come back.
 again=
-if [ -n "$warned" ] && {{ [ "$code" -eq {saved} ] || [ "$code" -eq 138 ]; }}; then
-  again="the time limit is near"
-elif [ "$code" -eq {saved} ] && [ "$(squeue --noheader --jobs={job} --format=%T)" = RUNNING ]; then
-  again="asked to end"  # and not cancelled or out of time: the grace time of a preemption
+state=$(squeue --noheader --jobs={job} --format=%T 2> /dev/null) || state=
+if [ -n "$warned" ] && [ "${{state:-RUNNING}}" = RUNNING ]; then
+  if [ "$code" -eq {saved} ] || [ "$code" -eq 138 ]; then again="the time limit is near"; fi
+elif [ "$code" -eq {saved} ] && [ "$state" = RUNNING ]; then
+  again="asked to end"  # the grace time of a preemption
 fi
 if [ -n "$again" ] && scontrol requeue {job}; then
   echo "$again: queued again, goes on from there"
