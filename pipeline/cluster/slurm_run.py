@@ -53,7 +53,11 @@ warn() {{
 trap warn USR1
 trap 'pass_on TERM' TERM
 """
-"""SLURM warns the script with USR1, and ends all with TERM: a preemption, a time limit or a scancel."""
+"""SLURM warns the script with USR1, and ends all with TERM: a preemption, a time limit or a scancel.
+
+A preemption with a grace time begins with TERM to what srun has started. Once that has saved and ended, the
+job would be over, and failed, before SLURM queues it again: the script does so itself.
+"""
 
 _WAIT = """\
 child=$!
@@ -67,8 +71,16 @@ while [ -n "$came" ]; do  # a signal ended the wait, not the command
   [ "$ended" -eq 127 ] || code=$ended
 done
 # {saved}: a training is saved. 138: the warning ended a command that has nothing to save.
-if [ -n "$warned" ] && {{ [ "$code" -eq {saved} ] || [ "$code" -eq 138 ]; }} && scontrol requeue {job}; then
-  echo "the time limit is near: queued again, goes on from there"
+# A job that was cancelled is not RUNNING any more; queued again it would come back.
+again=
+state=$(squeue --noheader --jobs={job} --format=%T 2> /dev/null) || state=
+if [ -n "$warned" ] && [ "${{state:-RUNNING}}" = RUNNING ]; then
+  if [ "$code" -eq {saved} ] || [ "$code" -eq 138 ]; then again="the time limit is near"; fi
+elif [ "$code" -eq {saved} ] && [ "$state" = RUNNING ]; then
+  again="asked to end"  # the grace time of a preemption
+fi
+if [ -n "$again" ] && scontrol requeue {job}; then
+  echo "$again: queued again, goes on from there"
   trap - TERM
   sleep 3600  # SLURM ends this try
 fi

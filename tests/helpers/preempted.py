@@ -209,10 +209,14 @@ class Preempted:
         return not (self.wrong or self.unequal)
 
 
-def preempt(calm: Launched, recipe: Path, run: Path, after: Sequence[int]) -> Preempted:
+def preempt(
+    calm: Launched, recipe: Path, run: Path, after: Sequence[int], *, ended: Sequence[int] = ()
+) -> Preempted:
     """Train anew what `calm` has trained, and have an urgent job take both nodes behind each step of `after`.
 
-    SLURM takes some seconds to act, in which training goes on; a step takes a tenth of a second more here.
+    Behind those that are in `ended` too, the processes get a plain SIGTERM instead, as the grace time of a
+    preemption begins where SLURM sends no other signal. SLURM takes some seconds to act, in which training
+    goes on; a step takes a tenth of a second more here.
     """
     shutil.copytree(calm.run, run, ignore=shutil.ignore_patterns(".slurm"))
     for name in TRAINED:
@@ -222,6 +226,9 @@ def preempt(calm: Launched, recipe: Path, run: Path, after: Sequence[int]) -> Pr
     for number, step in enumerate(after):
         launched.wait_for_step(step, number)
         starts.append(launched.started_at())
+        if step in ended:
+            launched.cluster.ask("scancel", "--signal=TERM", launched.training)
+            continue
         launched.cluster.ask(
             "sbatch", "--partition=urgent", "--nodes=2", "--ntasks-per-node=1", "--cpus-per-task=2",
             "--output=/dev/null", "--wrap=sleep 1",

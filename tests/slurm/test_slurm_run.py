@@ -106,6 +106,22 @@ def test_a_warned_job_starts_again_and_the_next_waits_for_it(
     assert "queued again" in log.read_text()
 
 
+def test_a_saved_job_starts_again_unless_it_was_cancelled(
+    cluster: Any, program: Callable[[str], None]
+) -> None:
+    program("echo x >> order; trap 'exit 75' TERM; while :; do sleep 0.1; done")
+    ids = submitted(plan(nodes=1))
+    starts = lambda: Path("order").read_text().count("x") if Path("order").is_file() else 0  # noqa: E731
+    until(lambda: starts() == 1)
+    # How a preemption's grace time begins; the job goes on running.
+    subprocess.run(["scancel", "--batch", "--signal=TERM", ids[0]], check=True, env=os.environ)
+    until(lambda: starts() == 2, 180)
+    subprocess.run(["scancel", ids[0]], check=True, env=os.environ)
+    until(lambda: states(cluster, ids) == ["CANCELLED"] * 3)
+    time.sleep(3)  # longer than the command takes to answer
+    assert states(cluster, ids)[0] == "CANCELLED" and starts() == 2
+
+
 def test_what_follows_a_failure_is_cancelled(cluster: Any, program: Callable[[str], None]) -> None:
     program("case $SLURM_JOB_NAME in *2-train) exit 5;; esac")
     ids = submitted(plan(nodes=1))

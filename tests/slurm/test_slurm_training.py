@@ -17,7 +17,7 @@ pytestmark = [
 ]
 STEPS = 100
 TRIGGERS = (5, 45)
-"""Steps behind which an urgent job comes."""
+"""Steps behind which it is disturbed: by an urgent job and the warning before it, by a plain SIGTERM."""
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +52,8 @@ def test_one_command_converts_trains_and_evaluates_on_two_nodes(calm: Launched) 
 
 
 def test_a_training_preempted_twice_equals_the_undisturbed_one(calm: Launched, recipe: Path) -> None:
-    """No step is trained twice: the warning before the preemption has the training save the one it is at."""
-    seen = preempt(calm, recipe, calm.run.with_name("preempted"), TRIGGERS)
+    """No step is trained twice: the signal before the end has the training save the one it is at."""
+    seen = preempt(calm, recipe, calm.run.with_name("preempted"), TRIGGERS, ended=TRIGGERS[1:])
     assert seen.exact, seen
     assert seen.steps == STEPS and seen.repeated == 0, seen
     assert [one.first_step - one.last_step for one in seen.restarts] == [1, 1]
