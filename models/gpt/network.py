@@ -31,6 +31,7 @@ from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
 from motionloom.models.layers.transformer import KVCache, Transformer
 from motionloom.models.tokenizer.base import Stream
+from motionloom.models.training.draws import Dropout
 
 
 class GptConfig(Config):
@@ -85,7 +86,7 @@ class InterleavedGPT(TokenNetwork):
         self.null_text = nn.Parameter(torch.randn(config.dim) * 0.02)
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
         self.embeddings = self._tables(config.dim)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.stack = Transformer(
             config.layers,
             config.dim,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tma.losses import TmaLossConfig, info_nce, kl_four, latent_loss, reconstruction_loss
 from motionloom.models.tma.network import Tma
+from motionloom.models.training import draws
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 
@@ -78,4 +78,4 @@ class TmaModule(StageModule):
     def _latent(self, mu: Tensor, logvar: Tensor) -> Tensor:
         if not self.training:
             return mu
-        return mu + torch.randn_like(mu) * (0.5 * logvar).exp()
+        return mu + draws.normal_like(mu) * (0.5 * logvar).exp()

@@ -74,6 +74,17 @@ def test_killed_twice_equals_undisturbed(settings: dict[str, Any], tmp_path: Pat
     assert_same_stage(tmp_path / "whole", tmp_path / "killed", whole, again)
 
 
+def test_draws_by_sample_are_the_same_in_parts(tmp_path: Path) -> None:
+    """Of two optimizers that take turns; draws by rank are not."""
+    bound = {"rtol": 0, "atol": 1e-12}
+    for draws in ("sample", "rank"):
+        settings = {"steps": 8, "validate_every": 0, "dtype": torch.float64, "draws": draws}
+        whole = train(tmp_path / f"{draws}-whole", **settings).state_dict()
+        parts = train(tmp_path / f"{draws}-parts", accumulate=4, **settings).state_dict()
+        same = all(torch.allclose(whole[name], parts[name], **bound) for name in whole)
+        assert same == (draws == "sample")
+
+
 def test_killed_behind_the_last_step_hands_over_the_average(tmp_path: Path) -> None:
     first = train(tmp_path, ema=0.9)
     again = train(tmp_path, ema=0.9)
