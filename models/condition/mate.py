@@ -29,9 +29,9 @@ from torch import Tensor, nn
 
 from motionloom.datasets.conditions import MODALITIES, Condition, Conditions
 from motionloom.datasets.schema import Config, UserError
+from motionloom.models.layers import draws
+from motionloom.models.layers.draws import Dropout
 from motionloom.models.layers.transformer import Transformer, sinusoid
-from motionloom.models.training import draws
-from motionloom.models.training.draws import Dropout
 
 _RANGE = 16
 """Bits of a position within its modality, for draws by sample."""

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from motionloom.models.diffusion.dmd import Dmd, dmd_loss
 from motionloom.models.gpt.frozen import Frozen
+from motionloom.models.layers import draws
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
-from motionloom.models.training import draws
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 

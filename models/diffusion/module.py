@@ -7,8 +7,8 @@ from typing import Any
 from torch import Tensor
 
 from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.layers import draws
 from motionloom.models.layers.transformer import length_mask
-from motionloom.models.training import draws
 from motionloom.models.training.distributed import masked_mean
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 

@@ -30,8 +30,8 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import Config
+from motionloom.models.layers import draws
 from motionloom.models.layers.transformer import length_mask
-from motionloom.models.training import draws
 
 PART: Part = "bodyhand"
 """What is judged; a face has no counterpart in the published evaluator."""

@@ -19,10 +19,10 @@ from motionloom.datasets.schema import Config
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import PAD
+from motionloom.models.layers import draws
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.training import draws
 from motionloom.models.training.distributed import masked_mean
 
 

@@ -14,9 +14,9 @@ from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import GptLossConfig, accuracy, align_loss, corrupt, cross_entropy
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.samples import log_likelihood, policy_loss, rewards, sample
+from motionloom.models.layers import draws
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.training import draws
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 

@@ -29,9 +29,9 @@ from torch import Tensor, nn
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
+from motionloom.models.layers.draws import Dropout
 from motionloom.models.layers.transformer import KVCache, Transformer
 from motionloom.models.tokenizer.base import Stream
-from motionloom.models.training.draws import Dropout
 
 
 class GptConfig(Config):

@@ -21,10 +21,10 @@ from motionloom.models.gpt.losses import predicted
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.tokens import PAD, Codes, TokenSequence, interleave
+from motionloom.models.layers import draws
 from motionloom.models.tma.losses import false_negatives
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.training import draws
 from motionloom.models.training.distributed import gather_rows, masked_mean, rank
 
 

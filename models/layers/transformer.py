@@ -17,14 +17,14 @@ Legend: B batch, L positions, S visible positions, D width, H heads.
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from motionloom.models.training import draws
+from motionloom.models.layers import draws
 
 Norm = Literal["pre", "post"]
 """Where LayerNorm stands: before attention and feed-forward, or behind their sums."""
@@ -188,7 +188,7 @@ class Transformer(nn.Module):
         again = self.checkpointed and torch.is_grad_enabled() and cache is None
         for index, block in enumerate(self.blocks):
             if again:
-                drawn = {"context_fn": draws.again} if draws.by_sample() else {}
+                drawn: Any = {"context_fn": draws.again} if draws.by_sample() else {}
                 x = checkpoint(block, x, mask, causal, use_reentrant=False, **drawn)
             else:
                 x = block(x, mask, causal, None if cache is None else cache.layers[index])

@@ -6,10 +6,10 @@ from typing import Any
 
 from torch import Tensor
 
+from motionloom.models.layers import draws
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tma.losses import TmaLossConfig, info_nce, kl_four, latent_loss, reconstruction_loss
 from motionloom.models.tma.network import Tma
-from motionloom.models.training import draws
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 

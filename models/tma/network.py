@@ -26,9 +26,9 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import Config
+from motionloom.models.layers import draws
 from motionloom.models.layers.basis import Basis
 from motionloom.models.layers.transformer import Norm, Transformer, length_mask, sinusoid
-from motionloom.models.training import draws
 
 
 class TmaConfig(Config):

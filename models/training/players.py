@@ -23,7 +23,7 @@ from torch.amp import GradScaler
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim import Optimizer
 
-from motionloom.models.training import draws
+from motionloom.models.layers import draws
 from motionloom.models.training.distributed import mean_gradients
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule

@@ -2,7 +2,7 @@
 
 Every random draw of a training step (dropout, latents, Gumbel noise) comes from a generator state that is a
 pure function of (seed, step, rank), so a run that was killed and resumed repeats the undisturbed run bit for
-bit; or of the sample it is for, so that a run repeats it on any number of ranks too (`training/draws.py`).
+bit; or of the sample it is for, so that a run repeats it on any number of ranks too (`layers/draws.py`).
 Codebooks draw by themselves, the same on every rank (`quantize/draws.py`).
 """
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
-from motionloom.models.training import draws
+from motionloom.models.layers import draws
 from motionloom.models.training.distributed import alone
 from motionloom.models.training.optim import OptimConfig as OptimConfig
 from motionloom.models.training.sharding import sharded

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from motionloom.models.layers import draws
+from motionloom.models.layers.draws import Dropout
 from motionloom.models.layers.transformer import KVCache, Transformer, length_mask
-from motionloom.models.training import draws
-from motionloom.models.training.draws import Dropout
 
 
 @dataclass

@@ -28,8 +28,8 @@ from motionloom.models.discriminator.patch import PatchDiscriminator
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy
 from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave, stream_names
+from motionloom.models.layers import draws
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
-from motionloom.models.training import draws
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
 from motionloom.models.utt.conditioned import ConditionedUtt

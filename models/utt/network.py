@@ -32,9 +32,9 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.models.condition.mate import Encoded
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
+from motionloom.models.layers import draws
+from motionloom.models.layers.draws import Dropout
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
-from motionloom.models.training import draws
-from motionloom.models.training.draws import Dropout
 from motionloom.models.utt.backbone import PrefixGru, PrefixTransformer, State
 
 

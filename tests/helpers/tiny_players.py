@@ -13,7 +13,7 @@ from rich.console import Console
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from motionloom.models.training.draws import Dropout
+from motionloom.models.layers.draws import Dropout
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
 from motionloom.pipeline.contract.stage import Shelf, StageContext

@@ -43,6 +43,7 @@ from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.tokens import interleave
+from motionloom.models.layers import draws
 from motionloom.models.tma.losses import TmaLossConfig
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
@@ -56,7 +57,6 @@ from motionloom.models.tokenizer.config import (
     SeparateConfig,
 )
 from motionloom.models.tokenizer.module import TokenizerModule
-from motionloom.models.training import draws
 from motionloom.models.training.distributed import alone, rank, sum_over_ranks, world_size
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 

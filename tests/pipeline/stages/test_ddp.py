@@ -196,6 +196,8 @@ def test_no_process_outlives_another(
     os.kill(other if victim == "other" else process.pid, signal.SIGKILL)
     output = process.communicate(timeout=30)[0]
     assert process.returncode != 0 and "Traceback" not in output
+    assert f"error: rank {int(victim == 'other')} on" in output and output.count("has died") == 1, output
+    assert "it was at stage tokenizer, step" in output
     end = time.monotonic() + 30
     while not is_gone(other):
         assert time.monotonic() < end, "the other process goes on alone"

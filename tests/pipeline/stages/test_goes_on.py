@@ -20,6 +20,7 @@ from torch import Tensor
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.stage import fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.team import lead_finds
 from motionloom.pipeline.stages.gpt import GptStageConfig
@@ -109,6 +110,17 @@ def test_the_average_is_that_of_the_weights(tmp_path: Path) -> None:
     rows = [read_metrics(tmp_path / name) for name in ("plain", "watched")]
     for one, two in zip(*rows, strict=True):
         assert (one == two) == ("train/loss" in one)
+
+
+def test_draws_are_fingerprinted_where_they_are_not_what_they_always_were() -> None:
+    assert "draws" not in fingerprint_fields(TrainConfig())
+    assert fingerprint_fields(TrainConfig(draws="sample"))["draws"] == "sample"
+
+
+def test_draws_by_sample_are_not_repeated_by_a_compiled_graph() -> None:
+    train = TrainConfig(draws="sample", compile=True, checkpoint_activations=True)
+    with pytest.raises(UserError, match=r"set train\.draws: rank, or one of them to false"):
+        GptStageConfig(train=train).require_fit(Hardware(accelerator="cpu", devices=1))
 
 
 def test_an_average_of_cut_weights_is_refused() -> None:

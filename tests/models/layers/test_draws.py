@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from scipy import stats
 from torch import Tensor
 
+from motionloom.models.layers import draws
 from motionloom.models.layers.transformer import Transformer
-from motionloom.models.training import draws
 
 M = 2**64 - 1
 GAMMA = 0x9E3779B97F4A7C15
