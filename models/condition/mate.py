@@ -29,7 +29,12 @@ from torch import Tensor, nn
 
 from motionloom.datasets.conditions import MODALITIES, Condition, Conditions
 from motionloom.datasets.schema import Config, UserError
+from motionloom.models.layers import draws
+from motionloom.models.layers.draws import Dropout
 from motionloom.models.layers.transformer import Transformer, sinusoid
+
+_RANGE = 16
+"""Bits of a position within its modality, for draws by sample."""
 
 
 class MateConfig(Config):
@@ -63,11 +68,13 @@ class Encoded(NamedTuple):
     timed: Tensor | None = None
     """[B, T, E], the part of `seq` that lies on the motion's time line, that of music, a position for
     `stride` frames; zero where a row has none. None = no row has any."""
+    places: Tensor | None = None
+    """int64 [S], for draws by sample: where each column of `seq` stands, whatever pads the others."""
 
     def rows(self, index: Tensor | slice) -> Encoded:
         """Some rows."""
         timed = None if self.timed is None else self.timed[index]
-        return Encoded(self.glob[index], self.seq[index], self.mask[index], timed)
+        return Encoded(self.glob[index], self.seq[index], self.mask[index], timed, self.places)
 
 
 class Mate(nn.Module):
@@ -91,7 +98,7 @@ class Mate(nn.Module):
         self.modality = nn.ParameterDict({name: _token(dim) for name in widths})
         self.aggregate = _token(dim)
         self.aggregate_of = nn.ParameterDict({name: _token(dim) for name in widths})
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.stack = Transformer(
             config.layers,
             dim,
@@ -125,9 +132,13 @@ class Mate(nn.Module):
         origin = sinusoid(1, first.shape[1], first.device).to(first.dtype)
         x = torch.cat([(first + origin)[:, None], *pieces], dim=1)
         mask = torch.cat(masks, dim=1)
+        sizes = [piece.shape[1] for piece in pieces]
+        places = _places(sizes, x.device) if draws.by_sample() else None
+        draws.columns(places)
         x = self.stack(self.dropout(x), torch.cat([mask.new_ones(size, 1), mask], dim=1))
+        draws.columns(None)
         seq = x[:, 1:].masked_fill(~mask[..., None], 0.0)
-        return Encoded(x[:, 0], seq, mask, self._timed(seq, [piece.shape[1] for piece in pieces]))
+        return Encoded(x[:, 0], seq, mask, self._timed(seq, sizes), None if places is None else places[1:])
 
     def unconditional(self, batch: int) -> Encoded:
         """What rows without any modality are encoded as, S = 0."""
@@ -192,6 +203,14 @@ def drop_conditions(conditions: Conditions, drop: Tensor) -> dict[str, Condition
             None if pooled is None else pooled.masked_fill(drop[:, None], 0.0),
         )
     return out
+
+
+def _places(sizes: list[int], device: torch.device) -> Tensor:
+    """Of the aggregation token and the positions of each modality: every one has a range of its own, so that
+    the padding of one moves no other.
+    """
+    ranges = [torch.arange(size, device=device) + (n << _RANGE) for n, size in enumerate(sizes, start=1)]
+    return torch.cat([torch.zeros(1, dtype=torch.int64, device=device), *ranges])
 
 
 def _timed(name: str) -> bool:

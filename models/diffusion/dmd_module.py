@@ -13,6 +13,7 @@ from torch import Tensor
 
 from motionloom.models.diffusion.dmd import Dmd, dmd_loss
 from motionloom.models.gpt.frozen import Frozen
+from motionloom.models.layers import draws
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
@@ -43,8 +44,8 @@ class DmdModule(StageModule):
         with torch.no_grad():
             codes = self.tokenizer.module.encode(motion, length, present)
             seen = self.tokenizer.module.coordinates(motion, present)
-        step = torch.randint(0, self.net.config.schedule.steps, (len(motion),), device=motion.device)
-        noise = torch.randn_like(seen)
+        step = draws.integers(self.net.config.schedule.steps, len(motion), motion.device)
+        noise = draws.normal_like(seen)
         hidden = hidden_stretch(groups, -(-motion.shape[1] // GROUP_FRAMES), self.net.config.hide)
         loss = dmd_loss(
             self.net, self.noiser, seen, codes, length, step, noise, hidden=hidden, present=present
@@ -58,7 +59,7 @@ def hidden_stretch(groups: Tensor, size: int, share: float) -> Tensor | None:
     """
     if not share:
         return None
-    chance, length, place = torch.rand(3, len(groups), device=groups.device)
+    chance, length, place = draws.uniforms(3, len(groups), groups.device)
     count = 1 + (length * (groups // 2)).long().clamp(max=(groups // 2 - 1).clamp(min=0))
     first = (place * (groups - count + 1)).long()
     at = torch.arange(size, device=groups.device)

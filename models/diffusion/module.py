@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.layers import draws
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.distributed import masked_mean
 from motionloom.models.training.stage_module import OptimConfig, StageModule
@@ -31,10 +31,10 @@ class DiffusionModule(StageModule):
         motion, length, text = batch["motion"], batch["length"], batch["conditions"]["text"].pooled
         schedule = self.net.config.schedule
         mask = length_mask(length, motion.shape[1])
-        step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)
-        noise = torch.randn_like(motion)
+        step = draws.integers(schedule.steps, len(motion), motion.device)
+        noise = draws.normal_like(motion)
         hidden = self.net.config.condition_dropout if self.training else 0.0
-        conditioned = torch.rand(len(motion), device=motion.device) >= hidden
+        conditioned = draws.uniform(len(motion), device=motion.device) >= hidden
         noisy = self.noiser.add_noise(motion, noise, step)
         found = self.net(noisy, step, text, mask, conditioned)
         target = motion if schedule.predicts == "sample" else noise

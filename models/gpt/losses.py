@@ -19,6 +19,7 @@ from motionloom.datasets.schema import Config
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import PAD
+from motionloom.models.layers import draws
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
@@ -70,8 +71,10 @@ def corrupt(tokens: Tensor, kinds: Tensor, ends: Tensor, pkeep: float) -> Tensor
     tokens, kinds int64 [B, L], ends int64 [streams]. End tokens and padding stay.
     """
     end = ends[kinds]
-    replace = (torch.rand(tokens.shape, device=tokens.device) >= pkeep) & (tokens != PAD) & (tokens != end)
-    draw = (torch.rand(tokens.shape, device=tokens.device) * end).long()
+    replace = (
+        (draws.uniform(*tokens.shape, device=tokens.device) >= pkeep) & (tokens != PAD) & (tokens != end)
+    )
+    draw = (draws.uniform(*tokens.shape, device=tokens.device) * end).long()
     return torch.where(replace, torch.minimum(draw, end - 1), tokens)
 
 
@@ -101,7 +104,7 @@ def soft_codes(
         here = steps[:, :, slots, : gpt.num_codes[name]]
         here = torch.where(valid, here, 0.0).flatten(1, 2)
         if sample:
-            out[name] = F.gumbel_softmax(here, tau=temperature, hard=True)
+            out[name] = draws.gumbel_softmax(here, temperature)
         else:
             soft = (here / temperature).softmax(-1)
             out[name] = F.one_hot(here.argmax(-1), here.shape[-1]).to(soft) + soft - soft.detach()

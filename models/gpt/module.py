@@ -14,6 +14,7 @@ from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import GptLossConfig, accuracy, align_loss, corrupt, cross_entropy
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.samples import log_likelihood, policy_loss, rewards, sample
+from motionloom.models.layers import draws
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.training.stage_module import OptimConfig, StageModule
@@ -68,7 +69,7 @@ class GptModule(StageModule):
         known = batch.get("known")
         inputs, drop = None, None
         if self.training:
-            drop = torch.rand(len(text), device=text.device) < config.condition_dropout
+            drop = draws.uniform(len(text), device=text.device) < config.condition_dropout
             if config.pkeep < 1:
                 inputs = corrupt(tokens, kinds, net.ends, config.pkeep)
         logits = net(tokens, kinds, text, inputs=inputs, drop_text=drop, known=known)

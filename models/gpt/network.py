@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
+from motionloom.models.layers.draws import Dropout
 from motionloom.models.layers.transformer import KVCache, Transformer
 from motionloom.models.tokenizer.base import Stream
 
@@ -85,7 +86,7 @@ class InterleavedGPT(TokenNetwork):
         self.null_text = nn.Parameter(torch.randn(config.dim) * 0.02)
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
         self.embeddings = self._tables(config.dim)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.stack = Transformer(
             config.layers,
             config.dim,

@@ -17,12 +17,14 @@ Legend: B batch, L positions, S visible positions, D width, H heads.
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
+
+from motionloom.models.layers import draws
 
 Norm = Literal["pre", "post"]
 """Where LayerNorm stands: before attention and feed-forward, or behind their sums."""
@@ -105,13 +107,8 @@ class SelfAttention(nn.Module):
                 mask = seen.tril(diagonal=before)
             # A single new position sees everything stored; a first block is plainly causal.
             causal = causal and before == 0 and length > 1
-        out = F.scaled_dot_product_attention(
-            query,
-            key,
-            value,
-            attn_mask=mask,
-            is_causal=causal and mask is None,
-            dropout_p=self.attention_dropout if self.training else 0.0,
+        out = draws.attention(
+            query, key, value, mask, causal, self.attention_dropout if self.training else 0.0
         )
         merged: Tensor = self.out(out.transpose(1, 2).reshape(batch, length, dim))
         return merged
@@ -130,7 +127,7 @@ class Block(nn.Module):
         self.norm_ff = nn.LayerNorm(dim)
         self.ff_in = nn.Linear(dim, ff)
         self.ff_out = nn.Linear(ff, dim)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = draws.Dropout(dropout)
 
     def forward(
         self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: LayerCache | None = None
@@ -191,7 +188,8 @@ class Transformer(nn.Module):
         again = self.checkpointed and torch.is_grad_enabled() and cache is None
         for index, block in enumerate(self.blocks):
             if again:
-                x = checkpoint(block, x, mask, causal, use_reentrant=False)
+                drawn: Any = {"context_fn": draws.again} if draws.by_sample() else {}
+                x = checkpoint(block, x, mask, causal, use_reentrant=False, **drawn)
             else:
                 x = block(x, mask, causal, None if cache is None else cache.layers[index])
         out: Tensor = self.norm(x)

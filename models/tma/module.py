@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
+from motionloom.models.layers import draws
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tma.losses import TmaLossConfig, info_nce, kl_four, latent_loss, reconstruction_loss
 from motionloom.models.tma.network import Tma
@@ -78,4 +78,4 @@ class TmaModule(StageModule):
     def _latent(self, mu: Tensor, logvar: Tensor) -> Tensor:
         if not self.training:
             return mu
-        return mu + torch.randn_like(mu) * (0.5 * logvar).exp()
+        return mu + draws.normal_like(mu) * (0.5 * logvar).exp()

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import Config
+from motionloom.models.layers import draws
 from motionloom.models.layers.basis import Basis
 from motionloom.models.layers.transformer import Norm, Transformer, length_mask, sinusoid
 
@@ -105,7 +106,7 @@ def noisy(tokens: Tensor, mask: Tensor, scale: float) -> Tensor:
     (bool [B, S], True = real) plays no part in the size.
     """
     squares = tokens.square().mean(-1).masked_fill(~mask, 0.0).sum(1) / mask.sum(1).clamp(min=1)
-    return tokens + scale * squares.sqrt()[:, None, None] * torch.randn_like(tokens)
+    return tokens + scale * squares.sqrt()[:, None, None] * draws.normal_like(tokens)
 
 
 def _stack(config: TmaConfig) -> Transformer:

@@ -24,6 +24,7 @@ from torch.amp import GradScaler
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim import Optimizer
 
+from motionloom.models.layers import draws
 from motionloom.models.training.distributed import mean_gradients
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule
@@ -143,12 +144,14 @@ class PlayersModule(StageModule):
         self, player: Player, turn: int, number: int, part: dict[str, Any], shared: list[dict[str, Tensor]]
     ) -> Tensor:
         self.seed_draws(number, turn)
+        self.key_draws(part, number, turn)
         values = self.play(player.name, part, shared[number])
         shared[number] = {name: value.detach() for name, value in shared[number].items()}
         named = _named(player, values)
         self.average({"loss": values["loss"], **named} if turn == 0 else named)
         with self._outside_forward():
             self.manual_backward(values["loss"] / self.accumulate)
+        draws.end()
         return values["loss"].detach()
 
     def _step(self, player: Player, turn: int, optimizer: Optimizer, scaler: GradScaler | None) -> bool:

@@ -2,7 +2,8 @@
 
 Every random draw of a training step (dropout, latents, Gumbel noise) comes from a generator state that is a
 pure function of (seed, step, rank), so a run that was killed and resumed repeats the undisturbed run bit for
-bit. Codebooks draw by themselves, the same on every rank (`quantize/draws.py`).
+bit; or of the sample it is for, so that a run repeats it on any number of ranks too (`layers/draws.py`).
+Codebooks draw by themselves, the same on every rank (`quantize/draws.py`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
+from motionloom.models.layers import draws
 from motionloom.models.training.distributed import alone
 from motionloom.models.training.optim import OptimConfig as OptimConfig
 from motionloom.models.training.sharding import sharded
@@ -46,6 +48,8 @@ class StageModule(L.LightningModule, ABC):
         self.seed = seed
         self.max_steps = max_steps
         self._since: dict[tuple[str, ...], tuple[Tensor, int]] = {}
+        self.draw_by_sample = False
+        """Whether what a step draws depends on the samples and not on the ranks."""
         self.row: tuple[str, ...] = ()
         """Names of the figures in the newest row of the log."""
         self.gauges: dict[str, float | Tensor] = {}
@@ -80,6 +84,7 @@ class StageModule(L.LightningModule, ABC):
         """One step; seeds torch from (seed, step, part of the step, rank) first."""
         part = batch_idx % self.trainer.accumulate_grad_batches
         self.seed_draws(part)
+        self.key_draws(batch, part)
         values = self.losses(batch)
         self.average(values)
         if part == self.trainer.accumulate_grad_batches - 1:
@@ -91,6 +96,18 @@ class StageModule(L.LightningModule, ABC):
         """Seed torch for one part of a step, and one of several losses that are computed on it in turn."""
         key = (self.seed * 1_000_003 + self.global_step) * 4099 + self.global_rank
         torch.manual_seed((key + (part << 48) + (turn << 56)) % 2**63)
+
+    def key_draws(self, batch: dict[str, Any], part: int, turn: int = 0) -> None:
+        """Have the draws of a part of a step depend on its samples, where they do."""
+        if self.draw_by_sample:
+            rows, device = len(batch["length"]), batch["length"].device
+            first = (part * self.trainer.world_size + self.global_rank) * rows
+            samples = torch.arange(first, first + rows, device=device)
+            draws.begin(self.seed, self.global_step, samples, turn)
+
+    def on_after_backward(self) -> None:
+        """Draws by sample are for a step; a backward pass may repeat them (activation checkpointing)."""
+        draws.end()
 
     @property
     def ends_row(self) -> bool:
@@ -140,6 +157,7 @@ class StageModule(L.LightningModule, ABC):
 
         What a loss draws here depends on (seed, batch) alone, so two validations differ by the weights only.
         """
+        draws.end()
         torch.manual_seed((self.seed * 1_000_003 + batch_idx) % 2**63)
         with alone():
             values = self.losses(batch)

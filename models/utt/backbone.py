@@ -20,6 +20,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from motionloom.models.layers import draws
+from motionloom.models.layers.draws import Dropout
 from motionloom.models.layers.transformer import KVCache, Transformer, length_mask
 
 
@@ -43,11 +45,18 @@ class PrefixTransformer(nn.Module):
         super().__init__()
         self.stack = Transformer(layers, dim, heads, ff, dropout=dropout, attention_dropout=attention_dropout)
 
-    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor) -> Tensor:
-        """Prefix [B, S, D], mask bool [B, S], x [B, L, D] -> the states of x, [B, L, D]."""
+    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor, places: Tensor | None = None) -> Tensor:
+        """Prefix [B, S, D], mask bool [B, S], x [B, L, D] -> the states of x, [B, L, D].
+
+        places: int64 [S] of the prefix's columns, below 2^19, for draws by sample (`Encoded.places`).
+        """
         size = prefix.shape[1]
         visible = prefix_mask(mask, x.shape[1])
+        if places is not None:
+            behind = torch.arange(x.shape[1], device=places.device) + (1 << (draws.PLACES - 1))
+            draws.columns(torch.cat([places, behind]))
         out: Tensor = self.stack(torch.cat([prefix, x], dim=1), visible)
+        draws.columns(None)
         return out[:, size:]
 
     def begin(self, prefix: Tensor, mask: Tensor, size: int) -> State:
@@ -73,11 +82,11 @@ class PrefixGru(nn.Module):
         super().__init__()
         self.norms = nn.ModuleList(nn.LayerNorm(dim) for _ in range(layers))
         self.layers = nn.ModuleList(nn.GRU(dim, dim, batch_first=True) for _ in range(layers))
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
         self.norm = nn.LayerNorm(dim)
 
-    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor) -> Tensor:
-        """As `PrefixTransformer.forward`."""
+    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor, places: Tensor | None = None) -> Tensor:
+        """As `PrefixTransformer.forward`; real positions come first here, so padding moves none."""
         return self.extend(x, self.begin(prefix, mask, x.shape[1]))
 
     def begin(self, prefix: Tensor, mask: Tensor, size: int) -> State:

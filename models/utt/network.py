@@ -32,6 +32,8 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.models.condition.mate import Encoded
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
+from motionloom.models.layers import draws
+from motionloom.models.layers.draws import Dropout
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
 from motionloom.models.utt.backbone import PrefixGru, PrefixTransformer, State
 
@@ -109,7 +111,7 @@ class Utt(TokenNetwork):
         self.start = nn.Parameter(torch.randn(config.dim) * 0.02)
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
         self.embeddings = self._tables(config.dim)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.backbone: PrefixTransformer | PrefixGru
         if config.kind == "gpt":
             self.backbone = PrefixTransformer(
@@ -154,8 +156,14 @@ class Utt(TokenNetwork):
             float32 [B, L, V]; -inf where a token is illegal. At padded positions the values mean nothing.
         """
         embedded = self.read(tokens, kinds, inputs, known, self.config.block_size)
+        places = None
+        if condition.places is not None:
+            places = torch.cat([condition.places.new_zeros(1), condition.places])
+        draws.columns(places)
         prefix, mask = self.prefix(condition, z)
-        hidden = self.backbone(prefix, mask, self.motion_inputs(embedded, 0, self.beside(condition)))
+        draws.columns(None)
+        motion = self.motion_inputs(embedded, 0, self.beside(condition))
+        hidden = self.backbone(prefix, mask, motion, places)
         return self.logits(hidden, kinds, self.legal(tokens, kinds))
 
     def prefix(self, condition: Encoded, z: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -73,7 +73,7 @@ class Line:
         *whole, self._read = self._read.split(b"\n")
         if len(self._read) > _LONGEST:
             self.closed = True
-        found = []
+        found: list[dict[str, Any]] = []
         for text in whole:
             try:
                 message = json.loads(text)

@@ -47,6 +47,10 @@ TICK = 1.0
 _GRACE = 3.0
 """Seconds in which processes may end in their own way, and write their stacks."""
 _CONNECT = 20.0
+_ASKED_TO = (0, 75, 130)
+"""Exit codes of processes that end because their work is done, because all were asked to save and stop, or
+because of Ctrl-C: the others have their own word about that.
+"""
 FLIGHT = "flight"
 """Folder of what is written when a stage ends badly, within the stage's."""
 
@@ -207,8 +211,8 @@ class Watch:
             with suppress(TypeError):  # of a process of another version
                 peer.beat = Beat(**message["beat"])
         elif "bye" in message:
-            peer.done = message["bye"] == 0
-            peer.code = message["bye"] or None
+            peer.done = message["bye"] in _ASKED_TO
+            peer.code = None if peer.done else message["bye"]
         elif "verdict" in message and self.verdict is None:
             with suppress(TypeError):
                 self.verdict = Verdict(**message["verdict"])

@@ -29,12 +29,12 @@ from motionloom.pipeline.runs.graph import (
     Selection,
     execute,
     make_plan,
-    perform,
     plan_table,
     require_fit,
     selected,
     stage_inputs,
 )
+from motionloom.pipeline.runs.perform import perform
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.replace import replaced_stages, require_asked, say_replaced, started_trainings
 from motionloom.pipeline.runs.shipped import nearest

@@ -24,23 +24,21 @@ from rich.table import Table
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
-from motionloom.models.training.distributed import alone
 from motionloom.pipeline.contract.stage import (
     Every,
     Finished,
     Shelf,
     Stage,
     StageContext,
-    StageKind,
     fingerprint_fields,
 )
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
-from motionloom.pipeline.launch.watch import current
 from motionloom.pipeline.runs.beginning import prepare_folder
 from motionloom.pipeline.runs.extend import extendable, extension
 from motionloom.pipeline.runs.outside import require_elsewhere
+from motionloom.pipeline.runs.perform import perform
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import fingerprint_of, write_json
@@ -314,24 +312,6 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 console.print(f"    finished in {seconds:.1f} s")
         team.part()
     return [row.stage.name for row in todo]
-
-
-def perform(kind: StageKind, context: StageContext, team: Team) -> None:
-    """One stage, by all processes that take part in its kind."""
-    watch = current()
-    if watch is not None:
-        watch.enter_stage(context.name, context.folder, "before its first step")
-    if kind.trains:
-        team.meet()
-        kind.run(context)
-        return
-    with alone():
-        if kind.shares:
-            team.meet()
-            kind.share(context)
-            team.meet()
-        if team.leads:
-            kind.run(context)
 
 
 def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]:

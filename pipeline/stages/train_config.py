@@ -49,6 +49,10 @@ class TrainConfig(Config):
     codebook is updated with every part (an average and resets over smaller batches). More processes instead
     of more parts change neither.
     """
+    draws: Literal["rank", "sample"] = Field("rank", json_schema_extra=LATER)
+    """What dropout, noise and latents of a step depend on: the rank (torch's generators; other numbers of
+    processes draw otherwise) or each sample of the global batch (elastic: any number of processes, and of
+    parts, draws the same; slower, with dropout of attention weights much slower)."""
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
     strategy: Literal["ddp", "fsdp"] = Field("ddp", json_schema_extra=RUNTIME)
     """What several processes hold: each the whole network (`ddp`), or each a part of the weights, gradients
@@ -101,6 +105,11 @@ class TrainedStageConfig(StageConfig):
         """The global batch must divide over the processes, and FSDP suit the network and the arithmetic."""
         self.train.local_batch(hardware.world())
         require_loggers(hardware.loggers)
+        if self.train.draws == "sample" and self.train.compile and self.train.checkpoint_activations:
+            raise UserError(
+                "train.checkpoint_activations repeats draws by sample in the backward pass, which "
+                "train.compile cannot do; set train.draws: rank, or one of them to false"
+            )
         if self.train.strategy == "fsdp":
             self._require_shardable()
 

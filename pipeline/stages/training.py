@@ -147,6 +147,7 @@ def fit(
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
     """Apply the settings that concern how the network computes."""
     module.fused = config.precision != "16-mixed"
+    module.draw_by_sample = config.draws == "sample"
     if isinstance(module, PlayersModule):
         module.accumulate = config.accumulate
     for part in module.modules():

@@ -12,215 +12,109 @@ float32, as in training.
 Nothing is drawn: there is no dropout, and the networks that sample latents or codes run in evaluation mode,
 or draw by seeds that do not depend on the rank.
 
+With draws by sample everything is drawn, and trainings go on from two ranks to one and to two again.
+
 The processes run this file as a script.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
 from batch_rows import rows_of
+from rank_cases import BATCH, CASES, ELASTIC, LENGTH, STEPS
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.conditions import Condition
-from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.diffusion.module import DiffusionModule
-from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
-from motionloom.models.gpt.losses import GptLossConfig
-from motionloom.models.gpt.module import GptModule
-from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.gpt.tokens import interleave
-from motionloom.models.tma.losses import TmaLossConfig
-from motionloom.models.tma.module import TmaModule
-from motionloom.models.tma.network import Tma, TmaConfig
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import (
-    AnyTokenizerConfig,
-    FsqConfig,
-    H2VQConfig,
-    MqConfig,
-    RvqConfig,
-    SeparateConfig,
-)
-from motionloom.models.tokenizer.module import TokenizerModule
-from motionloom.models.training.distributed import rank, world_size
-from motionloom.models.training.stage_module import OptimConfig, StageModule
+from motionloom.models.layers import draws
+from motionloom.models.training.distributed import alone, rank, sum_over_ranks, world_size
+from motionloom.models.training.stage_module import StageModule
 
 pytestmark = pytest.mark.slow
 
-STEPS = 20
-BATCH, FRAMES, TEXT = 6, 24, 6
-LAYOUT = MotionLayout.named("wholebody313")
-OPTIM = OptimConfig(lr=1e-3)
-LENGTH = torch.tensor([24, 23, 9, 5, 24, 2])  # 56 real frames on the first rank, 31 on the second
-SMALL: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "velocity_weight": 0.5}
-# Few enough uses that codes are reset, after the first step too.
-BOOK: dict[str, Any] = {**SMALL, "num_codes": 12, "decay": 0.8, "alpha": 0.5, "reset_below": 0.6}
-
-Batches = Callable[[int], dict[str, Tensor]]
+PHASES = ((0, 4), (4, 8), (8, 12))
+"""Steps on two ranks, on one, on two again."""
 
 
-def motion(step: int, dim: int) -> dict[str, Tensor]:
-    """A moving distribution, so that codes die on the way; behind a clip's end there is rubbish."""
-    generator = torch.Generator().manual_seed(step)
-    values = torch.randn(BATCH, FRAMES, dim, generator=generator, dtype=torch.float64)
-    return {"motion": values + 0.05 * step, "length": LENGTH}
+class Place:
+    """What a module asks its trainer."""
+
+    def __init__(self) -> None:
+        self.world_size, self.global_rank, self.global_step = world_size(), rank(), 0
+        self.accumulate_grad_batches = 1
 
 
-def tokenizer(config: AnyTokenizerConfig, handed: tuple[bool, ...] = ()) -> tuple[StageModule, Batches]:
-    """`handed` says which clips of a batch hold hands; all when empty."""
-    net = build_tokenizer(config, LAYOUT)
-    net.basis.learn(
-        np.zeros(net.dim), np.full(net.dim, 0.02)
-    )  # independent noise in every column bends fingers wildly
-    module = TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms())
-    present = torch.ones(BATCH, net.dim, dtype=torch.bool)
-    for row in (row for row, has in enumerate(handed) if not has):
-        present[row, np.searchsorted(net.columns.numpy(), LAYOUT.part("hand"))] = False
-    return module, lambda step: motion(step, net.dim) | ({"present": present} if handed else {})
+def trimmed(batch: dict[str, Any]) -> dict[str, Any]:
+    """Without the padding that no row of this rank needs, as the loaders give it."""
+    out = dict(batch)
+    if "tokens" in batch:
+        longest = int((batch["tokens"] >= 0).sum(1).max())
+        out |= {name: batch[name][:, :longest] for name in ("tokens", "kinds", "known")}
+    elif batch["motion"].shape[-1] == 20:
+        out["motion"] = batch["motion"][:, : int(batch["length"].max())]
+    if "conditions" in batch:
+        text = batch["conditions"]["text"]
+        size = int(text.mask.sum(1).max())
+        out["conditions"] = {"text": Condition(text.features[:, :size], text.mask[:, :size], text.pooled)}
+    return out
 
 
-def captions(step: int) -> dict[str, Tensor]:
-    generator = torch.Generator().manual_seed(step)
-    same = [0, 1, 2, 1, 3, 4]  # a caption that both ranks hold
-    return {
-        "conditions": {
-            "text": Condition(
-                torch.randn(BATCH, 4, TEXT, generator=generator, dtype=torch.float64),
-                torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
-                torch.eye(TEXT, dtype=torch.float64)[same],
-            )
-        },
-        "similarity": torch.eye(TEXT, dtype=torch.float64)[same],
-    }
+def elastic(case: str, steps: range, state: Path | None = None) -> list[dict[str, float]]:
+    """Figures of some steps, drawn by sample, gone on from `state` and written there where given."""
+    torch.manual_seed(0)
+    module, batches = ELASTIC[case]()
+    module.train().net.double()
+    module.draw_by_sample = True
+    optimizer = module.configure_optimizers()["optimizer"]
+    if state is not None and state.is_file():
+        saved = torch.load(state, weights_only=True)
+        module.net.load_state_dict(saved["net"])
+        optimizer.load_state_dict(saved["optimizer"])
+    module.trainer = place = Place()  # type: ignore[assignment]
+    model: nn.Module = Wrapped(module)
+    if world_size() > 1:
+        model = DistributedDataParallel(model, forward_sync_buffers=False)
+    size = BATCH // world_size()
+    mine = slice(rank() * size, (rank() + 1) * size)
+    rows = []
+    for step in steps:
+        place.global_step = step
+        batch = {"length": LENGTH, **batches(step)}
+        batch = trimmed(rows_of(batch, mine))
+        torch.manual_seed(1000 * rank() + step)  # torch's own draws would differ
+        module.key_draws(batch, 0)
+        values = model(batch)
+        optimizer.zero_grad()
+        values["loss"].backward()
+        draws.end()
+        optimizer.step()
+        names, figures = list(values), torch.stack([v.detach().double() for v in values.values()])
+        rows.append(dict(zip(names, (sum_over_ranks(figures) / world_size()).tolist(), strict=True)))
+    if state is not None and rank() == 0:
+        torch.save({"net": module.net.state_dict(), "optimizer": optimizer.state_dict()}, state)
+    return rows
 
 
-def tma() -> tuple[StageModule, Batches]:
-    net = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 20, TEXT)
-    loss = TmaLossConfig(kl=0.1, latent=0.1, contrastive=1.0)  # heavy, so that an error in a term would show
-    module = TmaModule(net, OPTIM, seed=0, max_steps=STEPS, loss=loss)
-    return module.eval(), lambda step: motion(step, 20) | captions(step)
-
-
-def gpt() -> tuple[StageModule, Batches]:
-    book = build_tokenizer(H2VQConfig(width=8, depth=1, code_dim=8, num_codes=9), LAYOUT)
-    for quantizer in book.codebooks().values():
-        quantizer.codebook.normal_()  # spread out, so that the alignment has something to gain
-    aligned = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), LAYOUT.dim, TEXT)
-    config = GptConfig(layers=2, dim=16, heads=2, ff=32, block_size=20)
-    net = InterleavedGPT(config, book.streams, book.pattern, text_dim=16)
-    module = GptModule(
-        net, OPTIM, seed=0, max_steps=STEPS, loss=GptLossConfig(align_weight=1.0),
-        tokenizer=book, tma=aligned,
-    )  # fmt: skip
-
-    def batch(step: int) -> dict[str, Tensor]:
-        generator = torch.Generator().manual_seed(step)
-        codes = {
-            "body": torch.randint(9, (BATCH, 10), generator=generator),
-            "hand": torch.randint(9, (BATCH, 5), generator=generator),
-        }
-        groups = torch.tensor([5, 5, 4, 1, 2, 1])
-        tokens, kinds, _ = interleave(codes, book.pattern, ends=net.num_codes, groups=groups)
-        text = torch.randn(BATCH, 16, generator=generator, dtype=torch.float64)
-        # One clip without hands on the first rank, two on the other.
-        handless = torch.tensor([False, False, True, False, True, True])
-        present = torch.ones(BATCH, LAYOUT.dim, dtype=torch.bool)
-        present[handless.nonzero(), torch.from_numpy(LAYOUT.part("hand"))] = False
-        known = ~(handless[:, None] & (kinds == 1)) | (tokens == 9)
-        told = {"similarity": captions(step)["similarity"], "known": known, "present": present}
-        return {"tokens": tokens, "kinds": kinds, "text": text, **told}
-
-    return module.eval(), batch
-
-
-def gpt_samples() -> tuple[StageModule, Batches]:
-    """L_align on motions that the model draws: each row with its own seed, whatever rank it is on."""
-    module, batch = gpt()
-    assert isinstance(module, GptModule) and module.tokenizer is not None and module.tma is not None
-    still = module.net.config.model_copy(
-        update={"dropout": 0.0, "attention_dropout": 0.0, "condition_dropout": 0.0}
-    )
-    net = InterleavedGPT(still, module.tokenizer.module.streams, module.net.pattern, text_dim=16)
-    drawn = UndrawnGpt(
-        net, OPTIM, seed=0, max_steps=STEPS, loss=GptLossConfig(align_weight=1.0, align_on="samples"),
-        tokenizer=module.tokenizer.module, tma=module.tma.module,
-    )  # fmt: skip
-    return drawn.train(), batch
-
-
-class UndrawnGpt(GptModule):
-    """The seeds of the samples are those of the whole batch, of which each rank takes its part."""
-
-    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """As the base class, with the draws replaced."""
-        whole = BATCH * self.loss_config.samples
-        mine = slice(rank() * whole // world_size(), (rank() + 1) * whole // world_size())
-        randint, generator = torch.randint, torch.Generator().manual_seed(0)
-        try:
-            torch.randint = lambda high, _: randint(high, (whole,), generator=generator)[mine]  # type: ignore[assignment]
-            return super().losses(batch)
-        finally:
-            torch.randint = randint
-
-
-def diffusion() -> tuple[StageModule, Batches]:
-    net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2), 20, TEXT)
-    module = Undrawn(net, OPTIM, seed=0, max_steps=STEPS)
-    return module.eval(), lambda step: motion(step, 20) | captions(step)
-
-
-class Undrawn(DiffusionModule):
-    """Time steps and noise are those of the whole batch, of which each rank takes its part."""
-
-    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """As the base class, with the draws replaced."""
-        whole = BATCH
-
-        def part(values: Tensor) -> Tensor:
-            size = whole // world_size()
-            return values[rank() * size : (rank() + 1) * size]
-
-        randint, randn_like = torch.randint, torch.randn_like
-        generator = torch.Generator().manual_seed(0)
-        try:
-            torch.randint = lambda low, high, size, **_: part(  # type: ignore[assignment]
-                randint(low, high, (whole,), generator=generator)
-            )
-            torch.randn_like = (
-                lambda x: part(  # type: ignore[assignment]
-                    torch.randn(whole, *x.shape[1:], generator=generator, dtype=x.dtype)
-                )
-            )
-            return super().losses(batch)
-        finally:
-            torch.randint, torch.randn_like = randint, randn_like
-
-
-CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
-    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
-    "h2vq, one rank without hands": lambda: tokenizer(H2VQConfig(**BOOK), (True, False, True) + 3 * (False,)),
-    "separate": lambda: tokenizer(SeparateConfig(**BOOK)),
-    "rvq": lambda: tokenizer(RvqConfig(**BOOK)),
-    "fsq": lambda: tokenizer(FsqConfig(**SMALL, steps=(5, 4))),
-    "mq": lambda: tokenizer(MqConfig(**SMALL, num_codes=12, start="data")),
-    "tma": tma,
-    "tma, compiled": tma,
-    "gpt": gpt,
-    "gpt, compiled": gpt,
-    "gpt, samples": gpt_samples,
-    "diffusion": diffusion,
-}
+def elastic_phases(case: str, folder: Path) -> list[dict[str, float]]:
+    """Two ranks, then the first alone, then two."""
+    state, found = folder / f"{case}.state", []
+    for number, (first, end) in enumerate(PHASES):
+        if number != 1:
+            found += elastic(case, range(first, end), state)
+        elif rank() == 0:
+            with alone():
+                found += elastic(case, range(first, end), state)
+        dist.barrier()
+    return found
 
 
 class Wrapped(nn.Module):
@@ -272,16 +166,24 @@ def worker(number: int, folder: Path) -> None:
     init = f"file://{folder}/rendezvous"
     dist.init_process_group("gloo", init_method=init, rank=number, world_size=2)
     torch.save({case: train(case) for case in CASES}, folder / f"{number}.pt")
+    rows = {case: elastic_phases(case, folder) for case in ELASTIC}
+    (folder / f"{number}.json").write_text(json.dumps(rows))
     dist.barrier()
     # Without destructors: those of DDP and gloo can wait for each other.
     os._exit(0)
 
 
 @pytest.fixture(scope="module")
-def two(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
-    """What each of two ranks found, per case."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the two ranks have written what they found."""
     folder = tmp_path_factory.mktemp("ranks")
     run_two_ranks(__file__, folder, numbered=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def two(folder: Path) -> list[dict[str, Any]]:
+    """What each of two ranks found, per case."""
     return [torch.load(folder / f"{number}.pt", weights_only=True) for number in range(2)]
 
 
@@ -300,6 +202,17 @@ def test_two_ranks_equal_one_process(case: str, two: list[dict[str, Any]]) -> No
     resets = [sum(v[1:]) for name, v in one["figures"].items() if name.startswith("resets")]
     if case.startswith(("h2vq", "rvq", "separate")):
         assert sum(resets) > 5, "the codebooks were too calm to prove much"
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("case", list(ELASTIC))
+def test_from_two_ranks_to_one_and_back_equals_one_process(case: str, folder: Path) -> None:
+    """Losses and all figures of every step, to 1e-6; the losses that are left in float32 are that exact."""
+    one = elastic(case, range(PHASES[-1][1]))
+    found = json.loads((folder / "0.json").read_text())[case]
+    assert len(found) == len(one)
+    for step, (row, expected) in enumerate(zip(found, one, strict=True)):
+        assert row == pytest.approx(expected, rel=1e-6, abs=1e-7), f"step {step}"
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -144,7 +145,7 @@ def test_the_others_end_when_the_lead_dies(
 
 
 def test_goodbye_is_no_death(trio: list[tuple[Watch, Ends]]) -> None:
-    trio[2][0].stop()
+    trio[2][0].stop(75)
     until(lambda: trio[0][0]._peers[2].done and trio[0][0]._peers[2].gone, "no goodbye")
     trio[1][0].stop(3)
     until(lambda: trio[0][1].code is not None, "an error of rank 1 ends nobody")
@@ -326,7 +327,7 @@ def test_a_read_that_hangs_ends_the_job_under_torchrun(trainings: Callable[..., 
     until(over, "the job goes on", 250)
     said = end_of(job, sorted(pids))
     assert said.count("has stalled: no progress") == 1 and "error: rank 1 on" in said, said
-    assert "stage duel, step 30, waiting for a batch" in said
+    assert re.search(r"stage duel, step (29|30), waiting for a batch", said), said  # Lightning reads ahead
     stacks = [(tmp_path / f"flight/stacks_rank_{rank}.txt").read_text() for rank in range(2)]
     assert "in __getitem__" in stacks[1] and "in __getitem__" not in stacks[0]
 

@@ -22,20 +22,19 @@ from motionloom.pipeline.runs.graph import Selection
 
 pytestmark = pytest.mark.slow
 
-# Without what draws per process (dropout, latent noise), so that one and two processes can be compared.
+# Everything is drawn by sample, so that one and two processes can be compared.
 RECIPE = """
 extends: small
 name: small
 stages:
   tokenizer: {train: {steps: 4, checkpoint_every: 2, validate_every: 2}}
   tma:
-    net: {dropout: 0.0}
-    loss: {reconstruction: 0.0, latent: 0.0}
-    train: {steps: 4, checkpoint_every: 2, validate_every: 2}
+    net: {dropout: 0.1, attention_dropout: 0.1}
+    train: {steps: 4, checkpoint_every: 2, validate_every: 2, draws: sample}
   gpt:
-    net: {dropout: 0.0, condition_dropout: 0.0}
+    net: {dropout: 0.1, condition_dropout: 0.1}
     loss: {align_weight: 0.0}
-    train: {steps: 10, checkpoint_every: 5, validate_every: 5}
+    train: {steps: 10, checkpoint_every: 5, validate_every: 5, draws: sample}
 """
 PAIR = ("--set", "hardware.devices=2")
 
@@ -197,6 +196,8 @@ def test_no_process_outlives_another(
     os.kill(other if victim == "other" else process.pid, signal.SIGKILL)
     output = process.communicate(timeout=30)[0]
     assert process.returncode != 0 and "Traceback" not in output
+    assert f"error: rank {int(victim == 'other')} on" in output and output.count("has died") == 1, output
+    assert "it was at stage tokenizer, step" in output
     end = time.monotonic() + 30
     while not is_gone(other):
         assert time.monotonic() < end, "the other process goes on alone"

@@ -1,0 +1,233 @@
+"""A small training of every kind of stage on made-up batches, for comparisons of ranks with one process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from motionloom.datasets.conditions import Condition
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.diffusion.module import DiffusionModule
+from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
+from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.gpt.tokens import interleave
+from motionloom.models.tma.losses import TmaLossConfig
+from motionloom.models.tma.module import TmaModule
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import (
+    AnyTokenizerConfig,
+    FsqConfig,
+    H2VQConfig,
+    MqConfig,
+    RvqConfig,
+    SeparateConfig,
+)
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.distributed import rank, world_size
+from motionloom.models.training.stage_module import OptimConfig, StageModule
+
+STEPS = 20
+BATCH, FRAMES, TEXT = 6, 24, 6
+LAYOUT = MotionLayout.named("wholebody313")
+OPTIM = OptimConfig(lr=1e-3)
+LENGTH = torch.tensor([24, 23, 9, 5, 24, 2])  # 56 real frames on the first rank, 31 on the second
+SMALL: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "velocity_weight": 0.5}
+# Few enough uses that codes are reset, after the first step too.
+BOOK: dict[str, Any] = {**SMALL, "num_codes": 12, "decay": 0.8, "alpha": 0.5, "reset_below": 0.6}
+
+Batches = Callable[[int], dict[str, Tensor]]
+
+
+def motion(step: int, dim: int) -> dict[str, Tensor]:
+    """A moving distribution, so that codes die on the way; behind a clip's end there is rubbish."""
+    generator = torch.Generator().manual_seed(step)
+    values = torch.randn(BATCH, FRAMES, dim, generator=generator, dtype=torch.float64)
+    return {"motion": values + 0.05 * step, "length": LENGTH}
+
+
+def tokenizer(config: AnyTokenizerConfig, handed: tuple[bool, ...] = ()) -> tuple[StageModule, Batches]:
+    """`handed` says which clips of a batch hold hands; all when empty."""
+    net = build_tokenizer(config, LAYOUT)
+    net.basis.learn(
+        np.zeros(net.dim), np.full(net.dim, 0.02)
+    )  # independent noise in every column bends fingers wildly
+    module = TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms())
+    present = torch.ones(BATCH, net.dim, dtype=torch.bool)
+    for row in (row for row, has in enumerate(handed) if not has):
+        present[row, np.searchsorted(net.columns.numpy(), LAYOUT.part("hand"))] = False
+    return module, lambda step: motion(step, net.dim) | ({"present": present} if handed else {})
+
+
+def captions(step: int) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(step)
+    same = [0, 1, 2, 1, 3, 4]  # a caption that both ranks hold
+    return {
+        "conditions": {
+            "text": Condition(
+                torch.randn(BATCH, 4, TEXT, generator=generator, dtype=torch.float64),
+                torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None],
+                torch.eye(TEXT, dtype=torch.float64)[same],
+            )
+        },
+        "similarity": torch.eye(TEXT, dtype=torch.float64)[same],
+    }
+
+
+def tma() -> tuple[StageModule, Batches]:
+    net = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 20, TEXT)
+    loss = TmaLossConfig(kl=0.1, latent=0.1, contrastive=1.0)  # heavy, so that an error in a term would show
+    module = TmaModule(net, OPTIM, seed=0, max_steps=STEPS, loss=loss)
+    return module.eval(), lambda step: motion(step, 20) | captions(step)
+
+
+def gpt() -> tuple[StageModule, Batches]:
+    book = build_tokenizer(H2VQConfig(width=8, depth=1, code_dim=8, num_codes=9), LAYOUT)
+    for quantizer in book.codebooks().values():
+        quantizer.codebook.normal_()  # spread out, so that the alignment has something to gain
+    aligned = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), LAYOUT.dim, TEXT)
+    config = GptConfig(layers=2, dim=16, heads=2, ff=32, block_size=20)
+    net = InterleavedGPT(config, book.streams, book.pattern, text_dim=16)
+    module = GptModule(
+        net, OPTIM, seed=0, max_steps=STEPS, loss=GptLossConfig(align_weight=1.0),
+        tokenizer=book, tma=aligned,
+    )  # fmt: skip
+
+    def batch(step: int) -> dict[str, Tensor]:
+        generator = torch.Generator().manual_seed(step)
+        codes = {
+            "body": torch.randint(9, (BATCH, 10), generator=generator),
+            "hand": torch.randint(9, (BATCH, 5), generator=generator),
+        }
+        groups = torch.tensor([5, 5, 4, 1, 2, 1])
+        tokens, kinds, _ = interleave(codes, book.pattern, ends=net.num_codes, groups=groups)
+        text = torch.randn(BATCH, 16, generator=generator, dtype=torch.float64)
+        # One clip without hands on the first rank, two on the other.
+        handless = torch.tensor([False, False, True, False, True, True])
+        present = torch.ones(BATCH, LAYOUT.dim, dtype=torch.bool)
+        present[handless.nonzero(), torch.from_numpy(LAYOUT.part("hand"))] = False
+        known = ~(handless[:, None] & (kinds == 1)) | (tokens == 9)
+        told = {"similarity": captions(step)["similarity"], "known": known, "present": present}
+        return {"tokens": tokens, "kinds": kinds, "text": text, **told}
+
+    return module.eval(), batch
+
+
+def gpt_samples() -> tuple[StageModule, Batches]:
+    """L_align on motions that the model draws: each row with its own seed, whatever rank it is on."""
+    module, batch = gpt()
+    assert isinstance(module, GptModule) and module.tokenizer is not None and module.tma is not None
+    still = module.net.config.model_copy(
+        update={"dropout": 0.0, "attention_dropout": 0.0, "condition_dropout": 0.0}
+    )
+    net = InterleavedGPT(still, module.tokenizer.module.streams, module.net.pattern, text_dim=16)
+    drawn = UndrawnGpt(
+        net, OPTIM, seed=0, max_steps=STEPS, loss=GptLossConfig(align_weight=1.0, align_on="samples"),
+        tokenizer=module.tokenizer.module, tma=module.tma.module,
+    )  # fmt: skip
+    return drawn.train(), batch
+
+
+class UndrawnGpt(GptModule):
+    """The seeds of the samples are those of the whole batch, of which each rank takes its part."""
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """As the base class, with the draws replaced."""
+        whole = BATCH * self.loss_config.samples
+        mine = slice(rank() * whole // world_size(), (rank() + 1) * whole // world_size())
+        randint, generator = torch.randint, torch.Generator().manual_seed(0)
+        try:
+            torch.randint = lambda high, _: randint(high, (whole,), generator=generator)[mine]  # type: ignore[assignment]
+            return super().losses(batch)
+        finally:
+            torch.randint = randint
+
+
+def diffusion() -> tuple[StageModule, Batches]:
+    net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2), 20, TEXT)
+    module = Undrawn(net, OPTIM, seed=0, max_steps=STEPS)
+    return module.eval(), lambda step: motion(step, 20) | captions(step)
+
+
+class Undrawn(DiffusionModule):
+    """Time steps and noise are those of the whole batch, of which each rank takes its part."""
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """As the base class, with the draws replaced."""
+        whole = BATCH
+
+        def part(values: Tensor) -> Tensor:
+            size = whole // world_size()
+            return values[rank() * size : (rank() + 1) * size]
+
+        randint, randn_like = torch.randint, torch.randn_like
+        generator = torch.Generator().manual_seed(0)
+        try:
+            torch.randint = lambda low, high, size, **_: part(  # type: ignore[assignment]
+                randint(low, high, (whole,), generator=generator)
+            )
+            torch.randn_like = (
+                lambda x: part(  # type: ignore[assignment]
+                    torch.randn(whole, *x.shape[1:], generator=generator, dtype=x.dtype)
+                )
+            )
+            return super().losses(batch)
+        finally:
+            torch.randint, torch.randn_like = randint, randn_like
+
+
+CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
+    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
+    "h2vq, one rank without hands": lambda: tokenizer(H2VQConfig(**BOOK), (True, False, True) + 3 * (False,)),
+    "separate": lambda: tokenizer(SeparateConfig(**BOOK)),
+    "rvq": lambda: tokenizer(RvqConfig(**BOOK)),
+    "fsq": lambda: tokenizer(FsqConfig(**SMALL, steps=(5, 4))),
+    "mq": lambda: tokenizer(MqConfig(**SMALL, num_codes=12, start="data")),
+    "tma": tma,
+    "tma, compiled": tma,
+    "gpt": gpt,
+    "gpt, compiled": gpt,
+    "gpt, samples": gpt_samples,
+    "diffusion": diffusion,
+}
+
+
+def drawing_tma() -> tuple[StageModule, Batches]:
+    module, batch = tma()
+    assert isinstance(module.net, Tma)
+    net = Tma(module.net.config.model_copy(update={"text_noise": 0.2, "text_dropout": 0.3}), 20, TEXT)
+    loss = TmaLossConfig(kl=0.1, latent=0.1, contrastive=1.0)
+    return TmaModule(net, OPTIM, seed=0, max_steps=STEPS, loss=loss), batch
+
+
+def drawing_gpt(align_on: Literal["predictions", "samples"]) -> tuple[StageModule, Batches]:
+    module, batch = gpt()
+    assert isinstance(module, GptModule) and module.tokenizer is not None and module.tma is not None
+    config = GptConfig(layers=2, dim=16, heads=2, ff=32, block_size=20, pkeep=0.8, condition_dropout=0.3)
+    book = module.tokenizer.module
+    return GptModule(
+        InterleavedGPT(config, book.streams, book.pattern, text_dim=16), OPTIM, seed=0, max_steps=STEPS,
+        loss=GptLossConfig(align_weight=1.0, align_on=align_on), tokenizer=book, tma=module.tma.module,
+    ), batch  # fmt: skip
+
+
+def drawing_diffusion() -> tuple[StageModule, Batches]:
+    net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2, condition_dropout=0.3), 20, TEXT)
+    return DiffusionModule(
+        net, OPTIM, seed=0, max_steps=STEPS
+    ), lambda step: motion(step, 20) | captions(step)
+
+
+ELASTIC: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
+    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
+    "tma": drawing_tma,
+    "gpt": lambda: drawing_gpt("predictions"),
+    "gpt, samples": lambda: drawing_gpt("samples"),
+    "diffusion": drawing_diffusion,
+}
