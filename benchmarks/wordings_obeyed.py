@@ -110,8 +110,8 @@ def measure(
         rows = []
         for seed in range(seeds):
             draw = random.Random(seed)
-            said = [caption(table, label, draw) for label in clips.labels]
-            made = bundle.generate(said, seed=seed, sampling=sampling)
+            words = [caption(table, label, draw) for label in clips.labels]
+            made = bundle.generate(words, seed=seed, sampling=sampling)
             found = shares(clips, [m.joints for m in made])
             rows.append(found if judge is None else found | judge.shares([m.features for m in made]))
         out[name] = over(rows)
@@ -138,9 +138,13 @@ def report(found: Mapping[str, Mapping[str, Interval]], title: str) -> Table:
     columns = list(dict.fromkeys(name for row in found.values() for name in row))
     table = Table("wordings", *columns, title=title, title_justify="left")
     for name, row in found.items():
-        cells = [f"{row[c].mean:.3f} ± {row[c].half_width:.3f}" if c in row else "" for c in columns]
-        table.add_row(name, *cells)
+        table.add_row(name, *(said(row[c]) if c in row else "" for c in columns))
     return table
+
+
+def said(value: Interval) -> str:
+    """With an interval where something was drawn more than once."""
+    return f"{value.mean:.3f} ± {value.half_width:.3f}" if value.half_width else f"{value.mean:.3f}"
 
 
 def main() -> None:

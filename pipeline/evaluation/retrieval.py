@@ -77,9 +77,8 @@ def retrieve(
     rows = [_result("A", "whole split", recall(text, motion, distance=distance))]
     if "text" in inputs:
         sentence = torch.as_tensor(shelf.get(inputs["text"]).cache.similarity([t.caption for t in truths]))
-        same = {"sentence": sentence, "threshold": THRESHOLD}
-        meaning = f"same meaning counts (cosine {THRESHOLD:g})"
-        rows.append(_result("B", meaning, recall(text, motion, **same, distance=distance)))
+        found_same = recall(text, motion, sentence=sentence, threshold=THRESHOLD, distance=distance)
+        rows.append(_result("B", f"same meaning counts (cosine {THRESHOLD:g})", found_same))
     for name, size in BATCHES.items():
         found_in = recall(text, motion, batch=size, seed=seed, distance=distance)
         rows.append(_result(name, f"batches of {size}", found_in))
