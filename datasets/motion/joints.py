@@ -49,19 +49,38 @@ def local_joints_of(joints: NDArray[Any], fps: float) -> NDArray[np.float64]:
     return out
 
 
+def rotations_of(features: NDArray[Any], layout: MotionLayout) -> NDArray[np.float64] | None:
+    """Local rotations [..., T, N, 3, 3] of columns [..., T, D], where the layout has true ones.
+
+    Raw SMPL parameters do. The 6-D rotations of the h3d family are computed from positions by the smallest
+    turn, and know no more than these: None, as for the exact family.
+    """
+    if layout.family != "raw" or features.shape[-1] != layout.dim:
+        return None
+    from scipy.spatial.transform import Rotation
+
+    vectors = _rotation_vectors(features, layout)
+    turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    return np.asarray(turns.reshape(*vectors.shape, 3), dtype=np.float64)
+
+
 def _posed(motion: NDArray[Any], layout: MotionLayout) -> NDArray[np.float64]:
     """Raw SMPL or SMPL-X parameters on the neutral skeleton, in the source's own axes."""
     # Without the face's columns the fields behind them would lie elsewhere.
     if motion.shape[-1] != layout.dim:
         raise UserError(f"layout {layout.name} is posed from all of its {layout.dim} columns")
+    skeleton: SkeletonName = "smpl22" if layout.has("pose") else "smplx52"
+    trans = np.asarray(motion[..., layout.slice("trans")], np.float64)
+    return smpl_joints(_rotation_vectors(motion, layout), trans, _neutral(skeleton))
+
+
+def _rotation_vectors(motion: NDArray[Any], layout: MotionLayout) -> NDArray[np.float64]:
+    """The pose [..., T, N, 3] of raw SMPL or SMPL-X parameters, as far as the skeleton goes."""
 
     def turns(field: str) -> NDArray[np.float64]:
         columns = np.asarray(motion[..., layout.slice(field)], np.float64)
         return columns.reshape(*columns.shape[:-1], -1, 3)
 
-    skeleton: SkeletonName = "smpl22" if layout.has("pose") else "smplx52"
     if layout.has("pose"):
-        rotations = turns("pose")[..., :BODY_JOINTS, :]
-    else:
-        rotations = np.concatenate([turns(f) for f in ("root_orient", "pose_body", "pose_hand")], axis=-2)
-    return smpl_joints(rotations, turns("trans")[..., 0, :], _neutral(skeleton))
+        return turns("pose")[..., :BODY_JOINTS, :]
+    return np.concatenate([turns(f) for f in ("root_orient", "pose_body", "pose_hand")], axis=-2)

@@ -46,7 +46,7 @@ def forward_kinematics(
     world[:, :, 0] = local[:, :, 0]
     joints = np.empty((3, 1, count, *lead))
     joints[:, 0, 0] = np.moveaxis(np.broadcast_to(root, (*lead, 3)), -1, 0)
-    for children in _levels(parents):
+    for children in levels(parents):
         above = [parents[child] for child in children]
         turned = world[:, :, above]
         world[:, :, children] = multiply(turned, local[:, :, children])
@@ -78,7 +78,7 @@ def joints_to_rotations(joints: NDArray[Any], skeleton: Skeleton) -> NDArray[np.
     children = [np.flatnonzero(parents == joint) for joint in range(count)]
     world = np.empty((3, 3, count + 1, *bones.shape[2:]))
     world[:, :, -1] = np.eye(3).reshape(3, 3, *(1,) * (bones.ndim - 2))  # the root's parent -1 is the world
-    for level in [[0], *_levels(skeleton.parents)]:
+    for level in [[0], *levels(skeleton.parents)]:
         world[:, :, level] = world[:, :, parents[level]]
         single = [joint for joint in level if len(children[joint]) == 1]
         if single:
@@ -91,7 +91,7 @@ def joints_to_rotations(joints: NDArray[Any], skeleton: Skeleton) -> NDArray[np.
     return axes_last(multiply(world[:, :, parents].swapaxes(0, 1), world[:, :, :-1]))
 
 
-def _levels(parents: Sequence[int]) -> list[list[int]]:
+def levels(parents: Sequence[int]) -> list[list[int]]:
     """Joints grouped by depth below the root, the root left out."""
     depth = [0] * len(parents)
     for joint, parent in enumerate(parents[1:], start=1):

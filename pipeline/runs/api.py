@@ -141,18 +141,20 @@ def generate_motions(
     seconds: float | None = None,
     seed: int = 0,
     sampling: dict[str, Any] | None = None,
+    figure: dict[str, Any] | None = None,
     device: str = "auto",
     console: Console,
 ) -> list[Path]:
     """Generate and write; returns the paths. `device`: auto, cpu, cuda or cuda:N.
 
     From captions, sound files, or both side by side (the first caption with the first file, and so on), or
-    from one script. `samples` motions of each.
+    from one script. `samples` motions of each. `figure` are the keys of `FigureOptions`.
     """
     from motionloom.pipeline.inference.bundle import Bundle
     from motionloom.pipeline.inference.outputs import write_motions
     from motionloom.pipeline.inference.page_words import page_note, page_title
     from motionloom.pipeline.inference.script import Script, read_music
+    from motionloom.pipeline.inference.shown import FigureOptions
 
     if not captions and not audio and script is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
@@ -165,12 +167,17 @@ def generate_motions(
         if name not in get_args(Format):
             raise UserError(f"--format {name}: no such format{nearest(name, get_args(Format))}")
     if not wanted:
-        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4 or html")
+        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4, html, glb, smplx or arkit")
     # All that needs no model is checked before one is opened.
     require_words(caption_list(captions))
     require_seed(seed)
     require_folder(out)
     drawing = SamplingConfig.parse(sampling or {}, "sampling")
+    posing = FigureOptions.parse(figure or {}, "figure")
+    if posing.body_model is not None and "smplx" not in wanted:
+        raise UserError("--body-model is what --format smplx is made for: name that format too")
+    if posing.arkit_bases is not None and "arkit" not in wanted:
+        raise UserError("--arkit-bases is what --format arkit is made by: name that format too")
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     bundle = Bundle.open(folder, choose_device(device))
@@ -188,7 +195,16 @@ def generate_motions(
         )
     title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
     note = page_note(len(motions), folder.resolve().name, seed)
-    paths = write_motions(out, motions, wanted, title=title, note=note, seed=seed)  # type: ignore[arg-type]
+    paths = write_motions(
+        out,
+        motions,
+        wanted,  # type: ignore[arg-type]
+        title=title,
+        note=note,
+        seed=seed,
+        figure=posing,
+        say=lambda line: console.print(line, soft_wrap=True, markup=False, highlight=False),
+    )
     for path in paths:
         console.print(str(path), soft_wrap=True)
     return paths

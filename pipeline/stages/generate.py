@@ -15,6 +15,7 @@ from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.inference.formats import FORMATS, Format
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.page_words import page_note
+from motionloom.pipeline.inference.shown import FigureOptions
 from motionloom.pipeline.render.score import Score
 
 
@@ -31,6 +32,8 @@ class GenerateConfig(StageConfig):
     """Longer songs are cut to this."""
     sampling: SamplingConfig = SamplingConfig()
     formats: list[Format] = Field(default_factory=lambda: list(FORMATS))
+    figure: FigureOptions = FigureOptions()
+    """How the shown figure follows the generated joints."""
 
 
 class GenerateStage(StageKind):
@@ -40,7 +43,7 @@ class GenerateStage(StageKind):
     summary = "motions from captions and music"
     config = GenerateConfig
     takes = ("data", Every("generators", GENERATOR))
-    version = 4  # dances
+    version = 5  # rigid figures
 
     def gives(self, config: Any) -> frozenset[str]:
         """Files to watch."""
@@ -66,6 +69,7 @@ class GenerateStage(StageKind):
             note=page_note(len(motions), context.recipe, context.seed),
             seed=context.seed,
             scores=[Score()] * len(said) + [clip.score() for _, clip in danced],
+            figure=config.figure,
         )
         titles = [motion.caption for motion in said] + [f"dance to {clip.title}" for _, clip in danced]
         for motion, title in zip(motions, titles, strict=True):

@@ -1,0 +1,262 @@
+"""GLB (binary glTF 2.0): the skinned body, its skeleton, and motions as animations of one file.
+
+Metres, Y up, +Z ahead, as glTF wants it; key times are seconds, so a frame rate is kept without being named.
+Two meshes share the skin: the body, and the head, whose expressions are morph targets. The rest pose is the
+T-pose, and every joint's rest rotation is none: an animation's rotations are the figure's local rotations.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.base.files import atomic_file
+from motionloom.datasets.motion.rigid import RigidMotion, on_one_skeleton
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.body.mesh import Body, Faces, body_for, colour_strip, neutral_body
+
+_FLOAT, _SHORT, _BYTE = 5126, 5123, 5121
+_VERTICES, _INDICES = 34962, 34963
+_LINEAR, _CLAMP = 9729, 33071
+_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+
+
+@dataclass(frozen=True)
+class GlbClip:
+    """One animation: a rigid motion of T frames."""
+
+    name: str
+    figure: RigidMotion
+    fps: float
+    expression: NDArray[Any] | None = None
+    """Weights [T, E] of the face's shapes: `face.expression_weights` [T, 8], or of ARKit's [T, 52]."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Goes into the animation's `extras`, plain JSON."""
+
+
+def write_glb(path: Path, clips: Sequence[GlbClip], faces: Faces = "expressions") -> list[RigidMotion]:
+    """Write the clips as animations of one body; returns the figures as written.
+
+    `faces` chooses the head's morph targets, which the clips' expressions are weights of. Clips of different
+    bone lengths are posed on their mean skeleton. The file appears whole or not at all.
+    """
+    if not clips:
+        raise UserError(f"{path}: a GLB needs at least one motion")
+    shapes = len(neutral_body("smplx52", faces).expressions)
+    for clip in clips:
+        _check(path, clip, shapes)
+    figures = on_one_skeleton([clip.figure for clip in clips])
+    body = body_for(figures[0].skeleton, faces)
+    data = b"".join(_Scene(body, clips, figures).gltf.save_to_bytes())
+    with atomic_file(path) as file:
+        file.write(data)
+    return figures
+
+
+class _Scene:
+    """The file while it is put together."""
+
+    def __init__(self, body: Body, clips: Sequence[GlbClip], figures: Sequence[RigidMotion]) -> None:
+        from pygltflib import GLTF2, Asset, Attributes, Node, Scene, Skin
+
+        self.gltf = GLTF2(asset=Asset(version="2.0", generator="motionloom"), scene=0)
+        self.blob = bytearray()
+        self.attributes = Attributes
+        skeleton, count = body.skeleton, len(body.skeleton)
+        # Joints are nodes 0..N-1, in the skeleton's order.
+        for joint, name in enumerate(skeleton.joints):
+            children = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
+            place = [float(value) for value in skeleton.offsets[joint]]
+            self.gltf.nodes.append(Node(name=name, translation=place, children=children))
+        bind = np.tile(np.eye(4), (count, 1, 1))
+        bind[:, 3, :3] = -skeleton.rest_joints  # column-major: the last row here is the last column there
+        self.gltf.skins = [
+            Skin(
+                name="skeleton",
+                joints=list(range(count)),
+                inverseBindMatrices=self._add(bind.reshape(-1, 16)),
+            )
+        ]
+        self._material()
+        moving = np.any([move.any(axis=1) for move in body.expressions.values()], axis=0)
+        # A triangle is the head's if one corner moves or belongs to it as a whole: meshes share no vertex.
+        head = _connected(body.triangles, moving)
+        self._mesh("body", body, ~head, expressions=False)
+        self._mesh("head", body, head, expressions=True)
+        self.gltf.nodes += [Node(name="body", mesh=0, skin=0), Node(name="head_mesh", mesh=1, skin=0)]
+        self.gltf.nodes.append(Node(name="figure", children=[0]))
+        self.gltf.scenes = [Scene(name="scene", nodes=[count + 2, count, count + 1])]
+        names = _distinct([clip.name for clip in clips])
+        for name, clip, figure in zip(names, clips, figures, strict=True):
+            self._animation(name, clip, figure, head=count + 1)
+        self._finish()
+
+    def _material(self) -> None:
+        from PIL import Image as Picture
+        from pygltflib import Image, Material, PbrMetallicRoughness, Sampler, Texture, TextureInfo
+
+        stream = io.BytesIO()
+        Picture.fromarray(colour_strip()).save(stream, "PNG")
+        view = self._view(stream.getvalue(), None)
+        self.gltf.images = [Image(name="colours", mimeType="image/png", bufferView=view)]
+        sampler = Sampler(magFilter=_LINEAR, minFilter=_LINEAR, wrapS=_CLAMP, wrapT=_CLAMP)
+        self.gltf.samplers = [sampler]
+        self.gltf.textures = [Texture(source=0, sampler=0)]
+        colour = PbrMetallicRoughness(
+            baseColorTexture=TextureInfo(index=0), metallicFactor=0.0, roughnessFactor=0.7
+        )
+        self.gltf.materials = [Material(name="figure", pbrMetallicRoughness=colour)]
+
+    def _mesh(self, name: str, body: Body, chosen: NDArray[np.bool_], *, expressions: bool) -> None:
+        from pygltflib import Mesh, Primitive
+
+        number = np.cumsum(chosen) - 1
+        triangles = number[body.triangles[chosen[body.triangles[:, 0]]]]
+        order = np.argsort(-body.weights[chosen], axis=1, kind="stable")[:, :4]
+        weights = np.take_along_axis(body.weights[chosen], order, axis=1)
+        joints = np.where(weights > 0, order, 0)
+        shares = weights.astype(np.float32)
+        shares /= shares.sum(axis=1, keepdims=True)
+        attributes = self.attributes(
+            POSITION=self._add(body.vertices[chosen], target=_VERTICES, bounds=True),
+            NORMAL=self._add(_unit(body.normals[chosen]), target=_VERTICES),
+            TEXCOORD_0=self._add(body.uv[chosen], target=_VERTICES),
+            JOINTS_0=self._add(joints, _BYTE, _VERTICES),
+            WEIGHTS_0=self._add(shares, target=_VERTICES),
+        )
+        indices = self._add(triangles.reshape(-1, 1), _SHORT, _INDICES)
+        primitive = Primitive(attributes=attributes, indices=indices, material=0)
+        mesh = Mesh(name=name, primitives=[primitive])
+        if expressions:
+            moves = body.expressions
+            at_rest = [not move.any() for move in moves.values()]
+            still = self._zeros(int(chosen.sum())) if any(at_rest) else 0
+            primitive.targets = [
+                {"POSITION": still if rest else self._add(move[chosen], target=_VERTICES, bounds=True)}
+                for rest, move in zip(at_rest, moves.values(), strict=True)
+            ]
+            mesh.weights = [0.0] * len(moves)
+            # Blender, three.js and engines read the targets' names from here.
+            mesh.extras = {"targetNames": list(moves)}
+        self.gltf.meshes.append(mesh)
+
+    def _animation(self, name: str, clip: GlbClip, figure: RigidMotion, head: int) -> None:
+        from pygltflib import Animation, AnimationChannel, AnimationChannelTarget, AnimationSampler
+        from scipy.spatial.transform import Rotation
+
+        frames, count = figure.rotations.shape[:2]
+        animation = Animation(name=name, extras={"fps": clip.fps, **clip.facts})
+        every = self._add((np.arange(frames) / clip.fps)[:, None], bounds=True)
+        first = self._add(np.zeros((1, 1)), bounds=True)
+
+        def channel(node: int, path: str, values: NDArray[Any]) -> None:
+            still = len(values) == frames and not (values != values[:1]).any()
+            kept = values[:1] if still else values
+            if path == "weights":
+                kept = kept.reshape(-1, 1)
+            sampler = AnimationSampler(
+                input=first if still else every, output=self._add(kept), interpolation="LINEAR"
+            )
+            target = AnimationChannelTarget(node=node, path=path)
+            animation.channels.append(AnimationChannel(sampler=len(animation.samplers), target=target))
+            animation.samplers.append(sampler)
+
+        channel(0, "translation", figure.root.astype(np.float32))
+        turns = Rotation.from_matrix(figure.rotations.reshape(-1, 3, 3)).as_quat().reshape(frames, count, 4)
+        # q and -q are one rotation; between keys players take the straight way, so neighbours share a sign.
+        flips = np.sign(np.einsum("tnq,tnq->tn", turns[1:], turns[:-1]))
+        turns[1:] *= np.cumprod(np.where(flips < 0, -1.0, 1.0), axis=0)[..., None]
+        for joint in range(count):
+            channel(joint, "rotation", _unit(turns[:, joint]))
+        if clip.expression is not None:
+            channel(head, "weights", np.asarray(clip.expression, dtype=np.float32))
+        self.gltf.animations.append(animation)
+
+    def _add(
+        self, values: NDArray[Any], kind: int = _FLOAT, target: int | None = None, bounds: bool = False
+    ) -> int:
+        """Number of a new accessor of values [count, width]."""
+        from pygltflib import Accessor
+
+        dtype = {_FLOAT: "<f4", _SHORT: "<u2", _BYTE: "u1"}[kind]
+        data = np.ascontiguousarray(values, dtype=dtype)
+        view = self._view(data.tobytes(), target)
+        accessor = Accessor(bufferView=view, componentType=kind, count=len(data), type=_TYPES[data.shape[1]])
+        if bounds:
+            accessor.min = [float(value) for value in data.min(axis=0)]
+            accessor.max = [float(value) for value in data.max(axis=0)]
+        self.gltf.accessors.append(accessor)
+        return len(self.gltf.accessors) - 1
+
+    def _zeros(self, count: int) -> int:
+        """Number of an accessor of `count` vectors of zeros, which takes no room in the file."""
+        from pygltflib import Accessor
+
+        zero = [0.0, 0.0, 0.0]
+        self.gltf.accessors.append(
+            Accessor(byteOffset=None, componentType=_FLOAT, count=count, type="VEC3", min=zero, max=zero)
+        )
+        return len(self.gltf.accessors) - 1
+
+    def _view(self, data: bytes, target: int | None) -> int:
+        from pygltflib import BufferView
+
+        view = BufferView(buffer=0, byteOffset=len(self.blob), byteLength=len(data), target=target)
+        self.gltf.bufferViews.append(view)
+        self.blob += data + bytes(-len(data) % 4)
+        return len(self.gltf.bufferViews) - 1
+
+    def _finish(self) -> None:
+        from pygltflib import Buffer
+
+        self.gltf.buffers = [Buffer(byteLength=len(self.blob))]
+        self.gltf.set_binary_blob(bytes(self.blob))
+
+
+def _connected(triangles: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The chosen vertices and all that hang together with them by triangles."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(chosen), len(chosen)))
+    _, label = connected_components(graph, directed=False)
+    out: NDArray[np.bool_] = np.isin(label, np.unique(label[chosen]))
+    return out
+
+
+def _unit(vectors: NDArray[Any]) -> NDArray[np.float32]:
+    """Unit vectors [..., C] to float32's last digit, as validators ask."""
+    rounded = np.asarray(vectors, dtype=np.float64)
+    out: NDArray[np.float32] = (rounded / np.linalg.norm(rounded, axis=-1, keepdims=True)).astype(np.float32)
+    return out
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Names that tools can tell apart: a repeated one gets a number."""
+    out: list[str] = []
+    for name in names:
+        number, wanted = 2, name or "motion"
+        base = wanted
+        while wanted in out:
+            wanted, number = f"{base} ({number})", number + 1
+        out.append(wanted)
+    return out
+
+
+def _check(path: Path, clip: GlbClip, shapes: int) -> None:
+    if not clip.fps > 0:
+        raise UserError(f"{path}: '{clip.name}' has fps {clip.fps}; it must be above 0")
+    if not np.isfinite(clip.figure.rotations).all() or not np.isfinite(clip.figure.root).all():
+        raise UserError(f"{path}: '{clip.name}' holds NaN or infinite values; a GLB file cannot")
+    wanted = [len(clip.figure.root), shapes]
+    if clip.expression is not None and list(clip.expression.shape) != wanted:
+        raise UserError(
+            f"{path}: '{clip.name}' has expression weights {list(clip.expression.shape)}, expected {wanted}"
+        )

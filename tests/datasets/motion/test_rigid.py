@@ -1,0 +1,186 @@
+"""Rigid skeletons against recorded motion, against stretched bones, and against scipy's slow solver."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from motionloom.datasets.motion.chain_solver import solve_poses
+from motionloom.datasets.motion.joints import joints_of, rotations_of
+from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.rigid import fit_rigid, measured_skeleton, share_twist
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+
+Floats = NDArray[np.float64]
+
+
+def lengths(joints: Floats, skeleton: Skeleton) -> Floats:
+    return np.linalg.norm(joints[:, 1:] - joints[:, list(skeleton.parents[1:])], axis=-1)
+
+
+def moving(skeleton: Skeleton, frames: int, seed: int, size: float = 0.5) -> tuple[Floats, Floats, Floats]:
+    """A smooth random motion: local rotations, root, joints."""
+    rng = np.random.default_rng(seed)
+    wave = rng.normal(size=(2, 1, len(skeleton), 3)) * size
+    time = np.linspace(0, 3, frames)[:, None, None]
+    vectors = wave[0] * np.sin(time) + wave[1] * np.cos(2 * time)
+    local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(frames, -1, 3, 3)
+    root = np.stack([np.sin(time[:, 0, 0]), 1 + 0 * time[:, 0, 0], time[:, 0, 0]], -1)
+    return local, root, forward_kinematics(local, root, skeleton.offsets, skeleton.parents)[0]
+
+
+def stretched(joints: Floats, skeleton: Skeleton, seed: int, amount: float = 0.25) -> Floats:
+    """The same directions with bones that change their length from frame to frame."""
+    rng = np.random.default_rng(seed)
+    out = joints.copy()
+    for joint, parent in enumerate(skeleton.parents[1:], start=1):
+        factor = 1 + amount * rng.uniform(-1, 1, size=(len(joints), 1))
+        out[:, joint] = out[:, parent] + factor * (joints[:, joint] - joints[:, parent])
+    return out
+
+
+@pytest.mark.parametrize("name", ["h3d012314__joints", "h3d012314__uniform"])
+def test_a_recorded_clip_of_constant_bones_is_reproduced(shared: Path, name: str) -> None:
+    with np.load(shared / "golden" / "t1_humanml3d_A.npz", allow_pickle=False) as file:
+        joints = file[name].astype(np.float64)
+    fitted = fit_rigid(joints, Skeleton.named("smpl22"))
+    assert fitted.error.max_mm < 1.0
+    np.testing.assert_allclose(fitted.joints, joints, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["smpl22", "smplx52"])
+def test_a_posed_skeleton_of_other_proportions_is_found_again(name: str) -> None:
+    """Bones of other lengths, and a pelvis, chest and palms of another shape."""
+    skeleton = Skeleton.named(name)
+    rng = np.random.default_rng(1)
+    bones = skeleton.offsets * rng.uniform(0.8, 1.25, size=(len(skeleton), 1))
+    local, root, _ = moving(skeleton, 40, seed=2)
+    joints, _ = forward_kinematics(local, root, bones, skeleton.parents)
+    fitted = fit_rigid(joints, skeleton)
+    assert fitted.error.max_mm < 1e-2
+    found = np.linalg.norm(fitted.skeleton.offsets, axis=-1)
+    np.testing.assert_allclose(found, np.linalg.norm(bones, axis=-1), atol=1e-9)
+
+
+def test_bones_of_stretched_figures_keep_one_length_and_directions_stay() -> None:
+    skeleton = Skeleton.named("smplx52")
+    _, _, clean = moving(skeleton, 60, seed=3)
+    joints = stretched(clean, skeleton, seed=4)
+    assert np.ptp(lengths(joints, skeleton), axis=0).max() > 0.1
+    fitted = fit_rigid(joints, skeleton)
+    assert np.ptp(lengths(fitted.joints, skeleton), axis=0).max() < 1e-6
+    again, _ = forward_kinematics(
+        fitted.rotations, fitted.root, fitted.skeleton.offsets, fitted.skeleton.parents
+    )
+    np.testing.assert_allclose(again, fitted.joints, atol=1e-12)
+    # Down the chain errors of lengths add up; the solver spreads them, so the fit is nearer everywhere.
+    own = skeleton.with_lengths_of(joints)
+    plain = joints_to_rotations(joints, own)
+    chained, _ = forward_kinematics(plain, joints[:, 0], own.offsets, own.parents)
+    assert fitted.error.mean_mm < 0.6 * np.linalg.norm(chained - joints, axis=-1).mean() * 1000
+
+
+def test_the_solver_finds_what_scipy_finds_frame_by_frame() -> None:
+    """An independent, slow reference: all local rotation vectors and the root, `least_squares` in float64."""
+    skeleton = Skeleton.named("smpl22")
+    _, _, clean = moving(skeleton, 4, seed=5, size=0.4)
+    joints = stretched(clean, skeleton, seed=6, amount=0.15)
+    own = measured_skeleton(joints, skeleton)
+    start = joints_to_rotations(joints, own)
+    turned, root = solve_poses(joints, own.offsets, own.parents, start, joints[:, 0])
+    posed, _ = forward_kinematics(turned, root, own.offsets, own.parents)
+    for frame in range(4):
+
+        def residual(values: Floats, frame: int = frame) -> Floats:
+            local = Rotation.from_rotvec(values[3:].reshape(-1, 3)).as_matrix()
+            shown, _ = forward_kinematics(local, values[:3], own.offsets, own.parents)
+            return (shown - joints[frame]).ravel()
+
+        first = np.concatenate([joints[frame, 0], Rotation.from_matrix(start[frame]).as_rotvec().ravel()])
+        reference = least_squares(residual, first, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        cost = float(np.square(posed[frame] - joints[frame]).sum() / 2)
+        assert cost <= reference.cost * (1 + 1e-4)
+        np.testing.assert_allclose((posed[frame] - joints[frame]).ravel(), reference.fun, atol=5e-4)
+
+
+def test_weights_decide_who_gives_way() -> None:
+    skeleton = Skeleton.named("smpl22")
+    local, root, joints = moving(skeleton, 3, seed=7, size=0.3)
+    hand = skeleton.index("left_wrist")
+    targets = joints.copy()
+    targets[:, hand] += [0.0, 0.03, 0.05]
+    weights = np.ones(len(skeleton))
+    weights[hand] = 1e4
+    turned, place = solve_poses(targets, skeleton.offsets, skeleton.parents, local, root, weights)
+    posed, _ = forward_kinematics(turned, place, skeleton.offsets, skeleton.parents)
+    assert np.linalg.norm(posed[:, hand] - targets[:, hand], axis=-1).max() < 1e-3
+    np.testing.assert_allclose(lengths(posed, skeleton), lengths(joints, skeleton), atol=1e-9)
+
+
+def test_known_rotations_keep_their_twist() -> None:
+    layout = MotionLayout.named("smpl75")
+    rng = np.random.default_rng(8)
+    features = 0.3 * rng.normal(size=(5, layout.dim))
+    rotations = rotations_of(features, layout)
+    assert rotations is not None
+    expected = Rotation.from_rotvec(features[:, 3:69].reshape(-1, 3)).as_matrix().reshape(5, 22, 3, 3)
+    np.testing.assert_allclose(rotations, expected, atol=1e-12)
+    fitted = fit_rigid(joints_of(features, layout), layout.skeleton, rotations=rotations)
+    assert fitted.error.max_mm < 1e-6
+    np.testing.assert_allclose(fitted.rotations, expected, atol=1e-6)
+    assert rotations_of(np.zeros((5, 133)), MotionLayout.named("body133")) is None
+
+
+def test_symmetric_figures_have_one_length_left_and_right() -> None:
+    skeleton = Skeleton.named("smplx52")
+    _, _, clean = moving(skeleton, 20, seed=9)
+    joints = stretched(clean, skeleton, seed=10, amount=0.1)
+    fitted = fit_rigid(joints, skeleton, symmetric=True)
+    found = np.linalg.norm(fitted.skeleton.offsets, axis=-1)
+    np.testing.assert_allclose(found, found[skeleton.mirror], atol=1e-12)
+    free = fit_rigid(joints, skeleton)
+    assert free.error.mean_mm <= fitted.error.mean_mm < free.error.mean_mm + 10
+
+
+def test_forearms_take_half_of_their_hands_twist_and_no_joint_moves() -> None:
+    skeleton = Skeleton.named("smplx52")
+    local = np.broadcast_to(np.eye(3), (30, len(skeleton), 3, 3)).copy()
+    elbow, wrist = skeleton.index("left_elbow"), skeleton.index("left_wrist")
+    axis = skeleton.offsets[wrist] / np.linalg.norm(skeleton.offsets[wrist])
+    turn = np.linspace(0, 3.6, 30)  # beyond half a turn: the share must not jump
+    local[:, wrist] = Rotation.from_rotvec(turn[:, None] * axis).as_matrix()
+    shared_out = share_twist(local, skeleton)
+    half = Rotation.from_rotvec(turn[:, None] / 2 * axis).as_matrix()
+    np.testing.assert_allclose(shared_out[:, elbow], half, atol=1e-9)
+    np.testing.assert_allclose(shared_out[:, elbow] @ shared_out[:, wrist], local[:, wrist], atol=1e-9)
+    root = np.zeros((30, 3))
+    before, _ = forward_kinematics(local, root, skeleton.offsets, skeleton.parents)
+    after, _ = forward_kinematics(shared_out, root, skeleton.offsets, skeleton.parents)
+    np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+def test_motions_that_no_skeleton_fits_are_refused() -> None:
+    skeleton = Skeleton.named("smpl22")
+    with pytest.raises(UserError, match=r"needs joints \[T, 22, 3\]"):
+        fit_rigid(np.zeros((4, 21, 3)), skeleton)
+    with pytest.raises(UserError, match="NaN"):
+        fit_rigid(np.full((4, 22, 3), np.nan), skeleton)
+    with pytest.raises(UserError, match="do not fit"):
+        fit_rigid(np.zeros((4, 22, 3)), skeleton, rotations=np.zeros((4, 21, 3, 3)))
+
+
+def test_joints_without_bones_and_single_frames_are_fitted() -> None:
+    skeleton = Skeleton.named("smplx52")
+    _, _, joints = moving(skeleton, 1, seed=11)
+    assert fit_rigid(joints, skeleton).error.max_mm < 1e-3
+    joints[:, 22:37] = joints[:, 20:21]  # a left hand without fingers
+    fitted = fit_rigid(joints, skeleton)
+    assert fitted.error.max_mm < 1e-3
+    assert np.isfinite(fitted.rotations).all()

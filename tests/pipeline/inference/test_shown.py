@@ -1,0 +1,149 @@
+"""One figure in every output: page, npz, BVH, GLB and SMPL-X files of one motion agree."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pygltflib
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.motion.features import encode
+from motionloom.datasets.motion.feet import FeetOptions
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.synth.face import APEX, BASIS
+from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.bundle import GeneratedMotion
+from motionloom.pipeline.inference.outputs import ALL_GLB, write_motions
+from motionloom.pipeline.inference.shown import FigureOptions, shown
+
+LAYOUT = MotionLayout.named("wholebody363")
+
+
+@pytest.fixture(scope="module")
+def motions(walk: Callable[..., NDArray[np.float64]]) -> list[GeneratedMotion]:
+    """Two motions whose bones change from frame to frame by up to a tenth; the first has a face."""
+    rng = np.random.default_rng(0)
+    out = []
+    for number, wave in enumerate((False, True)):
+        joints = walk(24, LAYOUT.fps, wave=wave)
+        clean = joints.copy()
+        for joint, parent in enumerate(LAYOUT.skeleton.parents[1:], start=1):
+            factor = rng.uniform(0.9, 1.1, size=(24, 1))
+            joints[:, joint] = joints[:, parent] + factor * (clean[:, joint] - clean[:, parent])
+        features = encode(joints, LAYOUT)[:, LAYOUT.part("bodyhand")]
+        face = None if number else np.tile(APEX * BASIS[:, 0], (24, 1)).astype(np.float32)
+        prompt = Prompt(text="a person waves" if wave else "a person walks")
+        out.append(GeneratedMotion(prompt, features, joints, face, LAYOUT))
+    return out
+
+
+def write(folder: Path, motions: list[GeneratedMotion], **options: Any) -> tuple[list[Path], list[str]]:
+    said: list[str] = []
+    figure = FigureOptions.parse(options, "figure")
+    formats = ["npz", "bvh", "html", "glb", "smplx"]
+    paths = write_motions(
+        folder, motions, formats, title="t", seed=0, figure=figure, say=said.append  # type: ignore[arg-type]
+    )  # fmt: skip
+    return paths, said
+
+
+def page_joints(page: Path, number: int) -> NDArray[np.float64]:
+    """Joints [T, N, 3] of one cell of a page, from its own data."""
+    text = page.read_text(encoding="utf-8")
+    found = re.search(r'<script[^>]*type="application/json"[^>]*>(.*?)</script>', text, re.S)
+    assert found
+    clip = json.loads(found[1])["motions"][number]
+    whole = np.frombuffer(base64.b64decode(clip["positions"]), "<u2").reshape(clip["frames"], -1, 3)
+    return np.asarray(clip["low"]) + np.asarray(clip["step"]) * whole
+
+
+def test_all_files_show_one_figure_of_constant_bones(motions: list[GeneratedMotion], tmp_path: Path) -> None:
+    paths, said = write(tmp_path / "out", motions)
+    names = [path.name for path in paths]
+    assert names == [
+        "00-a-person-walks.npz", "00-a-person-walks.bvh", "00-a-person-walks.glb",
+        "00-a-person-walks_smplx.npz", "01-a-person-waves.npz", "01-a-person-waves.bvh",
+        "01-a-person-waves.glb", "01-a-person-waves_smplx.npz", ALL_GLB, "index.html",
+    ]  # fmt: skip
+    assert all(path.is_file() for path in paths)
+    assert [line.split(":")[0] for line in said] == ["00-a-person-walks", "01-a-person-waves"]
+    parents = list(LAYOUT.skeleton.parents[1:])
+    for number, motion in enumerate(motions):
+        with np.load(paths[4 * number], allow_pickle=False) as file:
+            joints, facts = file["joints"].astype(np.float64), json.loads(str(file["metadata"]))
+            np.testing.assert_array_equal(file["features"], motion.features)
+        lengths = np.linalg.norm(joints[:, 1:] - joints[:, parents], axis=-1)
+        assert np.ptp(lengths, axis=0).max() < 1e-5  # float32
+        away = np.linalg.norm(joints - motion.joints, axis=-1) * 1000
+        assert facts["figure"]["rigid"] is True
+        assert facts["figure"]["fit_mean_mm"] == pytest.approx(away.mean(), abs=1e-2)
+        assert facts["figure"]["fit_max_mm"] == pytest.approx(away.max(), abs=1e-2)
+        assert f"{away.mean():.1f} mm on average" in said[number]
+        bvh = read_bvh(paths[4 * number + 1])
+        order = [bvh.joints.index(name) for name in LAYOUT.skeleton.joints]
+        np.testing.assert_allclose(bvh.positions()[:, order] / 100, joints, atol=2e-5)
+        np.testing.assert_allclose(page_joints(paths[-1], number), joints, atol=1e-4)
+    together = pygltflib.GLTF2().load(tmp_path / "out" / ALL_GLB)
+    assert [animation.name for animation in together.animations] == ["a person walks", "a person waves"]
+    paths_of = [[c.target.path for c in animation.channels] for animation in together.animations]
+    assert ["weights" in found for found in paths_of] == [True, False]
+
+
+def test_without_rigid_page_and_npz_show_the_generated_joints(
+    motions: list[GeneratedMotion], tmp_path: Path
+) -> None:
+    paths, _ = write(tmp_path / "out", motions[:1], rigid=False)
+    assert ALL_GLB not in [path.name for path in paths]  # one motion has its own file alone
+    with np.load(paths[0], allow_pickle=False) as file:
+        np.testing.assert_allclose(file["joints"], motions[0].joints, atol=1e-6)
+        assert json.loads(str(file["metadata"]))["figure"]["rigid"] is False
+    np.testing.assert_allclose(page_joints(paths[-1], 0), motions[0].joints, atol=1e-4)
+
+
+def test_faces_are_written_as_arkit_weights_by_the_users_bases(
+    motions: list[GeneratedMotion], tmp_path: Path
+) -> None:
+    """A basis whose 50 values are the first 50 shapes: weights are the values, cut to 0..1."""
+    arkit = np.random.default_rng(0).normal(size=(52, 70, 3))
+    np.savez(tmp_path / "bases.npz", source=arkit[:50], arkit=arkit)
+    options = FigureOptions(arkit_bases=tmp_path / "bases.npz")
+    paths = write_motions(
+        tmp_path / "out", motions[:1], ["arkit", "glb"], title="t", seed=0, figure=options
+    )  # fmt: skip
+    assert [path.name for path in paths] == ["00-a-person-walks.glb", "00-a-person-walks_arkit.csv"]
+    rows = np.loadtxt(paths[1], delimiter=",", skiprows=1)
+    assert rows.shape == (24, 53)
+    assert motions[0].face is not None
+    meant = motions[0].face[0] @ arkit[:50].reshape(50, -1)
+    reference = lsq_linear(arkit.reshape(52, -1).T, meant, bounds=(0, 1)).x
+    np.testing.assert_allclose(rows[0, 1:], reference, atol=1e-3)
+    assert len(pygltflib.GLTF2().load(paths[0]).meshes[1].primitives[0].targets) == 52
+    with pytest.raises(UserError, match="makes no face"):
+        write_motions(tmp_path / "no", motions, ["arkit"], title="t", seed=0)
+
+
+def test_planted_feet_say_what_they_cost(motions: list[GeneratedMotion]) -> None:
+    # Trembling bones make the feet of these walks fast: they stand by a looser rule.
+    feet = FeetOptions(height=0.1, speed=2.0)
+    plain, planted = shown(motions[0]), shown(motions[0], FigureOptions(plant_feet=True, feet=feet))
+    assert planted.feet is not None and plain.feet is None
+    facts = planted.facts()
+    assert facts["slide_after_cm_s"] < facts["slide_before_cm_s"]
+    assert facts["fit_unplanted_mean_mm"] == plain.facts()["fit_mean_mm"] < facts["fit_mean_mm"]
+    assert "feet slide" in planted.sentence and "feet" not in plain.sentence
+    assert motions[0].joints is planted.motion.joints  # what is measured stays as it was
+
+
+def test_feet_cannot_be_planted_without_bones() -> None:
+    with pytest.raises(UserError, match="leave rigid on"):
+        FigureOptions.parse({"rigid": False, "plant_feet": True}, "figure")

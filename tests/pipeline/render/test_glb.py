@@ -1,0 +1,260 @@
+"""GLB files: what they hold against the figure, Khronos' validator, and three.js in a real browser."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pygltflib
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from motionloom.datasets.motion.kinematics import forward_kinematics
+from motionloom.datasets.motion.rigid import RigidMotion, fit_rigid
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.synth.face import APEX, BASIS
+from motionloom.pipeline.render.body.face import EXPRESSIONS, expression_weights
+from motionloom.pipeline.render.body.glb import GlbClip, write_glb
+from motionloom.pipeline.render.body.mesh import body_for
+
+SKELETON = Skeleton.named("smplx52")
+FPS = 20.0
+
+
+@pytest.fixture(scope="module")
+def clips(walk: Callable[..., NDArray[np.float64]]) -> list[GlbClip]:
+    """A walk with a changing face, and a wave of other bone lengths without one."""
+    frames = 40
+    rise = np.linspace(0, 1, frames)[:, None]
+    face = APEX * rise * BASIS[:, 0] + 1.6 * (np.arange(frames) % 10 == 0)[:, None] * BASIS[:, 4]
+    first = fit_rigid(walk(frames), SKELETON)
+    second = fit_rigid(1.06 * walk(30, wave=True, turn=0.0), SKELETON)
+    return [
+        GlbClip("a walk", first, FPS, expression_weights(face), {"fit_mean_mm": 0.1}),
+        GlbClip("a wave <>&\"'é", second, FPS),
+    ]
+
+
+@pytest.fixture(scope="module")
+def written(clips: list[GlbClip], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[RigidMotion]]:
+    path = tmp_path_factory.mktemp("glb") / "motion.glb"
+    return path, write_glb(path, clips)
+
+
+def values(gltf: pygltflib.GLTF2, number: int) -> NDArray[Any]:
+    """An accessor's numbers [count, width], read by hand."""
+    accessor = gltf.accessors[number]
+    view = gltf.bufferViews[accessor.bufferView]
+    kind = {5126: "<f4", 5123: "<u2", 5121: "u1"}[accessor.componentType]
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor.type]
+    data = gltf.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
+    return np.frombuffer(data, kind).reshape(accessor.count, width)
+
+
+def test_animations_hold_the_figures_rotations_root_and_times(
+    written: tuple[Path, list[RigidMotion]], clips: list[GlbClip]
+) -> None:
+    path, figures = written
+    gltf = pygltflib.GLTF2().load(path)
+    assert [a.name for a in gltf.animations] == ["a walk", "a wave <>&\"'é"]
+    assert gltf.animations[0].extras == {"fps": FPS, "fit_mean_mm": 0.1}
+    for animation, figure, clip in zip(gltf.animations, figures, clips, strict=True):
+        frames = len(figure.root)
+        local = np.broadcast_to(np.eye(3), (frames, 52, 3, 3)).copy()
+        root = None
+        for channel in animation.channels:
+            sampler = animation.samplers[channel.sampler]
+            times, keys = values(gltf, sampler.input)[:, 0], values(gltf, sampler.output)
+            if len(times) > 1:
+                np.testing.assert_allclose(times, np.arange(frames) / FPS, atol=1e-6)
+            if channel.target.path == "rotation":
+                name = gltf.nodes[channel.target.node].name
+                local[:, SKELETON.index(name)] = Rotation.from_quat(keys).as_matrix()
+                turned = np.einsum("tq,tq->t", keys[1:], keys[:-1])
+                assert (turned > 0).all(), f"{name}: the long way round"
+            elif channel.target.path == "translation":
+                root = keys.astype(np.float64)
+            else:
+                assert clip.expression is not None
+                np.testing.assert_allclose(keys.reshape(frames, -1), clip.expression, atol=1e-6)
+        assert root is not None
+        offsets = np.array([node.translation for node in gltf.nodes[:52]])
+        joints, _ = forward_kinematics(local, root, offsets, SKELETON.parents)
+        np.testing.assert_allclose(joints, figure.joints, atol=1e-5)
+
+
+def test_motions_of_different_bones_share_their_mean(
+    written: tuple[Path, list[RigidMotion]], clips: list[GlbClip]
+) -> None:
+    _, figures = written
+    mean = np.mean([clip.figure.skeleton.offsets for clip in clips], axis=0)
+    for figure, clip in zip(figures, clips, strict=True):
+        np.testing.assert_allclose(figure.skeleton.offsets, mean, atol=1e-12)
+        away = np.linalg.norm(figure.joints - clip.figure.joints, axis=-1)
+        assert away.max() < 0.06  # 3 % of a leg and a trunk
+
+
+def test_meshes_are_the_body_and_joints_bind_at_rest(written: tuple[Path, list[RigidMotion]]) -> None:
+    path, figures = written
+    gltf, body = pygltflib.GLTF2().load(path), body_for(figures[0].skeleton)
+    parts = [mesh.primitives[0] for mesh in gltf.meshes]
+    places = np.concatenate([values(gltf, part.attributes.POSITION) for part in parts])
+    assert len(places) == len(body.vertices)
+    np.testing.assert_allclose(np.sort(places, axis=0), np.sort(body.vertices, axis=0), atol=1e-6)
+    assert sum(gltf.accessors[part.indices].count for part in parts) == 3 * len(body.triangles)
+    assert gltf.meshes[1].extras["targetNames"] == list(EXPRESSIONS)
+    assert parts[0].targets in (None, []) and len(parts[1].targets) == len(EXPRESSIONS)
+    for part in parts:
+        shares = values(gltf, part.attributes.WEIGHTS_0).astype(np.float64)
+        np.testing.assert_allclose(shares.sum(axis=1), 1, atol=1e-6)
+        assert (values(gltf, part.attributes.JOINTS_0) < 52).all()
+    bind = values(gltf, gltf.skins[0].inverseBindMatrices).reshape(52, 4, 4).swapaxes(1, 2)
+    rest = figures[0].skeleton.rest_joints
+    np.testing.assert_allclose(bind[:, :3, 3], -rest, atol=1e-6)
+
+
+def test_clips_that_cannot_be_written_are_refused(tmp_path: Path, clips: list[GlbClip]) -> None:
+    with pytest.raises(UserError, match="at least one motion"):
+        write_glb(tmp_path / "x.glb", [])
+    with pytest.raises(UserError, match="above 0"):
+        write_glb(tmp_path / "x.glb", [GlbClip("a", clips[0].figure, 0)])
+    with pytest.raises(UserError, match=r"expected \[40, 8\]"):
+        write_glb(tmp_path / "x.glb", [GlbClip("a", clips[0].figure, FPS, np.zeros((40, 3)))])
+    assert not list(tmp_path.iterdir())
+
+
+# Tools of the world outside: `MOTIONLOOM_NODE_MODULES` names a folder with gltf-validator and three.
+
+VALIDATE = """
+import { pathToFileURL } from "node:url";
+import fs from "node:fs";
+const { default: validator } = await import(pathToFileURL(process.argv[1]).href);
+const report = await validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])));
+console.log(JSON.stringify(report));
+"""
+
+
+def node_package(name: str, main: str) -> Path:
+    """A file of an npm package; skips with the reason where it is missing."""
+    folder = os.environ.get("MOTIONLOOM_NODE_MODULES")
+    if not folder:
+        pytest.skip(f"MOTIONLOOM_NODE_MODULES names no node_modules folder with {name}")
+    path = Path(folder) / name / main
+    if not path.is_file():
+        pytest.skip(f"{folder} has no {name}: npm install {name}")
+    return path
+
+
+def validated(path: Path) -> dict[str, Any]:
+    """The validator's report."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no node on this machine")
+    module = node_package("gltf-validator", "index.js")
+    done = subprocess.run(
+        [node, "--input-type=module", "-e", VALIDATE, str(module), str(path)],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
+
+
+@pytest.mark.browser
+def test_khronos_validator_finds_nothing(
+    written: tuple[Path, list[RigidMotion]], clips: list[GlbClip], tmp_path: Path
+) -> None:
+    report = validated(written[0])
+    assert report["issues"]["messages"] == []
+    assert report["info"]["animationCount"] == 2
+    assert report["info"]["hasMorphTargets"] and report["info"]["hasSkins"]
+    weights = np.linspace(0, 1, 40 * 52).reshape(40, 52)
+    write_glb(tmp_path / "arkit.glb", [GlbClip("faces", clips[0].figure, FPS, weights)], "arkit")
+    assert validated(tmp_path / "arkit.glb")["issues"]["messages"] == []
+    body = Skeleton.named("smpl22")
+    small = fit_rigid(clips[0].figure.joints[:, :22], body)
+    write_glb(tmp_path / "small.glb", [GlbClip("no fingers", small, FPS)])
+    assert validated(tmp_path / "small.glb")["issues"]["messages"] == []
+
+
+@pytest.fixture(scope="module")
+def three(written: tuple[Path, list[RigidMotion]]) -> Iterator[Any]:
+    """A page in which three.js has loaded the file."""
+    from playwright.sync_api import sync_playwright
+
+    modules = node_package("three", "build/three.module.js").parents[1]
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("no Chromium on this machine to drive")
+    kinds = {".html": "text/html", ".js": "text/javascript"}
+    here = {"/": Path(__file__).parent / "three" / "page.html", "/motion.glb": written[0]}
+
+    def answer(route: Any) -> None:
+        wanted = route.request.url.removeprefix("http://figure.test")
+        file = here.get(wanted, modules / wanted.removeprefix("/three/"))
+        if file.is_file():
+            kind = kinds.get(file.suffix, "application/octet-stream")
+            route.fulfill(body=file.read_bytes(), content_type=kind)
+        else:
+            route.fulfill(status=404, body="")
+
+    with sync_playwright() as playwright:
+        arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
+        page = browser.new_page(viewport={"width": 480, "height": 480})
+        page.route("**/*", answer)
+        page.goto("http://figure.test/")
+        page.wait_for_function("window.ready === true", timeout=30_000)
+        yield page
+        browser.close()
+
+
+@pytest.mark.browser
+def test_three_js_poses_joints_and_skin_as_the_figure_is(
+    three: Any, written: tuple[Path, list[RigidMotion]], clips: list[GlbClip]
+) -> None:
+    facts = three.evaluate("facts()")
+    assert facts["targets"] == list(EXPRESSIONS)
+    assert [name for name, _ in facts["animations"]] == [clip.name for clip in clips]
+    assert facts["animations"][0][1] == pytest.approx(39 / FPS)
+    gltf = pygltflib.GLTF2().load(written[0])
+    body = body_for(written[1][0].skeleton)
+    in_file = [values(gltf, mesh.primitives[0].attributes.POSITION) for mesh in gltf.meshes]
+    rng = np.random.default_rng(0)
+    for number, frame in ((0, 0), (0, 13), (0, 37), (1, 5), (1, 29)):
+        figure, clip = written[1][number], clips[number]
+        three.evaluate("([n, t]) => show(n, t, [1.2, 0.5, 2.8])", [number, frame / FPS])
+        seen = np.array(three.evaluate("names => joints(names)", list(SKELETON.joints)))
+        np.testing.assert_allclose(seen, figure.joints[frame], atol=1e-4)
+        face = None if clip.expression is None else clip.expression[frame : frame + 1]
+        posed = body.posed(figure.rotations[frame : frame + 1], figure.root[frame : frame + 1], face)[0]
+        for name, places in (("body", in_file[0]), ("head_mesh", in_file[1])):
+            some = rng.integers(0, len(places), 40).tolist()
+            shown = np.array(three.evaluate("([n, v]) => vertices(n, v)", [name, some]))
+            rows = [int(np.linalg.norm(body.vertices - places[v], axis=-1).argmin()) for v in some]
+            np.testing.assert_allclose(shown, posed[rows], atol=2e-4)
+
+
+@pytest.mark.browser
+def test_three_js_draws_left_in_blue_and_right_in_orange(three: Any) -> None:
+    from PIL import Image
+
+    three.evaluate("show(0, 0.5, [0.0, 0.3, 3.4])")
+    data = three.evaluate("document.querySelector('canvas').toDataURL('image/png')")
+    image = np.asarray(Image.open(io.BytesIO(base64.b64decode(data.split(",")[1]))).convert("RGB")).astype(
+        int
+    )
+    blue = (image[..., 2] - image[..., 0] > 60).nonzero()[1]
+    orange = (image[..., 0] - image[..., 2] > 70).nonzero()[1]
+    assert len(blue) > 2000 and len(orange) > 2000
+    # The figure looks at the camera: its left is on the right of the picture.
+    assert blue.mean() > orange.mean() + 20
