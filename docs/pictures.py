@@ -23,6 +23,7 @@ from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.shown import shown
 from motionloom.pipeline.render.picture import contact_sheet
 
 CAPTIONS = (
@@ -51,7 +52,7 @@ class Row:
 def generated_rows(run: Path, captions: tuple[str, ...], seed: int) -> list[Row]:
     """Motions that a trained run makes of the captions."""
     motions = Bundle.open(run).generate(captions, seed=seed)
-    return [Row(m.joints, "generated", m.caption, m.layout.fps) for m in motions]
+    return [Row(shown(m).joints, "generated", m.caption, m.layout.fps) for m in motions]
 
 
 def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[Row]:
@@ -76,7 +77,7 @@ def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[Row]:
         at = [min(round(beat * fps), len(motion.joints) - 1) for beat in clip.beats[:frames].tolist()]
         truth = clip.truth or {}
         words = f"{truth.get('genre', clip.song)}, {truth.get('bpm', '?')} beats a minute"
-        rows.append(Row(motion.joints, "to music", words, fps, at))
+        rows.append(Row(shown(motion).joints, "to music", words, fps, at))
     return rows
 
 

@@ -77,8 +77,7 @@ class BvhMotion:
 
     def _rotations(self, wanted: Sequence[int]) -> Floats:
         """Local rotations of some joints, joint first [M, T, 3, 3]."""
-        import roma
-        import torch
+        from scipy.spatial.transform import Rotation  # half a second, which reading a header need not take
 
         out = np.broadcast_to(np.eye(3), (len(wanted), self.frames, 3, 3)).copy()
         turns = _channel_columns(self.channels).rotations
@@ -89,8 +88,9 @@ class BvhMotion:
         for order, rows in groups.items():
             columns = [column for row in rows for column in turns[wanted[row]][1]]
             angles = self.values[:, columns].reshape(self.frames, len(rows), len(order))
-            joint_first = torch.from_numpy(np.ascontiguousarray(np.moveaxis(angles, 0, 1)))
-            out[rows] = roma.euler_to_rotmat(order, joint_first, degrees=True).numpy()
+            joint_first = np.moveaxis(angles, 0, 1).reshape(-1, len(order))
+            turned = Rotation.from_euler(order, joint_first, degrees=True)
+            out[rows] = turned.as_matrix().reshape(len(rows), self.frames, 3, 3)
         return out
 
     def positions(self) -> Floats:

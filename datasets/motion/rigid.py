@@ -34,6 +34,8 @@ Floats = NDArray[np.float64]
 _NO_BONE = 1e-9
 _ROUNDS = 6
 """Rounds of "turn to the bones, average the bones" for pelvis, chest and palms; a few settle it."""
+_MEASURED = 500
+"""Frames, at least, of longer motions that the shapes are measured on, spread evenly."""
 _FOREARM_SHARE = 0.5
 """Of a hand's twist that the forearm takes."""
 
@@ -111,6 +113,8 @@ def measured_skeleton(joints: NDArray[Any], skeleton: Skeleton, *, symmetric: bo
     points = np.asarray(joints, dtype=np.float64)
     parents = np.asarray(skeleton.parents)
     own = _lengths_only(points, skeleton, symmetric)
+    # Medians settle long before that; motions of many minutes would take as long again as their poses.
+    points = points[:: max(1, len(points) // _MEASURED)]
     lengths = np.linalg.norm(own.offsets, axis=-1, keepdims=True)
     forks = [j for j in range(len(skeleton)) if (parents == j).sum() > 1]
     bones = points.copy()

@@ -46,6 +46,7 @@ from motionloom.datasets.synth.pose import Track
 from motionloom.datasets.synth.smpl75 import smpl75_of
 from motionloom.datasets.synth.song import render_song
 from motionloom.datasets.synth.truth import ACTIONS, HANDS, Span, Truth, draw
+from motionloom.datasets.synth.wordings import many_body_captions, many_face_captions
 
 CONVERTER_VERSION = 2  # the face's words are about the body's person
 LICENCE = "CC0-1.0"
@@ -88,6 +89,9 @@ class SynthConfig(Config):
     test_fraction: float = Field(0.15, ge=0, lt=1)
     captions: int = Field(3, ge=1, le=8)
     """Different wordings per clip."""
+    wordings: Literal["few", "many"] = "few"
+    """Words that captions are made of: two or three for each thing in sentences of one form, or a dozen in
+    many forms, for models that shall take more words than their training's. Dances of `dances` have few."""
     music: bool = False
     """Give every dance its audio: a click on every beat over chords. For music that decides the dance, see
     `dances`."""
@@ -101,10 +105,12 @@ class SynthConfig(Config):
 
     @model_serializer(mode="wrap")
     def _as_before(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without `dances` a config says what it did before there were any: its shards stay as they are."""
+        """Without newer settings a config says what it did before there were any: its shards stay."""
         data: dict[str, Any] = handler(self)
         if data.get("dances") is None:
             data.pop("dances", None)
+        if data.get("wordings") == "few":
+            data.pop("wordings")
         return data
 
     @field_validator("actions", "hand_shapes")
@@ -214,14 +220,20 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
         wav = (render(float(truth.bpm or 120), track.first_beat, seconds, sound), SAMPLE_RATE)
     if isinstance(truth, DanceTruth):
         texts = dance_captions(truth, words, config.captions)
+    elif config.wordings == "many":
+        texts = many_body_captions(truth, words, config.captions, hands)
     else:
         texts = body_captions(truth, words, config.captions, hands)
+    if config.wordings == "many" and not isinstance(truth, DanceTruth):
+        face_texts = many_face_captions(truth, words)
+    else:
+        face_texts = face_captions(truth, words, body=texts)
     said = planned is None or planned.comes in ("text", "both")
     return Clip(
         joints=canonicalize(solved[:, : layout.num_joints] * size),
         face=face,
         texts=texts if said else [],
-        face_texts=face_captions(truth, words, body=texts) if has_face and said else [],
+        face_texts=face_texts if has_face and said else [],
         truth=truth.record(hands=hands, face=has_face),
         wav=wav,
         audio=audio,

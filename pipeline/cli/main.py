@@ -224,6 +224,7 @@ def compare(
 def export(
     run_folder: RunFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="New folder.")] = Path("exported"),
+    half: Annotated[bool, typer.Option("--half", help="Weights in half precision: half the size.")] = False,
 ) -> None:
     """One folder with all that generate needs: weights (safetensors), configs, statistics.
 
@@ -231,7 +232,7 @@ def export(
     """
     from motionloom.pipeline.runs.api import export_run
 
-    export_run(run_folder, out, console=make_console())
+    export_run(run_folder, out, half=half, console=make_console())
 
 
 def main() -> None:

@@ -122,10 +122,11 @@ def score_of(motion: GeneratedMotion) -> Score:
 
 
 def viewer_motion(
-    figure: ShownMotion, label: str, group: str = "", score: Score | None = None
+    motion: GeneratedMotion | ShownMotion, label: str, group: str = "", score: Score | None = None
 ) -> ViewerMotion:
     """A generated motion's figure as the viewer takes it, with its sound, beats and segments."""
-    motion, score = figure.motion, score or Score()
+    figure, score = shown(motion), score or Score()
+    motion = figure.motion
     return ViewerMotion(
         joints=figure.joints,
         fps=motion.layout.fps,
@@ -153,11 +154,12 @@ def _arkit_reader(
     return ArkitBases.read(figure.arkit_bases).weights
 
 
-def glb_clip(figure: ShownMotion, reader: FaceReader | None = None) -> GlbClip:
+def glb_clip(motion: GeneratedMotion | ShownMotion, reader: FaceReader | None = None) -> GlbClip:
     """A generated motion's figure as one animation of a GLB file, with its face.
 
     `reader` makes the weights of the face's shapes of expression values; without, the synthetic face's.
     """
+    figure = shown(motion)
     face = figure.motion.face
     return GlbClip(
         name=figure.motion.caption or "motion",
@@ -168,8 +170,15 @@ def glb_clip(figure: ShownMotion, reader: FaceReader | None = None) -> GlbClip:
     )
 
 
-def write_npz(path: Path, figure: ShownMotion, seed: int | None) -> Path:
+def write_glb_of(path: Path, motion: GeneratedMotion | ShownMotion) -> Path:
+    """The skinned body, moved by the figure, with its face."""
+    write_glb(path, [glb_clip(motion)])
+    return path
+
+
+def write_npz(path: Path, motion: GeneratedMotion | ShownMotion, seed: int | None) -> Path:
     """Joints [T, N, 3] in metres, features, expression, bones, and the facts as one JSON text (no pickle)."""
+    figure = shown(motion)
     motion = figure.motion
     facts = {
         "caption": motion.caption,
@@ -198,8 +207,9 @@ def write_npz(path: Path, figure: ShownMotion, seed: int | None) -> Path:
     return path
 
 
-def write_bvh_of(path: Path, figure: ShownMotion) -> Path:
+def write_bvh_of(path: Path, motion: GeneratedMotion | ShownMotion) -> Path:
     """The figure's bones and rotations."""
+    figure = shown(motion)
     fitted = figure.figure
     write_bvh(path, fitted.skeleton, fitted.rotations, fitted.root, figure.fps)
     return path

@@ -11,6 +11,7 @@ installation, the text encoder: nothing else is needed, and nothing in it is eve
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,13 +27,15 @@ from motionloom.pipeline.contract.streaming import StreamConfig
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.exported import write_exported
 from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.requests import caption_list
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.stream_request import stream_of
 from motionloom.pipeline.inference.streaming import MotionStream
+from motionloom.pipeline.inference.unknown import unknown_captions
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.outside import BUNDLE_FILE
-from motionloom.pipeline.store.weights import LayoutFacts
+from motionloom.pipeline.store.weights import LayoutFacts, halve_weights
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -93,8 +96,11 @@ class MotionModel(
 
         A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
         a motion is as long as its sound, or else the model decides. `sampling` is a `SamplingConfig` or a
-        mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused.
+        mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused; of a caption
+        that is far from all it was trained on, it warns.
         """
+        for unknown in unknown_captions(self.bundle, caption_list(captions or ()), caption_list(face or ())):
+            warnings.warn(str(unknown), stacklevel=2)
         return self.bundle.generate(
             captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
             sampling=sampling, strict=True,
@@ -195,11 +201,13 @@ class MotionModel(
         return cls(folder, device)
 
 
-def write_bundle(run: Path, out: Path) -> None:
-    """Copy what generation needs of a run's finished stages into `out`."""
+def write_bundle(run: Path, out: Path, *, half: bool = False) -> None:
+    """Copy what generation needs of a run's finished stages into `out`; with `half`, weights as 16 bits."""
     bundle = Bundle.from_run(run)
     for stage in bundle.stages:
         bundle.of(stage)  # opens every stage, so a broken one is found before anything is copied
     out.mkdir(parents=True, exist_ok=True)
     write_exported(bundle.stages, LayoutFacts.of(bundle.layout), bundle.layout.skeleton, out)
+    for weights in sorted(out.glob("*/model.safetensors")) if half else ():
+        halve_weights(weights)
     write_json(out / "config.json", _HUB_CONFIG)

@@ -8,27 +8,32 @@ from pathlib import Path
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import glb_clip, score_of, viewer_motion, write_bvh_of, write_npz
+from motionloom.pipeline.inference.outputs import (
+    score_of,
+    viewer_motion,
+    write_bvh_of,
+    write_glb_of,
+    write_npz,
+)
 from motionloom.pipeline.inference.page_words import page_title
 from motionloom.pipeline.inference.shown import shown
-from motionloom.pipeline.render.body.glb import write_glb
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, viewer_page
 
 
 def save_npz(path: Path, motion: GeneratedMotion) -> None:
     """Joints, features and facts."""
-    write_npz(_place(path), shown(motion), motion.seed)
+    write_npz(_place(path), motion, motion.seed)
 
 
 def save_bvh(path: Path, motion: GeneratedMotion) -> None:
     """Bone rotations."""
-    write_bvh_of(_place(path), shown(motion))
+    write_bvh_of(_place(path), motion)
 
 
 def save_glb(path: Path, motion: GeneratedMotion) -> None:
     """The skinned figure, its motion and its face."""
-    write_glb(_place(path), [glb_clip(shown(motion))])
+    write_glb_of(_place(path), motion)
 
 
 def save_mp4(path: Path, motion: GeneratedMotion) -> None:
@@ -49,7 +54,7 @@ def page_of(motion: GeneratedMotion) -> str:
 
 def cell_of(motion: GeneratedMotion) -> ViewerMotion:
     """What the viewer shows of it."""
-    return viewer_motion(shown(motion), "generated", score=score_of(motion))
+    return viewer_motion(motion, "generated", score=score_of(motion))
 
 
 def frame_of(motion: GeneratedMotion, height: int = 480) -> str:

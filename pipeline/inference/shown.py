@@ -6,7 +6,6 @@ do: they read the features' own joints (`GeneratedMotion.joints`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,8 +82,10 @@ class ShownMotion:
         return out
 
 
-def shown(motion: GeneratedMotion, options: FigureOptions | None = None) -> ShownMotion:
-    """The figure of one motion."""
+def shown(motion: GeneratedMotion | ShownMotion, options: FigureOptions | None = None) -> ShownMotion:
+    """The figure of one motion; one that was made already stays what it is."""
+    if isinstance(motion, ShownMotion):
+        return motion
     options = options or FigureOptions()
     layout = motion.layout
     figure = fit_rigid(
@@ -95,13 +96,8 @@ def shown(motion: GeneratedMotion, options: FigureOptions | None = None) -> Show
     )
     feet = None
     if options.plant_feet:
-        contacts = foot_contacts(
-            figure.joints, layout.skeleton, layout.fps, options.feet, motion.features, layout.without_face()
-        )
+        # Only the h3d family has contact columns; others are judged by height and speed.
+        columns = motion.features if layout.family == "h3d" else None
+        contacts = foot_contacts(figure.joints, layout.skeleton, layout.fps, options.feet, columns, layout)
         figure, feet = plant_feet(figure, motion.joints, contacts, layout.fps, options.feet)
     return ShownMotion(motion, figure, figure.joints if options.rigid else motion.joints, feet)
-
-
-def shown_all(motions: Sequence[GeneratedMotion], options: FigureOptions | None = None) -> list[ShownMotion]:
-    """The figures of several motions."""
-    return [shown(motion, options) for motion in motions]

@@ -155,6 +155,7 @@ def generate_motions(
     from motionloom.pipeline.inference.page_words import page_note, page_title
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions
+    from motionloom.pipeline.inference.unknown import unknown_captions
 
     if not captions and not audio and script is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
@@ -181,6 +182,9 @@ def generate_motions(
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     bundle = Bundle.open(folder, choose_device(device))
+    said = captions if segments is None else [segment.prompt.text for segment in segments]
+    for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
+        console.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
     if segments is not None:
         motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
     else:
@@ -342,8 +346,8 @@ def report_run(
     return page
 
 
-def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Path:
-    """Copy what generation needs into one folder."""
+def export_run(folder: Path, out: Path, *, half: bool = False, console: Console | None = None) -> Path:
+    """Copy what generation needs into one folder; with `half`, weights in half precision."""
     from motionloom.pipeline.inference.pretrained import write_bundle
 
     console = console or make_console()
@@ -351,7 +355,7 @@ def export_run(folder: Path, out: Path, *, console: Console | None = None) -> Pa
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
     with new_folder(out.absolute()) as whole:
-        write_bundle(folder, whole)
+        write_bundle(folder, whole, half=half)
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     console.print(
         f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"', soft_wrap=True

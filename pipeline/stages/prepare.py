@@ -11,8 +11,9 @@ from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
 from motionloom.pipeline.contract.stage import CPU, Finished, Given, StageConfig, StageContext, StageKind
 from motionloom.pipeline.store.data import captions_of
-from motionloom.pipeline.store.encoder_files import keep_place
+from motionloom.pipeline.store.encoder_files import BUILT_IN, keep_place
 from motionloom.pipeline.store.files import copy_files
+from motionloom.pipeline.store.known_captions import representatives, save_known
 from motionloom.pipeline.store.text import TextPreview, TextSource
 
 _STATS = "stats.safetensors"
@@ -73,12 +74,14 @@ class TextStage(StageKind):
     def run(self, context: StageContext) -> None:
         """Embed the captions of all splits."""
         keep_place(context.config.encoder, context.folder)
-        data, captions = context.given["data"], set[str]()
+        data, captions, trained = context.given["data"], set[str](), {False: set[str](), True: set[str]()}
         for split in data.splits:
             dataset = data.split(split)
             for index in in_order(dataset, "texts.json", "face_texts.json"):
-                captions.update(c.text for c in captions_of(dataset, index, face=False))
-                captions.update(c.text for c in captions_of(dataset, index, face=True))
+                for face in (False, True):
+                    said = {caption.text for caption in captions_of(dataset, index, face=face)}
+                    captions |= said
+                    trained[face] |= said if split == "train" else set()
         cache = build_text_cache(
             context.folder / "cache",
             captions,
@@ -91,6 +94,13 @@ class TextStage(StageKind):
         context.console.print(
             f"    {len(captions)} different captions, {cache.dim}-d embeddings by {cache.encoder}"
         )
+        if context.config.similarity == BUILT_IN:
+            body, face_captions = (sorted(trained[face]) for face in (False, True))
+            save_known(
+                context.folder,
+                representatives(body, cache.similarity(body)),
+                representatives(face_captions, cache.similarity(face_captions)),
+            )
 
     def preview(self, config: TextConfig, given: Given) -> TextPreview:
         """The width of the encoder's features."""
@@ -110,4 +120,7 @@ class TextStage(StageKind):
 
 
 def _source(stage: Finished, device: torch.device) -> TextSource:
-    return TextSource(stage.folder, stage.config.encoder, device, stage.exported)
+    source = TextSource(stage.folder, stage.config.encoder, device, stage.exported)
+    if stage.exported:
+        _ = source.known  # read at once: what is broken in an export is found before anything is made
+    return source

@@ -8,7 +8,7 @@ MATE, which learns from tokens alone, this is ours.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ import torch
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import SIMILARITY, TextCache
 from motionloom.datasets.text.encoder import EncodedText, TextEncoder
+from motionloom.pipeline.store.known_captions import KnownCaptions
 from motionloom.pipeline.store.networks import LoadedTma
 from motionloom.pipeline.store.text import TextSource
 
@@ -70,6 +71,15 @@ class AlignedText(TextSource):
     def encoder(self) -> TextEncoder:
         """Words, then TMA."""
         return AlignedEncoder(self.tma, self.words.encoder.encode, self.words.encoder.name)
+
+    @cached_property
+    def known(self) -> Mapping[str, KnownCaptions]:
+        """As the words have them."""
+        return self.words.known
+
+    @cached_property
+    def _sentences(self) -> TextEncoder:
+        return self.words._sentences
 
     def export(self, target: Path) -> None:
         """Nothing of its own: the words' encoder and TMA are exported beside it."""

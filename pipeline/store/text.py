@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,8 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
 from motionloom.pipeline.store.encoder_files import BUILT_IN, copy_encoder, copy_encoder_files, place_of
-from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.files import copy_files, write_json
+from motionloom.pipeline.store.known_captions import KNOWN_FILES, KnownCaptions, Unknown, load_known
 
 _EXPORTED = "text.json"
 _COPY = "encoder"
@@ -96,9 +97,29 @@ class TextSource:
         encoded = self.encoder.encode(captions)
         return encoded.tokens, encoded.mask
 
+    @cached_property
+    def known(self) -> Mapping[str, KnownCaptions]:
+        """Captions that stand for those of the training, "body" and "face"; none where they were not kept."""
+        return load_known(self.folder)
+
+    def unknown(self, captions: Sequence[str], *, face: bool = False) -> list[Unknown]:
+        """Those of `captions` that are far from all that were trained on."""
+        known = self.known.get("face" if face else "body")
+        if known is None or not captions:
+            return []
+        return known.unknown(captions, self._sentences.encode(captions).sentence)
+
+    @cached_property
+    def _sentences(self) -> TextEncoder:
+        """The encoder of `known`."""
+        if self.encoder_name == BUILT_IN:
+            return self.encoder
+        return load_text_encoder(BUILT_IN, device=str(self.device))
+
     def export(self, target: Path) -> None:
         """What encoding new words needs; an encoder that comes with the installation is not copied."""
         target.mkdir(parents=True, exist_ok=True)
+        copy_files(self.folder, target, [name for name in KNOWN_FILES if (self.folder / name).is_file()])
         name = self.encoder_name
         if name != BUILT_IN:
             if self.exported:

@@ -69,6 +69,20 @@ def save_model(folder: Path, net: torch.nn.Module, facts: ModelFacts) -> None:
     write_json(folder / "model.json", facts.dump())
 
 
+def halve_weights(path: Path) -> None:
+    """Write a file of weights again in half precision, 16 bits a number; networks compute in 32 all the same.
+
+    What half precision has no room for (beyond 65,504) stays as it is, and so does what is no number.
+    """
+    largest = torch.finfo(torch.float16).max
+    state = {
+        name: value.half() if value.dtype == torch.float32 and bool((value.abs() <= largest).all()) else value
+        for name, value in load_file(path).items()
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(state))
+
+
 def load_facts(folder: Path) -> ModelFacts:
     """Facts of the network in a folder."""
     facts = ModelFacts.load_json(folder / "model.json")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tarfile
 from pathlib import Path
 
@@ -266,3 +268,15 @@ def bvhio_positions(path: Path, frames: range | None = None) -> np.ndarray:
         world = {joint.Name: tuple(joint.PositionWorld) for joint, _, _ in root.layout()}
         out.append([world[name] for name in motion.joints])
     return np.array(out)
+
+
+def test_reading_a_clip_brings_no_torch(tmp_path: Path) -> None:
+    body = Skeleton.named("smpl22")
+    turns = np.tile(np.eye(3), (3, len(body), 1, 1))
+    write_bvh(tmp_path / "clip.bvh", body, turns, np.zeros((3, 3)), 30.0)
+    program = (
+        "import sys; from pathlib import Path; from motionloom.datasets.motion.bvh import read_bvh; "
+        "read_bvh(Path(sys.argv[1])).positions(); print('torch' in sys.modules)"
+    )
+    words = [sys.executable, "-P", "-c", program, str(tmp_path / "clip.bvh")]
+    assert subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip() == "False"

@@ -163,4 +163,4 @@ def test_a_run_of_before_opens(old: Path, small_run: Any, tmp_path: Path, call: 
     plan = {row.stage.name: row for row in make_plan(load_recipe(old / "recipe.yaml"), old)}
     again = {name for name, row in plan.items() if row.action == "run"}
     assert again == {"generate", "evaluate", "report"}, "no training is lost"
-    assert plan["generate"].reason == "generate v2 is now generate v4"
+    assert plan["generate"].reason == "generate v2 is now generate v5"

@@ -241,6 +241,7 @@ def test_the_commands_options_reach_the_sampling(
 ) -> None:
     seen: dict[str, Any] = {}
     monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: _Watching(seen))
+    monkeypatch.setattr("motionloom.pipeline.inference.unknown.unknown_captions", lambda *_: [])
     words = (
         "--sampler",
         "dpm++",

@@ -18,12 +18,13 @@ from scipy.optimize import lsq_linear
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.features import encode
 from motionloom.datasets.motion.feet import FeetOptions
+from motionloom.datasets.motion.joints import joints_of, rotations_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.face import APEX, BASIS
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.bundle import GeneratedMotion
-from motionloom.pipeline.inference.outputs import ALL_GLB, write_motions
+from motionloom.pipeline.inference.outputs import ALL_GLB, write_glb_of, write_motions
 from motionloom.pipeline.inference.shown import FigureOptions, shown
 
 LAYOUT = MotionLayout.named("wholebody363")
@@ -93,6 +94,9 @@ def test_all_files_show_one_figure_of_constant_bones(motions: list[GeneratedMoti
         order = [bvh.joints.index(name) for name in LAYOUT.skeleton.joints]
         np.testing.assert_allclose(bvh.positions()[:, order] / 100, joints, atol=2e-5)
         np.testing.assert_allclose(page_joints(paths[-1], number), joints, atol=1e-4)
+    alone = write_glb_of(tmp_path / "alone.glb", motions[0])
+    a, b = (pygltflib.GLTF2().load(path) for path in (alone, paths[2]))
+    assert a.binary_blob() == b.binary_blob()
     together = pygltflib.GLTF2().load(tmp_path / "out" / ALL_GLB)
     assert [animation.name for animation in together.animations] == ["a person walks", "a person waves"]
     paths_of = [[c.target.path for c in animation.channels] for animation in together.animations]
@@ -142,6 +146,22 @@ def test_planted_feet_say_what_they_cost(motions: list[GeneratedMotion]) -> None
     assert facts["fit_unplanted_mean_mm"] == plain.facts()["fit_mean_mm"] < facts["fit_mean_mm"]
     assert "feet slide" in planted.sentence and "feet" not in plain.sentence
     assert motions[0].joints is planted.motion.joints  # what is measured stays as it was
+
+
+@pytest.mark.parametrize(("name", "count"), [("smpl75", 22), ("smplx322", 52), ("h3d263", 22)])
+def test_every_family_of_layouts_has_a_figure(name: str, count: int) -> None:
+    """Raw parameters keep their own rotations; contact columns say when feet stand."""
+    layout = MotionLayout.named(name)
+    features = 0.1 * np.random.default_rng(3).normal(size=(12, layout.dim)).astype(np.float32)
+    motion = GeneratedMotion(Prompt("x"), features, joints_of(features, layout), None, layout)
+    figure = shown(motion, FigureOptions(plant_feet=True))
+    assert figure.joints.shape == (12, count, 3) and np.isfinite(figure.joints).all()
+    plain = shown(motion)
+    if layout.family == "raw":
+        assert plain.figure.error.max_mm < 1e-3
+        known = rotations_of(features, layout)
+        assert known is not None
+        np.testing.assert_allclose(plain.figure.rotations, known, atol=1e-5)
 
 
 def test_feet_cannot_be_planted_without_bones() -> None:

@@ -1,0 +1,109 @@
+"""What a model says of captions that it does not know."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.text.encoder import load_text_encoder
+from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.store.known_captions import (
+    FAR,
+    KNOWN_FILES,
+    KnownCaptions,
+    load_known,
+    representatives,
+    save_known,
+)
+
+TRAINED = (
+    "a person waves with the right hand",
+    "a man greets by waving both hands",
+    "someone walks straight ahead fast",
+    "a figure raises the right arm",
+    "the person does a left kick once",
+    "a woman jumps up twice",
+)
+OTHER_WORDS = (
+    "somebody is waving their left hand",
+    "someone strolls ahead slowly",
+    "lifts the right arm high",
+)
+ELSEWHERE = ("a person plays the violin", "a man rides a bicycle", "stock prices fell sharply")
+
+
+def unit(count: int, width: int, seed: int) -> np.ndarray:
+    drawn = np.random.default_rng(seed).normal(size=(count, width))
+    return (drawn / np.linalg.norm(drawn, axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_representatives_leave_no_caption_far() -> None:
+    vectors = unit(200, 3, 1)
+    texts = [f"caption {k:03d}" for k in range(200)]
+    made = representatives(texts, vectors, 12)
+    distances = np.sqrt(np.maximum(0, 2 - 2 * vectors.astype(np.float64) @ made.embeddings.T))
+    radius = distances.min(axis=1).max()
+    # Gonzalez: with the farthest caption, 13 lie pairwise `radius` apart; smaller balls need more than 12.
+    chosen = made.embeddings.astype(np.float64)
+    apart = np.sqrt(np.maximum(0, 2 - 2 * chosen @ chosen.T))[np.triu_indices(12, 1)].min()
+    assert apart >= radius - 1e-6
+    assert len(set(made.captions)) == 12
+    shuffled = np.random.default_rng(2).permutation(200)
+    again = representatives([texts[k] for k in shuffled], vectors[shuffled], 12)
+    assert again.captions == made.captions, "the choice hangs on the captions, not on their order"
+
+
+def test_fewer_captions_than_are_wanted_all_stand_for_themselves() -> None:
+    made = representatives(["b", "a"], unit(2, 4, 3), 12)
+    assert sorted(made.captions) == ["a", "b"]
+    assert representatives([], np.zeros((0, 4), np.float32)).captions == ()
+
+
+def test_other_words_are_known_and_other_things_are_not() -> None:
+    encoder = load_text_encoder("minilm")
+    known = KnownCaptions(TRAINED, encoder.encode(TRAINED).sentence)
+    assert known.unknown(OTHER_WORDS, encoder.encode(OTHER_WORDS).sentence) == []
+    found = known.unknown(ELSEWHERE, encoder.encode(ELSEWHERE).sentence)
+    assert [one.caption for one in found] == list(ELSEWHERE)
+    assert "a man rides a bicycle" in str(found[1]) and found[1].nearest[0] in str(found[1])
+
+
+def test_files_come_back(tmp_path: Path) -> None:
+    body, face = KnownCaptions(("a", "b"), unit(2, 8, 4)), KnownCaptions((), np.zeros((0, 8), np.float32))
+    save_known(tmp_path, body, face)
+    found = load_known(tmp_path)
+    assert found["body"].captions == ("a", "b") and found["face"].captions == ()
+    np.testing.assert_allclose(found["body"].embeddings, body.embeddings, atol=2**-11)
+    assert found["face"].unknown(["x"], unit(1, 8, 5)) == [], "a model without faces calls no face unknown"
+    assert load_known(tmp_path / "none") == {}
+
+
+@pytest.mark.parametrize("damage", ["cut", "other"])
+def test_damaged_files_are_named(tmp_path: Path, damage: str) -> None:
+    save_known(tmp_path, KnownCaptions(("a",), unit(1, 8, 4)), KnownCaptions(("b",), unit(1, 8, 6)))
+    path = tmp_path / KNOWN_FILES[1]
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:40])
+    else:
+        save_known(tmp_path / "x", KnownCaptions(("a", "c"), unit(2, 8, 4)), KnownCaptions((), unit(0, 8, 6)))
+        shutil.copyfile(tmp_path / "x" / KNOWN_FILES[1], path)
+    with pytest.raises(UserError, match=r"known\.safetensors"):
+        load_known(tmp_path)
+
+
+def test_generate_says_so_from_a_run_and_from_an_export(small_run: Any, call: Any, tmp_path: Path) -> None:
+    words = ["a person walks forward", "a person plays the violin"]
+    said = call("generate", small_run.folder, *words, "-o", tmp_path / "run", "-f", "npz").out
+    assert said.count("note: ") == 1 and "'a person plays the violin' is unlike" in said
+    call("export", small_run.folder, "-o", tmp_path / "model")
+    said = call("generate", tmp_path / "model", *words, "-o", tmp_path / "model-out", "-f", "npz").out
+    assert said.count("note: ") == 1
+    model = MotionModel.from_pretrained(tmp_path / "model", device="cpu")
+    with pytest.warns(UserWarning, match="violin.*The nearest it knows"):
+        model.generate(words, face=["a person looks happy"] * 2 if model.bundle.faces else None)
+    assert 0 < FAR < 1
