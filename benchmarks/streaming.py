@@ -44,12 +44,12 @@ def changing() -> Iterator[tuple[str, float]]:
     return ((caption, CAPTION_SECONDS) for caption in itertools.cycle(CAPTIONS))
 
 
-def first_chunk(model: MotionModel) -> dict[str, float]:
+def first_chunk(model: MotionModel, how: dict[str, str]) -> dict[str, float]:
     """Seconds until the first chunk is there."""
     clock, cpu, frames = [], [], 0
     for seed in range(FIRST):
         began, used = time.perf_counter(), time.process_time()
-        frames = len(next(model.stream(CAPTIONS[seed % len(CAPTIONS)], seed=seed)).joints)
+        frames = len(next(model.stream(CAPTIONS[seed % len(CAPTIONS)], seed=seed, streaming=how)).joints)
         clock.append(time.perf_counter() - began)
         cpu.append(time.process_time() - used)
     return {
@@ -59,11 +59,11 @@ def first_chunk(model: MotionModel) -> dict[str, float]:
     }
 
 
-def long_stream(model: MotionModel, minutes: float) -> dict[str, float]:
+def long_stream(model: MotionModel, how: dict[str, str], minutes: float) -> dict[str, float]:
     """Speed and memory over a long motion."""
     wanted, frames, after_a_minute, largest = minutes * 60 * model.fps, 0, 0.0, 0.0
     began, used = time.perf_counter(), time.process_time()
-    for chunk in model.stream(changing(), seed=1):
+    for chunk in model.stream(changing(), seed=1, streaming=how):
         frames += len(chunk.joints)
         if frames >= 60 * model.fps:
             now = resident()
@@ -87,8 +87,10 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", type=Path, help="run folders, or exported ones")
     parser.add_argument("--minutes", type=float, default=10.0, help="of motion")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--decoder", choices=("diffusion", "tokenizer"), help="of a UDE")
     parser.add_argument("--json", type=Path, help="write the figures here")
     given = parser.parse_args()
+    how = {} if given.decoder is None else {"decoder": given.decoder}
     torch.set_num_threads(given.threads)
     out = {}
     for run in given.runs:
@@ -96,7 +98,8 @@ def main() -> None:
         model = MotionModel.from_pretrained(run, device="cpu")
         next(model.stream(CAPTIONS[0]))
         loaded = {"load_seconds": time.perf_counter() - began}
-        out[run.resolve().name] = loaded | first_chunk(model) | long_stream(model, given.minutes)
+        figures = first_chunk(model, how) | long_stream(model, how, given.minutes)
+        out[run.resolve().name] = loaded | figures
         if given.json is not None:
             given.json.write_text(json.dumps(out, indent=1) + "\n", encoding="utf-8")
     table = Table("", *out)

@@ -180,6 +180,13 @@ def _denoise(
     """Motions [n, T, D] from noise."""
     noise = [torch.Generator().manual_seed(seed) for seed in seeds]
     x = torch.stack([torch.randn(frames, net.motion_dim, generator=g) for g in noise])
+    return _denoised(net, windows, x, noise, sampler, steps)
+
+
+def _denoised(
+    net: Dmd, windows: _Windows, x: Tensor, noise: list[torch.Generator], sampler: Sampler, steps: int
+) -> Tensor:
+    """Motions [n, T, D] from noise x [n, T, D]; `noise` is what steps draw from that draw."""
     x = x.to(windows.condition.device)
     scheduler = net.config.schedule.sampler(sampler, steps)
     x = x * scheduler.init_noise_sigma
@@ -189,3 +196,18 @@ def _denoise(
         stepped: Tensor = scheduler.step(found.to(x.dtype), step, x, **extra).prev_sample
         x = stepped
     return x
+
+
+@torch.no_grad()
+def decode_window(
+    net: Dmd,
+    codes: Mapping[str, Tensor],
+    x: Tensor,
+    *,
+    seed: int,
+    sampler: Sampler,
+    steps: int,
+) -> Tensor:
+    """One window [T, D] of tokens [1, G * per], denoised from x [T, D] as it is; `net` in evaluation mode."""
+    windows = _Windows(net, codes, None, None, len(x), len(x), 0)
+    return _denoised(net, windows, x[None], [torch.Generator().manual_seed(seed)], sampler, steps)[0]

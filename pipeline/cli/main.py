@@ -15,7 +15,7 @@ import sys
 import traceback
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -24,9 +24,10 @@ from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.data import data_app
 from motionloom.pipeline.cli.evaluate import evaluate
+from motionloom.pipeline.cli.generate import generate
 from motionloom.pipeline.cli.json_output import AsJson, print_json
 from motionloom.pipeline.cli.launch import launch
-from motionloom.pipeline.cli.options import Device, ModelFolder, RunFolder, Sets
+from motionloom.pipeline.cli.options import Device, RunFolder, Sets
 from motionloom.pipeline.cli.replay import replay
 from motionloom.pipeline.cli.serve import serve
 from motionloom.pipeline.cli.sweep import sweep
@@ -173,137 +174,7 @@ app.command()(launch)
 app.command()(replay)
 
 
-@app.command()
-def generate(
-    run_folder: ModelFolder,
-    captions: Annotated[
-        list[str] | None, typer.Argument(help="What the person does; one motion each.")
-    ] = None,
-    face: Annotated[
-        list[str] | None, typer.Option("--face", help="What the face does, one for each caption.")
-    ] = None,
-    audio: Annotated[
-        list[Path] | None,
-        typer.Option("--audio", help="A wav, flac, mp3 or ogg file to move to; beside a caption, both."),
-    ] = None,
-    script: Annotated[
-        Path | None, typer.Option("--script", help="YAML: segments of text and music, one motion.")
-    ] = None,
-    samples: Annotated[int, typer.Option(help="Motions of each caption, sound or script.")] = 1,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Folder for the files, default motions; a file with --stream."),
-    ] = None,
-    stream: Annotated[
-        bool,
-        typer.Option(
-            "--stream", help="One motion as JSON lines, written while it is made; - reads captions."
-        ),
-    ] = False,
-    formats: Annotated[
-        str | None,
-        typer.Option(
-            "--format",
-            "-f",
-            help="Comma-separated: npz, bvh, mp4, html (the default), glb, smplx, arkit.",
-        ),
-    ] = None,
-    seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
-    temperature: Annotated[
-        float, typer.Option(help="0: the likeliest tokens; below 1: safer, above 1: more varied.")
-    ] = 1.0,
-    top_k: Annotated[int, typer.Option(help="Draw from the k likeliest tokens; 0 = all.")] = 0,
-    top_p: Annotated[
-        float, typer.Option(help="Draw from the likeliest tokens of this total probability.")
-    ] = 0.95,
-    cfg_scale: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
-    face_cfg_scale: Annotated[
-        float | None, typer.Option(help="Guidance of the face; default: as --cfg-scale.")
-    ] = None,
-    music_cfg_scale: Annotated[
-        float | None, typer.Option(help="Guidance where there is music; default: as --cfg-scale.")
-    ] = None,
-    face_model: Annotated[
-        str | None, typer.Option(help="gpt, vae or diffusion; default: the first the run has.")
-    ] = None,
-    sampler: Annotated[
-        str | None, typer.Option(help="Of diffusion models: ddpm (default), ddim or dpm++.")
-    ] = None,
-    denoising_steps: Annotated[
-        int | None,
-        typer.Option(help="Denoising steps of diffusion models, default 50, at most those trained (1000)."),
-    ] = None,
-    rigid: Annotated[
-        bool, typer.Option(help="Show bones of constant length; without, the generated joints as they are.")
-    ] = True,
-    plant_feet: Annotated[
-        bool, typer.Option("--plant-feet", help="Hold feet still where they stand; says what that changes.")
-    ] = False,
-    body_model: Annotated[
-        Path | None, typer.Option(help="Your SMPL-X model (.npz), for --format smplx.")
-    ] = None,
-    arkit_bases: Annotated[
-        Path | None,
-        typer.Option(help="Your expression and ARKit bases (.npz: source, arkit), for --format arkit."),
-    ] = None,
-    device: Device = "auto",
-) -> None:
-    """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch; also GLB.
-
-    Example: `motionloom generate runs/humantomato-tiny "a person waves" --face "a happy face" -o out`
-
-    Example: `motionloom generate runs/ude-tiny --audio song.ogg --samples 3 -o dances`
-
-    Example: `motionloom generate runs/humantomato-tiny "a person bows" --format glb,html --plant-feet`
-
-    Example: `motionloom generate runs/humantomato-tiny --stream "a person walks" --seconds 60 -o walk.jsonl`
-    """
-    of_models = {
-        "face_cfg_scale": face_cfg_scale,
-        "music_cfg_scale": music_cfg_scale,
-        "sampler": sampler,
-        "denoising_steps": denoising_steps,
-    }
-    asked: dict[str, Any] = {
-        "face": face,
-        "audio": audio or [],
-        "script": script,
-        "seconds": seconds,
-        "seed": seed,
-        "sampling": {
-            "temperature": temperature,
-            "top_k": top_k,
-            "top_p": top_p,
-            "cfg_scale": cfg_scale,
-            "face_model": face_model,
-            **{name: value for name, value in of_models.items() if value is not None},
-        },
-        "device": device,
-    }
-    figure = {"rigid": rigid, "plant_feet": plant_feet, "body_model": body_model, "arkit_bases": arkit_bases}
-    if stream:
-        from motionloom.pipeline.runs.streams import stream_motion
-
-        if samples != 1 or formats is not None:
-            raise UserError("--stream writes one motion as JSON lines: leave --samples and --format out")
-        stream_motion(run_folder, captions or [], out=out, console=make_console(aside=True), **asked)
-        return
-    from motionloom.pipeline.runs.api import generate_motions
-
-    files: dict[str, Any] = {} if formats is None else {"formats": formats}
-    generate_motions(
-        run_folder,
-        captions or [],
-        samples=samples,
-        out=out or Path("motions"),
-        figure=figure,
-        console=make_console(),
-        **files,
-        **asked,
-    )
-
-
+app.command()(generate)
 app.command()(serve)
 app.command()(evaluate)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
@@ -25,6 +27,10 @@ class StreamConfig(Config):
     stage's `context_frames`."""
     hop_frames: int = Field(20, ge=1)
     """Frames that UDE draws at a time: another caption is heard after them."""
+    decoder: Literal["diffusion", "tokenizer"] | None = None
+    """What makes frames of a UDE's tokens: the diffusion decoder, which is better and needs the tokens of a
+    window before its first frame, or the tokenizer's own, which needs some groups. None takes the first
+    where the model has it."""
     ahead_seconds: float = Field(0.5, ge=0)
     """How far a stream whose captions come from a keyboard runs ahead of the clock."""
 
@@ -44,6 +50,18 @@ class TokenFlow(Protocol):
         ...
 
 
+class FrameFlow(Protocol):
+    """Frames of tokens as they come."""
+
+    def push(self, codes: Mapping[str, Tensor]) -> NDArray[np.float32] | None:
+        """More tokens -> the features [T, C] that are final now, in their own units; None = none yet."""
+        ...
+
+    def finish(self) -> NDArray[np.float32] | None:
+        """No more tokens follow: the rest."""
+        ...
+
+
 @runtime_checkable
 class StreamingGenerator(MotionGenerator, Protocol):
     """A generator of tokens that can be decoded as they come."""
@@ -57,4 +75,8 @@ class StreamingGenerator(MotionGenerator, Protocol):
         """The tokens of a new motion. Of one caption they are those of `generate` by the same seed, as long
         as the network's block holds them.
         """
+        ...
+
+    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> FrameFlow:
+        """What makes frames of them."""
         ...

@@ -18,9 +18,9 @@ from motionloom.pipeline.render.score import Segment
 WRITERS = {
     ".npz": "motionloom.pipeline.inference.saving:save_npz",
     ".bvh": "motionloom.pipeline.inference.saving:save_bvh",
+    ".glb": "motionloom.pipeline.inference.saving:save_glb",
     ".mp4": "motionloom.pipeline.inference.saving:save_mp4",
     ".html": "motionloom.pipeline.inference.saving:save_html",
-    ".glb": "motionloom.pipeline.inference.saving:save_glb",
 }
 """What writes a motion to a file that ends so: `module:function`, a function of (path, motion)."""
 
@@ -68,7 +68,7 @@ class GeneratedMotion:
         return tuple(self.layout.skeleton.joints)
 
     def save(self, path: Path | str) -> Path:
-        """Write one file; its ending says which kind: .npz, .bvh, .mp4, .html, .glb. Returns its path."""
+        """Write one file; its ending says which kind: .npz, .bvh, .glb, .mp4, .html. Returns its path."""
         path = Path(path)
         write = _from_table(WRITERS.get(path.suffix.lower()))
         if write is None:

@@ -31,6 +31,11 @@ def save_bvh(path: Path, motion: GeneratedMotion) -> None:
     write_bvh_of(_place(path), motion)
 
 
+def save_glb(path: Path, motion: GeneratedMotion) -> None:
+    """The skinned figure, its motion and its face."""
+    write_glb_of(_place(path), motion)
+
+
 def save_mp4(path: Path, motion: GeneratedMotion) -> None:
     """A film, with its music."""
     skeleton, sound = motion.layout.skeleton, motion.prompt.sound

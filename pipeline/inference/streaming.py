@@ -5,8 +5,9 @@ Tokens are drawn group by group and decoded as soon as the groups that a frame's
 frame is final: it is the one that decoding all tokens at once would give. What is kept is one block of the
 networks and the decoder's window, whatever the length of the motion.
 
-A diffusion decoder denoises long windows as a whole; a stream of a UDE that has one is decoded by the
-tokenizer's own decoder instead [ours].
+A UDE's diffusion decoder denoises all windows of a motion together. A stream has a choice: the tokenizer's
+own decoder, which answers at once, or windows that are denoised one after another
+(`models/diffusion/dmd_streaming.py`) [ours].
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ from motionloom.datasets.motion.flow import JointFlow
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import sample_seeds
-from motionloom.models.tokenizer.streaming import StreamDecoder
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished
@@ -227,7 +227,7 @@ class _Maker:
         self._encoder, self._fps = bundle.encoder(stage), bundle.layout.fps
         self._flow = generator.flow(seed, sampling, config)
         self._tokenizer = generator.tokenizer
-        self._decoder = StreamDecoder(self._tokenizer.net, -(-config.chunk_frames // generator.unit_frames))
+        self._decoder = generator.decoding(seed, sampling, config)
         self._frames: NDArray[np.float32] = np.zeros((0, len(self._tokenizer.columns)), np.float32)
         self.groups = 0
         """Groups drawn."""
@@ -248,13 +248,13 @@ class _Maker:
         self.groups += codes[stream.name].shape[1] // stream.per_group
         made = self._decoder.push(codes)
         if made is not None:
-            self._add(self._tokenizer.own_units(made[0]))
+            self._add(made)
 
     def finish(self) -> None:
         """No tokens follow."""
         made = self._decoder.finish()
         if made is not None:
-            self._add(self._tokenizer.own_units(made[0]))
+            self._add(made)
 
     def take(self, count: int) -> NDArray[np.float32]:
         """The next frames [T, C]."""

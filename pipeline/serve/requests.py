@@ -26,6 +26,7 @@ from motionloom.pipeline.serve.config import ServeConfig
 FILES = {
     "npz": "application/octet-stream",
     "bvh": "text/plain; charset=utf-8",
+    "glb": "model/gltf-binary",
     "html": "text/html; charset=utf-8",
 }
 
@@ -45,7 +46,7 @@ class MotionRequest(Config):
     cfg_scale: float = Field(1.0, ge=1, le=20, allow_inf_nan=False)
     temperature: float = Field(1.0, ge=0, le=10, allow_inf_nan=False)
     top_p: float = Field(0.95, gt=0, le=1)
-    format: Literal["joints", "viewer", "npz", "bvh", "html"] = "joints"
+    format: Literal["joints", "viewer", "npz", "bvh", "glb", "html"] = "joints"
     """Numbers, the viewer's data, or a file."""
     request: str = Field("", max_length=64)
     """A name for the answer to bear; made up where it is empty."""

@@ -25,7 +25,8 @@ from motionloom.pipeline.contract.generation import GenerationRequest, MotionGen
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage
-from motionloom.pipeline.contract.streaming import StreamConfig, TokenFlow
+from motionloom.pipeline.contract.streaming import FrameFlow, StreamConfig, TokenFlow
+from motionloom.pipeline.inference.decoding import Frames
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
 from motionloom.pipeline.stages.gpt_flow import GptFlow
@@ -323,6 +324,12 @@ class GptGenerator:
             seed=seed,
         )
         return GptFlow(tokens, lambda conditions: self.prior(GenerationRequest(conditions, None, [seed])))
+
+    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> FrameFlow:
+        """The tokenizer's own decoder."""
+        if streaming.decoder == "diffusion":
+            raise UserError("this model has no diffusion decoder; leave streaming's decoder out")
+        return Frames.of_tokenizer(self.tokenizer, streaming)
 
 
 def _check_text(stage: Stage, others: Mapping[str, Stage]) -> None:

@@ -21,6 +21,7 @@ from torch import Tensor
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd_sampling import decode_motions
+from motionloom.models.diffusion.dmd_streaming import DmdStream
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES
@@ -35,7 +36,8 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
     StageKind,
 )
-from motionloom.pipeline.contract.streaming import StreamConfig, TokenFlow
+from motionloom.pipeline.contract.streaming import FrameFlow, StreamConfig, TokenFlow
+from motionloom.pipeline.inference.decoding import Frames
 from motionloom.pipeline.inference.timeline import TokenTimeline
 from motionloom.pipeline.inference.timeline_flow import TimelineFlow
 from motionloom.pipeline.stages.dmd import LoadedDmd
@@ -198,19 +200,45 @@ class UdeGenerator:
         """Tokens as they come, those of `drive` where the lengths of all stretches are known."""
         return TimelineFlow(self.timeline, seed, sampling, hop=max(1, streaming.hop_frames // GROUP_FRAMES))
 
+    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> FrameFlow:
+        """The tokenizer's own decoder, or windows of the diffusion decoder."""
+        if self.dmd is None and streaming.decoder == "diffusion":
+            raise UserError("this model has no diffusion decoder; leave streaming's decoder out")
+        if self.dmd is None or streaming.decoder == "tokenizer":
+            return Frames.of_tokenizer(self.tokenizer, streaming)
+        sampler, steps = self._denoising(sampling)
+        decoder = DmdStream(
+            self.dmd.net,
+            {stream.name: stream.per_group for stream in self.tokenizer.net.streams},
+            seed=seed,
+            sampler=sampler,
+            steps=steps,
+            window=self.dmd.window,
+            overlap=self.config.overlap_frames,
+        )
+        return Frames(decoder, self.tokenizer.of_coordinates)
+
+    def _denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
+        """Sampler and steps, as asked for or else the stage's."""
+        asked = sampling.model_fields_set
+        return (
+            sampling.sampler if "sampler" in asked else self.config.sampler,
+            sampling.denoising_steps if "denoising_steps" in asked else self.config.denoising_steps,
+        )
+
     def decode(
         self, codes: Codes, seeds: Sequence[int], sampling: SamplingConfig, hidden: Tensor | None = None
     ) -> list[NDArray[np.float32]]:
         """Features in their own units, [T, C] a row; `hidden` as `decode_motions` takes it."""
         if self.dmd is None:
             return self.tokenizer.decode(codes.codes, codes.groups.tolist())
-        asked = sampling.model_fields_set
+        sampler, steps = self._denoising(sampling)
         made = decode_motions(
             self.dmd.net,
             codes,
             seeds=seeds,
-            sampler=sampling.sampler if "sampler" in asked else self.config.sampler,
-            steps=sampling.denoising_steps if "denoising_steps" in asked else self.config.denoising_steps,
+            sampler=sampler,
+            steps=steps,
             window=self.dmd.window,
             overlap=min(self.config.overlap_frames, self.dmd.window - GROUP_FRAMES),
             hidden=hidden,

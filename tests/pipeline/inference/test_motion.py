@@ -33,17 +33,23 @@ def test_its_facts(motion: GeneratedMotion) -> None:
     assert motion.joint_names[0] == "pelvis" and len(motion.joint_names) == 52
 
 
-@pytest.mark.parametrize("ending", [".npz", ".bvh", ".html", ".mp4", ".BVH"])
+@pytest.mark.parametrize("ending", [".npz", ".bvh", ".glb", ".html", ".mp4", ".BVH"])
 def test_saves_by_its_ending(motion: GeneratedMotion, tmp_path: Path, ending: str) -> None:
     path = motion.save(tmp_path / f"made{ending}")
-    start = {".npz": b"PK", ".bvh": b"HIERARCHY", ".html": b"<!doctype html>", ".mp4": b"\0\0\0"}
+    start = {
+        ".npz": b"PK",
+        ".bvh": b"HIERARCHY",
+        ".glb": b"glTF",
+        ".html": b"<!doctype html>",
+        ".mp4": b"\0\0\0",
+    }
     assert path.read_bytes().startswith(start[ending.lower()])
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
 def test_what_the_file_holds(motion: GeneratedMotion, tmp_path: Path) -> None:
     with np.load(motion.save(str(tmp_path / "made.npz")), allow_pickle=False) as file:
-        np.testing.assert_allclose(file["joints"], motion.joints, atol=1e-6)
+        np.testing.assert_allclose(file["joints"], motion.joints, atol=1e-3)  # of one rigid skeleton
         facts = json.loads(str(file["metadata"]))
     assert facts["seed"] == 9 and facts["caption"] == NASTY and facts["fps"] == 20.0
 

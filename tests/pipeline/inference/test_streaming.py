@@ -36,7 +36,7 @@ def model(small_run: Any) -> MotionModel:
 
 @pytest.fixture(scope="module")
 def ude(ude_run: Any) -> MotionModel:
-    """Without its diffusion decoder, which streams do not use."""
+    """Without its diffusion decoder, whose windows a stream denoises one by one."""
     made = MotionModel.from_pretrained(ude_run.folder, device="cpu")
     bundle = made.bundle
     bundle._generators[bundle.main.folder] = replace(bundle.generator, dmd=None)  # type: ignore[type-var]
@@ -193,6 +193,22 @@ def test_a_dance_without_an_end_of_its_own(ude: MotionModel) -> None:
     stream.say("a person waves")
     after = list(itertools.islice(stream, 8))
     assert first.caption == "a person walks" and after[-1].caption == "a person waves"
+
+
+def test_windows_of_the_diffusion_decoder(ude_run: Any, ude: MotionModel) -> None:
+    """Of the same tokens, in whatever pieces they come."""
+    model = MotionModel.from_pretrained(ude_run.folder, device="cpu")
+    captions = [("a person walks", 5.0), ("a person waves", 2.0)]
+    made = [whole(list(model.stream(captions, seed=2, streaming={"hop_frames": hop}))) for hop in (4, 40)]
+    assert len(made[0].joints) == 140
+    np.testing.assert_array_equal(made[0].features, made[1].features)
+    plain = whole(list(model.stream(captions, seed=2, streaming={"decoder": "tokenizer"})))
+    same(plain, whole(list(ude.stream(captions, seed=2))))
+    assert plain.features.shape == made[0].features.shape and (plain.features != made[0].features).any()
+    first = next(model.stream("a person walks", seed=2, streaming={"decoder": "diffusion"}))
+    assert 0 < len(first.joints) < model.bundle.generator.dmd.window  # type: ignore[attr-defined]
+    with pytest.raises(UserError, match="has no diffusion decoder"):
+        ude.stream("a person walks", streaming={"decoder": "diffusion"})
 
 
 # ---- JSON lines
