@@ -47,11 +47,6 @@ def save_html(path: Path, motion: GeneratedMotion) -> None:
     write_text(_place(path), page_of(motion))
 
 
-def save_glb(path: Path, motion: GeneratedMotion) -> None:
-    """The skinned body with the motion, for Blender and engines."""
-    write_glb_of(_place(path), motion)
-
-
 def page_of(motion: GeneratedMotion) -> str:
     """The viewer page as text."""
     return viewer_page([cell_of(motion)], page_title([motion.caption]))

@@ -23,7 +23,8 @@ from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import Team
-from motionloom.pipeline.runs.graph import make_plan, perform, stage_inputs
+from motionloom.pipeline.runs.graph import make_plan, stage_inputs
+from motionloom.pipeline.runs.perform import perform
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.stages.train_config import TrainConfig
 from motionloom.pipeline.store.crash import (
