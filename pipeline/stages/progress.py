@@ -19,6 +19,9 @@ from motionloom.datasets.base.progress import Pace, bar
 from motionloom.models.training.stage_module import LOG_EVERY, StageModule
 from motionloom.pipeline.stages.loggers import Loggers
 
+_REDRAW = 0.1
+"""Seconds between two states of the bar, which is drawn no more often."""
+
 
 class StepProgress(Callback):
     """Steps done, loss, speed and time left: a bar on a terminal, a line every 15 s elsewhere."""
@@ -28,6 +31,7 @@ class StepProgress(Callback):
         self.progress: Progress | None = None
         self.pace = Pace(steps)
         self.first = 0
+        self._next = 0.0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Open the bar at the resumed step."""
@@ -52,6 +56,11 @@ class StepProgress(Callback):
         step, shown = trainer.global_step, self.console.is_terminal
         if not shown and not self.pace.due(step) and step < self.steps:
             return
+        if shown and step < self.steps:
+            now = time.monotonic()
+            if now < self._next:  # a loss that is read is one that the GPU is waited for
+                return
+            self._next = now + _REDRAW
         loss = float(trainer.callback_metrics.get("loss", 0.0))
         note = f"loss {loss:.4f}  {self.pace.speed(step):.1f} steps/s"
         if shown:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import torch
 import torch.distributed as dist
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback
@@ -164,6 +165,6 @@ def _mean(rows: list[RowMeans]) -> RowMeans:
     """Of several ranks', which have the same names and counts."""
     first = rows[0]
     return [
-        {**means, "sums": sum(row[place]["sums"] for row in rows) / len(rows)}
+        {**means, "sums": torch.stack([row[place]["sums"] for row in rows]).mean(0)}
         for place, means in enumerate(first)
     ]
