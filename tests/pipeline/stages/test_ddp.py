@@ -72,7 +72,7 @@ def running(start: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
             continue
 
 
-def finish(process: Any, code: int = 0, seconds: float = 90) -> str:
+def finish(process: Any, code: int = 0, seconds: float = 240) -> str:
     """The output of a process that must end by itself."""
     output: str = process.communicate(timeout=seconds)[0]
     assert process.returncode == code, output
