@@ -30,6 +30,10 @@ class Heartbeat(Callback):
             mine.enter_stage(self.name, self.folder, _READING)
         self._note(_READING, trainer)
 
+    def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """What came between two chunks is over."""
+        self._note(_READING, trainer)
+
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
     ) -> None:
