@@ -204,9 +204,10 @@ def generate_motions(
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     bundle = Bundle.open(folder, choose_device(device))
+    aside = make_console(aside=True)  # standard output is the list of files
     said = captions if segments is None else [segment.prompt.text for segment in segments]
     for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
-        console.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
+        aside.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
     if segments is not None:
         motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
     else:
@@ -229,7 +230,7 @@ def generate_motions(
         note=note,
         seed=seed,
         figure=posing,
-        say=lambda line: console.print(line, soft_wrap=True, markup=False, highlight=False),
+        say=lambda line: aside.print(line, soft_wrap=True, markup=False),
     )
     for path in paths:
         console.print(str(path), markup=False, soft_wrap=True)

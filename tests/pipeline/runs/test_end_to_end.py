@@ -20,6 +20,7 @@ from safetensors.numpy import load_file, save_file
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.shown import shown
 from motionloom.pipeline.store.artifact import Artifact
 
 pytestmark = pytest.mark.slow
@@ -69,7 +70,8 @@ def motions(copy: Path, tmp_path_factory: pytest.TempPathFactory, start: Callabl
     process = start("generate", copy, *WAVE, "--seed", 5, "-o", folder)
     output, _ = process.communicate(timeout=120)
     assert process.returncode == 0, output
-    assert {Path(line).suffix for line in output.splitlines()} == {".npz", ".bvh", ".mp4", ".html"}
+    written = [Path(line) for line in output.splitlines() if Path(line).is_file()]
+    assert {path.suffix for path in written} == {".npz", ".bvh", ".mp4", ".html"}
     return folder
 
 
@@ -219,7 +221,8 @@ def test_from_pretrained_needs_the_saved_folder_alone(
     model = MotionModel.from_pretrained(tmp_path / "saved")
     made = model.generate([WAVE[0]], face=[WAVE[2]], seconds=2.0, seed=5)[0]
     first = arrays(only(motions, ".npz"))
-    np.testing.assert_array_equal(made.joints.astype(np.float32), first["joints"].astype(np.float32))
+    np.testing.assert_array_equal(made.features, first["features"])
+    np.testing.assert_allclose(shown(made).joints, first["joints"], atol=1e-6)  # stored in half the digits
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     with pytest.raises(UserError, match="nobody/none: no such folder, and the hub does not give it"):
         MotionModel.from_pretrained("nobody/none", local_files_only=True)

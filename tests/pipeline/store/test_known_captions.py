@@ -98,10 +98,10 @@ def test_damaged_files_are_named(tmp_path: Path, damage: str) -> None:
 
 def test_generate_says_so_from_a_run_and_from_an_export(small_run: Any, call: Any, tmp_path: Path) -> None:
     words = ["a person walks forward", "a person plays the violin"]
-    said = call("generate", small_run.folder, *words, "-o", tmp_path / "run", "-f", "npz").out
+    said = call("generate", small_run.folder, *words, "-o", tmp_path / "run", "-f", "npz").err
     assert said.count("note: ") == 1 and "'a person plays the violin' is unlike" in said
     call("export", small_run.folder, "-o", tmp_path / "model")
-    said = call("generate", tmp_path / "model", *words, "-o", tmp_path / "model-out", "-f", "npz").out
+    said = call("generate", tmp_path / "model", *words, "-o", tmp_path / "model-out", "-f", "npz").err
     assert said.count("note: ") == 1
     model = MotionModel.from_pretrained(tmp_path / "model", device="cpu")
     with pytest.warns(UserWarning, match="violin.*The nearest it knows"):
