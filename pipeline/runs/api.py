@@ -204,10 +204,6 @@ def generate_motions(
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     bundle = Bundle.open(folder, choose_device(device))
-    aside = make_console(aside=True)  # standard output is the list of files
-    said = captions if segments is None else [segment.prompt.text for segment in segments]
-    for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
-        aside.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
     if segments is not None:
         motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
     else:
@@ -220,6 +216,10 @@ def generate_motions(
             sampling=drawing,
             strict=True,
         )
+    aside = make_console(aside=True)  # standard output is the list of files
+    said = captions if segments is None else [segment.prompt.text for segment in segments]
+    for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
+        aside.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
     title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
     note = page_note(len(motions), folder.resolve().name, seed)
     paths = write_motions(

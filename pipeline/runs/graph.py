@@ -290,20 +290,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 place = f"{plan.index(row) + 1}/{len(plan)}"
                 console.print(f"[bold]\\[{place}] {stage.name}[/] ({stage.kind.summary})")
                 _prepare(folder, row)
-            context = StageContext(
-                name=stage.name,
-                recipe=recipe.name,
-                config=stage.config,
-                folder=folder,
-                inputs=stage_inputs(recipe, run, stage),
-                seed=recipe.seed_of(stage),
-                hardware=recipe.hardware,
-                console=console,
-                shelf=Shelf(recipe.hardware.device()),
-                rank=team.rank,
-                world=team.world,
-            )
-            perform(stage.kind, context, team)
+            perform(stage.kind, context_of(recipe, run, stage, folder, console, team), team)
             if leads:
                 seconds = time.perf_counter() - begin
                 took = {"seconds": round(seconds, 2), "hardware": recipe.hardware.describe()}
@@ -312,6 +299,25 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 console.print(f"    finished in {seconds:.1f} s")
         team.part()
     return [row.stage.name for row in todo]
+
+
+def context_of(
+    recipe: Recipe, run: Path, stage: Stage, folder: Path, console: Console, team: Team
+) -> StageContext:
+    """What a stage works with in `folder`."""
+    return StageContext(
+        name=stage.name,
+        recipe=recipe.name,
+        config=stage.config,
+        folder=folder,
+        inputs=stage_inputs(recipe, run, stage),
+        seed=recipe.seed_of(stage),
+        hardware=recipe.hardware,
+        console=console,
+        shelf=Shelf(recipe.hardware.device()),
+        rank=team.rank,
+        world=team.world,
+    )
 
 
 def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]:

@@ -17,13 +17,13 @@ from rich.console import Console
 from rich.table import Table
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.stage import Shelf, Stage, StageContext
+from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.flight.replay import ReplayDone, ReplaySteps
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import Team
-from motionloom.pipeline.runs.graph import make_plan, stage_inputs
+from motionloom.pipeline.runs.graph import context_of, make_plan
 from motionloom.pipeline.runs.perform import perform
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.stages.train_config import TrainConfig
@@ -60,18 +60,9 @@ def replay_crash(bundle: Path, *, anomaly: bool = False, console: Console | None
             link_or_copy(bundle / CHECKPOINT, scratch / "checkpoints" / name)
     team.meet()
     steps = ReplaySteps(record.step, train.accumulate, anomaly=anomaly)
-    context = StageContext(
-        name=stage.name,
-        recipe=recipe.name,
+    context = replace(
+        context_of(recipe, run, stage, scratch, console, team),
         config=_without_validation(stage.config),
-        folder=scratch,
-        inputs=stage_inputs(recipe, run, stage),
-        seed=recipe.seed_of(stage),
-        hardware=recipe.hardware,
-        console=console,
-        shelf=Shelf(recipe.hardware.device()),
-        rank=team.rank,
-        world=team.world,
         watched_by=(steps,),
     )
     say: Any = console.print

@@ -6,6 +6,7 @@ write and for root too.
 
 from __future__ import annotations
 
+import re
 import resource
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -76,9 +77,10 @@ def files_of(folder: Path) -> set[Path]:
 
 def require_sentence(answer: Any) -> str:
     assert answer.code == 2, answer.out + answer.err
-    assert answer.err.startswith("error: ") and "Traceback" not in answer.err
-    assert "Errno" not in answer.err and ".tmp" not in answer.err
-    return str(answer.err)
+    said = str(answer.err)
+    assert re.search(r"^error: ", said, re.MULTILINE) and "Traceback" not in said
+    assert "Errno" not in said and ".tmp" not in said
+    return said[said.index("error: ") :]  # behind what was said of the motions
 
 
 @pytest.mark.parametrize("name", sorted(set(WRITING) - {"evaluate"}))
