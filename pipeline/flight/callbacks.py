@@ -14,7 +14,7 @@ from motionloom.pipeline.flight.bundles import Bundles
 from motionloom.pipeline.flight.not_finite import NotFinite
 from motionloom.pipeline.flight.profiler import StepProfiler
 from motionloom.pipeline.flight.recorder import FlightRecorder, FlightSettings
-from motionloom.pipeline.flight.waits import Waiting
+from motionloom.pipeline.flight.waits import Waits
 
 
 def flight_callbacks(
@@ -26,13 +26,13 @@ def flight_callbacks(
     accumulate: int,
     on_not_finite: Literal["stop", "continue"],
     branched: bool,
-    waits: Waiting | None = None,
-    settle: Callable[[], None] = lambda: None,
+    waits: Waits,
+    settle: Callable[[], None],
 ) -> list[Callback]:
     """What stands before all other callbacks of a training, the log of its figures among them.
 
-    `waits` measures what the training waits for, where something does that closer than Lightning's hooks.
-    `settle` returns when the checkpoint that is being written is on disk.
+    `waits` is where the training counts what it waits for; `settle` returns when the checkpoint
+    that is being written is on disk.
     """
     own: list[Callback] = [OwnSettings()] if branched else []
     if context.watched_by:

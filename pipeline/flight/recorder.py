@@ -27,17 +27,9 @@ from motionloom.pipeline.flight.bundles import Bundles
 from motionloom.pipeline.flight.groups import read_norms
 from motionloom.pipeline.flight.not_finite import NotFinite
 from motionloom.pipeline.flight.ranks import GradientWaits, gathered, waited_in_steps
-from motionloom.pipeline.flight.waits import Waited, Waiting
+from motionloom.pipeline.flight.waits import Waited, Waits
 from motionloom.pipeline.flight.watch import Watch
 from motionloom.pipeline.store.flight_log import FOLDER, FlightLog
-
-
-@dataclass
-class HookWaits:
-    """`Waiting` as the hooks of a training show it, where nothing closer measures it."""
-
-    data: float = 0.0
-    checkpoints: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -64,11 +56,10 @@ class FlightRecorder(Callback):
         failures: NotFinite,
         bundles: Bundles,
         console: Console,
-        waits: Waiting | None = None,
+        waits: Waits,
     ) -> None:
         self.settings, self.failures, self.bundles, self.console = settings, failures, bundles, console
-        self._hooks = HookWaits()
-        self.waits: Waiting = self._hooks if waits is None else waits
+        self.waits = waits
         self.total = Waited()
         """Since this process began to train."""
         self._log: FlightLog | None = None
@@ -80,9 +71,9 @@ class FlightRecorder(Callback):
         self._latest: deque[float] = deque(maxlen=100)
         self._own: list[float] = []
         self._began: float | None = None
-        self._ended = self._idle = self._row = self._paused = 0.0
+        self._ended = self._row = 0.0
         self._step = self._first = 0
-        self._seen = HookWaits()
+        self._seen = replace(waits)
         self._units = 0.0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -97,19 +88,18 @@ class FlightRecorder(Callback):
             path = self.settings.folder / FOLDER / f"rank_{trainer.global_rank}.jsonl"
             self._log = FlightLog(path, self.settings.rows)
             self._log.begin(self._step)
-        self._row = self._ended = self._idle = time.perf_counter()
-        self._seen = HookWaits(self.waits.data, self.waits.checkpoints)
+        self._row = self._ended = time.perf_counter()
+        self._seen = replace(self.waits)
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """A checkpoint was made since the last chunk."""
-        self._resume_clock()
+        """The validation and the checkpoint since the last chunk are time of no step."""
+        self._ended = time.perf_counter()
 
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
     ) -> None:
         """The batch is here."""
         now = time.perf_counter()
-        self._hooks.data += now - self._idle
         self._began = self._began or now
         length = batch.get("length") if isinstance(batch, dict) else None
         if isinstance(length, Tensor):
@@ -130,21 +120,10 @@ class FlightRecorder(Callback):
             self._began, self._ended = None, now
             if self._step % LOG_EVERY == 0:
                 self._end_row(trainer, pl_module)
-        self._idle = time.perf_counter()
 
     def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """A network that is lost is not validated."""
         self._check(trainer, pl_module)
-        self._paused = time.perf_counter()
-
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """The time of a validation is that of no step."""
-        pause = time.perf_counter() - self._paused
-        self._ended, self._idle = self._ended + pause, self._idle + pause
-
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Until the next chunk begins, a checkpoint is made."""
-        self._paused = time.perf_counter()
 
     def on_save_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
@@ -155,7 +134,6 @@ class FlightRecorder(Callback):
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Say how fast it was and what it waited for."""
         assert isinstance(pl_module, StageModule)
-        self._resume_clock()
         self._read_lengths()
         self._count(trainer, pl_module)
         steps = self._step - self._first
@@ -176,13 +154,6 @@ class FlightRecorder(Callback):
         if self._unit:
             said.append(f"{self._units * trainer.world_size / self.total.wall:,.0f} {self._unit}/s")
         return f"{', '.join(said)}; {self.total.say(team=trainer.world_size > 1)}"
-
-    def _resume_clock(self) -> None:
-        """Behind a chunk's end; what happened there was a checkpoint."""
-        now = time.perf_counter()
-        if self._paused > self._ended:
-            self._hooks.checkpoints += now - self._paused
-        self._ended = self._idle = now
 
     def _check(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """All processes compare; a collective, so that all go on or all stop."""
@@ -212,7 +183,7 @@ class FlightRecorder(Callback):
         found = Waited(
             now - self._row, waits.data - self._seen.data, waits.checkpoints - self._seen.checkpoints, ranks
         )
-        self._row, self._seen = now, HookWaits(waits.data, waits.checkpoints)
+        self._row, self._seen = now, replace(waits)
         self.total.add(replace(found))
         return found
 

@@ -11,11 +11,11 @@ from typing import Any, cast
 import lightning as L
 from torch.utils.data import DataLoader, Dataset
 
+from motionloom.pipeline.flight.waits import Waits
 from motionloom.pipeline.launch.ending import end_with_parent
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.interruption import unsignalled
 from motionloom.pipeline.stages.train_config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.stages.waits import Waits
 
 
 class ChunkLoader:

@@ -20,8 +20,8 @@ from lightning.pytorch.callbacks import Callback
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.stage_module import RowMeans, StageModule
+from motionloom.pipeline.flight.waits import Waits
 from motionloom.pipeline.stages.train_config import TrainConfig
-from motionloom.pipeline.stages.waits import Waits
 from motionloom.pipeline.store.background import BackgroundWriter, name_of
 
 ROW = "row"

@@ -29,6 +29,7 @@ from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.flight.branch import require_branch
 from motionloom.pipeline.flight.callbacks import flight_callbacks
+from motionloom.pipeline.flight.waits import Waits
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.launch.team import environment, lead_finds
@@ -39,7 +40,6 @@ from motionloom.pipeline.stages.loggers import Loggers
 from motionloom.pipeline.stages.progress import MetricLog, StepProgress
 from motionloom.pipeline.stages.saving import ROW, Checkpoints, ResumeBetweenChunks, SealedCheckpoints
 from motionloom.pipeline.stages.train_config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.stages.waits import Waits
 from motionloom.pipeline.store.background import BackgroundWriter, step_of
 from motionloom.pipeline.store.checkpoints import readable
 

@@ -44,11 +44,6 @@ class BackgroundWriter:
         """Whether a checkpoint is being written."""
         return self._thread is not None and self._thread.is_alive()
 
-    def poll(self) -> None:
-        """Raise the error of a writing that has ended, without waiting for one that has not."""
-        if self._thread is not None and not self._thread.is_alive():
-            self.finish()
-
     def finish(self) -> None:
         """Wait until what is being written is on disk.
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import torch
 
+from motionloom.pipeline.flight.waits import Waits
 from motionloom.pipeline.stages.loading import ChunkLoader
 from motionloom.pipeline.stages.saving import _mean
-from motionloom.pipeline.stages.waits import Waits
 
 
 class Reader:

@@ -74,7 +74,6 @@ def test_what_is_trained_meanwhile_is_not_in_the_file(
     writer.write(trained, tmp_path / name_of(7))
     change(trained)
     assert writer.busy and not (tmp_path / name_of(7)).exists()
-    writer.poll()  # waits for nothing
     threading.Timer(0.2, go.set).start()
     writer.write({"global_step": 14}, tmp_path / name_of(14))
     assert (tmp_path / name_of(7)).exists()
@@ -84,7 +83,7 @@ def test_what_is_trained_meanwhile_is_not_in_the_file(
     assert (tmp_path / "other/one.ckpt").read_bytes() == (tmp_path / name_of(7)).read_bytes()
 
 
-@pytest.mark.parametrize("ask", ["write", "poll", "finish"])
+@pytest.mark.parametrize("ask", ["write", "finish"])
 def test_an_error_comes_out_where_the_training_asks_next(
     ask: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
