@@ -1,14 +1,18 @@
 """Frechet distance between two sets of embeddings (FID), by symmetric eigen-decomposition.
 
-tr sqrt(A B) of two covariances equals the sum of square roots of the eigenvalues of sqrt(A) B sqrt(A), which
-is symmetric: no general matrix square root, no imaginary parts to drop, and singular covariances need no
-epsilon.
+tr sqrt(A B) of two covariances equals the sum of square roots of the eigenvalues of R' B R for any R with
+A = R R', which is symmetric: no general matrix square root, no imaginary parts to drop, and singular
+covariances need no epsilon. R is the Cholesky factor where A is well conditioned, which is the fastest, and
+else the symmetric root.
 """
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+WELL_CONDITIONED = 1e-5
+"""Smallest pivot of a Cholesky factor, relative to the largest, that float64 is sure of (squared: 1e-10)."""
 
 
 def statistics(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -19,12 +23,22 @@ def statistics(x: Tensor) -> tuple[Tensor, Tensor]:
     return x.mean(0), torch.cov(x.T).view(x.shape[1], x.shape[1])
 
 
+def _root(cov: Tensor) -> Tensor:
+    """R [Z, Z] with R R' = `cov`."""
+    factor, failed = torch.linalg.cholesky_ex(cov)
+    pivots = factor.diagonal()
+    if not failed and pivots.min() > WELL_CONDITIONED * pivots.max():
+        return factor
+    values, vectors = torch.linalg.eigh(cov)
+    root: Tensor = (vectors * values.clamp(min=0).sqrt()) @ vectors.T
+    return root
+
+
 def frechet_distance(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tensor) -> Tensor:
     """Squared Frechet distance of two Gaussians; scalar float64, never negative."""
     mean_a, cov_a, mean_b, cov_b = (x.double() for x in (mean_a, cov_a, mean_b, cov_b))
-    values, vectors = torch.linalg.eigh(cov_a)
-    root = (vectors * values.clamp(min=0).sqrt()) @ vectors.T
-    product = root @ cov_b @ root
+    root = _root(cov_a)
+    product = root.T @ cov_b @ root
     shared = torch.linalg.eigvalsh((product + product.T) / 2).clamp(min=0).sqrt().sum()
     distance = (mean_a - mean_b).square().sum() + cov_a.trace() + cov_b.trace() - 2 * shared
     out: Tensor = distance.clamp(min=0)
