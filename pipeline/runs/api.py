@@ -176,6 +176,7 @@ def generate_motions(
     from motionloom.pipeline.inference.outputs import write_motions
     from motionloom.pipeline.inference.page_words import page_note, page_title
     from motionloom.pipeline.inference.script import Script, read_music
+    from motionloom.pipeline.inference.shipped_models import say_model
     from motionloom.pipeline.inference.shown import FigureOptions
     from motionloom.pipeline.inference.unknown import unknown_captions
 
@@ -204,6 +205,9 @@ def generate_motions(
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     bundle = Bundle.open(folder, choose_device(device))
+    aside = make_console(aside=True)  # standard output is the list of files
+    if (taken := say_model(folder)) is not None:
+        aside.print(taken, markup=False, highlight=False, soft_wrap=True)
     if segments is not None:
         motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
     else:
@@ -216,7 +220,6 @@ def generate_motions(
             sampling=drawing,
             strict=True,
         )
-    aside = make_console(aside=True)  # standard output is the list of files
     said = captions if segments is None else [segment.prompt.text for segment in segments]
     for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
         aside.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
@@ -234,6 +237,9 @@ def generate_motions(
     )
     for path in paths:
         console.print(str(path), markup=False, soft_wrap=True)
+    if "html" in wanted:
+        place = (out / "index.html").resolve()
+        aside.print(f"watch it in a browser: {place}", markup=False, highlight=False, soft_wrap=True)
     return paths
 
 
@@ -370,16 +376,28 @@ def report_run(
     return page
 
 
-def export_run(folder: Path, out: Path, *, half: bool = False, console: Console | None = None) -> Path:
-    """Copy what generation needs into one folder; with `half`, weights in half precision."""
+def export_run(
+    folder: Path,
+    out: Path,
+    *,
+    half: bool = False,
+    sampling: dict[str, Any] | None = None,
+    console: Console | None = None,
+) -> Path:
+    """Copy what generation needs into one folder; with `half`, weights in half precision.
+
+    `sampling` are fields of `SamplingConfig` that motions of this model are drawn with where nobody says
+    otherwise.
+    """
     from motionloom.pipeline.inference.pretrained import write_bundle
 
     console = console or make_console()
+    drawing = SamplingConfig.parse(sampling or {}, "sampling")
     require_folder(out)
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
     with new_folder(out.absolute()) as whole:
-        write_bundle(folder, whole, half=half)
+        write_bundle(folder, whole, half=half, sampling=drawing)
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     console.print(
         f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"',
