@@ -23,8 +23,6 @@ from motionloom.pipeline.store.outside import BUNDLE_FILE
 CARD_FIGURES = "card.json"
 """Beside a model's card: its figures, and what it is in one line."""
 
-_PLACE = "motionloom.models.pretrained"
-
 
 @dataclass(frozen=True)
 class ShippedModel:
@@ -55,8 +53,7 @@ class ShippedModel:
 
 def shipped_models() -> dict[str, ShippedModel]:
     """The models that come with this installation, by name; none where it was made without their weights."""
-    inside = resources.files(_PLACE).iterdir()
-    found = (ShippedModel(place.name, place) for place in inside if (place / BUNDLE_FILE).is_file())
+    found = (ShippedModel(one.name, one) for one in _place().iterdir() if (one / BUNDLE_FILE).is_file())
     return {model.name: model for model in sorted(found, key=lambda model: model.name)}
 
 
@@ -88,6 +85,10 @@ def no_such_model(name: Path | str) -> str:
     return f"{said}; models that come with motionloom: {', '.join(shipped)}"
 
 
+def _place() -> Traversable:
+    return resources.files("motionloom.models.pretrained")
+
+
 def _size(place: Traversable) -> int:
     if isinstance(place, Path):
         return place.stat().st_size if place.is_file() else sum(_size(one) for one in place.iterdir())
@@ -100,7 +101,7 @@ def _unpacked(name: str) -> Path:
     keep = ExitStack()
     atexit.register(keep.close)
     out = Path(keep.enter_context(tempfile.TemporaryDirectory(prefix="motionloom-"))) / name
-    _copy(resources.files(_PLACE) / name, out)
+    _copy(_place() / name, out)
     return out
 
 
