@@ -124,7 +124,7 @@ def generate(
             raise UserError("--stream writes one motion as JSON lines: leave --samples and --format out")
         stream_motion(run_folder, captions or [], out=out, console=make_console(aside=True), **asked)
         return
-    from motionloom.pipeline.runs.api import generate_motions
+    from motionloom.pipeline.runs.generation import generate_motions
 
     files: dict[str, Any] = {} if formats is None else {"formats": formats}
     files["figure"] = {
