@@ -238,7 +238,7 @@ def card_of(
     head = ["right, %", *(f"{title}: {kind}" for title in shares for kind in KINDS)]
     lines = [head, ["---"] * len(head), *rows_of(shares)]
     size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
-    options = "".join(f" --{name.replace('_', '-')} {value:g}" for name, value in sampling.items())
+    options = "".join(f" --{name.replace('_', '-')} {value}" for name, value in sampling.items())
     recommended = bundle.recommended.model_dump(mode="json", exclude_unset=True)
     recipe_file = figures["recipe"]
     return CARD.read_text(encoding="utf-8").format(
@@ -246,7 +246,7 @@ def card_of(
         name=figures["name"],
         description=recipe.description,
         options="" if sampling == recommended else options,
-        sampling=", ".join(f"{name} {value:g}" for name, value in sampling.items())
+        sampling=", ".join(f"{name} {value}" for name, value in sampling.items())
         or "the defaults of sampling",
         fps=bundle.layout.fps,
         bytes=size,

@@ -1,7 +1,7 @@
 """GLB and BVH files in Blender itself: bones where ours are, upright, left on the left, actions, shape keys.
 
-Runs where `MOTIONLOOM_BLENDER` names a Python that has Blender as a module (`pip install bpy` in an environment
-of its own; it wants another Python and numpy than ours).
+Runs where `MOTIONLOOM_BLENDER` names a Python that has Blender as a module: `pip install bpy` in an
+environment of its own.
 """
 
 from __future__ import annotations

@@ -231,7 +231,8 @@ def test_three_js_poses_joints_and_skin_as_the_figure_is(
     assert facts["animations"][0][1] == pytest.approx(39 / FPS)
     gltf = pygltflib.GLTF2().load(written[0])
     body = body_for(written[1][0].skeleton)
-    in_file = [values(gltf, mesh.primitives[0].attributes.POSITION) for mesh in gltf.meshes]
+    lift = [0.0, body.vertices[:, 1].min(), 0.0]
+    in_file = [values(gltf, mesh.primitives[0].attributes.POSITION) + lift for mesh in gltf.meshes]
     rng = np.random.default_rng(0)
     for number, frame in ((0, 0), (0, 13), (0, 37), (1, 5), (1, 29)):
         figure, clip = written[1][number], clips[number]
