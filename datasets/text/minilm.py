@@ -49,7 +49,7 @@ class MiniLm:
         digest = hashlib.sha256()
         for name, value in sorted(self._weights.items()):
             digest.update((_PREFIX + name).encode())
-            digest.update(value.cpu().contiguous().view(-1).view(torch.uint8).numpy())
+            digest.update(value.cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
         return digest.hexdigest()[:12]
 
     @torch.inference_mode()
