@@ -1,16 +1,21 @@
-"""What a model of synthetic clips knows, measured, as the card of its exported folder.
+"""What a model of synthetic clips knows, measured: the card of its exported folder, and its figures again.
 
     motionloom run humantomato-synthetic
-    motionloom export runs/humantomato-synthetic -o model --half
-    python benchmarks/model_card.py runs/humantomato-synthetic model --cfg 1.5 --top-p 0.9
+    motionloom export runs/humantomato-synthetic -o model --half --cfg-scale 1.5 --top-p 0.9
+    python benchmarks/model_card.py model --write
 
-Motions are generated for the test clips' captions, once as they are worded in training and once in other
+The test clips are made here, from the data settings and the seed of the recipe, so nothing is needed but the
+model. Motions are generated for the clips' captions, once as they are worded in training and once in other
 words (`synthetic_wordings.json` beside this script: sentences that the captions of synthetic clips never
 make), and measured on their joints and expressions: does the motion do what the caption says? "Held out" are
 combinations of words that training never showed. Beside them stands another clip's motion, which is what a
 guess gets. The other words were written before the model was first measured on them.
 
-Writes `README.md` (the card) and `card.json` (the figures) into the model's folder.
+With `--write`: `README.md` (the card) and `card.json` (the figures) into the model's folder. Without, what
+the card says is measured again, by the settings that stand there, and compared. A model that comes with the
+package:
+
+    python benchmarks/model_card.py synthetic
 """
 
 from __future__ import annotations
@@ -23,17 +28,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from learning import Shares, judge, test_truths
+from learning import Shares, judge
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.motion.features import face_of
+from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
 from motionloom.datasets.synth.truth import ACTIONS, FACES, HANDS
-from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
 from motionloom.pipeline.inference.unknown import unknown_captions
-from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+
+RECIPE = "humantomato-synthetic"
+KINDS = ("held out", "other")
 
 WORDS = Path(__file__).with_name("synthetic_wordings.json")
 IMPLIED = {"punch": "fist", "wave": "spread"}
@@ -82,7 +94,7 @@ def rows_of(shares: Mapping[str, Shares]) -> list[list[str]]:
     names = [name for name in names if name not in last] + last
     return [
         [name, *(f"{100 * share[kind][name]:.1f}" if name in share[kind] else ""
-                 for share in shares.values() for kind in ("held out", "other"))]
+                 for share in shares.values() for kind in KINDS)]
         for name in names
     ]  # fmt: skip
 
@@ -93,92 +105,166 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
 
 
+def test_clips(recipe: Recipe, most: int) -> tuple[list[Truth], SynthConfig]:
+    """Test clips of a recipe's synthetic data in a fixed order, at most so many, as its shards hold them; and
+    the data's settings."""
+    stage = next((stage for stage in recipe.stages if stage.kind.name == "synth"), None)
+    if stage is None:
+        raise UserError(f"{recipe.name}: has no stage of synthetic clips to be measured on")
+    seed = recipe.seed_of(stage) if stage.config.seed is None else stage.config.seed  # type: ignore[attr-defined]
+    config = SynthConfig.parse({**stage.config.dump(), "seed": seed}, recipe.name)
+    numbers = [index for index in range(config.clips) if split_of(index, config) == "test"]
+    chosen = [numbers[k] for k in np.random.default_rng(0).permutation(len(numbers))[:most]]
+    return [truth_from(make_sample(index, config), config) for index in chosen], config
+
+
+def truth_from(sample: Sample, config: SynthConfig) -> Truth:
+    """One clip with its first captions, cut to whole groups of four frames."""
+    layout = config.motion_layout
+    motion = np.asarray(sample.motion, dtype=np.float32)
+    motion = motion[: len(motion) // 4 * 4]
+    body, caption = motion[:, layout.part("bodyhand")], sample.texts[0].text if sample.texts else ""
+    return Truth(
+        id=sample.meta.id,
+        features=body,
+        joints=joints_of(body, layout),
+        face=face_of(motion, layout) if layout.has("face") else None,
+        caption=caption,
+        face_caption=sample.face_texts[0].text if sample.face_texts else caption,
+        truth=sample.meta.truth,
+    )
+
+
+def noted(model: Path) -> dict[str, Any]:
+    """What the card beside a model holds; empty where there is none."""
+    path = model / CARD_FIGURES
+    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", type=Path, help="its test clips are what is asked for")
-    parser.add_argument("model", type=Path, help="the exported folder")
-    parser.add_argument("--name", help="what the card calls it; default: the recipe's name")
-    parser.add_argument("--clips", type=int, default=10_000, help="test clips, at most")
-    parser.add_argument("--top-p", type=float, default=0.95)
-    parser.add_argument("--cfg", type=float, default=1.0, help="classifier-free guidance of body and hands")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("model", type=Path, help="an exported folder, or the name of a model of the package")
+    parser.add_argument("--write", action="store_true", help="write the card into the model's folder")
+    parser.add_argument("--recipe", help=f"what it was made by; default: as the card says, or {RECIPE}")
+    parser.add_argument("--name", help="what the card calls it; default: the folder's name, or the card's")
+    parser.add_argument("--clips", type=int, help="test clips, at most; default: as the card says, or all")
+    parser.add_argument("--top-p", type=float, help="default: as the card says, or the export")
+    parser.add_argument("--cfg", type=float, help="guidance of body and hands; default: likewise")
+    parser.add_argument("--seed", type=int, help="default: as the card says, or 0")
     parser.add_argument("--licence", default="apache-2.0")
     args = parser.parse_args()
-    data = json.loads((args.run / "stages/data/artifact.json").read_text())["config"]
-    words = json.loads(WORDS.read_text())
-    truths = [truth for truth in test_truths(args.run) if truth.truth]
-    truths = [truths[k] for k in np.random.default_rng(0).permutation(len(truths))[: args.clips]]
-    rng = np.random.default_rng(args.seed)
+    model, console = model_folder(args.model), Console()
+    before = noted(model)
+    recipe = load_recipe(args.recipe or before.get("recipe", RECIPE), strict=False)
+    most = args.clips or before.get("clips", 1_000_000)
+    seed = before.get("seed", 0) if args.seed is None else args.seed
+    words = json.loads(WORDS.read_text(encoding="utf-8"))
+    truths, data = test_clips(recipe, most)
+    rng = np.random.default_rng(seed)
     try:
         other = [words_of(truth.truth or {}, words, rng) for truth in truths]
     except KeyError as error:
         raise UserError(f"{WORDS.name} has no other words for {error}") from None
-    bundle = Bundle.open(args.model)
-    sampling = SamplingConfig(top_p=args.top_p, cfg_scale=args.cfg)
-    fps, hold_out = bundle.layout.fps, data["hold_out"]
+    bundle = Bundle.open(model)
+    asked = {"top_p": args.top_p, "cfg_scale": args.cfg}
+    asked = {name: value for name, value in asked.items() if value is not None}
+    sampling = bundle.drawing(asked or before.get("sampling"))
     said = {
         FAMILIAR: ([t.caption for t in truths], [t.face_caption for t in truths]),
-        OTHER: ([body for body, _ in other], [face for _, face in other]),
+        OTHER: ([body for body, _ in other], [face or body for body, face in other]),
     }
     order = np.random.default_rng(0).permutation(len(truths))
+    fps, hold_out = bundle.layout.fps, data.hold_out
     shares = {GUESS: judge(truths, ((truths[k].joints, truths[k].face) for k in order), fps, hold_out)}
     for title, (captions, faces) in said.items():
-        made = bundle.generate(captions, face=faces, sampling=sampling, seed=args.seed)
+        made = bundle.generate(captions, face=faces, sampling=sampling, seed=seed)
         shares[title] = judge(truths, ((motion.joints, motion.face) for motion in made), fps, hold_out)
-    strange = {title: len(unknown_captions(bundle, captions)) for title, (captions, _) in said.items()}
-    table = Table("right, %", *(f"{title}: {kind}" for title in shares for kind in ("held out", "other")))
+    table = Table("right, %", *(f"{title}: {kind}" for title in shares for kind in KINDS))
     for row in rows_of(shares):
         table.add_row(*row)
-    Console().print(table)
+    console.print(table)
     figures = {
+        "name": args.name or before.get("name", args.model.resolve().name),
+        "description": recipe.description,
+        "recipe": args.recipe or before.get("recipe", RECIPE),
         "clips": len(truths),
-        "sampling": sampling.dump(),
-        "seed": args.seed,
+        "apart": sum(apart(truth, hold_out) for truth in truths),
+        "sampling": sampling.model_dump(mode="json", exclude_unset=True),
+        "seed": seed,
         "right": shares,
-        "unknown": strange,
+        "unknown": {title: len(unknown_captions(bundle, captions)) for title, (captions, _) in said.items()},
     }
-    (args.model / "card.json").write_text(json.dumps(figures, indent=1) + "\n")
-    (args.model / "README.md").write_text(card(args, data, bundle, shares, other, strange, truths))
-    Console().print(str(args.model / "README.md"))
+    if args.write:
+        (model / CARD_FIGURES).write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        card = card_of(figures, recipe, data, bundle, other, model, args.licence)
+        (model / "README.md").write_text(card, encoding="utf-8")
+        console.print(str(model / "README.md"), soft_wrap=True)
+    else:
+        console.print(compared(before, figures), soft_wrap=True)
 
 
-def card(
-    args: argparse.Namespace, data: dict[str, Any], bundle: Bundle, shares: dict[str, Shares],
-    other: list[tuple[str, str]], strange: dict[str, int], truths: list[Truth],
+def apart(truth: Truth, hold_out: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a clip is of a combination that training never showed."""
+    record = truth.truth or {}
+    return any(all(record.get(key) == value for key, value in one.items()) for one in hold_out)
+
+
+def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """One line: how far the figures are from those of the card."""
+    if not before:
+        return "no card here to compare with; --write makes one"
+    if any(before.get(key) != now[key] for key in ("clips", "seed", "sampling", "recipe")):
+        return "not comparable with the card: other clips, seed, sampling or recipe"
+    gaps = {
+        f"{name}, {title}, {kind}": 100 * abs(value - before["right"][title][kind][name])
+        for title, kinds in now["right"].items()
+        for kind, row in kinds.items()
+        for name, value in row.items()
+    }
+    worst = max(gaps, key=lambda where: gaps[where])
+    if gaps[worst] == 0:
+        return f"all {len(gaps)} shares as on the card"
+    return f"{len(gaps)} shares, at most {gaps[worst]:.1f} points from the card ({worst})"
+
+
+def card_of(
+    figures: Mapping[str, Any], recipe: Recipe, data: SynthConfig, bundle: Bundle,
+    other: Sequence[tuple[str, str]], model: Path, licence: str,
 ) -> str:  # fmt: skip
     """The card as Markdown."""
-    recipe = load_recipe(args.run / "recipe.yaml", strict=False)
-    name = args.name or recipe.name
-    head = ["right, %", *(f"{title}: {kind}" for title in shares for kind in ("held out", "other"))]
+    shares, strange, sampling = figures["right"], figures["unknown"], figures["sampling"]
+    head = ["right, %", *(f"{title}: {kind}" for title in shares for kind in KINDS)]
     lines = [head, ["---"] * len(head), *rows_of(shares)]
-    apart = sum(
-        any(all((t.truth or {}).get(k) == v for k, v in c.items()) for c in data["hold_out"]) for t in truths
-    )
-    size = sum(path.stat().st_size for path in args.model.rglob("*") if path.is_file()) / 1e6
-    return CARD.read_text().format(
-        licence=args.licence,
-        name=name,
+    size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
+    options = "".join(f" --{name.replace('_', '-')} {value}" for name, value in sampling.items())
+    recommended = bundle.recommended.model_dump(mode="json", exclude_unset=True)
+    recipe_file = figures["recipe"]
+    return CARD.read_text(encoding="utf-8").format(
+        licence=licence,
+        name=figures["name"],
         description=recipe.description,
-        folder=name,
-        cfg=args.cfg,
-        top_p=args.top_p,
+        options="" if sampling == recommended else options,
+        sampling=", ".join(f"{name} {value}" for name, value in sampling.items())
+        or "the defaults of sampling",
         fps=bundle.layout.fps,
         bytes=size,
-        clips=f"{data['clips']:,}",
-        actions="Actions: " + ", ".join(data["actions"] or ACTIONS),
-        hands=", ".join(data["hand_shapes"] or HANDS[1:]),
+        clips=f"{sum(split_of(k, data) == 'train' for k in range(data.clips)):,}",
+        actions="Actions: " + ", ".join(data.actions or ACTIONS),
+        hands=", ".join(data.hand_shapes or HANDS[1:]),
         faces=", ".join(FACES),
-        count=len(truths),
-        apart=apart,
-        seed=args.seed,
+        count=figures["clips"],
+        apart=figures["apart"],
+        seed=figures["seed"],
         table="\n".join("| " + " | ".join(line) + " |" for line in lines),
         examples="; ".join(f'"{body}"' for body, _ in other[:3]),
         unknown=f"{strange[OTHER]} of these captions and {strange[FAMILIAR]} of the usual it calls unknown.",
-        commands=f"motionloom run {recipe.name}\nmotionloom export runs/{recipe.name} -o model --half",
+        commands=f"motionloom run {recipe_file}\n"
+        f"motionloom export runs/{recipe.name} -o {figures['name']} --half{options}\n"
+        f"python benchmarks/model_card.py {figures['name']} --recipe {recipe_file} --write",
         recipe_seed=recipe.seed,
-        digests="\n".join(f"- `{path}` `{digest}`" for path, digest in digests(args.model).items()),
+        digests="\n".join(f"- `{path}` `{digest}`" for path, digest in digests(model).items()),
     )
 
 

@@ -11,7 +11,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
+
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.synth.generate import synthesize
+from motionloom.pipeline.evaluation.truth import truth_of
+from motionloom.pipeline.runs.recipe import load_recipe
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 SCRIPTS = sorted(FOLDER.glob("*.py"))
@@ -48,6 +54,48 @@ def test_a_benchmark_can_be_loaded(script: Path, monkeypatch: pytest.MonkeyPatch
     module = loaded(script, monkeypatch)
     assert callable(module.main) and module.__doc__
     assert f"benchmarks/{script.name}" in module.__doc__, "its command stands in its docstring"
+
+
+def test_a_models_card_is_measured_on_the_clips_that_a_run_would_hold_back(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Made one by one, without shards: the test split's motions, captions and truths."""
+    card = loaded(FOLDER / "model_card.py", monkeypatch)
+    text = """
+name: held
+seed: 5
+stages:
+  data:
+    kind: synth
+    clips: 30
+    wordings: many
+    test_fraction: 0.2
+    hold_out: [{action: walk}]
+"""
+    (tmp_path / "held.yaml").write_text(text)
+    recipe = load_recipe(tmp_path / "held.yaml")
+    made, config = card.test_clips(recipe, 1000)
+    assert config.seed == 5
+    synthesize(config, tmp_path / "shards", progress=False)
+    dataset = ShardDataset.open(tmp_path / "shards", "test")
+    wanted = {truth.id: truth for truth in (truth_of(dataset, row) for row in range(len(dataset)))}
+    assert {truth.id for truth in made} == set(wanted) and len(made) >= 8
+    for truth in made:
+        for name, value in vars(wanted[truth.id]).items():
+            np.testing.assert_array_equal(getattr(truth, name), value, err_msg=name)
+    few, _ = card.test_clips(recipe, 3)
+    assert [truth.id for truth in few] == [truth.id for truth in made[:3]]
+
+
+def test_figures_of_a_card_are_compared_where_they_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    card = loaded(FOLDER / "model_card.py", monkeypatch)
+    right = {"words": {"other": {"all": 0.5}}}
+    figures = {"clips": 2, "seed": 0, "sampling": {}, "recipe": "r", "right": right}
+    assert card.compared({}, figures).startswith("no card")
+    assert card.compared(figures, figures) == "all 1 shares as on the card"
+    assert card.compared({**figures, "seed": 1}, figures).startswith("not comparable")
+    off = {**figures, "right": {"words": {"other": {"all": 0.75}}}}
+    assert card.compared(figures, off) == "1 shares, at most 25.0 points from the card (all, words, other)"
 
 
 class ReadError(Exception):

@@ -176,11 +176,14 @@ def test_the_sdist_is_the_tree(sdist: Path) -> None:
 
 
 def test_the_wheel_has_every_file_of_the_packages(wheel: Path) -> None:
-    """Recipes, the papers' tables, skeletons, the pages' css, js and html, the marks of typed packages."""
+    """Recipes, the papers' tables, skeletons, models, the pages' css, js and html, the marks of typed
+    packages."""
     with zipfile.ZipFile(wheel) as archive:
         inside = {name for name in archive.namelist() if ".dist-info/" not in name}
     assert inside == {f"motionloom/{name}" for name in files_of(*FOLDERS)}
     kinds = {".py", ".yaml", ".json", ".css", ".js", ".html", ".typed"}
+    if any((ROOT / "models" / "pretrained").glob("*/bundle.json")):
+        kinds |= {".safetensors", ".md"}  # a trained model and its card
     assert {Path(name).suffix or Path(name).name for name in inside} == kinds
 
 

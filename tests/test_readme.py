@@ -176,9 +176,12 @@ def test_inline_make_targets_exist() -> None:
 
 
 def test_first_commands_of_the_readme() -> None:
-    assert [words for where, words in COMMANDS if where.startswith("README")][:2] == [
+    """What the last one makes is judged in tests/pipeline/inference/test_shipped_models.py."""
+    assert [words for where, words in COMMANDS if where.startswith("README")][:4] == [
         ["make", "demo"],
         ["make", "test"],
+        ["pip", "install", "."],
+        ["motionloom", "generate", "synthetic", "a person waves with the left hand"],
     ]
 
 

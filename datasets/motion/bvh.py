@@ -231,11 +231,15 @@ def _hierarchy_lines(skeleton: Skeleton, joint: int, depth: int) -> list[str]:
 
 
 def _euler_degrees(rotations: Floats) -> Floats:
-    """Euler angles [T, N, 3] in degrees, without jumps of whole turns between frames."""
-    import roma
-    import torch
+    """Euler angles [T, N, 3] in degrees, in `WRITTEN_ORDER`, without jumps of whole turns between frames.
 
-    angles = roma.rotmat_to_euler(
-        WRITTEN_ORDER, torch.from_numpy(np.ascontiguousarray(rotations)), degrees=True
-    )
-    return np.unwrap(angles.numpy(), axis=0, period=360.0)
+    R = Rz(a) Rx(b) Ry(c), entry by entry: the libraries that know all orders take a second to import.
+    """
+    level = np.hypot(rotations[..., 0, 1], rotations[..., 1, 1])  # |cos b|
+    first = np.arctan2(-rotations[..., 0, 1], rotations[..., 1, 1])
+    second = np.arctan2(rotations[..., 2, 1], level)
+    third = np.arctan2(-rotations[..., 2, 0], rotations[..., 2, 2])
+    locked = level < 1e-7  # gimbal lock: only a sum of the other two angles counts
+    first = np.where(locked, np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0]), first)
+    angles = np.stack([first, second, np.where(locked, 0.0, third)], axis=-1)
+    return np.unwrap(np.degrees(angles), axis=0, period=360.0)

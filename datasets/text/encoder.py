@@ -13,6 +13,7 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,6 +24,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.text.minilm import MiniLm
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,27 @@ class TextEncoder(Protocol):
 
     def encode(self, captions: Sequence[str]) -> EncodedText:
         """Encode a batch. A caption's result does not depend on its neighbours beyond float noise."""
+
+
+class MiniLmEncoder:
+    """MiniLM as it comes with the installation, without the libraries of other encoders (`minilm.py`)."""
+
+    def __init__(self, folder: Path, device: str = "cpu") -> None:
+        self._model = MiniLm(folder, device)
+        self.dim = self._model.dim
+
+    @cached_property
+    def name(self) -> str:
+        """See `TextEncoder`; made when it is asked for, since it reads all weights."""
+        return f"minilm:{self._model.digest}"
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        """See `TextEncoder`."""
+        return _pack(*self._model(captions))
+
+    def vocabulary(self) -> list[str]:
+        """The pieces its tokenizer knows."""
+        return list(self._model.tokenizer.get_vocab())
 
 
 class SentenceEncoder:
@@ -102,10 +125,10 @@ class ClipEncoder:
         return list(self._tokenizer.get_vocab())
 
 
-def load_text_encoder(spec: str, *, device: str = "cpu") -> SentenceEncoder | ClipEncoder:
+def load_text_encoder(spec: str, *, device: str = "cpu") -> MiniLmEncoder | SentenceEncoder | ClipEncoder:
     """`minilm`, a local model folder, or a name on the Hugging Face hub (only that uses the network)."""
     if spec == "minilm":
-        return SentenceEncoder("minilm", _sentence_model(_minilm_folder(), device=device, local=True))
+        return MiniLmEncoder(_minilm_folder(), device)
     folder = Path(spec).expanduser()
     if folder.is_dir():
         if (folder / "modules.json").exists():

@@ -8,7 +8,19 @@ from typing import Annotated, Any
 import typer
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.cli.options import Device, ModelFolder
+from motionloom.pipeline.cli.options import (
+    CfgScale,
+    DenoisingSteps,
+    Device,
+    DiffusionSampler,
+    FaceCfgScale,
+    ModelFolder,
+    MusicCfgScale,
+    Temperature,
+    TopK,
+    TopP,
+    given,
+)
 from motionloom.pipeline.launch.console import make_console
 
 
@@ -48,30 +60,17 @@ def generate(
     ] = None,
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
-    temperature: Annotated[
-        float, typer.Option(help="0: the likeliest tokens; below 1: safer, above 1: more varied.")
-    ] = 1.0,
-    top_k: Annotated[int, typer.Option(help="Draw from the k likeliest tokens; 0 = all.")] = 0,
-    top_p: Annotated[
-        float, typer.Option(help="Draw from the likeliest tokens of this total probability.")
-    ] = 0.95,
-    cfg_scale: Annotated[float, typer.Option(help="Classifier-free guidance; 1 = off.")] = 1.0,
-    face_cfg_scale: Annotated[
-        float | None, typer.Option(help="Guidance of the face; default: as --cfg-scale.")
-    ] = None,
-    music_cfg_scale: Annotated[
-        float | None, typer.Option(help="Guidance where there is music; default: as --cfg-scale.")
-    ] = None,
+    temperature: Temperature = None,
+    top_k: TopK = None,
+    top_p: TopP = None,
+    cfg_scale: CfgScale = None,
+    face_cfg_scale: FaceCfgScale = None,
+    music_cfg_scale: MusicCfgScale = None,
     face_model: Annotated[
         str | None, typer.Option(help="gpt, vae or diffusion; default: the first the run has.")
     ] = None,
-    sampler: Annotated[
-        str | None, typer.Option(help="Of diffusion models: ddpm (default), ddim or dpm++.")
-    ] = None,
-    denoising_steps: Annotated[
-        int | None,
-        typer.Option(help="Denoising steps of diffusion models, default 50, at most those trained (1000)."),
-    ] = None,
+    sampler: DiffusionSampler = None,
+    denoising_steps: DenoisingSteps = None,
     rigid: Annotated[
         bool, typer.Option(help="Show bones of constant length; without, the generated joints as they are.")
     ] = True,
@@ -89,6 +88,8 @@ def generate(
 ) -> None:
     """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch; also GLB.
 
+    Example: `motionloom generate synthetic "a person waves with the left hand"`
+
     Example: `motionloom generate runs/humantomato-tiny "a person waves" --face "a happy face" -o out`
 
     Example: `motionloom generate runs/ude-tiny --audio song.ogg --samples 3 -o dances`
@@ -97,26 +98,23 @@ def generate(
 
     Example: `motionloom generate runs/humantomato-tiny --stream "a person walks" --seconds 60 -o walk.jsonl`
     """
-    of_models = {
-        "face_cfg_scale": face_cfg_scale,
-        "music_cfg_scale": music_cfg_scale,
-        "sampler": sampler,
-        "denoising_steps": denoising_steps,
-    }
     asked: dict[str, Any] = {
         "face": face,
         "audio": audio or [],
         "script": script,
         "seconds": seconds,
         "seed": seed,
-        "sampling": {
-            "temperature": temperature,
-            "top_k": top_k,
-            "top_p": top_p,
-            "cfg_scale": cfg_scale,
-            "face_model": face_model,
-            **{name: value for name, value in of_models.items() if value is not None},
-        },
+        "sampling": given(
+            temperature=temperature,
+            top_k=top_k,
+            top_p=top_p,
+            cfg_scale=cfg_scale,
+            face_cfg_scale=face_cfg_scale,
+            music_cfg_scale=music_cfg_scale,
+            face_model=face_model,
+            sampler=sampler,
+            denoising_steps=denoising_steps,
+        ),
         "device": device,
     }
     if stream:
@@ -126,7 +124,7 @@ def generate(
             raise UserError("--stream writes one motion as JSON lines: leave --samples and --format out")
         stream_motion(run_folder, captions or [], out=out, console=make_console(aside=True), **asked)
         return
-    from motionloom.pipeline.runs.api import generate_motions
+    from motionloom.pipeline.runs.generation import generate_motions
 
     files: dict[str, Any] = {} if formats is None else {"formats": formats}
     files["figure"] = {

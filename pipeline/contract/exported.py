@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.registry import stage_kind
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Role
 from motionloom.pipeline.store.outside import BUNDLE_FILE
 from motionloom.pipeline.store.weights import LayoutFacts
@@ -31,6 +34,8 @@ class ExportedStage(Config):
     config: dict[str, Any]
     inputs: dict[str, str]
     """Role -> name of another stage of the export."""
+    sha256: dict[str, str] = Field(default_factory=dict)
+    """File of weights -> its sha256; what stands here is compared when the stage is opened."""
 
 
 class BundleFile(Config):
@@ -41,6 +46,8 @@ class BundleFile(Config):
     generators: tuple[str, ...]
     """Stages that generate, the default first."""
     stages: dict[str, ExportedStage] = Field(default_factory=dict)
+    sampling: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `SamplingConfig` that its motions are best drawn with, where nobody says otherwise."""
 
 
 def open_exported(folder: Path) -> list[Finished]:
@@ -54,6 +61,11 @@ def open_exported(folder: Path) -> list[Finished]:
                 f"run again"
             )
     return makers
+
+
+def exported_sampling(folder: Path) -> SamplingConfig:
+    """How an export's motions are best drawn; fields of which it says nothing are not set."""
+    return SamplingConfig.parse(_read(folder).sampling, f"{folder / BUNDLE_FILE}: sampling")
 
 
 def exported_stage(folder: Path) -> Finished:
@@ -90,6 +102,7 @@ def _build(
             f"{path}: stages.{name} was made by version {entry.version} of kind {kind.name}, which "
             f"is now version {kind.version}; run and export the recipe again"
         )
+    _require_whole(folder / name, entry.sha256, path)
     inputs = {
         role: _build(folder, facts, source, (*above, name), made) for role, source in entry.inputs.items()
     }
@@ -103,6 +116,19 @@ def _build(
             )
     made[name] = Finished(name, kind, config, folder / name, inputs, exported=True)
     return made[name]
+
+
+def _require_whole(stage: Path, digests: Mapping[str, str], path: Path) -> None:
+    """Refuse weights that are not those that were exported; files that are missing say so when they load."""
+    for name, digest in digests.items():
+        if Path(name).name != name:
+            raise UserError(
+                f"{path}: stages.{stage.name}.sha256 names {name!r}, which is no file of its folder"
+            )
+        if (stage / name).is_file() and sha256_of(stage / name) != digest:
+            raise UserError(
+                f"{stage / name}: is not the file that was exported (another sha256); copy the folder again"
+            )
 
 
 def _format_of(path: Path) -> Any:

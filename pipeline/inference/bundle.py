@@ -17,13 +17,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.places import no_such_folder
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.motion.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import sample_seeds
-from motionloom.pipeline.contract.exported import open_exported
+from motionloom.pipeline.contract.exported import exported_sampling, open_exported
 from motionloom.pipeline.contract.generation import (
     DrivenGenerator,
     GenerationRequest,
@@ -46,6 +45,7 @@ from motionloom.pipeline.inference.requests import (
     sampling_of,
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
+from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model, say_model
 from motionloom.pipeline.render.score import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.outside import BUNDLE_FILE, owner_of
@@ -63,10 +63,14 @@ _BEYOND = 0.5
 class Bundle:
     """The generators of a model, loaded at once so that a broken one is found first, all on one device."""
 
-    def __init__(self, stages: Sequence[Finished], shelf: Shelf) -> None:
+    def __init__(
+        self, stages: Sequence[Finished], shelf: Shelf, recommended: SamplingConfig | None = None
+    ) -> None:
         self.stages = tuple(stages)
         """The stages that generate, the default of each kind first."""
         self.shelf = shelf
+        self.recommended = recommended or SamplingConfig()
+        """How its motions are best drawn; fields that are not set here are nobody's recommendation."""
         self._generators: dict[Path, MotionGenerator] = {}
         self._encoders: dict[Path, PromptEncoder] = {}
         for stage in self.stages:
@@ -76,15 +80,18 @@ class Bundle:
             raise UserError("no finished stage here generates body motion; run the recipe to the end first")
 
     @staticmethod
-    def open(folder: Path, device: torch.device = CPU) -> Bundle:
-        """Open a run folder or an exported folder."""
+    def open(name: Path | str, device: torch.device = CPU) -> Bundle:
+        """Open a run folder, an exported folder, or a model that comes with the package, by its name."""
+        folder = model_folder(name)
         if (folder / BUNDLE_FILE).is_file():
-            return Bundle._of(folder, open_exported(folder), device)
+            return Bundle._of(folder, open_exported(folder), device, exported_sampling(folder))
         if not (folder / "recipe.yaml").is_file():
             if not folder.exists():
-                raise UserError(no_such_folder(folder))
+                raise UserError(no_such_model(name))
+            said = say_model(name)
             raise UserError(
                 f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no {BUNDLE_FILE})"
+                + ("" if said is None else "; the model of this name is taken where no such folder is")
             )
         return Bundle.from_run(folder, device)
 
@@ -97,9 +104,14 @@ class Bundle:
         return Bundle._of(run, makers, device)
 
     @staticmethod
-    def _of(folder: Path, stages: Sequence[Finished], device: torch.device) -> Bundle:
+    def _of(
+        folder: Path,
+        stages: Sequence[Finished],
+        device: torch.device,
+        recommended: SamplingConfig | None = None,
+    ) -> Bundle:
         try:
-            return Bundle(stages, Shelf(device))
+            return Bundle(stages, Shelf(device), recommended)
         except UserError as error:
             if str(error).startswith(str(folder)):
                 raise
@@ -173,6 +185,11 @@ class Bundle:
         frames = self.generator.max_frames
         return math.inf if frames is None else frames / self.layout.fps
 
+    def drawing(self, given: SamplingConfig | Mapping[str, Any] | None = None) -> SamplingConfig:
+        """How to draw: the fields that are given, else those that the model recommends."""
+        named = [config.model_dump(exclude_unset=True) for config in (self.recommended, sampling_of(given))]
+        return SamplingConfig.parse({**named[0], **named[1]}, "sampling")
+
     def generate(
         self,
         captions: Sequence[str] | None = None,
@@ -200,6 +217,7 @@ class Bundle:
         if strict:
             require_words(faces or [], "face")
             require_used(self, faces, sampling)
+        sampling = self.drawing(sampling)
         prompts = prompts_of(texts, faces, sounds, music)
         require_driven(self.generator, prompts)
         frames = self._frames(seconds, prompts)
@@ -221,7 +239,7 @@ class Bundle:
         sampling: SamplingConfig | Mapping[str, Any] | None = None,
     ) -> list[GeneratedMotion]:
         """One motion driven by segments of text and music in turn, and other samples of it (`script.py`)."""
-        sampling, generator, fps = sampling_of(sampling), self.generator, self.layout.fps
+        sampling, generator, fps = self.drawing(sampling), self.generator, self.layout.fps
         require_seed(seed)
         if not isinstance(generator, DrivenGenerator):
             raise UserError(

@@ -4,23 +4,33 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.exported import FORMAT, BundleFile, ExportedStage
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.outside import BUNDLE_FILE
-from motionloom.pipeline.store.weights import LayoutFacts
+from motionloom.pipeline.store.weights import LayoutFacts, halve_weights
 
 
-def write_exported(stages: Iterable[Finished], layout: LayoutFacts, skeleton: Skeleton, out: Path) -> None:
+def write_exported(
+    stages: Iterable[Finished],
+    layout: LayoutFacts,
+    skeleton: Skeleton,
+    out: Path,
+    *,
+    half: bool = False,
+    sampling: Mapping[str, Any] | None = None,
+) -> None:
     """Copy what the generators `stages` need to load into `out`; `bundle.json` is written last.
 
-    Stages of other runs come along like the run's own, so an export is whole in itself.
+    Stages of other runs come along like the run's own, so an export is whole in itself. With `half`, weights
+    as 16 bits; `sampling` are fields of `SamplingConfig` to draw with where nobody says otherwise.
     """
     makers = list(stages)
     needed: dict[Path, Finished] = {}
@@ -33,6 +43,8 @@ def write_exported(stages: Iterable[Finished], layout: LayoutFacts, skeleton: Sk
         name = names[folder]
         try:
             stage.kind.export(stage, out / name)
+            if half and (weights := out / name / "model.safetensors").is_file():
+                halve_weights(weights)
         except BaseException:
             for made in (*entries, name):  # nothing that looks like a model is left
                 shutil.rmtree(out / made, ignore_errors=True)
@@ -43,6 +55,7 @@ def write_exported(stages: Iterable[Finished], layout: LayoutFacts, skeleton: Sk
             version=stage.kind.version,
             config=stage.kind.exported_config(stage.config).dump(),
             inputs={role: names[source.folder] for role, source in stage.inputs.items() if role in roles},
+            sha256={path.name: sha256_of(path) for path in sorted((out / name).glob("*.safetensors"))},
         )
     write_json(out / "skeleton.json", _plain(skeleton))
     facts = BundleFile(
@@ -50,6 +63,7 @@ def write_exported(stages: Iterable[Finished], layout: LayoutFacts, skeleton: Sk
         layout=layout,
         generators=tuple(names[stage.folder] for stage in makers),
         stages=entries,
+        sampling=dict(sampling or {}),
     )
     write_json(out / BUNDLE_FILE, facts.dump())
 

@@ -1,6 +1,6 @@
 """`MotionModel`: a trained model in one folder, saved, loaded and shared through the hub.
 
-    model = MotionModel.from_pretrained("exported")        # a folder, or a name on the Hugging Face hub
+    model = MotionModel.from_pretrained("synthetic")       # a model of the package, a folder, or a hub's name
     motions = model.generate(["a person waves"], seed=1)
     motions[0].joints                                      # [T, N, 3] metres
 
@@ -20,22 +20,24 @@ import torch
 from huggingface_hub import ModelHubMixin, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
-from motionloom.datasets.base.places import hub_is_away, no_such_folder, require_hub_name
+from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.streaming import StreamConfig
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.exported import write_exported
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.requests import caption_list
+from motionloom.pipeline.inference.requests import caption_list, require_used, sampling_of
 from motionloom.pipeline.inference.script import Script
+from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
 from motionloom.pipeline.inference.stream_request import stream_of
 from motionloom.pipeline.inference.streaming import MotionStream
 from motionloom.pipeline.inference.unknown import unknown_captions
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.outside import BUNDLE_FILE
-from motionloom.pipeline.store.weights import LayoutFacts, halve_weights
+from motionloom.pipeline.store.weights import LayoutFacts
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -53,23 +55,25 @@ class MotionModel(
     """Captions, music or both to whole-body motions."""
 
     def __init__(self, folder: Path | str, device: str | torch.device = "auto") -> None:
-        self.folder = Path(folder)
+        self.folder = model_folder(folder)
         self.bundle = Bundle.open(self.folder, choose_device(device))
         # The mixin would write our argument, a local path, into the config.json that the hub wants.
         self._hub_mixin_config = dict(_HUB_CONFIG)
 
     @classmethod
     def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> MotionModel:
-        """A folder, or a name on the hub (`owner/name`).
+        """A folder, a model that comes with the package, or a name on the hub (`owner/name`).
 
         `options` are `device` (auto: a GPU if there is one; cpu, cuda, cuda:N) and the hub's (revision,
         token, local_files_only).
         """
         name = pretrained_model_name_or_path
-        if Path(name).is_dir():  # the hub's own way in warns of a run folder, which has no config.json
+        if model_folder(
+            name
+        ).is_dir():  # the hub's own way in warns of a run folder, which has no config.json
             return cls(name, options.get("device", "auto"))
         if isinstance(name, Path) or "/" not in name:
-            raise UserError(no_such_folder(Path(name)))
+            raise UserError(no_such_model(name))
         require_hub_name(name)
         away = hub_is_away()
         if away:
@@ -97,14 +101,19 @@ class MotionModel(
         A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
         a motion is as long as its sound, or else the model decides. `sampling` is a `SamplingConfig` or a
         mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused; of a caption
-        that is far from all it was trained on, it warns.
+        that is far from all it was trained on, it warns. What `sampling` leaves out is as the model's export
+        recommends, or the default.
         """
-        for unknown in unknown_captions(self.bundle, caption_list(captions or ()), caption_list(face or ())):
+        for unknown in self.unknown(caption_list(captions or ()), caption_list(face or ())):
             warnings.warn(str(unknown), stacklevel=2)
         return self.bundle.generate(
             captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
             sampling=sampling, strict=True,
         )  # fmt: skip
+
+    def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
+        """Captions that are far from all that it was trained on, and what it knows nearest to each."""
+        return unknown_captions(self.bundle, captions, face)
 
     def perform(
         self,
@@ -149,10 +158,12 @@ class MotionModel(
                 the same seed and length, as far as the network's block goes.
             sampling: As of `generate`.
             streaming: How much at a time: a `StreamConfig` or a mapping like `{"chunk_frames": 4}`.
+
+        As `generate`, it warns of a caption that the model does not know, when its turn has come.
         """
         return stream_of(
             self.bundle, captions, face=face, sound=sound, seconds=seconds, seed=seed,
-            sampling=sampling, streaming=streaming,
+            sampling=sampling, streaming=streaming, notice=_warn,
         )  # fmt: skip
 
     @property
@@ -201,13 +212,25 @@ class MotionModel(
         return cls(folder, device)
 
 
-def write_bundle(run: Path, out: Path, *, half: bool = False) -> None:
-    """Copy what generation needs of a run's finished stages into `out`; with `half`, weights as 16 bits."""
-    bundle = Bundle.from_run(run)
+def _warn(unknown: Unknown) -> None:
+    """Of a stream's caption; the place of the warning is the loop that takes the chunks."""
+    warnings.warn(str(unknown), stacklevel=6)
+
+
+def write_bundle(
+    run: Path, out: Path, *, half: bool = False, sampling: SamplingConfig | Mapping[str, Any] | None = None
+) -> None:
+    """Copy what generation needs of a run's finished stages into `out`; with `half`, weights as 16 bits.
+
+    What is set of `sampling` goes with the model: motions are drawn so where nobody says otherwise.
+    """
+    bundle, drawing = Bundle.from_run(run), sampling_of(sampling)
+    require_used(bundle, None, drawing)
     for stage in bundle.stages:
         bundle.of(stage)  # opens every stage, so a broken one is found before anything is copied
     out.mkdir(parents=True, exist_ok=True)
-    write_exported(bundle.stages, LayoutFacts.of(bundle.layout), bundle.layout.skeleton, out)
-    for weights in sorted(out.glob("*/model.safetensors")) if half else ():
-        halve_weights(weights)
+    write_exported(
+        bundle.stages, LayoutFacts.of(bundle.layout), bundle.layout.skeleton, out,
+        half=half, sampling=drawing.model_dump(mode="json", exclude_unset=True),
+    )  # fmt: skip
     write_json(out / "config.json", _HUB_CONFIG)

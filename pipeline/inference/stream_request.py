@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.requests import require_driven, require_used, sampling_of
 from motionloom.pipeline.inference.script import DrivenSegment, Script
 from motionloom.pipeline.inference.streaming import MotionStream
+from motionloom.pipeline.store.known_captions import Unknown
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -32,13 +33,14 @@ def stream_of(
     seed: int = 0,
     sampling: SamplingConfig | Mapping[str, Any] | None = None,
     streaming: StreamConfig | Mapping[str, Any] | None = None,
+    notice: Callable[[Unknown], object] | None = None,
 ) -> MotionStream:
-    """A stream of `MotionModel.stream`'s arguments."""
+    """A stream of `MotionModel.stream`'s arguments; `notice` is given captions that are unknown."""
     drawing = sampling_of(sampling)
     require_used(bundle, [face] if face else None, drawing)
     segments = segments_of(bundle, captions, face=face, sound=sound, seconds=seconds)
     config = StreamConfig.parse({} if streaming is None else streaming, "streaming")
-    return MotionStream(bundle, segments, seed=seed, sampling=drawing, config=config)
+    return MotionStream(bundle, segments, seed=seed, sampling=drawing, config=config, notice=notice)
 
 
 def segments_of(

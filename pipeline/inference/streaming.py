@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +32,9 @@ from motionloom.pipeline.inference.bundle import Bundle, split_columns
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import require_driven, require_seed
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames
+from motionloom.pipeline.inference.unknown import unknown_captions
 from motionloom.pipeline.render.score import Driver, Segment
+from motionloom.pipeline.store.known_captions import Unknown
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ class MotionStream(Iterator[MotionChunk]):
         seed: Equal seeds, segments and settings give equal motions.
         sampling: How tokens are drawn.
         config: How much at a time.
+        notice: Is given each caption that the model does not know, once, when its segment begins.
     """
 
     def __init__(
@@ -110,11 +113,15 @@ class MotionStream(Iterator[MotionChunk]):
         seed: int,
         sampling: SamplingConfig,
         config: StreamConfig,
+        notice: Callable[[Unknown], object] | None = None,
     ) -> None:
         require_seed(seed)
         self.layout, self.seed = bundle.layout, seed
         seeds = sample_seeds(seed, 2)
         self._segments, self._said = segments, deque[DrivenSegment]()
+        sampling = bundle.drawing(sampling)
+        self._bundle, self._face_model = bundle, sampling.face_model
+        self._notice, self._noticed = notice, set[str]()
         self._body = _Maker(bundle, bundle.main, seeds[0], sampling, config)
         face = _streaming_face(bundle, sampling)
         self._face = None if face is None else _Maker(bundle, face, seeds[1], sampling, config)
@@ -198,9 +205,19 @@ class MotionStream(Iterator[MotionChunk]):
         self._left = None if frames is None else frames // unit
         self._number += 1
         self._bounds.append((self._body.groups * unit, segment.prompt))
+        self._look(segment.prompt)
         self._body.condition(segment.prompt, segment.prompt.text)
         if self._face is not None:
             self._face.condition(segment.prompt, segment.prompt.words)
+
+    def _look(self, prompt: Prompt) -> None:
+        """Give notice of words that the model does not know."""
+        if self._notice is None:
+            return
+        for unknown in unknown_captions(self._bundle, [prompt.text], [prompt.face_text], self._face_model):
+            if unknown.caption not in self._noticed:
+                self._noticed.add(unknown.caption)
+                self._notice(unknown)
 
     def _check(self, segment: DrivenSegment, number: int) -> int | None:
         """Its frames; None without an end."""

@@ -1,4 +1,4 @@
-"""The Python API behind the commands: run a recipe, generate, evaluate, report, export.
+"""The Python API behind the commands: run a recipe, evaluate, report, export.
 
 Without a console they speak on standard output.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -19,8 +19,6 @@ from motionloom.pipeline.contract.lookup import finished_stages, preview_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, Shelf, Stage, StageContext
 from motionloom.pipeline.contract.units import WORK
-from motionloom.pipeline.inference.formats import Format
-from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.launch.team import Team
@@ -37,7 +35,6 @@ from motionloom.pipeline.runs.graph import (
 from motionloom.pipeline.runs.perform import perform
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.replace import replaced_stages, require_asked, say_replaced, started_trainings
-from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.outside import owner_of
@@ -148,93 +145,6 @@ def _say_estimate(recipe: Recipe, console: Console, todo: Sequence[Stage] | None
             console.print(str(error), markup=False)
             return
     console.print(estimate_table(estimate(recipe, {stage.name for stage in todo})))
-
-
-def generate_motions(
-    folder: Path,
-    captions: Sequence[str] = (),
-    *,
-    face: Sequence[str] | None = None,
-    audio: Sequence[Path] = (),
-    script: Path | None = None,
-    samples: int = 1,
-    out: Path,
-    formats: str = "npz,bvh,mp4,html",
-    seconds: float | None = None,
-    seed: int = 0,
-    sampling: dict[str, Any] | None = None,
-    figure: dict[str, Any] | None = None,
-    device: str = "auto",
-    console: Console,
-) -> list[Path]:
-    """Generate and write; returns the paths. `device`: auto, cpu, cuda or cuda:N.
-
-    From captions, sound files, or both side by side (the first caption with the first file, and so on), or
-    from one script. `samples` motions of each. `figure` are the keys of `FigureOptions`.
-    """
-    from motionloom.pipeline.inference.bundle import Bundle
-    from motionloom.pipeline.inference.outputs import write_motions
-    from motionloom.pipeline.inference.page_words import page_note, page_title
-    from motionloom.pipeline.inference.script import Script, read_music
-    from motionloom.pipeline.inference.shown import FigureOptions
-    from motionloom.pipeline.inference.unknown import unknown_captions
-
-    if not captions and not audio and script is None:
-        raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
-    if script is not None and (captions or audio or seconds is not None or face):
-        raise UserError("--script says everything: leave captions, --face, --audio and --seconds out")
-    if samples < 1:
-        raise UserError(f"--samples {samples}: take 1 or more")
-    wanted = [f.strip() for f in formats.split(",") if f.strip()]
-    for name in wanted:
-        if name not in get_args(Format):
-            raise UserError(f"--format {name}: no such format{nearest(name, get_args(Format))}")
-    if not wanted:
-        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4, html, glb, smplx or arkit")
-    # All that needs no model is checked before one is opened.
-    require_words(caption_list(captions))
-    require_seed(seed)
-    require_folder(out)
-    drawing = SamplingConfig.parse(sampling or {}, "sampling")
-    posing = FigureOptions.parse(figure or {}, "figure")
-    if posing.body_model is not None and "smplx" not in wanted:
-        raise UserError("--body-model is what --format smplx is made for: name that format too")
-    if posing.arkit_bases is not None and "arkit" not in wanted:
-        raise UserError("--arkit-bases is what --format arkit is made by: name that format too")
-    segments = None if script is None else Script.read(script).open(script.parent, str(script))
-    sounds = [read_music(path) for path in audio]
-    bundle = Bundle.open(folder, choose_device(device))
-    if segments is not None:
-        motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
-    else:
-        motions = bundle.generate(
-            [text for text in captions for _ in range(samples)] or None,
-            face=face and [text for text in face for _ in range(samples)],
-            sounds=[sound for sound in sounds for _ in range(samples)] or None,
-            seconds=seconds,
-            seed=seed,
-            sampling=drawing,
-            strict=True,
-        )
-    aside = make_console(aside=True)  # standard output is the list of files
-    said = captions if segments is None else [segment.prompt.text for segment in segments]
-    for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
-        aside.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
-    title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
-    note = page_note(len(motions), folder.resolve().name, seed)
-    paths = write_motions(
-        out,
-        motions,
-        wanted,  # type: ignore[arg-type]
-        title=title,
-        note=note,
-        seed=seed,
-        figure=posing,
-        say=lambda line: aside.print(line, soft_wrap=True, markup=False),
-    )
-    for path in paths:
-        console.print(str(path), markup=False, soft_wrap=True)
-    return paths
 
 
 def _stages_again(
@@ -370,16 +280,28 @@ def report_run(
     return page
 
 
-def export_run(folder: Path, out: Path, *, half: bool = False, console: Console | None = None) -> Path:
-    """Copy what generation needs into one folder; with `half`, weights in half precision."""
+def export_run(
+    folder: Path,
+    out: Path,
+    *,
+    half: bool = False,
+    sampling: dict[str, Any] | None = None,
+    console: Console | None = None,
+) -> Path:
+    """Copy what generation needs into one folder; with `half`, weights in half precision.
+
+    `sampling` are fields of `SamplingConfig` that motions of this model are drawn with where nobody says
+    otherwise.
+    """
     from motionloom.pipeline.inference.pretrained import write_bundle
 
     console = console or make_console()
+    drawing = SamplingConfig.parse(sampling or {}, "sampling")
     require_folder(out)
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
     with new_folder(out.absolute()) as whole:
-        write_bundle(folder, whole, half=half)
+        write_bundle(folder, whole, half=half, sampling=drawing)
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     console.print(
         f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"',

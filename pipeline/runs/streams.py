@@ -6,7 +6,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -23,6 +23,7 @@ from motionloom.pipeline.store.files import require_file_place
 if TYPE_CHECKING:
     from motionloom.pipeline.inference.bundle import Bundle
     from motionloom.pipeline.inference.streaming import MotionStream
+    from motionloom.pipeline.store.known_captions import Unknown
 
 STDIN = "-"
 """The caption that stands for the lines of standard input."""
@@ -52,6 +53,7 @@ def stream_motion(
     """
     from motionloom.pipeline.inference.bundle import Bundle
     from motionloom.pipeline.inference.script import Script, read_music
+    from motionloom.pipeline.inference.shipped_models import say_model
     from motionloom.pipeline.inference.stream_lines import frame_lines, heading
     from motionloom.pipeline.inference.stream_request import stream_of
     from motionloom.pipeline.inference.streaming import MotionStream
@@ -74,16 +76,25 @@ def stream_motion(
     sound = read_music(audio[0]) if audio else None
     opened = None if script is None else Script.read(script).open(script.parent, str(script))
     bundle = Bundle.open(folder, choose_device(device))
+    if (taken := say_model(folder)) is not None:
+        console.print(taken, markup=False, highlight=False, soft_wrap=True)
+
+    def notice(unknown: Unknown) -> None:
+        console.print(f"note: {unknown}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+
     config, words = StreamConfig(), face[0] if face else ""
     live = list(captions) == [STDIN] and seconds is None
     if opened is not None:
-        stream = MotionStream(bundle, iter(opened), seed=seed, sampling=drawing, config=config)
+        stream = MotionStream(
+            bundle, iter(opened), seed=seed, sampling=drawing, config=config, notice=notice
+        )  # fmt: skip
     elif list(captions) == [STDIN]:
-        stream = _of_lines(bundle, given or sys.stdin, seconds, seed, drawing, console)
+        stream = _of_lines(bundle, given or sys.stdin, seconds, seed, drawing, console, notice)
     else:
         asked = (captions[0] if captions else None) if len(captions) < 2 else list(captions)
         stream = stream_of(
-            bundle, asked, face=words, sound=sound, seconds=seconds, seed=seed, sampling=drawing
+            bundle, asked, face=words, sound=sound, seconds=seconds, seed=seed, sampling=drawing,
+            notice=notice,
         )  # fmt: skip
     with ExitStack() as stack:
         file: TextIO = sys.stdout if out is None else stack.enter_context(out.open("w", encoding="utf-8"))
@@ -118,17 +129,18 @@ def _of_lines(
     seed: int,
     sampling: SamplingConfig,
     console: Console,
+    notice: Callable[[Unknown], object],
 ) -> MotionStream:
     """A stream whose captions are lines, read as they come."""
     from motionloom.pipeline.inference.stream_request import stream_of
 
     lines: Iterator[str] = (line.strip() for line in given if line.strip())
     if seconds is not None:
-        return stream_of(bundle, lines, seconds=seconds, seed=seed, sampling=sampling)
+        return stream_of(bundle, lines, seconds=seconds, seed=seed, sampling=sampling, notice=notice)
     first = next(lines, None)
     if first is None:
         raise UserError("standard input has no caption; write one a line")
-    stream = stream_of(bundle, first, seed=seed, sampling=sampling)
+    stream = stream_of(bundle, first, seed=seed, sampling=sampling, notice=notice)
 
     def listen() -> None:
         for line in lines:

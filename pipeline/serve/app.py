@@ -25,7 +25,7 @@ from motionloom.pipeline.inference.pretrained import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
 from motionloom.pipeline.serve.config import ServeConfig
 from motionloom.pipeline.serve.guard import Guard
-from motionloom.pipeline.serve.requests import Answer, MotionRequest, lines, make, stream
+from motionloom.pipeline.serve.requests import Answer, MotionRequest, lines, make, notes_of, stream
 from motionloom.pipeline.serve.sounds import Sounds
 from motionloom.pipeline.serve.work import Busy, Stopped, Worker
 
@@ -96,6 +96,7 @@ class Site:
                 "joint_names": list(skeleton.joints),
                 "parents": [int(parent) for parent in skeleton.parents],
                 "settings": sorted(bundle.generator.settings),
+                "sampling": bundle.recommended.model_dump(mode="json", exclude_unset=True),
                 "limits": {
                     "seconds": longest,
                     "caption": limits.max_caption,
@@ -126,7 +127,7 @@ class Site:
         def work() -> None:
             try:
                 made = stream(self.model, asked, sound, self.config)
-                for piece in lines(made, asked, self.name):
+                for piece in lines(made, asked, self.name, notes_of(self.model, asked)):
                     loop.call_soon_threadsafe(pieces.put_nowait, piece)
                     if gone or self.worker.stopped:
                         break

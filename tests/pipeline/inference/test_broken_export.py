@@ -233,3 +233,47 @@ def test_seeds_go_by_the_place_in_the_list(whole: Path) -> None:
     for given in ("wave", ["wave", ""]):
         with pytest.raises(UserError, match="captions"):
             model.generate(given, seconds=1.0)
+
+
+def test_weights_that_were_changed_are_refused(model: Path) -> None:
+    """One number of a network is another: it would load, and draw other motions."""
+    path = model / "gpt" / "model.safetensors"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(UserError, match=r"gpt/model\.safetensors: is not the file that was exported"):
+        Bundle.open(model)
+    change(model / "bundle.json", lambda f: f["stages"]["gpt"].update(sha256={}))
+    assert Bundle.open(model).generator.method == "gpt", "exports of before have no sha256"
+    change(
+        model / "bundle.json", lambda f: f["stages"]["gpt"].update(sha256={"../stats/stats.safetensors": ""})
+    )
+    with pytest.raises(UserError, match="no file of its folder"):
+        Bundle.open(model)
+
+
+def test_an_export_draws_as_it_recommends(small_run: Any, call: Any, tmp_path: Path) -> None:
+    """By command and from Python; what is asked for goes first, field by field."""
+    folder = tmp_path / "own"
+    assert (
+        call("export", small_run.folder, "-o", folder, "--cfg-scale", "1.5", "--temperature", "0").code == 0
+    )
+    model = MotionModel.from_pretrained(folder, device="cpu")
+    assert model.bundle.recommended.model_dump(exclude_unset=True) == {"cfg_scale": 1.5, "temperature": 0.0}
+    mixed = model.bundle.drawing({"cfg_scale": 2.0, "top_p": 0.8})
+    assert mixed.model_dump(exclude_unset=True) == {"cfg_scale": 2.0, "temperature": 0.0, "top_p": 0.8}
+    words = {"captions": ["a person waves"], "seconds": 1.0, "seed": 4}
+    plain = Bundle.open(small_run.folder)
+    (wanted,) = plain.generate(**words, sampling={"cfg_scale": 1.5, "temperature": 0.0})
+    (made,) = model.generate(**words)
+    np.testing.assert_array_equal(made.joints, wanted.joints)
+    (drawn,) = plain.generate(**words)
+    assert not np.array_equal(made.joints, drawn.joints)
+    said = call(
+        "generate", folder, "a person waves", "--seconds", "1", "--seed", "4", "-f", "npz", "-o", tmp_path
+    )
+    with np.load(said.out.split()[0], allow_pickle=False) as file:
+        np.testing.assert_array_equal(file["features"], wanted.features)
+    change(folder / "bundle.json", lambda facts: facts.update(sampling={"cfg_scael": 1}))
+    with pytest.raises(UserError, match=r"bundle.json: sampling: unknown key 'cfg_scael'; did you mean"):
+        Bundle.open(folder)

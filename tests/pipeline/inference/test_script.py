@@ -15,7 +15,7 @@ from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.script import DrivenSegment, Script, ScriptSegment, read_music, sound_of
-from motionloom.pipeline.runs.api import generate_motions
+from motionloom.pipeline.runs.generation import generate_motions
 
 Write = Callable[..., Path]
 

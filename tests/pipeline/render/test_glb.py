@@ -110,7 +110,9 @@ def test_meshes_are_the_body_and_joints_bind_at_rest(written: tuple[Path, list[R
     parts = [mesh.primitives[0] for mesh in gltf.meshes]
     places = np.concatenate([values(gltf, part.attributes.POSITION) for part in parts])
     assert len(places) == len(body.vertices)
-    np.testing.assert_allclose(np.sort(places, axis=0), np.sort(body.vertices, axis=0), atol=1e-6)
+    lift = [0.0, -body.vertices[:, 1].min(), 0.0]  # at rest it stands on the floor
+    np.testing.assert_allclose(np.sort(places, axis=0), np.sort(body.vertices + lift, axis=0), atol=1e-6)
+    assert abs(places[:, 1].min()) < 1e-6 and 1.5 < places[:, 1].max() < 2.0
     assert sum(gltf.accessors[part.indices].count for part in parts) == 3 * len(body.triangles)
     assert gltf.meshes[1].extras["targetNames"] == list(EXPRESSIONS)
     assert parts[0].targets in (None, []) and len(parts[1].targets) == len(EXPRESSIONS)
@@ -120,7 +122,8 @@ def test_meshes_are_the_body_and_joints_bind_at_rest(written: tuple[Path, list[R
         assert (values(gltf, part.attributes.JOINTS_0) < 52).all()
     bind = values(gltf, gltf.skins[0].inverseBindMatrices).reshape(52, 4, 4).swapaxes(1, 2)
     rest = figures[0].skeleton.rest_joints
-    np.testing.assert_allclose(bind[:, :3, 3], -rest, atol=1e-6)
+    np.testing.assert_allclose(bind[:, :3, 3], -rest - lift, atol=1e-6)
+    np.testing.assert_allclose(gltf.nodes[0].translation, rest[0] + lift, atol=1e-6)
 
 
 def test_clips_that_cannot_be_written_are_refused(tmp_path: Path, clips: list[GlbClip]) -> None:
@@ -228,7 +231,8 @@ def test_three_js_poses_joints_and_skin_as_the_figure_is(
     assert facts["animations"][0][1] == pytest.approx(39 / FPS)
     gltf = pygltflib.GLTF2().load(written[0])
     body = body_for(written[1][0].skeleton)
-    in_file = [values(gltf, mesh.primitives[0].attributes.POSITION) for mesh in gltf.meshes]
+    lift = [0.0, body.vertices[:, 1].min(), 0.0]
+    in_file = [values(gltf, mesh.primitives[0].attributes.POSITION) + lift for mesh in gltf.meshes]
     rng = np.random.default_rng(0)
     for number, frame in ((0, 0), (0, 13), (0, 37), (1, 5), (1, 29)):
         figure, clip = written[1][number], clips[number]

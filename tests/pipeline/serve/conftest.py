@@ -18,11 +18,13 @@ import pytest
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.serve.app import Site
 from motionloom.pipeline.serve.command import listen, server_of
 from motionloom.pipeline.serve.config import ServeConfig
 from motionloom.pipeline.serve.work import Worker
+from motionloom.pipeline.store.known_captions import Unknown
 
 LAYOUT = MotionLayout.named("wholebody363", fps=20.0)
 
@@ -38,8 +40,19 @@ class QuickModel:
         self.open = threading.Event()
         self.open.set()
         self.asked: list[str] = []
+        self.sampling: list[SamplingConfig] = []
         generator = SimpleNamespace(modalities=self.modalities, settings=frozenset({"cfg_scale"}))
-        self.bundle = SimpleNamespace(layout=LAYOUT, faces={"gpt": None}, generator=generator)
+        self.bundle = SimpleNamespace(
+            layout=LAYOUT,
+            faces={"gpt": None},
+            generator=generator,
+            recommended=SamplingConfig(cfg_scale=1.5, top_p=0.9),
+        )
+
+    def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
+        """All that is said of a violin."""
+        known = ("a person <b>claps</b>", "a person bows")
+        return [Unknown(caption, known) for caption in (*captions, *face) if "violin" in caption]
 
     def generate(
         self,
@@ -53,6 +66,7 @@ class QuickModel:
     ) -> list[GeneratedMotion]:
         caption = (captions or [""])[0]
         self.asked.append(caption)
+        self.sampling.append(sampling)
         if caption == "break":
             raise ZeroDivisionError
         assert self.open.wait(20)

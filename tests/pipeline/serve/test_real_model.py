@@ -33,6 +33,13 @@ def test_each_gets_the_motion_of_its_own_seed(small_run: Any, run_server: Callab
         list(clients.map(ask, range(12)))
         got = served.post("/api/stream", {"caption": captions[0], "seconds": 0.6, "request": "s"})
         head, *frames = [json.loads(line) for line in got.body.splitlines()]
+        assert head["notes"] == []
+        strange = {"caption": "a person plays the violin", "seconds": 0.6}
+        first = served.post("/api/stream", strange).body.splitlines()[0]
+        (note,) = json.loads(first)["notes"]
+        assert (
+            note == served.post("/api/generate", strange).json["notes"][0] and "unlike all captions" in note
+        )
         assert head["request"] == "s" and got.headers["content-type"] == "application/x-ndjson"
         np.testing.assert_allclose([frame["joints"] for frame in frames], wanted[0], atol=2e-5)
         bad = served.post("/api/generate", {"caption": "a", "seconds": 29.0})

@@ -108,6 +108,39 @@ def test_one_motion_after_another_leaves_nothing(visit: Any, until: Any) -> None
     assert page.evaluate("__viewer.playing") and page.locator("#caption").input_value() == " a person waves 2"
 
 
+@pytest.mark.parametrize("size", SIZES)
+def test_what_the_model_does_not_know_stands_beside_the_motion(visit: Any, until: Any, size: str) -> None:
+    page = visit(*SIZES[size])
+    note = page.get_by_role("note")
+    page.get_by_label("What the person does").fill("someone plays the <i>violin")
+    page.keyboard.press("Enter")
+    until(page, DRAWN)
+    assert note.is_visible() and page.locator("#notes *").count() == 1, "the words are text, not markup"
+    said = str(note.text_content())
+    assert said.startswith("'someone plays the <i>violin' is unlike all captions") and "a person bows" in said
+    above, figure = note.bounding_box(), page.locator("canvas").bounding_box()
+    assert above["y"] + above["height"] <= figure["y"] and figure["y"] < SIZES[size][1]
+    wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    assert wide[0] <= wide[1]
+    page.get_by_label("What the person does").fill("a person bows")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('figcaption')?.textContent === 'a person bows'")
+    assert not note.is_visible()
+
+
+def test_guidance_is_the_models_until_it_is_changed(visit: Any, until: Any, quick: Any) -> None:
+    page = visit()
+    assert page.get_by_label("Guidance").input_value() == "1.5"
+    page.get_by_label("What the person does").fill("one")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('figcaption')?.textContent === 'one'")
+    page.get_by_label("What the person does").fill("two")
+    page.get_by_label("Guidance").fill("1")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('figcaption')?.textContent === 'two'")
+    assert [asked.model_dump(exclude_unset=True) for asked in quick.sampling] == [{}, {"cfg_scale": 1.0}]
+
+
 def test_what_is_refused_is_said(visit: Any, until: Any, quick: Any) -> None:
     page = visit()
     page.get_by_role("button", name="Generate").click()

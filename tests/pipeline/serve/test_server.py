@@ -69,6 +69,7 @@ def test_the_viewers_data_and_files(served: Any, tmp_path: Path) -> None:
 def test_info_and_page(served: Any) -> None:
     info = served.ask("GET", "/api/info").json
     assert info["model"] == "quick" and info["modalities"] == ["audio", "text"] and info["face"] is True
+    assert info["sampling"] == {"cfg_scale": 1.5, "top_p": 0.9}
     assert info["limits"]["seconds"] == 5.0 and info["limits"]["waiting"] == 32
     page = served.ask("GET", "/")
     assert page.status == 200 and page.headers["content-type"].startswith("text/html")
@@ -101,6 +102,16 @@ def test_bad_input_is_one_sentence(served: Any, quick: Any, body: Any, words: st
     got = served.post("/api/generate", body)
     assert got.status == 400 and words in got.json["error"] and "\n" not in got.json["error"]
     assert not quick.asked
+
+
+def test_words_that_the_model_does_not_know_are_noted(served: Any) -> None:
+    asked = {**WAVE, "caption": "a person plays the violin", "face": "a face like a violin"}
+    for kind in ("joints", "viewer"):
+        notes = served.post("/api/generate", {**asked, "format": kind}).json["notes"]
+        assert [note.partition(" is unlike")[0] for note in notes] == [
+            f"'{asked[k]}'" for k in ("caption", "face")
+        ]
+    assert served.post("/api/generate", WAVE).json["notes"] == []
 
 
 def test_bad_input_bears_its_name(served: Any) -> None:

@@ -107,3 +107,23 @@ def test_generate_says_so_from_a_run_and_from_an_export(small_run: Any, call: An
     with pytest.warns(UserWarning, match="violin.*The nearest it knows"):
         model.generate(words, face=["a person looks happy"] * 2 if model.bundle.faces else None)
     assert 0 < FAR < 1
+
+
+def test_a_stream_says_so_when_the_captions_turn_comes(small_run: Any, call: Any, tmp_path: Path) -> None:
+    """By the command, from Python, and of a caption that comes on the way; each caption once."""
+    known, strange = "a person walks forward", "a person plays the violin"
+    options = ["--stream", "--seconds", "0.8", "-o", tmp_path / "made.jsonl"]
+    said = call("generate", small_run.folder, known, strange, known, strange, *options).err
+    assert said.count("note: ") == 1 and f"note: '{strange}' is unlike all captions" in said
+    model = MotionModel.from_pretrained(small_run.folder, device="cpu")
+    stream = model.stream([(known, 0.8), (strange, 0.8), (known, 0.8)], seed=1)
+    with pytest.warns(UserWarning, match="violin.*The nearest it knows") as warned:
+        list(stream)
+    assert len(warned) == 1 and warned[0].filename == __file__
+    stream = model.stream(known, seed=1)
+    next(stream)
+    stream.say("stock prices fell sharply", seconds=0.4)
+    with pytest.warns(UserWarning, match="stock prices"):
+        for chunk in stream:
+            if chunk.caption != known:
+                break
