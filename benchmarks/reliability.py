@@ -64,6 +64,7 @@ class Asked(NamedTuple):
 def base_run(recipe: str, work: Path) -> Path:
     """A finished run of a recipe; the stage under test is taken out of copies of it."""
     run = work / f"base-{recipe}"
+    work.mkdir(parents=True, exist_ok=True)
     words = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "run"]
     with (work / f"base-{recipe}.log").open("a") as log:
         words += [str(RECIPES / f"{recipe}.yaml"), "--out", str(run)]
@@ -74,7 +75,6 @@ def base_run(recipe: str, work: Path) -> Path:
 def kills(work: Path, asked: Asked) -> None:
     """SIGKILL at random moments: every family of trainings, loader workers 0 and 2, ranks 1 and 2."""
     folder = work / "kills"
-    folder.mkdir(parents=True, exist_ok=True)
     bases = {recipe: base_run(recipe, folder) for recipe, _ in FAMILIES.values()}
     cells = [
         Cell(

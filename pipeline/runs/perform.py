@@ -6,6 +6,7 @@ from motionloom.models.training.distributed import alone
 from motionloom.pipeline.contract.stage import StageContext, StageKind
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.launch.watch import current
+from motionloom.pipeline.runs.sound import require_sound_shards
 
 
 def perform(kind: StageKind, context: StageContext, team: Team) -> None:
@@ -14,13 +15,15 @@ def perform(kind: StageKind, context: StageContext, team: Team) -> None:
     if watch is not None:
         watch.enter_stage(context.name, context.folder, "before its first step")
     if kind.trains:
-        team.meet()
+        require_sound_shards(context, team)
         kind.run(context)
         return
     with alone():
         if kind.shares:
-            team.meet()
+            require_sound_shards(context, team)
             kind.share(context)
             team.meet()
+        elif team.leads:
+            require_sound_shards(context, Team())
         if team.leads:
             kind.run(context)
