@@ -187,9 +187,9 @@ class Interruption(Callback):
             return
         self._cut = False
         _validate(trainer)
-        if self._cut:
-            self._stop(trainer, self._agreement.now())
-        self.checkpoints.save(trainer, again=True)
+        if not self._cut:
+            self.checkpoints.save(trainer, again=True)
+        self._stop(trainer, self._agreement.now())
 
     def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Its batches take another time than steps."""
