@@ -160,12 +160,12 @@ def trainings(
             str(config.batch_size),
             f"{middle['samples_per_second']:,.0f}",
             f"{1000 * middle['step_seconds']:.1f}",
-            f"{work / 1e12:.2f}",
+            f"{work / 1e12:.3g}",
             used,
             "" if share is None else f"{share:.0%}",
             ", ".join(f"{key} {value:.1%}" for key, value in waited.items()),
-            f"{most:.1f}" if most else "",
-            f"{said:.1f}" + (f" ({said / most - 1:+.0%})" if most else ""),
+            f"{most:.3g}" if most else "",
+            f"{said:.3g}" + (f" ({said / most - 1:+.0%})" if most else ""),
         ]
 
 
