@@ -61,7 +61,7 @@ class Compared(Config):
         return known is not None and known.sha256 == shard.info.sha256 and state in known.states
 
 
-def require_sound_shards(context: StageContext, team: Team) -> None:
+def require_sound_shards(context: StageContext, team: Team, run: Path) -> None:
     """Refuse shards among the stage's inputs that are not those of their manifest.
 
     Every process of `team` calls this; it returns when all are here, and an error is raised in all.
@@ -80,8 +80,7 @@ def require_sound_shards(context: StageContext, team: Team) -> None:
     if watch is not None:
         watch.rest("comparing shards with their sha256")
     begin = time.monotonic()
-    again, record = how == "always", context.folder.parent.parent / FILE_NAME
-    size = compare_shards(shards, record, team, context.console, again=again)
+    size = compare_shards(shards, run / FILE_NAME, team, context.console, again=how == "always")
     seconds = time.monotonic() - begin
     if size and seconds > _WORTH_A_LINE:
         context.console.print(
