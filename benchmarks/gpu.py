@@ -86,7 +86,9 @@ def recipe(size: str, steps: int, device: str, profile: int) -> dict[str, Any]:
             stages[f"{name}-{short}"] = settings | {"kind": kind, "train": own}
     if device == "cpu":  # half precision on a CPU has no scaler
         stages = {name: stage for name, stage in stages.items() if "fp16" not in name}
-    hardware = {"accelerator": device if device != "cuda" else "gpu", "profile": profile}
+    hardware: dict[str, Any] = {"accelerator": device if device != "cuda" else "gpu", "profile": profile}
+    if device == "cpu":
+        hardware["stall_seconds"] = 0  # a busy CPU may compile for longer than a step may take
     return {"name": "gpu", "extends": f"humantomato-{size}", "hardware": hardware, "stages": stages}
 
 
