@@ -127,7 +127,12 @@ def held_out(folder: Path, *, prefer: str = "val") -> str:
 
 
 def local_shards(folder: Path) -> list[LocalShard]:
-    """All shards of a data stage that lie in folders of this machine; a server's are compared on arrival."""
+    """All shards of a data stage that lie in folders of this machine; a server's are compared on arrival.
+
+    None of a kind that is not ours and keeps its data in another way.
+    """
+    if _is_plain(folder) and not (folder / SHARDS).is_dir():
+        return []
     return [
         LocalShard(store.root / shard.name, shard)
         for store, manifest in _sources(folder)
