@@ -43,7 +43,7 @@ def pid_of(out: Path, rank: int) -> int:
     return int((out / f"{rank}.pid").read_text())
 
 
-def wait_for_step(out: Path, step: int, seconds: float = 200) -> None:
+def wait_for_step(out: Path, step: int, seconds: float = 300) -> None:
     """Until a checkpoint of that step or a later one is there."""
     reached = lambda: any(int(p.stem[5:]) >= step for p in out.glob("checkpoints/s*.ckpt"))  # noqa: E731
     until(reached, "no steps", seconds)
