@@ -86,7 +86,9 @@ def recipe(size: str, steps: int, device: str, profile: int) -> dict[str, Any]:
             stages[f"{name}-{short}"] = settings | {"kind": kind, "train": own}
     if device == "cpu":  # half precision on a CPU has no scaler
         stages = {name: stage for name, stage in stages.items() if "fp16" not in name}
-    hardware = {"accelerator": device if device != "cuda" else "gpu", "profile": profile}
+    hardware: dict[str, Any] = {"accelerator": device if device != "cuda" else "gpu", "profile": profile}
+    if device == "cpu":
+        hardware["stall_seconds"] = 0  # a busy CPU may compile for longer than a step may take
     return {"name": "gpu", "extends": f"humantomato-{size}", "hardware": hardware, "stages": stages}
 
 
@@ -160,12 +162,12 @@ def trainings(
             str(config.batch_size),
             f"{middle['samples_per_second']:,.0f}",
             f"{1000 * middle['step_seconds']:.1f}",
-            f"{work / 1e12:.2f}",
+            f"{work / 1e12:.3g}",
             used,
             "" if share is None else f"{share:.0%}",
             ", ".join(f"{key} {value:.1%}" for key, value in waited.items()),
-            f"{most:.1f}" if most else "",
-            f"{said:.1f}" + (f" ({said / most - 1:+.0%})" if most else ""),
+            f"{most:.3g}" if most else "",
+            f"{said:.3g}" + (f" ({said / most - 1:+.0%})" if most else ""),
         ]
 
 

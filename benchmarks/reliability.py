@@ -29,11 +29,15 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from kill_matrix import Cell, Seen, read_seen, run_cells  # noqa: E402
 from preempted import launch, preempt, write_recipe  # noqa: E402
+from rich.console import Console  # noqa: E402
 from slurm_cluster import Cluster, why_not  # noqa: E402
 
 from motionloom.datasets.schema import UserError  # noqa: E402
-from motionloom.datasets.shards.reader import ShardDataset  # noqa: E402
+from motionloom.datasets.shards.checksums import LocalShard  # noqa: E402
+from motionloom.datasets.shards.reader import ShardDataset, load_manifest  # noqa: E402
 from motionloom.datasets.shards.reading import Reading  # noqa: E402
+from motionloom.pipeline.launch.team import Team  # noqa: E402
+from motionloom.pipeline.runs.sound import compare_shards  # noqa: E402
 from motionloom.pipeline.store.checkpoints import DamagedError, read_checkpoint  # noqa: E402
 
 RECIPES = ROOT / "benchmarks/reliability"
@@ -64,6 +68,7 @@ class Asked(NamedTuple):
 def base_run(recipe: str, work: Path) -> Path:
     """A finished run of a recipe; the stage under test is taken out of copies of it."""
     run = work / f"base-{recipe}"
+    work.mkdir(parents=True, exist_ok=True)
     words = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "run"]
     with (work / f"base-{recipe}.log").open("a") as log:
         words += [str(RECIPES / f"{recipe}.yaml"), "--out", str(run)]
@@ -74,7 +79,6 @@ def base_run(recipe: str, work: Path) -> Path:
 def kills(work: Path, asked: Asked) -> None:
     """SIGKILL at random moments: every family of trainings, loader workers 0 and 2, ranks 1 and 2."""
     folder = work / "kills"
-    folder.mkdir(parents=True, exist_ok=True)
     bases = {recipe: base_run(recipe, folder) for recipe, _ in FAMILIES.values()}
     cells = [
         Cell(
@@ -193,9 +197,10 @@ def _damaged_checkpoint(run: Path, folder: Path, rng: np.random.Generator) -> di
 
 
 def _damaged_shard(run: Path, folder: Path, rng: np.random.Generator) -> dict[str, int]:
-    shards = run / "stages/data/shards"
-    for path in shards.iterdir():
+    for path in (run / "stages/data/shards").iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
+    shards = [LocalShard(folder / shard.name, shard) for shard in load_manifest(folder).shards]
+    record = folder / "compared.json"
     path = next(folder.glob("*-train-*.tar"))
     raw = path.read_bytes()
     streamed = Reading(mode="streamed", order="streamed")
@@ -203,13 +208,18 @@ def _damaged_shard(run: Path, folder: Path, rng: np.random.Generator) -> dict[st
         "shard, one bit flipped: opened with `verify`": lambda: ShardDataset.open(
             folder, "train", verify=True
         ),
+        "the same, before a stage reads it (default)": lambda: compare_shards(
+            shards, record, Team(), Console(quiet=True)
+        ),
         "the same, by the streamed reader": lambda: _read(
             ShardDataset.open(folder, "train", reading=streamed)
         ),
-        "the same, by the indexed reader": lambda: _read(ShardDataset.open(folder, "train")),
+        "the same, by the indexed reader alone": lambda: _read(ShardDataset.open(folder, "train")),
     }
     found = dict.fromkeys(ways, 0)
     for place in rng.integers(len(raw), size=FLIPS):
+        path.write_bytes(raw)
+        compare_shards(shards, record, Team(), Console(quiet=True))  # it was sound, and is noted as such
         path.write_bytes(_flipped(raw, place, rng))
         for name, way in ways.items():
             found[name] += _refused(way, UserError)

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SCHEMA_VERSION, Caption, ClipMeta, Manifest, Split, UserError
 from motionloom.datasets.shards.access import Access, MappedShards, RangedShards
+from motionloom.datasets.shards.checksums import LocalShard, require_sound
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.index import INDEX_FILE, MANIFEST_FILE, SPLITS, read_index
 from motionloom.datasets.shards.order import Source
@@ -121,7 +121,7 @@ class ShardDataset:
             raise UserError(f"{store.place}: split '{split}' has no clips")
         if isinstance(store, LocalStore):
             for shard in shards:
-                _check_file(store.root / shard.name, shard.bytes, shard.sha256 if verify else None)
+                require_sound(LocalShard(store.root / shard.name, shard), content=verify)
         dataset = ShardDataset(store, known, manifest, digest, reading)
         dataset._check_motion_sizes()
         return dataset
@@ -274,20 +274,6 @@ class ShardDataset:
         store = open_store(place, reading.cache)
         manifest, _ = read_manifest(store, digest)
         ShardDataset.__init__(self, store, split, manifest, digest, reading)
-
-
-def _check_file(path: Path, size: int, sha256: str | None) -> None:
-    try:
-        found = path.stat().st_size
-    except OSError:
-        raise UserError(f"{path}: the shard is missing; copy it back or convert again") from None
-    if found != size:
-        raise UserError(
-            f"{path}: {found} bytes, the manifest says {size}: truncated or changed; "
-            f"copy it back or convert again"
-        )
-    if sha256 is not None and sha256_of(path) != sha256:
-        raise UserError(f"{path}: the sha256 is not the manifest's: damaged; copy it back or convert again")
 
 
 def require_layout(found: MotionLayout, wanted: MotionLayout, where: str) -> None:

@@ -46,7 +46,7 @@ from motionloom.pipeline.cli.serve import serve
 from motionloom.pipeline.cli.sweep import sweep
 from motionloom.pipeline.launch import watch
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
-from motionloom.pipeline.launch.process import Interrupted, TeamError, leave, process_rank
+from motionloom.pipeline.launch.process import Interrupted, JointError, TeamError, leave, process_rank
 
 app = typer.Typer(
     name="motionloom",
@@ -303,6 +303,10 @@ def _exit_code() -> int:
     try:
         code = app(prog_name="motionloom", standalone_mode=False) or 0
         sys.stdout.flush()  # here a full disk can still be answered
+    except JointError as error:
+        if process_rank() == 0:
+            errors.print(f"error: {error}", style="red", markup=False)
+        return error.exit_code
     except UserError as error:
         errors.print(f"error: {error}", style="red", markup=False)
         return 2

@@ -6,6 +6,7 @@ that counts them, never differences between two machines' clocks.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -13,6 +14,8 @@ from typing import Any
 SILENT = 5.0
 """Seconds without a word after which a process counts as one that does not answer. Words come every second
 from a thread of their own, whatever the process computes."""
+_UNITS = 10
+"""A unit of a divided work may take so many times as long as the longest one of its kind so far."""
 
 
 @dataclass
@@ -32,7 +35,12 @@ class Beat:
     idle: float = 0.0
     """Seconds since it last did."""
     expected: bool = False
-    """Whether progress is expected of what it does: a training's steps, not a conversion or a wait."""
+    """Whether progress is expected of what it does: a training's steps, its units of a divided work, not a
+    conversion or a wait."""
+    work: str = ""
+    """Which units of a divided work it makes; how long one takes nobody knows before one is made."""
+    longest: float = 0.0
+    """Seconds of the longest of them that it has made."""
 
     def name(self) -> str:
         """As a sentence names it."""
@@ -86,6 +94,9 @@ def judge(peers: Sequence[Peer], stall_seconds: float) -> Verdict | None:
 
     Processes that train together wait for each other, so when one stalls none makes progress. The one that
     does not answer is to blame, else the one that has done least. 0 `stall_seconds`: none is.
+
+    Processes that divide a work wait for nobody. How long a unit of it takes depends on the network and the
+    machine, so there the limit is the longest unit of any process ten times, if that is more.
     """
     here = [peer for peer in peers if peer.known and not peer.done]
     for peer in here:
@@ -107,9 +118,17 @@ def judge(peers: Sequence[Peer], stall_seconds: float) -> Verdict | None:
     if not waiting:
         return None
     peer = min(waiting, key=lambda peer: (peer.beat.count, -peer.beat.idle))
-    if peer.beat.idle <= stall_seconds:
+    if peer.beat.idle <= max(stall_seconds, _unit_limit(peer.beat, here)):
         return None
     return _verdict(peer, f"has stalled: no progress for {peer.beat.idle:.0f} s", stalled=True)
+
+
+def _unit_limit(beat: Beat, here: Sequence[Peer]) -> float:
+    """Seconds that what a process does may take for all that is known of it; 0 for a training's step."""
+    if not beat.work:
+        return 0.0
+    longest = max(peer.beat.longest for peer in here if peer.beat.work == beat.work)
+    return _UNITS * longest if longest else math.inf
 
 
 def _verdict(peer: Peer, what: str, *, stalled: bool, mute: bool = False) -> Verdict:

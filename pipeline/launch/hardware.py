@@ -43,7 +43,11 @@ class Hardware(Config):
     """CPU threads per process; 0 leaves torch's choice."""
     stall_seconds: int = Field(600, ge=0)
     """Seconds without a step, a validation batch or a word of one of the processes after which a training
-    counts as stalled and the run ends; 0 = never. Compiling counts, so it must be longer than that takes."""
+    counts as stalled and the run ends; 0 = never. Compiling counts, so it must be longer than that takes. In
+    work that processes divide (tokens, evaluation) a unit may take ten times as long as any before it."""
+    verify_shards: Literal["once", "always", "never"] = "once"
+    """Whether shards in folders are compared with their sha256 before a stage reads them: files that have not
+    been compared in this run as they are now, all each time a stage starts, or none."""
     loggers: tuple[LoggerName, ...] = ("tensorboard", "csv")
     """Where the figures of trainings go, besides `metrics.jsonl`; wandb, mlflow and trackio are extras."""
     flight_rows: int = Field(1000, ge=0)

@@ -6,6 +6,8 @@ import os
 import sys
 from typing import NoReturn
 
+from motionloom.datasets.schema import UserError
+
 SAVED = 75
 """Exit code of a run that a signal has ended with all its steps saved, whatever signal it was.
 
@@ -31,6 +33,15 @@ class Interrupted(BaseException):
     def exit_code(self) -> int:
         """`SAVED`; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise."""
         return 0 if _started_by_lead() else SAVED
+
+
+class JointError(UserError):
+    """A user's mistake that all processes of a run have found together: the lead alone says it."""
+
+    @property
+    def exit_code(self) -> int:
+        """2; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise."""
+        return 0 if _started_by_lead() else 2
 
 
 def process_rank() -> int:

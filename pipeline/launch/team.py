@@ -81,6 +81,17 @@ class Team:
         except RuntimeError as error:
             raise TeamError(str(error)) from None
 
+    def gather(self, mine: Found) -> list[Found]:
+        """What every process gives, in the order of their ranks, in all of them."""
+        if self.waiting is None:
+            return [mine]
+        found = [mine] * self.world
+        try:
+            dist.all_gather_object(found, mine, self.waiting)
+        except RuntimeError as error:
+            raise TeamError(str(error)) from None
+        return found
+
     def part(self) -> None:
         """This process has done all that the others need it for."""
         watch.end()

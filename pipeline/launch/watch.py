@@ -5,7 +5,7 @@ for a stopped one, and a process that converts data for hours notices nobody's d
 
 Every process keeps a connection of its own to the lead (rank 0) and says every second where it is
 (`beats.Beat`). The lead judges them all, the others the lead. A closed connection is a death and ends the run
-within seconds; silence, or a training without progress, is a stall, and ends it after
+within seconds; silence, or a training or a divided work without progress, is a stall, and ends it after
 `hardware.stall_seconds`. Then one process prints one sentence, after a stall each writes the stacks of its
 threads to `flight/stacks_rank_N.txt` in the stage's folder, a process of the same machine that does not
 answer is killed, children are, and all end with `ENDED`. A training in one process is watched for stalls
@@ -29,8 +29,8 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -115,6 +115,7 @@ class Watch:
         """A stage begins."""
         self.folder = folder
         self.beat.stage, self.beat.step, self.beat.count = name, None, 0
+        self.beat.work, self.beat.longest = "", 0.0
         self.rest(phase)
 
     def progress(self, phase: str, step: int | None = None, *, alike: bool = True) -> None:
@@ -123,9 +124,20 @@ class Watch:
         """
         if step is not None:
             self.beat.step = step
-        self.beat.phase, self.beat.expected = phase, True
+        self.beat.phase, self.beat.expected, self.beat.work = phase, True, ""
         self.beat.count += alike
         self._noted += 1
+
+    @contextmanager
+    def unit(self, work: str, phase: str) -> Iterator[None]:
+        """Make one unit of a `work` that the processes divide; they are to make the others."""
+        if work != self.beat.work:
+            self.beat.longest = 0.0
+        self.progress(phase, alike=False)
+        self.beat.work = work
+        begin = time.monotonic()
+        yield
+        self.beat.longest = max(self.beat.longest, time.monotonic() - begin)
 
     def rest(self, phase: str) -> None:
         """From now on no progress is expected, as nobody can tell how long this takes."""
@@ -270,6 +282,13 @@ _current: Watch | None = None
 def current() -> Watch | None:
     """The watch of this process, if one runs."""
     return _current
+
+
+def unit(work: str, index: int, count: int) -> AbstractContextManager[None]:
+    """Have this process's watch, if one runs, know that it makes unit `index` of the `count` of a work."""
+    if _current is None:
+        return nullcontext()
+    return _current.unit(work, f"making unit {index + 1} of {count} ({work})")
 
 
 def begin(watch: Watch) -> Watch:

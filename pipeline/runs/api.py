@@ -221,7 +221,7 @@ def _stage_again(
         world=team.world,
         again=state,
     )
-    perform(stage.kind, context, team)
+    perform(stage.kind, context, team, folder)
 
 
 def _finished_inputs(folder: Path, inputs: dict[str, Finished], state: RunState) -> dict[str, Finished]:

@@ -290,7 +290,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 place = f"{plan.index(row) + 1}/{len(plan)}"
                 console.print(f"[bold]\\[{place}] {stage.name}[/] ({stage.kind.summary})")
                 _prepare(folder, row)
-            perform(stage.kind, context_of(recipe, run, stage, folder, console, team), team)
+            perform(stage.kind, context_of(recipe, run, stage, folder, console, team), team, run)
             if leads:
                 seconds = time.perf_counter() - begin
                 took = {"seconds": round(seconds, 2), "hardware": recipe.hardware.describe()}

@@ -72,7 +72,7 @@ def replay_crash(bundle: Path, *, anomaly: bool = False, console: Console | None
     say(f"{record.said}", markup=False, soft_wrap=True)
     error: Exception | None = None
     try:
-        perform(stage.kind, context, team)
+        perform(stage.kind, context, team, run)
     except ReplayDone:
         pass
     except UserError:

@@ -55,8 +55,27 @@ class ChunkLoader:
         self._reader, self._next = None, -1
 
 
+class CuttableLoader:
+    """A loader of a validation that `cuts(batches done, all batches)` ends early."""
+
+    def __init__(self, loader: DataLoader[Any], cuts: Callable[[int, int], bool]) -> None:
+        self.loader, self.cuts = loader, cuts
+
+    def __len__(self) -> int:
+        """Batches of a whole validation."""
+        return len(self.loader)
+
+    def __iter__(self) -> Iterator[Any]:
+        """The batches; it asks when the next one is wanted."""
+        count = len(self)
+        for done, batch in enumerate(self.loader, start=1):
+            yield batch
+            if self.cuts(done, count):
+                return
+
+
 class TrainingData(L.LightningDataModule):
-    """The loaders of one training."""
+    """The loaders of one training; `cuts` ends a validation early (`CuttableLoader`)."""
 
     def __init__(
         self,
@@ -66,9 +85,10 @@ class TrainingData(L.LightningDataModule):
         chunk: int,
         hardware: Hardware,
         waits: Waits,
+        cuts: Callable[[int, int], bool],
     ) -> None:
         super().__init__()
-        self.train, self.validation = train, validation
+        self.train, self.validation, self.cuts = train, validation, cuts
         self.config, self.chunk, self.hardware, self.waits = config, chunk, hardware, waits
         self._chunks: ChunkLoader | None = None
 
@@ -85,12 +105,12 @@ class TrainingData(L.LightningDataModule):
         self._chunks = ChunkLoader(read, lambda: trainer.global_step * parts, self.chunk * parts, self.waits)
         return self._chunks
 
-    def val_dataloader(self) -> DataLoader[Any] | list[Any]:
+    def val_dataloader(self) -> CuttableLoader | list[Any]:
         """All batches of the held-out data."""
         if self.validation is None:
             return []
         dataset = self.validation()
-        return _loader(dataset, range(len(cast(Sized, dataset))), self.hardware)
+        return CuttableLoader(_loader(dataset, range(len(cast(Sized, dataset))), self.hardware), self.cuts)
 
     def close(self) -> None:
         """Let the workers go."""

@@ -94,6 +94,8 @@ class MetricLog(Callback):
         self.path = folder / "metrics.jsonl"
         self.loggers = loggers
         self.rows: list[dict[str, float]] = []
+        self.validates = True
+        """Whether a validation that ends has a row: one that was cut short has none."""
         self._texts: list[tuple[str, str]] = []
         """Each row and what only the loggers get, as JSON: a checkpoint takes the text as it is."""
         self._written = 0
@@ -142,7 +144,7 @@ class MetricLog(Callback):
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Take a row of validation figures."""
-        if not trainer.sanity_checking:
+        if self.validates and not trainer.sanity_checking:
             self._take(trainer, [name for name in trainer.callback_metrics if name.startswith("val/")], {})
 
     def saved(self, step: int) -> None:

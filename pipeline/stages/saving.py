@@ -52,10 +52,10 @@ class Checkpoints(Callback):
         self._last = -1
         self._writing: int | None = None
 
-    def save(self, trainer: L.Trainer) -> None:
-        """Save this step, unless it is saved; every rank must ask."""
+    def save(self, trainer: L.Trainer, *, again: bool = False) -> None:
+        """Save this step, unless it is saved (`again`: in any case); every rank must ask."""
         step = trainer.global_step
-        if step == self._last:
+        if step == self._last and not again:
             return
         with self.waits.for_checkpoints():
             self.finish()
@@ -123,6 +123,8 @@ class ResumeBetweenChunks(Callback):
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """In the middle of a chunk: gather what every rank has added to the next row."""
+        # Also of a step that is saved once more, behind the validation that was made up for.
+        checkpoint["epoch"] = max(0, trainer.global_step - 1) // self.chunk
         if trainer.global_step % self.chunk == 0:
             return
         assert isinstance(pl_module, StageModule)

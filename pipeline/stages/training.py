@@ -60,7 +60,6 @@ def fit(
     if config.branch is not None:
         require_branch(context.name, config.branch.step, config.steps, newest, module)
     waits, folder = Waits(), context.folder / "checkpoints"
-    data = TrainingData(train, validation, config, chunk, hardware, waits)
     validate = max(1, -(-config.validate_every // chunk)) if config.validate_every and validation else None
     players = isinstance(module, PlayersModule)
     average = AveragedWeights(config.ema) if config.ema else None
@@ -70,6 +69,8 @@ def fit(
     writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every, since=since)
     checkpoints = Checkpoints(folder, writer, waits, log.saved)
     signals = Signals()
+    stop = Interruption(context.name, config.steps, chunk, config.accumulate, signals, checkpoints, log)
+    data = TrainingData(train, validation, config, chunk, hardware, waits, stop.cuts_validation)
     if hardware.resolved_accelerator() == "gpu":
         hardware.device()  # refuses in one sentence where there is no GPU
     launcher = environment()
@@ -111,8 +112,7 @@ def fit(
             log,
             StepProgress(context.name, config.steps, context.console, longer=longer),
             *([average] if average else []),
-            # Last: what all others do at the end of a step is in the checkpoint of an interruption.
-            Interruption(context.name, config.steps, chunk, config.accumulate, signals, checkpoints),
+            stop,  # last: what all others do at the end of a step is in the checkpoint of an interruption
         ],
     )
     leave_signals_alone(trainer)

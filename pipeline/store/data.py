@@ -12,10 +12,11 @@ from pydantic import Field
 from motionloom.datasets.loading.mix import MixedDataset
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Config, Manifest
+from motionloom.datasets.shards.checksums import LocalShard
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.reader import ShardDataset, read_manifest
 from motionloom.datasets.shards.reading import CacheConfig, Reading
-from motionloom.datasets.shards.store import open_store
+from motionloom.datasets.shards.store import LocalStore, Store, open_store
 
 SHARDS = "shards"
 REFERENCE = "reference.json"
@@ -125,15 +126,36 @@ def held_out(folder: Path, *, prefer: str = "val") -> str:
     return next(split for split in (prefer, other, "train") if split in splits)
 
 
+def local_shards(folder: Path) -> list[LocalShard]:
+    """All shards of a data stage that lie in folders of this machine; a server's are compared on arrival.
+
+    None of a kind that is not ours and keeps its data in another way.
+    """
+    if _is_plain(folder) and not (folder / SHARDS).is_dir():
+        return []
+    return [
+        LocalShard(store.root / shard.name, shard)
+        for store, manifest in _sources(folder)
+        if isinstance(store, LocalStore)
+        for shard in manifest.shards
+    ]
+
+
 def _manifests(folder: Path) -> list[Manifest]:
+    return [manifest for _, manifest in _sources(folder)]
+
+
+def _sources(folder: Path) -> list[tuple[Store, Manifest]]:
     if (folder / MIX).is_file():
         places = Mix.load_json(folder / MIX).folders(folder)
-        return [manifest for place in places for manifest in _manifests(place)]
+        return [source for place in places for source in _sources(place)]
     if _is_plain(folder):
-        return [read_manifest(open_store(folder / SHARDS))[0]]
-    parts = Reference.load_json(folder / REFERENCE).parts
-    cache = Reader.load_json(folder / READER).cache
-    return [read_manifest(open_store(part.path, cache))[0] for part in parts]
+        stores = [open_store(folder / SHARDS)]
+    else:
+        cache = Reader.load_json(folder / READER).cache
+        parts = Reference.load_json(folder / REFERENCE).parts
+        stores = [open_store(part.path, cache) for part in parts]
+    return [(store, read_manifest(store)[0]) for store in stores]
 
 
 def _filled(manifest: Manifest) -> set[str]:

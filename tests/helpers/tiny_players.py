@@ -123,12 +123,14 @@ def train(
     module: dict[str, Any] | None = None,
     dies_at: int | None = None,
     signalled: dict[int, signal.Signals] | None = None,
+    validation_signalled: dict[int, signal.Signals] | None = None,
     console: Console | None = None,
     **settings: Any,
 ) -> Duel:
     """Train a duel in `folder`, from its newest checkpoint.
 
-    `dies_at` a step all ends with an error; while a step of `signalled` is taken, that signal comes.
+    `dies_at` a step all ends with an error; while a step of `signalled` is taken, or a batch of
+    `validation_signalled` is read, that signal comes.
     """
     given: dict[str, Any] = {
         "steps": 24, "batch_size": 8, "checkpoint_every": 6, "validate_every": 12, **settings
@@ -142,7 +144,7 @@ def train(
         lambda batch, rank, world: Vectors(
             batch, rank, world, parts=config.accumulate, dtype=dtype, dies_at=dies_at, signalled=signalled
         ),
-        lambda: Vectors(8, size=2, dtype=dtype),
+        lambda: Vectors(8, size=3, dtype=dtype, signalled=validation_signalled),
         0.0,
     )
     return duel

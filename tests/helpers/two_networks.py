@@ -1,13 +1,12 @@
 """Two network namespaces with a cable between them: two machines, as far as a launcher can see.
 
-Each knows its own host name by its own address, and no name server: what a training looks up it finds there
-or not at all.
+Each has a host name of its own, knows both by their addresses, and has no name server: what a training looks
+up it finds there or not at all.
 """
 
 from __future__ import annotations
 
 import os
-import platform
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -24,22 +23,24 @@ class Node(NamedTuple):
     """One of the two."""
 
     name: str
-    """Of its namespace."""
+    """Of its namespace, and of the host."""
     device: str
     """Its end of the cable."""
     address: str
 
     def words(self, *command: object) -> list[str]:
         """The command, run there."""
-        return ["ip", "netns", "exec", self.name, *map(str, command)]
+        named = ["unshare", "--uts", "sh", "-c", f'hostname {self.name} && exec "$@"', "sh"]
+        return ["ip", "netns", "exec", self.name, *named, *map(str, command)]
 
 
 def why_not() -> str:
     """Why there can be no namespaces here; empty when there can."""
     if os.name != "posix" or os.geteuid() != 0:
         return "making network namespaces needs root"
-    if shutil.which("ip") is None:
-        return "not installed: ip (Debian: iproute2)"
+    for program, package in (("ip", "iproute2"), ("unshare", "util-linux"), ("hostname", "hostname")):
+        if shutil.which(program) is None:
+            return f"not installed: {program} (Debian: {package})"
     trial = f"trial-{os.getpid()}"
     if subprocess.run(["ip", "netns", "add", trial], capture_output=True).returncode:
         return "this machine lets nobody make network namespaces"
@@ -61,8 +62,8 @@ def two_networks() -> Iterator[tuple[Node, Node]]:
             folder = _SETTINGS / node.name
             folder.mkdir(parents=True)
             left.callback(shutil.rmtree, folder)
-            names = f"127.0.0.1 localhost\n{node.address} {platform.node()}\n"
-            (folder / "hosts").write_text(names)
+            names = [f"{one.address} {one.name}" for one in (first, second)]
+            (folder / "hosts").write_text("\n".join(["127.0.0.1 localhost", *names, ""]))
             (folder / "resolv.conf").write_text("options timeout:1 attempts:1\n")
         _ip("link", "add", first.device, "netns", first.name, "type", "veth",
             "peer", "name", second.device, "netns", second.name)  # fmt: skip

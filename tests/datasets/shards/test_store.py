@@ -48,6 +48,7 @@ def same(one: ShardDataset, other: ShardDataset) -> None:
         "pipe:touch PWNED_store|",
         "simplecache::s3://b/c",
         "gs://bucket/x",
+        "gs://bucket/'x y'",
         "hf://datasets/x",
         "ssh://host/x",
         "python:x",

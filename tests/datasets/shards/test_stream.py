@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import tarfile
 from collections import Counter
@@ -246,6 +247,41 @@ def test_every_damage_stops_the_stream(
     with pytest.raises(UserError, match=said) as raised:
         read_shard(LocalStore(tmp_path), shard, data._index, range(8, 16), {"motion.npy"})
     assert shard.name in str(raised.value)
+
+
+class Payload:
+    """Leaves a marker wherever it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        return os.system, ("touch PWNED",)
+
+
+@pytest.mark.parametrize("ending", ["pkl", "pyd", "pth", "motion.pkl"])
+def test_members_with_code_stop_the_stream_unread(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    """WebDataset's decoders would run them, by the ending of the name."""
+    monkeypatch.chdir(tmp_path)
+    data = ShardDataset.open(root, "train")
+    shard = data._shards[1]
+    code = (f"000001-000000.{ending}", pickle.dumps(Payload()))
+    first, *rest = members(root / shard.name)
+    (tmp_path / shard.name).write_bytes(tar([first, code, *rest]))
+    for wanted in ({"motion.npy"}, {"motion.npy", ending}):
+        with pytest.raises(UserError, match=f"sample 0 is .*'{ending}'"):
+            read_shard(LocalStore(tmp_path), shard, data._index, range(8, 16), wanted)
+    assert [path.name for path in tmp_path.iterdir()] == [shard.name]
+
+
+def test_no_environment_turns_a_shard_into_a_command(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """WebDataset's own opener follows GOPEN_REWRITE to a shell; it is never called."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GOPEN_REWRITE", f"{root}=pipe:touch PWNED; cat {root}")
+    data = opened(root, "streamed")
+    np.testing.assert_array_equal(data.motion(9), ShardDataset.open(root, "train").motion(9))
+    assert not list(tmp_path.iterdir())
 
 
 def test_shared_broken_shards_are_refused(root: Path, shared: Path, tmp_path: Path) -> None:

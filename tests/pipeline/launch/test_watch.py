@@ -1,7 +1,7 @@
 """One process of a run dies or stalls: all end, one sentence says which one, nothing is left behind.
 
 What is judged, on made-up figures; the connections, between threads of this process; and whole trainings,
-whose processes run this file as a script.
+whose processes are those of `watched_training.py`.
 """
 
 from __future__ import annotations
@@ -14,17 +14,21 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from two_ranks import HELPERS
+from watched_training import Jobs, descendants, end_of, is_gone, pid_of, until, wait_for_step
 
+from motionloom.pipeline.contract.units import Units
 from motionloom.pipeline.launch import ending
 from motionloom.pipeline.launch.beats import Beat, Peer, judge
 from motionloom.pipeline.launch.lines import Line
 from motionloom.pipeline.launch.watch import ENDED, Watch
+
+linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks up processes in /proc")
 
 
 def peer(
@@ -57,6 +61,55 @@ def test_the_dead_and_not_their_victims_are_blamed() -> None:
     assert verdict is not None and "rank 1" in verdict.sentence and "exit code 1" in verdict.sentence
 
 
+def test_units_of_a_divided_work_may_take_what_units_take() -> None:
+    """Ten times the longest so far of the same work, by whoever made it; nobody knows before."""
+    own, other = peer(0, idle=900), peer(1, expected=False)
+    own.beat.work, other.beat.work = "generated", "reconstructed"
+    other.beat.longest = 1.0
+    assert judge([own, other], 60) is None, "units of another work say nothing"
+    other.beat.work, other.beat.longest = "generated", 91.0
+    assert judge([own, other], 60) is None
+    other.beat.longest = 89.0
+    verdict = judge([own, other], 60)
+    assert verdict is not None and verdict.stalled and verdict.rank == 0
+    other.beat.longest, own.beat.idle = 0.1, 59.0
+    assert judge([own, other], 60) is None
+    own.beat.idle = 61.0
+    assert judge([own, other], 60) is not None
+
+
+def test_a_process_says_which_unit_it_makes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mine, seen = Watch(0, 60), []
+    monkeypatch.setattr("motionloom.pipeline.launch.watch._current", mine)
+    mine.enter_stage("tokens", tmp_path, "before its first step")
+
+    def result(index: int) -> dict[str, Any]:
+        seen.append((mine.beat.place(), mine.beat.expected, mine.beat.work, mine.beat.longest > 0))
+        return {"x": np.zeros(1)}
+
+    units = Units(tmp_path, rank=1, world=2)
+    units.make("train", 4, result)
+    assert seen == [
+        ("stage tokens, making unit 2 of 4 (train)", True, "train", False),
+        ("stage tokens, making unit 4 of 4 (train)", True, "train", True),
+    ]
+    assert not mine.beat.expected and mine.beat.longest > 0
+    units.make("val", 2, result)
+    assert seen[2:] == [("stage tokens, making unit 2 of 2 (val)", True, "val", False)]
+
+
+@linux
+@pytest.mark.slow
+def test_a_unit_that_hangs_ends_the_stage(jobs: Jobs, tmp_path: Path) -> None:
+    """Work that processes divide, where nobody waits for another one."""
+    job = jobs.start(tmp_path, "units", (sys.executable, "-P"))
+    until(lambda: len([*tmp_path.glob("work/train-*.npz")]) == 3, "no units", 250)
+    said = end_of([job], descendants(job))[0]
+    assert said.count("has stalled: no progress") == 1 and "error: rank 1 on" in said, said
+    assert "stage shared, making unit 4 of 4 (train)" in said
+    assert "in result" in (tmp_path / "flight/stacks_rank_1.txt").read_text()
+
+
 def test_the_one_that_stopped_first_is_blamed_and_not_those_who_wait_for_it() -> None:
     verdict = judge([peer(0, idle=64, count=9), peer(1, idle=63, count=8), peer(2, idle=62, count=8)], 60)
     assert verdict is not None and verdict.stalled and verdict.rank == 1 and not verdict.mute
@@ -82,13 +135,6 @@ class Ends:
 
     def __call__(self, code: int) -> None:
         self.code = code
-
-
-def until(true: Callable[[], bool], what: str, seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, what
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -188,7 +234,7 @@ def test_a_message_of_many_pieces_and_rubbish() -> None:
         assert line.receive() == [{"a": 1}] and line.closed
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks up processes in /proc")
+@linux
 def test_only_the_very_process_is_killed() -> None:
     sleeper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     try:
@@ -210,7 +256,7 @@ PARENT = (
 )
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks up processes in /proc")
+@linux
 @pytest.mark.parametrize("starts", [False, True])
 def test_a_hanging_loader_worker_ends_with_its_process(starts: bool) -> None:
     """Also one that had not finished to start when the process died."""
@@ -236,88 +282,26 @@ def test_a_hanging_loader_worker_ends_with_its_process(starts: bool) -> None:
 
 # Whole trainings.
 
-STALL = 15
-"""Seconds; longer than a busy machine takes over one step of so small a training."""
-
-
-def worker(out: Path, hangs: str) -> None:
-    """One rank: trains until something ends it. `hangs`: rank 1 does, in the read of batch 33."""
-    from rich.console import Console
-    from tiny_players import Duel, Vectors, context
-
-    from motionloom.pipeline.launch.team import Team
-    from motionloom.pipeline.stages.train_config import TrainConfig
-    from motionloom.pipeline.stages.training import fit
-
-    given = {"devices": 2, "stall_seconds": STALL}
-    stage = context(out, Console(quiet=True), **given)
-    team = Team.start(stage.hardware)
-    (out / f"{team.rank}.pid").write_text(str(os.getpid()))
-    at = 33 if team.rank == 1 and hangs == "hangs" else None
-    config = TrainConfig(steps=10**6, batch_size=8, validate_every=0, checkpoint_every=5)
-    duel = Duel(seed=3, max_steps=config.steps)
-    fit(stage, duel, config, lambda *place: Vectors(*place, hangs_at=at), None, 0.0)
-
-
-def is_gone(pid: int) -> bool:
-    return not ending._stat(pid) or ending._stat(pid)[0] == "Z"
-
-
-@pytest.fixture
-def trainings() -> Iterator[Callable[..., Any]]:
-    """Starts a job; nothing of it outlives the test."""
-    jobs: list[Any] = []
-
-    def go(out: Path, how: str, *launcher: str) -> Any:
-        jobs.append(_job(out, how, launcher))
-        return jobs[-1]
-
-    yield go
-    for job in jobs:
-        try:
-            os.killpg(job.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            continue
-
-
-def _job(out: Path, how: str, launcher: tuple[str, ...]) -> Any:
-    path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), HELPERS]))
-    env = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        [sys.executable, *launcher, __file__, str(out), how],
-        env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
-    )  # fmt: skip
-
-
-def end_of(job: Any, pids: list[int]) -> str:
-    """What the job said; it ends by itself, and no process that it started is left."""
-    said: str = job.communicate(timeout=150)[0]
-    until(lambda: all(map(is_gone, pids)), f"left behind: {[p for p in pids if not is_gone(p)]}\n{said}", 40)
-    assert job.returncode != 0, said
-    return said
-
-
-linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks up processes in /proc")
-
 
 @linux
 @pytest.mark.slow
-def test_a_stopped_lead_ends_the_job(trainings: Callable[..., Any], tmp_path: Path) -> None:
-    job = trainings(tmp_path, "goes", "-P")
-    until(lambda: any(int(p.stem[5:]) >= 100 for p in tmp_path.glob("checkpoints/s*.ckpt")), "no steps", 150)
-    pids = [job.pid, *ending._descendants(job.pid)]
-    os.kill(int((tmp_path / "0.pid").read_text()), signal.SIGSTOP)
-    said = end_of(job, pids)
-    assert said.count("has stalled: it has not answered") == 1 and "error: rank 0 on" in said
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_stopped_rank_ends_the_job(jobs: Jobs, tmp_path: Path, rank: int) -> None:
+    job = jobs.start(tmp_path, "goes", (sys.executable, "-P"))
+    wait_for_step(tmp_path, 30)
+    pids = descendants(job)
+    os.kill(pid_of(tmp_path, rank), signal.SIGSTOP)
+    said = end_of([job], pids)[0]
+    assert said.count("has stalled: it has not answered") == 1 and f"error: rank {rank} on" in said, said
     assert "it was at stage duel, step" in said
-    assert "training.py" in (tmp_path / "flight/stacks_rank_1.txt").read_text()
+    assert "training.py" in (tmp_path / f"flight/stacks_rank_{1 - rank}.txt").read_text()
 
 
 @linux
 @pytest.mark.slow
-def test_a_read_that_hangs_ends_the_job_under_torchrun(trainings: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_read_that_hangs_ends_the_job_under_torchrun(jobs: Jobs, tmp_path: Path) -> None:
     launch = ("-P", "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    job = trainings(tmp_path, "hangs", *launch)
+    job = jobs.start(tmp_path, "hangs", (sys.executable, *launch))
     pids: set[int] = set()
 
     def over() -> bool:
@@ -325,12 +309,8 @@ def test_a_read_that_hangs_ends_the_job_under_torchrun(trainings: Callable[..., 
         return job.poll() is not None
 
     until(over, "the job goes on", 250)
-    said = end_of(job, sorted(pids))
+    said = end_of([job], sorted(pids))[0]
     assert said.count("has stalled: no progress") == 1 and "error: rank 1 on" in said, said
     assert re.search(r"stage duel, step (32|33), waiting for a batch", said), said  # Lightning reads ahead
     stacks = [(tmp_path / f"flight/stacks_rank_{rank}.txt").read_text() for rank in range(2)]
     assert "in __getitem__" in stacks[1] and "in __getitem__" not in stacks[0]
-
-
-if __name__ == "__main__":
-    worker(Path(sys.argv[1]), sys.argv[2])

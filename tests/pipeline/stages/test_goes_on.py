@@ -171,6 +171,10 @@ def interrupt(out: Path, rank: int, hardware: dict[str, Any]) -> None:
         with pytest.raises(Interrupted) as stopped:
             train(out / "interrupted", signalled=signalled, **settings)
         stops.append(stopped.value.step)
+        if step == 1:  # in the first validation, of one rank
+            signalled = {0: signal.SIGTERM} if rank == 1 else None
+            with pytest.raises(Interrupted, match="saved at step 7 of 24"):
+                train(out / "interrupted", validation_signalled=signalled, **settings)
     again = train(out / "interrupted", **settings)
     assert_equal(whole.state_dict(), again.state_dict())
     (out / f"stops-{rank}.json").write_text(json.dumps(stops))

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import torch
 from rich.console import Console
-from same_stage import assert_equal, assert_same_stage, newest
+from same_stage import assert_same_stage
 from tiny_players import context, train
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -101,17 +101,34 @@ def test_interrupted_equals_undisturbed(training: Train, tmp_path: Path) -> None
     assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
 
 
-def test_the_end_of_a_chunk_is_validated_before_it_is_left(tmp_path: Path) -> None:
-    whole = train(tmp_path / "whole", **FULL)
-    for at in (6, 23):  # the last steps of a chunk and of the training
-        with pytest.raises(Interrupted, match=f"duel is saved at step {at + 1} of 24"):
-            train(tmp_path / "hit", signalled={at: TERM}, **FULL)
-        rows = read_metrics(tmp_path / "hit")
-        assert rows == read_metrics(tmp_path / "whole")[: len(rows)]
-        assert rows[-1]["step"] == (7 if at == 6 else 21) and "val/loss" in rows[-1]
-    again = train(tmp_path / "hit", **FULL)
-    assert_equal(whole.net.state_dict(), again.net.state_dict())
-    assert_equal(newest(tmp_path / "whole"), newest(tmp_path / "hit"))
+@pytest.mark.parametrize("training", [train, train_tokenizer], ids=["two optimizers", "codebooks"])
+def test_a_validation_is_cut_short_and_made_up_for(training: Train, tmp_path: Path) -> None:
+    """Behind its current batch, at the ends of chunks and of the training."""
+    whole = training(tmp_path / "whole", **FULL | {"steps": 21})
+    rows = read_metrics(tmp_path / "whole")
+    for at in (6, 13, 20):
+        with pytest.raises(Interrupted) as stopped:
+            training(tmp_path / "hit", signalled={at: TERM}, **FULL | {"steps": 21})
+        assert stopped.value.step == at + 1
+        cut = [row for row in rows if row["step"] <= at + ("val/loss" not in row)]
+        assert read_metrics(tmp_path / "hit") == cut
+        assert len([row for row in cut if "val/loss" in row]) == at // 7
+    again = training(tmp_path / "hit", **FULL | {"steps": 21})
+    assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
+
+
+def test_a_validation_that_is_made_up_for_is_cut_short_again(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole")
+    for _ in range(3):
+        with pytest.raises(Interrupted, match="saved at step 12 of 24"):
+            train(tmp_path / "hit", validation_signalled={1: TERM})
+    with pytest.raises(Interrupted, match="saved at step 12 of 24"):
+        train(tmp_path / "hit", validation_signalled={2: TERM})  # the last batch: it is whole
+    rows = read_metrics(tmp_path / "hit")
+    assert rows == [row for row in read_metrics(tmp_path / "whole") if row["step"] <= 12]
+    assert "val/loss" in rows[-1] and rows[-1]["step"] == 12
+    again = train(tmp_path / "hit")
+    assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
 
 
 def test_signals_are_noted_and_the_first_counts() -> None:
@@ -175,7 +192,7 @@ def test_ranks_ask_each_other_about_twice_a_second(monkeypatch: pytest.MonkeyPat
     for step in range(1, 1000):
         clock[0] += 1 / 256
         before = agreement._last
-        number = agreement.at(step)
+        number = agreement.at_border()
         if agreement._last != before:
             asked.append((step, clock[0]))
         if number:

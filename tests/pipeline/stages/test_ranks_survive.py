@@ -55,6 +55,26 @@ def test_two_ranks_killed_in_a_write_and_elsewhere_train_the_same(tried: Tried) 
     assert seen.exact, seen
 
 
+def test_a_damaged_shard_ends_both_ranks_with_one_sentence(tried: Tried, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    copy_without(tried.base, run, "tokenizer")
+    shard = next((run / "stages/data/shards").glob("*-val-*.tar"))
+    raw = bytearray(shard.read_bytes())
+    raw[len(raw) // 2] ^= 4
+    shard.write_bytes(raw)
+    words = ["run", tried.recipe, "--out", run, "--until", "tokenizer", "--set", "hardware.devices=2"]
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", *map(str, words)],
+        capture_output=True, text=True, timeout=240, env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    said = [line for line in done.stderr.splitlines() if "error" in line or "rank" in line]
+    assert said == [
+        f"error: {shard}: the sha256 is not the manifest's: damaged; copy it back or convert again"
+    ]
+    assert not (run / "stages/tokenizer/checkpoints").exists()
+
+
 @pytest.mark.skipif(bool(why_not()), reason=why_not())
 def test_two_machines_train_the_same_as_one(tried: Tried, tmp_path: Path) -> None:
     """torchrun on two nodes that share a run folder and a cable, against two ranks on one machine."""

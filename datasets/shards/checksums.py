@@ -1,0 +1,83 @@
+"""Shards of a folder compared with the sha256 of their manifest.
+
+The indexed reader maps files and takes clips out of them, so a flipped bit would be trained on without a
+word. Whole files are compared before they are read, at the speed of the disk, and what a file was like then
+tells whether it has been touched since.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+from motionloom.datasets.schema import ShardInfo, UserError
+
+_ADVICE = "copy it back or convert again"
+
+
+class LocalShard(NamedTuple):
+    """A shard in a folder of this machine."""
+
+    path: Path
+    info: ShardInfo
+
+    def state(self) -> list[int]:
+        """What changes when somebody writes to the file or puts another in its place; empty: none is there.
+
+        The time of the last change of any kind (ctime) is the system's own: a copy that restores the time of
+        the last write, as rsync does, is seen, and so are files of two machines that lie under one path.
+        """
+        try:
+            found = self.path.stat()
+        except OSError:
+            return []
+        return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
+
+
+def require_sound(shard: LocalShard, *, content: bool = True) -> None:
+    """Refuse a shard that is missing, has another size or, where `content` is compared, another sha256."""
+    path, info = shard
+    try:
+        size = path.stat().st_size
+    except OSError:
+        raise UserError(f"{path}: the shard is missing; {_ADVICE}") from None
+    if size != info.bytes:
+        raise UserError(
+            f"{path}: {size} bytes, the manifest says {info.bytes}: truncated or changed; {_ADVICE}"
+        )
+    if not content:
+        return
+    try:
+        with path.open("rb") as file:
+            found = hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); {_ADVICE}") from None
+    if found != info.sha256:
+        raise UserError(f"{path}: the sha256 is not the manifest's: damaged; {_ADVICE}")
+
+
+def problems(
+    shards: Sequence[LocalShard], threads: int, done: Callable[[], object] = lambda: None
+) -> list[str]:
+    """What is wrong with shards, in their order; `done` is called for each that has been compared.
+
+    Hashing runs outside the interpreter's lock.
+    """
+
+    def problem(shard: LocalShard) -> str | None:
+        try:
+            require_sound(shard)
+        except UserError as error:
+            return str(error)
+        return None
+
+    found = []
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        for said in pool.map(problem, shards):
+            if said is not None:
+                found.append(said)
+            done()
+    return found
