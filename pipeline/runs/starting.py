@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +58,7 @@ class StartingModel:
     @staticmethod
     def open(name: str, where: str) -> StartingModel:
         """The model in a folder; `where` is what names it, for messages."""
-        folder = Path(name).expanduser()
-        made = _generators(folder, f"{where}: {START} = '{name}'")
+        made = _generators(_folder(name), f"{where}: {START} = '{name}'")
         gpts = [stage for stage in made if stage.kind.name == "gpt" and not stage.config.face]
         if not gpts:
             kinds = ", ".join(dict.fromkeys(stage.kind.name for stage in made)) or "nothing"
@@ -74,12 +74,23 @@ class StartingModel:
         return StartingModel(name, stages, faces, load_facts(tokenizer.folder).layout.layout())
 
 
+def _folder(name: str) -> Path:
+    """A folder that is there, else that of a model of the package."""
+    folder = Path(name).expanduser()
+    if folder.exists() or len(folder.parts) != 1:
+        return folder
+    return Path(str(resources.files("motionloom.models"))) / "pretrained" / name
+
+
 def _generators(folder: Path, where: str) -> list[Finished]:
     if (folder / BUNDLE_FILE).is_file():
         return open_exported(folder)
     if (folder / "recipe.yaml").is_file():
         return generators_of(folder)
-    raise UserError(f"{where}: no export and no run is there; name the folder of one (motionloom export RUN)")
+    raise UserError(
+        f"{where}: no model of the package is called so, and no export or run is there; name the folder of "
+        f"one"
+    )
 
 
 def _of_face(stage: Finished) -> bool:

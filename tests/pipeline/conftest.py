@@ -251,7 +251,7 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any
     recipe.write_text(SMALL)
     folder = root / "run"
     process = start("run", recipe, "--out", folder)
-    output, _ = process.communicate(timeout=2000)
+    output, _ = process.communicate(timeout=240)
     assert process.returncode == 0, output
     return SmallRun(recipe, folder, output)
 
@@ -264,6 +264,6 @@ def ude_run(tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any])
     recipe.write_text(UDE)
     folder = root / "run"
     process = start("run", recipe, "--out", folder, "--until", "ude")
-    output, _ = process.communicate(timeout=2000)
+    output, _ = process.communicate(timeout=240)
     assert process.returncode == 0, output
     return SmallRun(recipe, folder, output)

@@ -79,7 +79,7 @@ def mine(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Mine:
 
 def test_stages_are_those_of_the_model(mine: Mine) -> None:
     recipe = mine.load("data.unit=cm")
-    at = {name: str(mine.exported / name) for name in ("stats", "tokenizer", "tma", "gpt", "face_gpt")}
+    at = {name: str(mine.exported / name) for name in ("stats", "tokenizer", "tma", "gpt")}
     kept = BundleFile.load_json(mine.exported / "bundle.json").stages
 
     def places(stage: str) -> dict[str, str]:
@@ -93,7 +93,9 @@ def test_stages_are_those_of_the_model(mine: Mine) -> None:
     assert places("tma") == {"stats": at["stats"], "start": at["tma"]}
     assert places("tokens") == {"stats": at["stats"]}
     assert places("gpt") == {"start": at["gpt"]}
-    assert places("generate") == {"generators.model:face_gpt": at["face_gpt"]}
+    faces = ("face_gpt", "face_vae", "face_diffusion")
+    assert places("generate") == {f"generators.model:{name}": str(mine.exported / name) for name in faces}
+    assert list(recipe.stage("generate").inputs) == ["data", "generators.gpt", *places("generate")]
     data, gpt = recipe.stage("data").config, recipe.stage("gpt").config
     assert (data.layout, data.fps, data.fingers) == ("wholebody363", 20.0, "resting")
     assert gpt.net.dump() == kept["gpt"].config["net"] and gpt.prior == "tma"
@@ -122,7 +124,7 @@ def test_the_resolved_recipe_is_the_same_without_a_start(mine: Mine, tmp_path: P
 @pytest.mark.parametrize(
     ("sets", "says"),
     [
-        (["start=nowhere"], "start = 'nowhere': no export and no run is there"),
+        (["start=nowhere"], "start = 'nowhere': no model of the package .* no export or run is there"),
         (["data.layout=body133"], "layout = body133, but start .* was trained on layout wholebody363"),
         (["data.fps=30"], "stages.data.fps = 30, but start .* was trained on fps 20.0; leave it out"),
         (["gpt.net.heads=2"], "starts from .*model/gpt', which differs in net.heads; give both the same"),
@@ -189,7 +191,7 @@ def test_it_trains_adapters_and_leaves_plain_weights(mine: Mine, trained: Path, 
     # What its pages, commands and exports read: its own body, and the face of the model it started from.
     export_run(trained, tmp_path / "out", console=QUIET)
     facts = BundleFile.load_json(tmp_path / "out/bundle.json")
-    assert facts.generators == ("gpt", "face_gpt")
+    assert facts.generators == ("gpt", "face_gpt", "face_vae", "face_diffusion")
     made = Bundle.open(tmp_path / "out").generate(["somebody sways"], seconds=2.0, seed=1)[0]
     again = Bundle.open(trained).generate(["somebody sways"], seconds=2.0, seed=1)[0]
     np.testing.assert_array_equal(made.features, again.features)
