@@ -63,7 +63,7 @@ ARMS: dict[str, dict[str, tuple[float, float]]] = {
     "lora": {"tokenizer": (0.25, 1.0e-3), "tma": (0.15, 5.0e-4), "gpt": (0.60, 1.0e-3)},
 }
 """Arm -> training -> its share of the time, and its learning rate."""
-BATCH = {"tokenizer": 32, "tma": 64, "gpt": 32}
+BATCH = {"tokenizer": 32, "tma": 32, "gpt": 16}
 SIZE = 32
 SHOWN = ("t2m_r1", "t2m_r3", "m2t_r1", "content", "style", "obeys")
 PROBE = (10, 40)
