@@ -320,7 +320,8 @@ def main() -> None:
         for seed in args.seeds:
             other = np.random.default_rng(seed).permutation(len(clips.truths))
             keep("another clip's", seed, clips.figures([clips.truths[i].joints for i in other]))
-    for seed in args.seeds if "as it came" not in found else ():
+    untrained = "as it came" not in found and args.arms != ["scratch"]  # which takes the model's sizes alone
+    for seed in args.seeds if untrained else ():
         keep("as it came", seed, figures_of(Bundle.open(args.start), clips, seed, args))
     cost = costs(args, console)
     for arm in args.arms:

@@ -122,10 +122,10 @@ def _entry(
     if "kind" not in entry:
         stage = model.stages.get(key)
         if stage is None or not stage.kind.trains:
-            roles = [role for role, found in model.stages.items() if found.kind.trains]
+            known = [role for role, found in model.stages.items() if found.kind.trains]
             raise UserError(
                 f"{where}: stages.{key} has no kind, and {START} '{model.name}' has no '{key}' to go on from"
-                f"{nearest(key, roles)}"
+                f"{nearest(key, known)}"
             )
         settings = {field: value for field, value in stage.config.dump().items() if field not in _OWN}
         entry = merge({"kind": stage.kind.name, **settings}, entry)

@@ -17,7 +17,9 @@ START = "start"
 
 
 def starts_from(name: str, first: str, others: Mapping[str, Stage]) -> bool:
-    """Whether a stage is `first`, or was trained on from it, directly or over others."""
+    """Whether a stage is `first`, or was trained on from it, directly or over others; "" is none."""
+    if not first:
+        return not name
     seen: set[str] = set()
     while name not in seen:
         if name == first:

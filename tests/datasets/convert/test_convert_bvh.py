@@ -24,7 +24,6 @@ from motionloom.datasets.motion.canonical import canonicalize, resample
 from motionloom.datasets.motion.features import decode
 from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.resting_hands import with_resting_hands
 from motionloom.datasets.schema import Manifest, Split, UserError
 from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
@@ -123,25 +122,6 @@ def test_features_are_those_of_the_clip(clips: Path, tmp_path: Path) -> None:
     got = decode(np.array(dataset.motion(0)), MotionLayout.named("body133"))
     np.testing.assert_allclose(got, expected, atol=1e-4)
     assert expected[..., 1].min() == pytest.approx(0, abs=1e-9)
-
-
-@pytest.mark.parametrize("fingers", ["resting", "missing"])
-def test_files_without_fingers_fill_a_layout_with_hands(clips: Path, tmp_path: Path, fingers: str) -> None:
-    """Hands at rest, motion or not; the face is missing; the body's columns are those of the body alone."""
-    given: dict[str, Any] = {"limit": 2, "splits_map": "ignore"}
-    convert(config(clips, layout="wholebody363", fps=20.0, fingers=fingers, **given), tmp_path / "whole")
-    convert(config(clips, **given), tmp_path / "body")
-    layout = MotionLayout.named("wholebody363", fps=20.0)
-    for split in {path.name.split("-")[1] for path in (tmp_path / "body").glob("*.tar")}:
-        whole, body = (ShardDataset.open(tmp_path / name, split) for name in ("whole", "body"))
-        assert whole.meta(0).has_hands is (fingers == "resting") and not whole.meta(0).has_face
-        motion = np.array(whole.motion(0))
-        np.testing.assert_allclose(motion[:, layout.part("body")], np.array(body.motion(0)), atol=1e-5)
-        assert not motion[:, layout.slice("face")].any()
-        joints = decode(motion, layout)
-        np.testing.assert_allclose(joints, with_resting_hands(joints[:, :22]), atol=0.02)
-    with pytest.raises(UserError, match="smplx52"):
-        prepare_bvh(config(clips, layout="wholebody313", **given))
 
 
 def test_worker_count_changes_no_byte(copy: Path, tmp_path: Path) -> None:
