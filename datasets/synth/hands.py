@@ -9,22 +9,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from motionloom.datasets.motion.resting_hands import RELAXED_FAN, RELAXED_FLEX, RELAXED_THUMB
 from motionloom.datasets.synth.maths import Array, ease, rot_y, rot_z, wander
 
 # Flexion of (knuckle, middle joint, last joint) for index, middle, pinky, ring; radians.
 _FLEX: dict[str, tuple[tuple[float, float, float], ...]] = {
-    "relaxed": ((0.3, 0.4, 0.25), (0.38, 0.45, 0.3), (0.5, 0.5, 0.3), (0.45, 0.48, 0.3)),
+    "relaxed": RELAXED_FLEX,
     "fist": ((1.35, 1.6, 1.0), (1.4, 1.65, 1.0), (1.4, 1.6, 1.0), (1.42, 1.65, 1.0)),
     "point": ((0.02, 0.06, 0.05), (1.35, 1.6, 1.0), (1.4, 1.6, 1.0), (1.4, 1.65, 1.0)),
     "spread": ((-0.05, 0.02, 0.0), (-0.05, 0.02, 0.0), (-0.02, 0.04, 0.0), (-0.04, 0.02, 0.0)),
     "pinch": ((0.85, 0.85, 0.3), (0.35, 0.35, 0.2), (0.25, 0.25, 0.15), (0.3, 0.3, 0.2)),
     "wave_fingers": ((0.5, 0.5, 0.3), (0.5, 0.5, 0.3), (0.5, 0.5, 0.3), (0.5, 0.5, 0.3)),
 }
-_FAN = np.array([-0.06, -0.02, 0.1, 0.04])
+_FAN = np.array(RELAXED_FAN)
 _FAN_WIDE = np.array([-0.34, -0.08, 0.5, 0.2])
 # Rotation vectors of the three thumb joints.
 _THUMB: dict[str, tuple[tuple[float, float, float], ...]] = {
-    "relaxed": ((0.25, 0.1, -0.25), (0.0, 0.1, -0.15), (0.0, 0.1, -0.1)),
+    "relaxed": RELAXED_THUMB,
     "fist": ((0.7, 0.75, -0.55), (0.1, 0.6, -0.35), (0.0, 0.5, -0.2)),
     "point": ((0.7, 0.7, -0.5), (0.1, 0.55, -0.35), (0.0, 0.5, -0.2)),
     "spread": ((0.0, -0.45, 0.1), (0.0, -0.15, 0.0), (0.0, -0.05, 0.0)),

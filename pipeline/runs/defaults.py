@@ -46,6 +46,8 @@ def fill(stages: Entries, defaults: Entries, where: str) -> dict[str, dict[str, 
 def require_used(keys: Any, stages: Any, where: str) -> None:
     """Refuse defaults that concern no stage; both as they were read, in whatever form."""
     entries = stages.values() if isinstance(stages, dict) else ()
+    if any(isinstance(entry, dict) and "kind" not in entry for entry in entries):
+        return  # they are of the kinds of the model that the recipe starts from, whatever that will be
     concerned = list(dict.fromkeys(key for entry in entries for key in _concerning(entry)))
     for key in keys or ():
         if key not in concerned and (key == TRAINED or key in stage_kinds()):

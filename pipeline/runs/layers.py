@@ -16,7 +16,7 @@ from motionloom.pipeline.runs.shipped import find_recipe, nearest
 from motionloom.pipeline.store.yaml import load_yaml, read_yaml
 
 _DEEPEST = 4
-_TOP = ("name", "description", "seed", "data_seed", "hardware", "defaults", "stages")
+_TOP = ("name", "description", "seed", "data_seed", "hardware", "start", "defaults", "stages")
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,17 @@ def read_recipe_file(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise UserError(f"{path}: a recipe is a mapping with 'name' and 'stages'")
     stages = data.get("stages")
+    if "start" in data:
+        data["start"] = _start_place(data["start"], path.parent)
     if isinstance(stages, dict):
         data["stages"] = {name: with_places(entry, path.parent) for name, entry in stages.items()}
     return data
+
+
+def _start_place(name: Any, folder: Path) -> Any:
+    """A `start` as it is seen from the folder of the recipe file, where there is one, else as it stands."""
+    there = isinstance(name, str) and (folder / Path(name).expanduser()).is_dir()
+    return str(folder / Path(name).expanduser()) if there else name
 
 
 def _base(path: Path, base: str) -> Path:

@@ -12,7 +12,8 @@ A stage's inputs are found by role: a stage that needs `data` takes the stage ca
 of an export (`start: runs/other/stages/gpt`). `seed` is everybody's; `data_seed`, where it is given, is that
 of all that comes before the first training. `extends:` starts from another recipe file, one beside this one
 or a shipped one by name; a stage that is `null` is left out. `defaults:` holds what stages share
-(`defaults.py`). `--set stage.field=value` overrides one value.
+(`defaults.py`), and `start:` names a trained model to go on from (`starting.py`).
+`--set stage.field=value` overrides one value.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from motionloom.pipeline.runs.inputs import Sources
 from motionloom.pipeline.runs.layers import override, read_layers, read_recipe_file
 from motionloom.pipeline.runs.outside import as_stages
 from motionloom.pipeline.runs.shipped import find_recipe, nearest
+from motionloom.pipeline.runs.starting import with_start
 from motionloom.pipeline.store.outside import place_from
 from motionloom.pipeline.store.yaml import dump_yaml
 
@@ -47,6 +49,9 @@ class RecipeFile(Config):
     data_seed: int | None = Field(None, ge=0)
     """Of all that comes before the first training; null = `seed`."""
     hardware: Hardware = Hardware()
+    start: str | None = None
+    """A trained model that stages go on from: one of the package, or the folder of an export or a run; see
+    `starting.py`."""
     defaults: dict[str, dict[str, Any]] = Field(default_factory=dict)
     """What stages of a kind, or all that train (`trained`), share; see `defaults.py`."""
     stages: dict[str, dict[str, Any]]
@@ -154,7 +159,8 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = (), *, stri
     for text in overrides:
         layers = override(layers, text)
     where = f"{path} with --set" if overrides else str(path)
-    file = RecipeFile.parse(layers.data, where)
+    data = with_start(layers.data, where)
+    file = RecipeFile.parse(data, where)
     require_used(file.defaults.keys() - known, file.stages, where)
     parsed = _parse(fill(file.stages, file.defaults, where), where)
     sources = Sources([stage for stage, _ in parsed], where, layers.removed, strict)

@@ -13,9 +13,12 @@ from motionloom.datasets.schema import UserError
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Recipes that come with the package, by name: `FOLDER/SIZE.yaml` is called `FOLDER-SIZE`."""
+    """Recipes that come with the package, by name: `FOLDER/SIZE.yaml` is called `FOLDER-SIZE`, `NAME.yaml` at
+    the top `NAME`.
+    """
     folder = Path(str(resources.files("motionloom.configs")))
     found = {f"{path.parent.name}-{path.stem}": path for path in folder.glob("*/*.yaml")}
+    found |= {path.stem: path for path in folder.glob("*.yaml")}
     return dict(sorted(found.items()))
 
 

@@ -21,21 +21,22 @@ from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.streaming import TokenStream
+from motionloom.models.training.lora import LoraConfig, add_lora, merge_lora, require_peft
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage
+from motionloom.pipeline.contract.stage import GENERATOR, LATER, Finished, Given, Stage
 from motionloom.pipeline.contract.streaming import FrameFlow, StreamConfig, TokenFlow
 from motionloom.pipeline.inference.decoding import Frames
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
 from motionloom.pipeline.stages.gpt_flow import GptFlow
-from motionloom.pipeline.stages.same_text import same_encoder
+from motionloom.pipeline.stages.gpt_start import require_own_text, require_start
+from motionloom.pipeline.stages.starting import START, require_start_layout
 from motionloom.pipeline.stages.streams import require_streams, stream_facts
 from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer, device_of
-from motionloom.pipeline.store.outside import is_place
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import TokenBatches
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
@@ -44,9 +45,6 @@ if TYPE_CHECKING:
     from motionloom.models.gpt.module import GptModule
 
 Prior = Literal["tma", "sentence"]
-
-_SIZES = ("layers", "dim", "heads", "ff", "block_size")
-"""Of the network; a GPT goes on from another only where these are equal."""
 
 
 class GptStageConfig(TrainedStageConfig):
@@ -63,10 +61,20 @@ class GptStageConfig(TrainedStageConfig):
     """Train on the face captions."""
     min_frames: int = Field(16, ge=1)
     """Captions about fewer frames are left out where the clip has a longer one."""
+    lora: LoraConfig | None = Field(None, json_schema_extra=LATER)
+    """Train adapters beside the weights that `inputs.start` brings; null trains all. What is saved is one
+    network of plain weights either way."""
 
     def require_fit(self, hardware: Hardware) -> None:
-        """A model that samples as it trains is neither one graph nor cut over ranks."""
+        """A model that samples as it trains is neither one graph nor cut over ranks, nor are adapters."""
         super().require_fit(hardware)
+        if self.lora is not None:
+            require_peft()
+            if self.train.compile or self.train.strategy == "fsdp":
+                raise UserError(
+                    "lora trains adapters, which train.compile and train.strategy fsdp do not know; set "
+                    "compile: false and strategy: ddp, or lora: null"
+                )
         if self.aligned_on_samples and (self.train.compile or self.train.strategy == "fsdp"):
             raise UserError(
                 "loss.align_on samples draws motions token by token, which train.compile and train.strategy "
@@ -99,8 +107,8 @@ class GptStage(TrainedStage):
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Its TMA must read captions as it does, and a GPT that it starts from must be the same network."""
-        _check_text(stage, others)
-        _check_start(stage, others)
+        require_own_text(stage, others)
+        require_start(stage, others)
 
     def facts(self, config: GptStageConfig, given: Given) -> ModelFacts:
         """Config, streams and the width of the prior."""
@@ -113,6 +121,8 @@ class GptStage(TrainedStage):
             "prior": config.prior,
             **stream_facts(tokenizer.net),
         }
+        if START in given:
+            require_start_layout(given["data"].layout, tokenizer.layout)
         layout = LayoutFacts.of(given["data"].layout)
         return ModelFacts(kind="gpt", config=config.net.dump(), layout=layout, extra=extra)
 
@@ -125,13 +135,15 @@ class GptStage(TrainedStage):
 
     def prepare(self, config: GptStageConfig, net: InterleavedGPT, given: Given) -> None:
         """Go on from another GPT's weights, where the recipe names one."""
-        if "start" in given:
-            net.load_state_dict(given["start"].net.state_dict())
+        if START in given:
+            net.load_state_dict(given[START].net.state_dict())
 
     def module(self, config: GptStageConfig, net: Any, given: Given, seed: int) -> GptModule:
         """Cross-entropy, and L_align on what the frozen tokenizer and TMA make of its tokens."""
         from motionloom.models.gpt.module import GptModule
 
+        if config.lora is not None:
+            add_lora(net, config.lora)
         return GptModule(
             net,
             config.optim,
@@ -141,6 +153,11 @@ class GptStage(TrainedStage):
             tokenizer=given["tokenizer"].net if config.aligned else None,
             tma=given["tma"].net if config.aligned else None,
         )
+
+    def trained(self, config: GptStageConfig, net: Any) -> None:
+        """Adapters become part of the weights."""
+        if config.lora is not None:
+            merge_lora(net)
 
     def batches(self, config: GptStageConfig, net: nn.Module, given: Given, seed: int, say: Say) -> Batches:
         """Token sequences with one caption each."""
@@ -193,8 +210,10 @@ class GptStage(TrainedStage):
         return Batches(train, validation)
 
     def dry_module(self, config: GptStageConfig, net: Any, given: Given) -> GptModule:
-        """Without the judge of sampled motions, which keeps nothing for the backward pass."""
-        module = self.module(config, net, given, seed=0)
+        """Without the judge of sampled motions, which keeps nothing for the backward pass, and without
+        adapters, which peft cannot make of tensors without values: a bound from above.
+        """
+        module = self.module(config.model_copy(update={"lora": None}), net, given, seed=0)
         if config.aligned_on_samples:
             module.tokenizer = None
         return module
@@ -330,42 +349,3 @@ class GptGenerator:
         if streaming.decoder == "diffusion":
             raise UserError("this model has no diffusion decoder; leave streaming's decoder out")
         return Frames.of_tokenizer(self.tokenizer, streaming)
-
-
-def _check_text(stage: Stage, others: Mapping[str, Stage]) -> None:
-    """A TMA must be given captions by the encoder that it was trained on."""
-    tma, own = others.get(stage.inputs.get("tma", "")), stage.inputs.get("text", "")
-    other = tma.inputs.get("text", "") if tma is not None else own
-    if not same_encoder(own, other, others):
-        raise UserError(
-            f"stage '{stage.name}' reads captions as '{own}' encodes them, but its TMA "
-            f"'{stage.inputs['tma']}' was trained on those of '{other}'; name one text stage for both, "
-            f"or leave the TMA out (inputs: {{tma: null}})"
-        )
-
-
-def _its_own(start: Stage, wrong: list[str]) -> str:
-    """Where the inputs of a GPT outside the run lie, for the message."""
-    roles = [name.removeprefix("inputs.") for name in wrong if name.startswith("inputs.")]
-    there = [f"{role}: {start.inputs[role]}" for role in roles if is_place(start.inputs.get(role, ""))]
-    return f", like inputs: {{{', '.join(there)}}}" if there else ""
-
-
-def _check_start(stage: Stage, others: Mapping[str, Stage]) -> None:
-    """A GPT can go on from another's weights where both are one network that reads and writes the same."""
-    start = others.get(stage.inputs.get("start", ""))
-    if start is None:
-        return
-    ours: GptStageConfig = stage.config
-    theirs: Any = start.config
-    wrong = [f"net.{size}" for size in _SIZES if getattr(ours.net, size) != getattr(theirs.net, size)]
-    wrong += ["prior"] if ours.prior != theirs.prior else []
-    roles = ("tokenizer",) + (("tma",) if ours.prior == "tma" else ())
-    if not same_encoder(start.inputs.get("text", ""), stage.inputs.get("text", ""), others):
-        wrong.append("inputs.text")
-    wrong += [f"inputs.{role}" for role in roles if start.inputs.get(role) != stage.inputs.get(role)]
-    if wrong:
-        raise UserError(
-            f"stage '{stage.name}' starts from '{start.name}', which differs in {', '.join(wrong)}; give "
-            f"both the same{_its_own(start, wrong)}"
-        )

@@ -4,6 +4,7 @@ B.5.1, D).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -21,8 +22,10 @@ from motionloom.models.tma.losses import TmaLossConfig
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import ALIGNMENT, FACE_ALIGNMENT, GENERATOR, Finished, Given
+from motionloom.pipeline.contract.stage import ALIGNMENT, FACE_ALIGNMENT, GENERATOR, Finished, Given, Stage
 from motionloom.pipeline.stages.examples import caption_example
+from motionloom.pipeline.stages.same_text import same_encoder
+from motionloom.pipeline.stages.starting import START, require_same_start, require_start_layout
 from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.store.networks import LoadedTma
@@ -31,6 +34,9 @@ from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
 if TYPE_CHECKING:
     from motionloom.models.tma.module import TmaModule
+
+_FREE = frozenset({"dropout", "attention_dropout", "text_dropout", "text_noise"})
+"""Settings that are of the training and not of the network: another one may go on with others."""
 
 
 class TmaStageConfig(TrainedStageConfig):
@@ -67,7 +73,7 @@ class TmaStage(TrainedStage):
     name = "tma"
     summary = "text-motion alignment"
     config = TmaStageConfig
-    takes = ("data", "stats", "text", "rewordings?")
+    takes = ("data", "stats", "text", "rewordings?", "start?: tma")
     version = 2  # the filter of negatives is sBERT's
 
     def gives(self, config: TmaStageConfig) -> frozenset[str]:
@@ -81,9 +87,21 @@ class TmaStage(TrainedStage):
             return names | {ALIGNMENT}
         return names if config.loss.contrastive == 0 else names | {FACE_ALIGNMENT}
 
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
+        """A TMA that it starts from must be the same network, over the same text and statistics."""
+        require_same_start(stage, others, _FREE)
+        start = others.get(stage.inputs.get(START, ""))
+        if start is not None and not same_encoder(start.inputs.get("text", ""), stage.inputs["text"], others):
+            raise UserError(
+                f"stage '{stage.name}' starts from '{start.name}', which reads captions of another text "
+                f"encoder; give '{stage.inputs['text']}' the encoder of '{start.inputs['text']}'"
+            )
+
     def facts(self, config: TmaStageConfig, given: Given) -> ModelFacts:
         """Config, layout and the widths of both sides."""
         layout = given["data"].layout
+        if START in given:
+            require_start_layout(layout, given[START].layout)
         part_columns(layout, config.part)
         extra = {"text_dim": given["text"].dim, "max_frames": config.max_frames, "part": config.part}
         return ModelFacts(kind="tma", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra)
@@ -100,8 +118,10 @@ class TmaStage(TrainedStage):
         return Tma.of_layout(config, layout, part, facts.fact("text_dim", int))
 
     def prepare(self, config: TmaStageConfig, net: Tma, given: Given) -> None:
-        """The coordinates it reads depend on how features are normalised."""
-        if net.basis is not None:
+        """The coordinates it reads depend on how features are normalised; or all comes from a start."""
+        if START in given:
+            net.load_state_dict(given[START].net.state_dict())
+        elif net.basis is not None:
             columns, stats = part_columns(given["data"].layout, config.part), given["stats"]
             net.basis.learn(stats.mean[columns], stats.std[columns])
 

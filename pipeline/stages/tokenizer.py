@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -23,8 +24,9 @@ from motionloom.models.tokenizer.config import (
     parse_tokenizer,
 )
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import Given
+from motionloom.pipeline.contract.stage import Given, Stage
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.starting import START, require_same_start, require_start_layout
 from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
 from motionloom.pipeline.stages.windows import window_batches
@@ -33,6 +35,14 @@ from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 
 if TYPE_CHECKING:
     from motionloom.models.tokenizer.module import TokenizerModule
+
+_FREE = frozenset(
+    {
+        "recon", "velocity_weight", "alpha", "decay", "reset_below",
+        "codebook_weight", "commitment_weight", "start",
+    }
+)  # fmt: skip
+"""Settings that are of the training and not of the network: another one may go on with others."""
 
 
 class TokenizerStageConfig(TrainedStageConfig):
@@ -103,7 +113,7 @@ class MqStageConfig(TokenizerStageConfig):
 class TokenizerStage(TrainedStage):
     """A tokenizer, trained on windows of the training split."""
 
-    takes = ("data", "stats")
+    takes = ("data", "stats", "start?: tokenizer")
     version = 2  # fingers in the palm's frame (`finger_gain`)
 
     def __init__(self, name: str, summary: str, config: type[TokenizerStageConfig]) -> None:
@@ -113,8 +123,14 @@ class TokenizerStage(TrainedStage):
         """Tokens of motion, and motion of tokens."""
         return super().gives(config) | {"tokenizer"}
 
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
+        """A tokenizer that it starts from must be the same network over equally normalised motion."""
+        require_same_start(stage, others, _FREE)
+
     def facts(self, config: TokenizerStageConfig, given: Given) -> ModelFacts:
         """Config and layout."""
+        if START in given:
+            require_start_layout(given["data"].layout, given[START].layout)
         layout = LayoutFacts.of(given["data"].layout)
         return ModelFacts(kind=config.net.kind, config=config.net.dump(), layout=layout)
 
@@ -124,7 +140,10 @@ class TokenizerStage(TrainedStage):
         return build_tokenizer(config, facts.layout.layout())
 
     def prepare(self, config: TokenizerStageConfig, net: Tokenizer, given: Given) -> None:
-        """The coordinates it learns in depend on how features are normalised."""
+        """The coordinates it learns in depend on how features are normalised; or all comes from a start."""
+        if START in given:
+            net.load_state_dict(given[START].net.state_dict())
+            return
         columns, stats = net.columns.numpy(), given["stats"]
         net.basis.learn(stats.mean[columns], stats.std[columns])
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
+from motionloom.models.training.lora import trained_share
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.contract.stage import SHOWING, Finished, Given, StageContext, StageKind
 from motionloom.pipeline.launch.hardware import Hardware
@@ -79,6 +80,9 @@ class TrainedStage(StageKind):
     def prepare(self, config: Any, net: Any, given: Given) -> None:
         """Set what the network takes over from other stages before training: statistics, weights."""
 
+    def trained(self, config: Any, net: Any) -> None:
+        """Make the trained network, in place, what is saved."""
+
     def loaded(self, net: Any, facts: ModelFacts, given: Given) -> Any:
         """What other stages get: the trained network, frozen, or an object around it."""
         return net
@@ -98,9 +102,14 @@ class TrainedStage(StageKind):
         net = self.network(facts, given)
         self.prepare(config, net, given)
         module = self.module(config, net, given, seed)
-        batches = self.batches(config, net, given, seed, _printer(context))
+        say = _printer(context)
+        batches = self.batches(config, net, given, seed, say)
+        part, whole = trained_share(net)
+        if part < whole:
+            say(f"{part:,} of {whole:,} parameters are trained ({part / whole:.1%})")
         fit(context, module, config.train, batches.train, batches.validation, config.optim.grad_clip)
         if module.global_rank == 0:
+            self.trained(config, module.net)
             save_model(context.folder, module.net, facts)
 
     def preview(self, config: Any, given: Given) -> Any:

@@ -34,6 +34,7 @@ from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.motion.joint_map import JointMap
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.motion.resting_hands import with_resting_hands
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.sample import Sample
 
@@ -57,7 +58,7 @@ def prepare_bvh(
     """Plan the conversion. `scan` is a file that remembers what unchanged files hold, `maps` a folder for the
     joint maps that are guessed.
     """
-    target = config.motion_layout().skeleton
+    target = config.mapped_skeleton()
     given = None
     if config.joint_map != "auto":  # a wrong map should fail before the long part
         given = JointMap.load(config.joint_map, target=target.name)
@@ -99,7 +100,7 @@ def _guessed(
 ) -> tuple[ConversionPlan[BvhClip], dict[str, JointMap]]:
     """The plan, with a note on each guessed joint map, and the maps."""
     clips = ((clip.batch, clip.label(), clip.found.skeleton) for _, clip in plan.items)
-    guesses = guess_maps(clips, config.motion_layout().skeleton, config.source, folder)
+    guesses = guess_maps(clips, config.mapped_skeleton(), config.source, folder)
     notes = [
         f"{map_name(number)}: guessed from {guess.source}; {guess.summary()}"
         for number, guess in enumerate(guesses.values(), start=1)
@@ -160,6 +161,8 @@ class BvhClips:
         motion = read_bvh(data, name=label)
         joints = self.maps.of(motion).apply(motion, unit=config.unit, up=config.up)
         try:
+            if len(self.layout.skeleton) > joints.shape[1]:
+                joints = with_resting_hands(joints)
             return features_of(
                 joints, config.source_fps or motion.fps, self.layout, same_bones=config.retarget
             )
@@ -174,7 +177,7 @@ class BvhClips:
             split=clip.split,
             frames=len(motion),
             licence=self.config.licence,
-            has_hands=layout.num_joints > BODY_JOINTS,
+            has_hands=layout.num_joints > BODY_JOINTS and self.config.fingers != "missing",
             has_face=False,
         )
         return Sample(meta=meta, motion=motion, texts=list(clip.texts))

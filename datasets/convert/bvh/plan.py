@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -19,6 +19,7 @@ from motionloom.datasets.convert.common.splits import check_id, hash_split
 from motionloom.datasets.motion.bvh_text import find_motion, load_text, parse_hierarchy
 from motionloom.datasets.motion.joint_map import Unit, Up
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Split, UserError
 
 
@@ -34,7 +35,7 @@ class BvhConfig(CaptionConfig):
     licence: str
     """Licence of the clips, kept in every sample."""
     layout: str = "body133"
-    """Feature layout of the shards: body133 or h3d263."""
+    """Feature layout of the shards: body133, h3d263, or one with hands and a face."""
     fps: float = Field(default=20.0, gt=0, le=240)
     """Frame rate of the shards; clips are resampled by time."""
     source_fps: float | None = Field(default=None, gt=0)
@@ -45,13 +46,22 @@ class BvhConfig(CaptionConfig):
     """Upward axis of the files."""
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton."""
+    fingers: Literal["recorded", "resting", "missing"] = Field("recorded", json_schema_extra={"later": True})
+    """Of layouts with hands: the files have them (`recorded`, which needs a joint map with fingers); they
+    have none, and each clip gets hands at rest, which count as motion (`resting`) or do not (`missing`).
+    """
 
     def motion_layout(self) -> MotionLayout:
         """The layout of the written shards."""
         layout = super().motion_layout()
-        if layout.family == "raw" or layout.has("face"):
+        if layout.family == "raw":
             raise UserError(f"layout {self.layout} cannot be made from joints; use body133 or h3d263")
         return layout
+
+    def mapped_skeleton(self) -> Skeleton:
+        """The skeleton that the joint map reads: without fingers where the files have none."""
+        own = self.motion_layout().skeleton
+        return own if self.fingers == "recorded" else Skeleton.named("smpl22")
 
     def options(self, *local: str) -> dict[str, Any]:
         """What the output depends on, for the manifest: files by name and checksum instead of local paths."""
@@ -61,6 +71,8 @@ class BvhConfig(CaptionConfig):
             if path != "auto":
                 given[key] = digest_of(path) if path else None
         given["splits"] = bool(self.splits)
+        if self.fingers == "recorded":  # as before there was a choice: shards made then stay valid
+            del given["fingers"]
         return given
 
 

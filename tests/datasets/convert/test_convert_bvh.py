@@ -371,7 +371,7 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such file or folder"):
         plan_bvh(config(copy, source=tmp_path / "none"))
     with pytest.raises(UserError, match="cannot be made from joints"):
-        convert(config(copy, layout="wholebody363"), tmp_path / "face")
+        convert(config(copy, layout="smpl75"), tmp_path / "raw")
 
 
 def pack(folder: Path, parts: int, suffix: str = "tar.xz") -> None:

@@ -31,7 +31,7 @@ stages:
 """
 
 
-@pytest.mark.parametrize("name", sorted(shipped_recipes()))
+@pytest.mark.parametrize("name", sorted({*shipped_recipes()} - {"finetune"}))  # test_finetune.py
 def test_shipped_recipes_load_and_reload(name: str, tmp_path: Path) -> None:
     recipe = load_recipe(name)
     assert recipe.description
@@ -40,6 +40,9 @@ def test_shipped_recipes_load_and_reload(name: str, tmp_path: Path) -> None:
 
 def test_shipped_recipes_are_named_by_folder_and_size() -> None:
     for name, path in shipped_recipes().items():
+        if name == "finetune":  # of no family, at the top
+            assert read_yaml(path)["name"] == name == path.stem and path.parent.name == "configs"
+            continue
         assert read_yaml(path)["name"] == name == f"{path.parent.name}-{path.stem}"
         assert load_recipe(f"{path.parent.name}/{path.stem}").name == name
 

@@ -1,0 +1,344 @@
+"""Does a trained model's help last? Fine-tuning against training from nothing, for equal processor time.
+
+    motionloom data convert bvh mocap shards --captions mocap/captions.jsonl --licence CC-BY-NC-4.0 \
+      --layout wholebody363 --fingers resting
+    python benchmarks/finetuning.py LABELS WORK --data shards --start synthetic --judge runs/bvh-body
+
+`scratch` trains tokenizer, TMA and GPT from new weights, with the data's own statistics. `whole` and `lora`
+train networks of the same sizes on from those of `--start`, all of the GPT or adapters of it. All have the
+same clips, and `--seconds` of processor time for their three trainings: what a step costs is measured first,
+and the seconds that were really taken are reported. Each arm takes the best of the same number of learning
+rates of its GPT (`--rates`, times its recipe's), by its cross-entropy on held-out clips with a seed of its
+own (`--search-seed`).
+
+One motion is made for the first caption of every test clip. They are judged by what no arm was trained with:
+retrieval among 32 by another run's TMA, which reads the body alone (`--judge`); the labels of the nearest
+recorded clip by its latents; and by geometry whether the motion does what the clip is labelled with
+(caption_check.py). LABELS is a JSON lines file with `id`, `content` and `style` of the clips. Beside them:
+recorded motion, another clip's, and what `--start` makes before it is trained.
+
+Killed and started again it goes on where it was; `--show` prints what there is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch.nn.functional as F
+import yaml
+from caption_check import BY_CONTENT
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+from wordings import Label, read_labels
+
+from motionloom.datasets.motion.canonical import canonicalize
+from motionloom.datasets.motion.features import encode
+from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.evaluation.figures import embed_motions, retrieval_figures
+from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.graph import Selection
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.stages.training import read_metrics
+
+Joints = NDArray[np.float64]
+
+STAGES = ("tokenizer", "tma", "gpt")
+ARMS: dict[str, dict[str, tuple[float, float]]] = {
+    "scratch": {"tokenizer": (0.35, 2.0e-3), "tma": (0.15, 5.0e-4), "gpt": (0.50, 1.0e-3)},
+    "whole": {"tokenizer": (0.25, 1.0e-3), "tma": (0.15, 5.0e-4), "gpt": (0.60, 5.0e-4)},
+    "lora": {"tokenizer": (0.25, 1.0e-3), "tma": (0.15, 5.0e-4), "gpt": (0.60, 1.0e-3)},
+}
+"""Arm -> training -> its share of the time, and its learning rate."""
+BATCH = {"tokenizer": 32, "tma": 32, "gpt": 16}
+SIZE = 32
+SHOWN = ("t2m_r1", "t2m_r3", "m2t_r1", "content", "style", "obeys")
+PROBE = (10, 40)
+"""Steps of the two trainings whose difference says what a step costs."""
+
+
+class Clips:
+    """The test clips, and what judges motions that are made for them."""
+
+    def __init__(self, args: argparse.Namespace, data: Any, labels: Mapping[str, Label]) -> None:
+        dataset = data.split("test")
+        found = [truth_of(dataset, i) for i in range(len(dataset))]
+        self.truths: list[Truth] = found[: args.tested or None]
+        self.labels = np.array([labels[t.id] for t in self.truths])
+        self.captions = [t.caption for t in self.truths]
+        self.fps: float = dataset.layout.fps
+        self.layout = MotionLayout.named("body133", fps=self.fps)
+        judge = finished_stages(args.judge)["tma"]
+        shelf = Shelf()
+        self._tma = shelf.get(judge)
+        self._text = self._tma.embed_captions(self.captions, shelf.given(judge.inputs)["text"].cache)
+        self._recorded = self.latents([t.joints for t in self.truths])
+
+    def latents(self, joints: Sequence[Joints]) -> Tensor:
+        """The judge's latents of motions, by their bodies alone."""
+        bodies = [encode(canonicalize(j[:, :BODY_JOINTS]), self.layout) for j in joints]
+        return F.normalize(embed_motions(self._tma, bodies).double(), dim=-1)
+
+    def figures(self, joints: Sequence[Joints], skip_own: bool = False) -> dict[str, float]:
+        """Shares of motions [n], one for each clip; `skip_own` where they are the clips themselves."""
+        latent = self.latents(joints)
+        found = retrieval_figures(self._text, latent, size=SIZE, repeats=10, seed=0)
+        near = latent @ self._recorded.T
+        if skip_own:
+            near.fill_diagonal_(-2)
+        right = self.labels[near.argmax(1).numpy()] == self.labels
+        obeyed = [
+            BY_CONTENT[content](j[:, :BODY_JOINTS], self.fps)
+            for j, (content, _) in zip(joints, self.labels, strict=True)
+            if content in BY_CONTENT
+        ]
+        out = {name: interval.mean for name, interval in found.items()}
+        return out | {
+            "content": float(right[:, 0].mean()),
+            "style": float(right[:, 1].mean()),
+            "obeys": float(np.mean(obeyed)),
+        }
+
+    def reconstruction(self, tokenizer: Any) -> dict[str, float]:
+        """Mean distance of the body's joints after the tokenizer, mm: from the root, and in the world."""
+        pose, world = [], []
+        for truth in self.truths[::4]:
+            made = joints_of(reconstruct_truth(tokenizer, truth), tokenizer.layout)[:, :BODY_JOINTS]
+            real = truth.joints[: len(made), :BODY_JOINTS]
+            world.append(np.linalg.norm(made - real, axis=-1).mean())
+            made, real = made - made[:, :1], real - real[:, :1]
+            pose.append(np.linalg.norm(made - real, axis=-1).mean())
+        return {"pose_mm": 1000 * float(np.mean(pose)), "world_mm": 1000 * float(np.mean(world))}
+
+
+def write(folder: Path, recipe: dict[str, Any]) -> Path:
+    path = folder.parent / f"{folder.name}.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(yaml.safe_dump(recipe, sort_keys=False))
+    return path
+
+
+def base(args: argparse.Namespace, console: Console) -> Path:
+    """A run with the clips and their captions, which all arms read."""
+    folder = args.work / "base"
+    data = {"kind": "shards", "path": str(args.data.resolve()), "verify": False}
+    stages = {"data": data, "stats": {"kind": "stats"}, "text": {"kind": "text"}}
+    recipe = {"name": "finetuning-base", "seed": 1, "hardware": {"threads": 1}, "stages": stages}
+    run_recipe(write(folder, recipe), folder, console=console)
+    return folder
+
+
+def arm_recipe(
+    args: argparse.Namespace, arm: str, seed: int, steps: Mapping[str, int], rate: float
+) -> dict[str, Any]:
+    """The three trainings of an arm; the GPT's learning rate is multiplied by `rate`."""
+    read = {"data": str(args.work.resolve() / "base/stages/data")}
+    text = {"text": str(args.work.resolve() / "base/stages/text")}
+    stages: dict[str, Any] = {name: {} for name in STAGES} | {"tokens": {"kind": "tokens"}}
+    recipe = {"name": f"finetuning-{arm}", "seed": seed, "hardware": {"threads": 1}, "stages": stages}
+    recipe["start"] = str(args.start.resolve()) if args.start.is_dir() else str(args.start)
+    if arm == "scratch":  # the sizes of the model, none of its weights
+        path = write(args.work / "sizes", {**recipe, "stages": stages_of(stages, read, text)})
+        sizes = load_recipe(path)
+        for name in STAGES:
+            stage = sizes.stage(name)
+            settings = {k: v for k, v in stage.config.dump().items() if k not in ("optim", "train")}
+            stages[name] = {"kind": stage.kind.name, **settings}
+        own = {"stats": str(args.work.resolve() / "base/stages/stats")}
+        del recipe["start"]
+        stages["tokens"]["inputs"] = dict(own)
+        for name in ("tokenizer", "tma"):
+            stages[name]["inputs"] = dict(own)
+    for name in STAGES:
+        lr = ARMS[arm][name][1] * (rate if name == "gpt" else 1.0)
+        stages[name]["optim"] = {"lr": lr, "warmup_steps": min(50, steps[name] // 5), "schedule": "cosine"}
+        every = max(1, steps[name] // 4)
+        length = {"steps": steps[name], "batch_size": BATCH[name]}
+        stages[name]["train"] = {**length, "checkpoint_every": every, "validate_every": every}
+    stages["gpt"]["loss"] = {"align_weight": 0.0}
+    stages["gpt"]["lora"] = {"rank": args.rank} if arm == "lora" else None
+    return {**recipe, "stages": stages_of(stages, read, text)}
+
+
+def stages_of(stages: dict[str, Any], data: dict[str, str], text: dict[str, str]) -> dict[str, Any]:
+    """The stages with the inputs that lie in the base run."""
+    needs = {name: data | (text if name in ("tma", "gpt") else {}) for name in stages}
+    return {
+        name: {**entry, "inputs": {**needs[name], **entry.get("inputs", {})}}
+        for name, entry in stages.items()
+    }
+
+
+def train(recipe: dict[str, Any], folder: Path, console: Console) -> dict[str, float]:
+    """Run an arm, stage by stage; processor seconds of its trainings, those of an earlier, killed run too."""
+    path, log = write(folder, recipe), folder.parent / f"{folder.name}.seconds.json"
+    taken: dict[str, float] = json.loads(log.read_text()) if log.is_file() else {}
+    for name in ("tokenizer", "tma", "tokens", "gpt"):
+        begin = time.process_time()
+        run_recipe(path, folder, select=Selection(until=name), replace=True, console=console)
+        if name in STAGES:
+            seconds = time.process_time() - begin
+            if name not in taken or seconds > 20:  # planning alone takes a second or two
+                taken[name] = taken.get(name, 0.0) + seconds
+            log.write_text(json.dumps(taken))
+    return taken
+
+
+def costs(args: argparse.Namespace, console: Console) -> dict[str, float]:
+    """Processor seconds of a step of each training; "lora" of a GPT's adapters."""
+    kept = args.work / "costs.json"
+    out: dict[str, float] = json.loads(kept.read_text()) if kept.is_file() else {}
+    for arm, names in (("whole", STAGES), ("lora", ("gpt",))):
+        for name in names:
+            key = "lora" if arm == "lora" else name
+            if key in out:
+                continue
+            spent = []
+            for steps in PROBE:
+                recipe = arm_recipe(args, arm, 0, dict.fromkeys(STAGES, PROBE[0]) | {name: steps}, 1.0)
+                folder = args.work / "probe"
+                path = write(folder, recipe)
+                above = {"tokenizer": None, "tma": None, "gpt": "tokens"}[name]
+                if above is not None:
+                    run_recipe(
+                        path, folder, select=Selection(until="tma,tokens"), replace=True, console=console
+                    )
+                begin = time.process_time()
+                select = Selection(only=name, force=True)
+                run_recipe(path, folder, select=select, replace=True, console=console)
+                spent.append(time.process_time() - begin)
+            out[key] = (spent[1] - spent[0]) / (PROBE[1] - PROBE[0])
+            kept.write_text(json.dumps(out, indent=1))
+    console.print("processor seconds a step:", {k: round(v, 4) for k, v in out.items()})
+    return out
+
+
+def steps_of(args: argparse.Namespace, arm: str, cost: Mapping[str, float]) -> dict[str, int]:
+    """Steps that fill the time."""
+    out = {}
+    for name, (share, _) in ARMS[arm].items():
+        each = cost["lora" if arm == "lora" and name == "gpt" else name]
+        out[name] = max(20, round(args.seconds * share / each / 10) * 10)
+    return out
+
+
+def best_rate(args: argparse.Namespace, arm: str, steps: Mapping[str, int], console: Console) -> float:
+    """The rate whose GPT predicts held-out clips best, with the search's seed."""
+    kept = args.work / "search.json"
+    found: dict[str, dict[str, float]] = json.loads(kept.read_text()) if kept.is_file() else {}
+    rows = found.setdefault(arm, {})
+    folder = args.work / "search" / arm
+    for rate in args.rates:
+        if str(rate) not in rows:
+            train(arm_recipe(args, arm, args.search_seed, steps, rate), folder, console)
+            losses = [row["val/ce"] for row in read_metrics(folder / "stages/gpt") if "val/ce" in row]
+            rows[str(rate)] = losses[-1]
+            kept.write_text(json.dumps(found, indent=1))
+    return float(min(rows, key=lambda rate: rows[rate]))
+
+
+def figures_of(bundle: Bundle, clips: Clips, seed: int, args: argparse.Namespace) -> dict[str, float]:
+    """Of motions for the captions, and of the tokenizer."""
+    sampling = SamplingConfig(top_p=args.top_p, cfg_scale=args.cfg_scale)
+    made = bundle.generate(clips.captions, seed=seed, sampling=sampling)
+    tokenizer = bundle.generator.tokenizer  # type: ignore[attr-defined]
+    return clips.figures([m.joints for m in made]) | clips.reconstruction(tokenizer)
+
+
+def show(found: Mapping[str, Any], console: Console) -> None:
+    """One row for each arm: mean and deviation over the seeds."""
+    columns = [*SHOWN, "pose_mm", "world_mm", "seconds"]
+    table = Table("arm", *columns, title="test clips; mean ± deviation over seeds", title_justify="left")
+
+    def cell(rows: Sequence[Mapping[str, float]], name: str) -> str:
+        values = np.array([row[name] for row in rows if name in row]) * (100.0 if name in SHOWN else 1.0)
+        if not len(values):
+            return ""
+        more = f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else ""
+        return f"{values.mean():.1f}{more}"
+
+    for arm, rows in found.items():
+        table.add_row(arm, *(cell(list(rows.values()), name) for name in columns))
+    console.print(table)
+    scratch = found.get("scratch", {})
+    for arm in ("whole", "lora"):
+        both = [seed for seed in found.get(arm, {}) if seed in scratch]
+        for name in ("t2m_r1", "obeys"):
+            gains = [100 * (found[arm][seed][name] - scratch[seed][name]) for seed in both]
+            if gains:
+                said = ", ".join(f"{gain:+.1f}" for gain in gains)
+                console.print(f"{arm} - scratch, {name}: {said} points")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("labels", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--data", type=Path, help="shards of the clips, in the layout of the model")
+    parser.add_argument("--start", type=Path, default=Path("synthetic"), help="the model to go on from")
+    parser.add_argument("--judge", type=Path, help="a run with a TMA in layout body133 on the same clips")
+    parser.add_argument("--seconds", type=float, default=300.0, help="processor seconds of the trainings")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--rates", type=float, nargs="+", default=[0.3, 1.0, 3.0])
+    parser.add_argument("--search-seed", type=int, default=100)
+    parser.add_argument("--rank", type=int, default=16)
+    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
+    parser.add_argument("--tested", type=int, default=0, help="test clips to generate for; 0 for all")
+    parser.add_argument("--top-p", type=float, default=0.95)
+    parser.add_argument("--cfg-scale", type=float, default=1.0)
+    parser.add_argument("--show", action="store_true", help="only print what there is")
+    args = parser.parse_args()
+    console, kept = Console(width=160), args.work / "figures.json"
+    found: dict[str, dict[str, dict[str, float]]] = json.loads(kept.read_text()) if kept.is_file() else {}
+    if args.show:
+        show(found, console)
+        return
+    data = Shelf().get(finished_stages(base(args, console))["data"])
+    clips = Clips(args, data, read_labels(args.labels))
+
+    def keep(arm: str, seed: int, row: dict[str, float]) -> None:
+        found.setdefault(arm, {})[str(seed)] = row
+        kept.write_text(json.dumps(found, indent=1))
+
+    if "recorded" not in found:
+        keep("recorded", 0, clips.figures([t.joints for t in clips.truths], skip_own=True))
+        for seed in args.seeds:
+            other = np.random.default_rng(seed).permutation(len(clips.truths))
+            keep("another clip's", seed, clips.figures([clips.truths[i].joints for i in other]))
+    untrained = "as it came" not in found and args.arms != ["scratch"]  # which takes the model's sizes alone
+    for seed in args.seeds if untrained else ():
+        keep("as it came", seed, figures_of(Bundle.open(args.start), clips, seed, args))
+    cost = costs(args, console)
+    for arm in args.arms:
+        steps = steps_of(args, arm, cost)
+        rate = best_rate(args, arm, steps, console) if len(args.rates) > 1 else args.rates[0]
+        console.print(arm, steps, f"GPT's rate x {rate:g}")
+    for seed in args.seeds:
+        for arm in args.arms:
+            if str(seed) in found.get(arm, {}):
+                continue
+            steps, folder = steps_of(args, arm, cost), args.work / f"{arm}-{seed}"
+            rate = best_rate(args, arm, steps, console) if len(args.rates) > 1 else args.rates[0]
+            taken = train(arm_recipe(args, arm, seed, steps, rate), folder, console)
+            row = figures_of(Bundle.open(folder), clips, seed, args)
+            keep(arm, seed, row | {"seconds": sum(taken.values())})
+        show(found, console)
+
+
+if __name__ == "__main__":
+    main()

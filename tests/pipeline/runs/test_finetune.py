@@ -1,0 +1,225 @@
+"""Going on from an exported model with BVH clips of one's own: what is taken over, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from bvh_clips import write_clip
+from rich.console import Console
+from safetensors.torch import load_file
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.exported import BundleFile
+from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.runs.api import export_run, run_recipe
+from motionloom.pipeline.runs.graph import Selection
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.stages.starting import require_start_layout
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.weights import load_facts
+
+QUIET = Console(quiet=True)
+
+SHORT = """
+extends: finetune
+name: mine
+start: {start}
+hardware: {{accelerator: cpu, threads: 1, convert_workers: 1}}
+stages:
+  data: {{source: clips, captions: clips/captions.jsonl, look: 0}}
+  tokenizer:
+    net: {{reset_below: 0.01}}
+    train: {{steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}}
+  tma: {{train: {{steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}}}}
+  gpt: {{lora: {{rank: 4}}, train: {{steps: 6, batch_size: 4, checkpoint_every: 2, validate_every: 4}}}}
+"""
+
+
+@dataclass(frozen=True)
+class Mine:
+    """An exported model, a folder of clips and a recipe that goes on with them."""
+
+    exported: Path
+    recipe: Path
+
+    def load(self, *sets: str) -> Recipe:
+        """The recipe with `--set`."""
+        return load_recipe(self.recipe, sets)
+
+
+@pytest.fixture(scope="module")
+def mine(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Mine:
+    """Ten clips without fingers, captioned, and the export of the small run beside them."""
+    root = tmp_path_factory.mktemp("mine")
+    export_run(small_run.folder, root / "model", half=True, console=QUIET)
+    rows = []
+    (root / "clips").mkdir()
+    for number in range(10):
+        write_clip(root / "clips" / f"sway-{number}.bvh", number)
+        split = {8: "val", 9: "test"}.get(number, "train")
+        rows.append({"id": f"sway-{number}", "caption": f"somebody sways, take {number}", "split": split})
+    (root / "clips/captions.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    (root / "mine.yaml").write_text(
+        SHORT.format(start="model")
+        .replace("source: clips", f"source: {root}/clips")
+        .replace("captions: clips", f"captions: {root}/clips")
+    )
+    return Mine(root / "model", root / "mine.yaml")
+
+
+def test_stages_are_those_of_the_model(mine: Mine) -> None:
+    recipe = mine.load("data.unit=cm")
+    at = {name: str(mine.exported / name) for name in ("stats", "tokenizer", "tma", "gpt")}
+    kept = BundleFile.load_json(mine.exported / "bundle.json").stages
+
+    def places(stage: str) -> dict[str, str]:
+        return {
+            role: str(Path(name).resolve())
+            for role, name in recipe.stage(stage).inputs.items()
+            if "/" in name
+        }
+
+    assert places("tokenizer") == {"stats": at["stats"], "start": at["tokenizer"]}
+    assert places("tma") == {"stats": at["stats"], "start": at["tma"]}
+    assert places("tokens") == {"stats": at["stats"]}
+    assert places("gpt") == {"start": at["gpt"]}
+    faces = ("face_gpt", "face_vae", "face_diffusion")
+    assert places("generate") == {f"generators.model:{name}": str(mine.exported / name) for name in faces}
+    assert list(recipe.stage("generate").inputs) == ["data", "generators.gpt", *places("generate")]
+    data, gpt = recipe.stage("data").config, recipe.stage("gpt").config
+    assert (data.layout, data.fps, data.fingers) == ("wholebody363", 20.0, "resting")
+    assert gpt.net.dump() == kept["gpt"].config["net"] and gpt.prior == "tma"
+    assert gpt.loss.align_weight == 0 and gpt.train.steps == 6 and gpt.optim.lr == 1e-3
+    assert recipe.stage("tokenizer").kind.name == kept["tokenizer"].kind == "h2vq"
+
+
+def test_what_is_left_out_is_the_models_own(mine: Mine) -> None:
+    recipe = mine.load("tokenizer=null", "tma=null", "gpt.lora=null")
+    inputs = recipe.stage("gpt").inputs
+    for role in ("tokenizer", "tma"):
+        assert Path(inputs[role]).resolve() == mine.exported / role
+        assert role not in [stage.name for stage in recipe.stages]
+    assert Path(recipe.stage("evaluate").inputs["tokenizer"]).resolve() == mine.exported / "tokenizer"
+    assert recipe.stage("gpt").config.lora is None
+
+
+def test_the_resolved_recipe_is_the_same_without_a_start(mine: Mine, tmp_path: Path) -> None:
+    recipe = mine.load()
+    (tmp_path / "again.yaml").write_text(recipe.to_yaml())
+    assert "\nstart:" not in recipe.to_yaml()
+    again = load_recipe(tmp_path / "again.yaml")
+    assert again.to_yaml() == recipe.to_yaml()
+
+
+@pytest.mark.parametrize(
+    ("sets", "says"),
+    [
+        (["start=nowhere"], "start = 'nowhere': no model of the package .* no export or run is there"),
+        (["data.layout=body133"], "layout = body133, but start .* was trained on layout wholebody363"),
+        (["data.fps=30"], "stages.data.fps = 30, but start .* was trained on fps 20.0; leave it out"),
+        (["gpt.net.heads=2"], "starts from .*model/gpt', which differs in net.heads; give both the same"),
+        (["tokenizer.net.num_codes=8"], "'tokenizer' starts from .* which differs in net.num_codes;"),
+        (["tma.net.layers=3"], "'tma' starts from .* which differs in net.layers;"),
+        (["tokenizer.kind=vq"], "'gpt' starts from .* which differs in inputs.tokenizer;"),
+        (["stages.tokenizer={kind: vq, inputs: {start: MODEL/tokenizer}}"], r"differs in kind \(h2vq\);"),
+        (["text.encoder=another"], "'tma' starts from .* captions of another text encoder"),
+        (["stages.face_gpt={}"], "stages.face_gpt has no kind, and start .* has no 'face_gpt' to go on from"),
+        (["gpt.inputs={start: null}"], "has lora and no trained GPT to add adapters to"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_before_anything_runs(mine: Mine, sets: list[str], says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        mine.load(*(text.replace("MODEL", str(mine.exported)) for text in sets))
+
+
+def test_statistics_of_the_data_are_refused(mine: Mine, tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(yaml.safe_dump({"extends": str(mine.recipe), "stages": {"stats": {"kind": "stats"}}}))
+    with pytest.raises(
+        UserError, match=r"'tokenizer' starts from .* differs in inputs.stats; .*model/stats}"
+    ):
+        load_recipe(path)
+
+
+def test_shards_are_to_have_the_layout_of_the_model(mine: Mine) -> None:
+    recipe = mine.load("stages.data={kind: shards, path: there}")
+    assert recipe.stage("data").config.layout == "wholebody363"
+    layout = MotionLayout.named("wholebody363", fps=20.0)
+    require_start_layout(layout, MotionLayout.named("wholebody363", fps=20.0))
+    with pytest.raises(UserError, match=r"holds layout wholebody363 \(exact, 30 fps\), .* 20 fps"):
+        require_start_layout(MotionLayout.named("wholebody363"), layout)
+
+
+def test_a_ude_is_refused(ude_run: Any, mine: Mine) -> None:
+    with pytest.raises(UserError, match="whose body is made by a stage of kind gpt; this one has ude"):
+        mine.load(f"start={ude_run.folder}")
+
+
+@pytest.fixture(scope="module")
+def trained(mine: Mine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The whole way to a GPT, a few steps each."""
+    pytest.importorskip("peft", reason="peft is not installed (the extra `lora`)")
+    run = tmp_path_factory.mktemp("trained") / "run"
+    with (run.parent / "out.txt").open("w") as out:
+        console = Console(file=out, width=200)
+        run_recipe(mine.recipe, run, select=Selection(until="gpt"), console=console)
+    return run
+
+
+def test_it_trains_adapters_and_leaves_plain_weights(mine: Mine, trained: Path, tmp_path: Path) -> None:
+    said = (trained.parent / "out.txt").read_text()
+    assert "parameters are trained (" in said and said.count("parameters are trained") == 1
+    before, after = (
+        load_file(p / "model.safetensors") for p in (mine.exported / "gpt", trained / "stages/gpt")
+    )
+    assert before.keys() == after.keys()
+    moved = {name for name, value in after.items() if not torch.equal(value, before[name].float())}
+    ends = ("attention.qkv.weight", "attention.out.weight", "ff_in.weight", "ff_out.weight")
+    assert moved == {name for name in after if name.endswith(ends)}
+    data = Data(trained / "stages/data").split("train")
+    assert data.layout.name == "wholebody363" and data.layout.fps == 20
+    # What its pages, commands and exports read: its own body, and the face of the model it started from.
+    export_run(trained, tmp_path / "out", console=QUIET)
+    facts = BundleFile.load_json(tmp_path / "out/bundle.json")
+    assert facts.generators == ("gpt", "face_gpt", "face_vae", "face_diffusion")
+    made = Bundle.open(tmp_path / "out").generate(["somebody sways"], seconds=2.0, seed=1)[0]
+    again = Bundle.open(trained).generate(["somebody sways"], seconds=2.0, seed=1)[0]
+    np.testing.assert_array_equal(made.features, again.features)
+    assert made.joints.shape == (40, 52, 3) and made.face is not None
+
+
+@pytest.mark.parametrize("name", ["tokenizer", "tma", "gpt"])
+def test_every_weight_comes_from_the_export(mine: Mine, name: str) -> None:
+    """Codebooks, and coordinates that depend on the statistics, among them."""
+    recipe, shelf = mine.load(), Shelf()
+    stage = recipe.stage(name)
+    start = recipe.outside[stage.inputs["start"]]
+    torch.manual_seed(5)
+    net = stage.kind.network(load_facts(start.folder), shelf.given_to(start))  # type: ignore[attr-defined]
+    stage.kind.prepare(stage.config, net, shelf.given({"start": start}))  # type: ignore[attr-defined]
+    wanted, state = load_file(start.folder / "model.safetensors"), net.state_dict()
+    assert state.keys() == wanted.keys()
+    for key, value in wanted.items():
+        torch.testing.assert_close(state[key], value.to(state[key].dtype), rtol=0, atol=0)
+
+
+def test_a_killed_training_of_adapters_ends_with_the_same_bytes(
+    mine: Mine, trained: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    gpt = run / "stages/gpt"
+    for name in ("artifact.json", "model.json", "model.safetensors", "checkpoints/step=00000006.ckpt"):
+        (gpt / name).unlink()
+    run_recipe(mine.recipe, run, select=Selection(until="gpt"), console=QUIET)
+    for name in ("model.safetensors", "metrics.jsonl"):
+        assert (gpt / name).read_bytes() == (trained / "stages/gpt" / name).read_bytes()
