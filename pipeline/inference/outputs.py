@@ -138,6 +138,7 @@ def viewer_motion(
         sound=score.sound,
         beats=score.beats,
         segments=score.segments,
+        figure=figure.figure if figure.joints is figure.figure.joints else None,
     )
 
 
