@@ -72,7 +72,7 @@ function mountViewer(root, data, options) {
   const play = (on) => {
     if (on && state.time >= duration) state.time = 0;
     state.playing = on;
-    if (on && pace) pace.begin();
+    if (on && pace) pace.begin(clips.length);
     bar.play.textContent = on ? "❚❚" : "▶";
     bar.play.setAttribute("aria-label", on ? "Pause" : "Play");
     bar.play.title = on ? "Pause (space)" : "Play (space)";
@@ -299,7 +299,7 @@ function mountViewer(root, data, options) {
     get frame() { return frame(); }, get time() { return state.time; }, get playing() { return state.playing; },
     get draws() { return state.draws; }, get frames() { return last + 1; }, get camera() { return { ...camera }; },
     get follow() { return state.follow; }, get loop() { return state.loop; },
-    remove, play, setFrame, setView, zoom, turn, toggle: (name) => toggle(name, name),
+    remove, play, setFrame, paint: () => paintAll(cells.filter((cell) => cell.visible)), setView, zoom, turn, toggle: (name) => toggle(name, name),
     get sound() { return player.on; }, get audio() { return player.audio; },
     get segment() { return lead && segmentAt(lead.score, localTime(lead)); },
     get view() { return stage && stage.ready ? "webgl" : "2d"; }, stage, pace, clips,

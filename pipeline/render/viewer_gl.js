@@ -75,9 +75,9 @@ function makePainter(gl) {
     fall(items) {
       gl.bindFramebuffer(gl.FRAMEBUFFER, target);
       gl.disable(gl.DEPTH_TEST);
-      gl.disable(gl.SCISSOR_TEST);
       gl.disable(gl.CULL_FACE);
-      gl.viewport(0, 0, TILE * TILES, TILE * TILES);
+      gl.enable(gl.SCISSOR_TEST);
+      gl.scissor(0, 0, TILE * Math.min(items.length, TILES), TILE * Math.ceil(items.length / TILES));
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
       gl.enable(gl.BLEND);
@@ -113,6 +113,7 @@ function makePainter(gl) {
         gl.uniform4f(shadows.at.tile, column / TILES, line / TILES, 1 / TILES, 1 / TILES);
         gl.uniform2f(shadows.at.spread, SHADOW_SPREAD / item.field[2], SHADOW_SPREAD / item.field[3]);
         gl.uniform3fv(shadows.at.tint, item.shadow);
+        gl.uniform1i(shadows.at.taps, item.taps);
         gl.uniform1i(shadows.at.fallen, 1);
         gl.activeTexture(gl.TEXTURE1);
         gl.bindTexture(gl.TEXTURE_2D, fallen);

@@ -116,16 +116,18 @@ uniform sampler2D fallen;
 uniform vec4 tile;
 uniform vec2 spread;
 uniform vec3 tint;
+uniform int taps;
 out vec4 shade;
 vec2 at(vec2 move) { return texture(fallen, tile.xy + tile.zw * clamp(vAt + move * spread, 0.0, 1.0)).rg; }
 void main() {
   float wide = 0.0, close = at(vec2(0.0)).r;
-  for (int k = 0; k < 16; k++) {
-    float angle = 2.3999632 * float(k), reach = sqrt((float(k) + 0.5) / 16.0);
+  for (int k = 0; k < 10; k++) {
+    if (k >= taps) break;
+    float angle = 2.3999632 * float(k), reach = sqrt((float(k) + 0.5) / float(taps));
     vec2 move = reach * vec2(cos(angle), sin(angle));
     wide += at(move).g;
-    if (k % 2 == 0) close += at(0.3 * move).r;
+    if (k % 3 == 0) close += at(0.4 * move).r;
   }
-  float dark = 0.2 * wide / 16.0 + 0.3 * pow(close / 9.0, 1.5);
+  float dark = 0.2 * wide / float(taps) + 0.3 * pow(close / float((taps + 2) / 3 + 1), 1.5);
   shade = vec4(tint, 1.0) * dark;
 }`];

@@ -7,11 +7,12 @@ const LAMP_ABOVE = unit([-0.25, 1, 0.55]); // from which side light comes, in th
 const LAMP_SLOPE = [LAMP_ABOVE[0] / LAMP_ABOVE[1], LAMP_ABOVE[2] / LAMP_ABOVE[1]];
 const SHADOW_SPREAD = 0.11; // metres over which the shadow's rim is soft
 const BODY_REACH = 0.15, HEAD_REACH = 0.27; // how far the body goes beyond its joints, metres
-const NEAR_DETAIL = 300; // a figure of so many pixels is drawn with all vertices
+const NEAR_DETAIL = 400; // a figure of so many pixels is drawn with all vertices
 const BUSY = 13, SLOW = 21; // milliseconds of drawing, and between frames, from which on quality is traded for pace
 
-/* Pixels a CSS pixel at most, and whether only the far detail is drawn; the first is what stands still. */
-const QUALITIES = [{ ratio: 2, coarse: false }, { ratio: 1, coarse: false }, { ratio: 1, coarse: true }, { ratio: 0.75, coarse: true }];
+/* Pixels a CSS pixel at most, and whether only the far detail is drawn; what stands still has the first. */
+const QUALITIES = [{ ratio: 2, coarse: false }, { ratio: 1, coarse: false }, { ratio: 1, coarse: true }, { ratio: 0.7, coarse: true }];
+const FEW = 2; // without a GPU, more figures than that start with the far detail
 
 /* The page's stage, or null: no WebGL2, no body, or `?view=2d` in the address. */
 const openStage = (() => {
@@ -24,22 +25,22 @@ const openStage = (() => {
 
 function makeStage() {
   const canvas = document.createElement("canvas");
-  const gl = canvas.getContext("webgl2", { alpha: true, antialias: true, depth: true, powerPreference: "high-performance" });
+  const software = drawnInSoftware();
+  const gl = canvas.getContext("webgl2", { alpha: true, antialias: !software, depth: true, powerPreference: "high-performance" });
   let painter = gl && makePainter(gl);
   if (!painter) return null;
+  const limit = Math.min(gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), 8192); // asked once: an answer waits for all that is under way
   const watchers = new Set();
   const changed = () => { for (const watcher of watchers) watcher(); };
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); painter = null; changed(); });
   canvas.addEventListener("webglcontextrestored", () => { painter = makePainter(gl); changed(); });
 
-  const stage = { canvas, gl, quality: 0, watchers, get ready() { return painter !== null; } };
+  const stage = { canvas, gl, software, quality: 0, watchers, get ready() { return painter !== null; } };
   /* Draws the items and hands each to `show(item)`, its picture in `item.source` of the canvas. */
   stage.draw = (items, show) => {
-    const limit = Math.min(gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), 8192);
     for (let rest = items; rest.length && painter;) {
       const { group, width, height } = packed(rest.slice(0, painter.most), limit);
-      if (canvas.width < width) canvas.width = width;
-      if (canvas.height < height) canvas.height = height;
+      fitCanvas(canvas, width, height);
       for (const item of group) { // WebGL counts from below
         item.source = [...item.rect];
         item.rect[1] = canvas.height - item.rect[1] - item.rect[3];
@@ -53,6 +54,23 @@ function makeStage() {
   stage.forget = (clip) => { if (painter) painter.forget(clip); };
   stage.lose = () => gl.getExtension("WEBGL_lose_context").loseContext();
   return stage;
+}
+
+/* All of the canvas is copied with each picture: it grows as it must and shrinks where half of it is not used. */
+function fitCanvas(canvas, width, height) {
+  const waste = canvas.width * canvas.height > 2 * width * height;
+  if (waste || canvas.width < width || canvas.height < height) {
+    canvas.width = waste ? width : Math.max(width, canvas.width);
+    canvas.height = waste ? height : Math.max(height, canvas.height);
+  }
+}
+
+/* Whether the processor makes the pixels: smooth edges then come from drawing a still picture twice as large. */
+function drawnInSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2"), info = gl && gl.getExtension("WEBGL_debug_renderer_info");
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  if (gl) gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
 }
 
 /* As many of the items as fit, each with its `rect`: shelves from left to right and top to bottom. */
@@ -78,12 +96,12 @@ function stageItem(stage, clip, lens, frame, face, theme, quality) {
   const bones = bonesAt(clip, frame), pose = clip.pose, level = clip.floor - SOLE, size = pose.size;
   const field = shadowField(pose.places, level, size), box = figureBox(lens, clip, field, level);
   if (!box) return null;
-  const ratio = Math.min(window.devicePixelRatio || 1, QUALITIES[quality].ratio);
+  const pixels = window.devicePixelRatio || 1, ratio = Math.min(stage.software && quality === 0 ? 2 * pixels : pixels, QUALITIES[quality].ratio);
   const tall = ((1.7 * size * lens.focal) / Math.max(lens.distance, NEAR)) * ratio;
   const detail = QUALITIES[quality].coarse || tall < NEAR_DETAIL ? 1 : 0;
   return {
     clip, lens, box, ratio, detail, field, level, palette: theme.palette, shadow: theme.fallen, face: faceWeights(face),
-    bones,
+    bones, taps: QUALITIES[quality].coarse ? 5 : 10,
   };
 }
 
@@ -123,7 +141,7 @@ function figureBox(lens, clip, [x, z, width, depth], level) {
 /* Steps down through the qualities where drawing takes too long, a step a second at most; starts again with `begin`. */
 function watchPace(stage) {
   let spent = 0, gap = 0, count = 0;
-  const begin = () => { stage.quality = 0; spent = gap = count = 0; };
+  const begin = (figures) => { stage.quality = !stage.software ? 0 : figures > FEW ? 2 : 1; spent = gap = count = 0; };
   const note = (milliseconds, between) => {
     count += 1;
     const weight = Math.max(1 / count, 0.08);

@@ -9,6 +9,7 @@ positions travel apart.
 from __future__ import annotations
 
 import base64
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -19,7 +20,7 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.render.body.mesh import Body, Detail, figure_size, neutral_body, stretches
 from motionloom.pipeline.render.body.posing import Posing
 
-DETAILS: tuple[Detail, ...] = ("near", "far")
+DETAILS: tuple[Detail, ...] = ("near", "far", "shadow")
 COLOURS = (3, 2, 5)
 """Swatches in the rows of the colour strip (`mesh.colour_strip`)."""
 _TURN_STEPS = 1022
@@ -28,13 +29,13 @@ _STILL = 1e-5
 
 @cache
 def mesh_data() -> dict[str, Any]:
-    """The body in two details, as plain JSON types."""
+    """The body in its details, as plain JSON types."""
     skeleton = Skeleton.named("smplx52")
     return {
         "parents": list(skeleton.parents),
         "rest": _floats(skeleton.rest_joints),
         "colours": list(COLOURS),
-        "details": [_detail(neutral_body("smplx52", "controls", detail)) for detail in DETAILS],
+        "details": [_detail(detail) for detail in DETAILS],
     }
 
 
@@ -69,7 +70,54 @@ def pack_turns(turns: NDArray[Any]) -> NDArray[np.uint32]:
     return np.asarray(out.reshape(turns.shape[:-2]), dtype=np.uint32)
 
 
-def _detail(body: Body) -> dict[str, Any]:
+def in_reach(body: Body) -> Body:
+    """The same mesh with neighbours side by side: triangles along a space-filling curve, vertices by first use.
+
+    Renderers keep the last few vertices that they have moved; in the order of the grid, each would be moved for
+    every triangle around it.
+    """
+    middle = body.vertices[body.triangles].mean(axis=1)
+    low, high = middle.min(axis=0), middle.max(axis=0)
+    cells = ((middle - low) / (high - low).max() * 1023).astype(np.int64)
+    curve = np.zeros(len(cells), dtype=np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            curve |= (cells[:, axis] >> bit & 1) << 3 * bit + axis
+    # Parts that overlap in space stay apart.
+    triangles = body.triangles[np.lexsort((curve, _piece_of(body)))]
+    _, first = np.unique(triangles, return_index=True)
+    order = triangles.ravel()[np.sort(first)]
+    number = np.zeros(len(body.vertices), dtype=np.int64)
+    number[order] = np.arange(len(order))
+    return replace(
+        body,
+        vertices=body.vertices[order],
+        normals=body.normals[order],
+        triangles=number[triangles],
+        weights=body.weights[order],
+        uv=body.uv[order],
+        expressions={name: move[order] for name, move in body.expressions.items()},
+    )
+
+
+def _piece_of(body: Body) -> NDArray[np.int64]:
+    """Which connected piece each triangle belongs to [F]."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = np.concatenate([body.triangles[:, [0, 1]], body.triangles[:, [1, 2]]])
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(body.vertices),) * 2)
+    label = connected_components(graph, directed=False)[1]
+    return np.asarray(label[body.triangles[:, 0]], dtype=np.int64)
+
+
+def _detail(detail: Detail) -> dict[str, Any]:
+    body = neutral_body("smplx52", "controls", detail)
+    if detail == "shadow":  # without the face
+        still = {name: np.zeros_like(move) for name, move in body.expressions.items()}
+        painted = body.uv[body.triangles[:, 0], 1] * 4 >= len(COLOURS) - 1
+        body = replace(body, triangles=body.triangles[~painted], expressions=still)
+    body = in_reach(body)
     low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
     step = (high - low) / 65535
     places = np.round((body.vertices - low) / step)
@@ -79,7 +127,7 @@ def _detail(body: Body) -> dict[str, Any]:
     row = np.minimum((body.uv[:, 1] * 4).astype(np.int64), len(COLOURS) - 1)
     colour = np.stack([np.round(255 * body.uv[:, 0]), row], axis=1)
     looks = np.stack(list(body.expressions.values()), axis=1)
-    size = float(np.abs(looks).max()) / 127
+    size = max(float(np.abs(looks).max()), 1e-3) / 127
     moves = np.round(looks / size)
     moving = np.flatnonzero(moves.any(axis=(1, 2)))
     return {

@@ -27,13 +27,14 @@ from motionloom.pipeline.render.raster import HAIR, PALETTE
 Floats = NDArray[np.float64]
 Faces = Literal["expressions", "controls", "arkit"]
 """Which shapes a body's face has: those of the synthetic basis, the drawn face's controls, or ARKit's 52."""
-Detail = Literal["full", "near", "far"]
-"""How fine the mesh is: for files, for figures that are watched, for many or small ones."""
+Detail = Literal["full", "near", "far", "shadow"]
+"""How fine the mesh is: for files, for figures that are watched, for many or small ones, for what they cast."""
 
 _SPACING: dict[Detail, tuple[float, float, float, float]] = {
     "full": (0.019, 0.0056, 0.0095, 0.005),
-    "near": (0.024, 0.0082, 0.0125, 0.006),
+    "near": (0.029, 0.0072, 0.0125, 0.006),
     "far": (0.036, 0.0125, 0.019, 0.009),
+    "shadow": (0.05, 0.02, 0.032, 0.02),
 }
 """The grid's spacing of trunk and limbs, hands, head and nose in metres; vertices lie on the surface."""
 _SOFTNESS = (0.02, 0.004, 0.012, 0.01)

@@ -60,10 +60,10 @@ def trunk_and_limbs(skeleton: Skeleton) -> Field:
         add(f"{side}_elbow", elbow, belly, 0.038, 0.042)
         add(f"{side}_elbow", belly, wrist, 0.042, 0.0285, 0.92)
         hip, knee, ankle, ball = (place(f"{side}_{name}") for name in ("hip", "knee", "ankle", "foot"))
-        add(f"{side}_hip", hip, knee, 0.086, 0.054)
+        add(f"{side}_hip", hip, knee, 0.086, 0.047)
         calf = knee + np.array([0.0, 0.0, -0.014]) + 0.3 * (ankle - knee)
-        add(f"{side}_knee", knee, calf, 0.05, 0.055)
-        add(f"{side}_knee", calf, ankle, 0.055, 0.036)
+        add(f"{side}_knee", knee, calf, 0.045, 0.05)
+        add(f"{side}_knee", calf, ankle, 0.05, 0.035)
         low = ball[1] - 0.012
         heel = np.array([ankle[0], low + 0.008, ankle[2] - 0.03])
         add(f"{side}_ankle", ankle, heel, 0.037, 0.034)
