@@ -71,7 +71,9 @@ def processor_seconds(root: int) -> float:
     return total
 
 
-def measure(browser: Any, page_file: Path, size: tuple[int, int], view: str, seconds: float) -> dict[str, Any]:
+def measure(
+    browser: Any, page_file: Path, size: tuple[int, int], view: str, seconds: float
+) -> dict[str, Any]:
     """One line of the table."""
     page = browser.new_page(viewport={"width": size[0], "height": size[1]})
     page.goto(page_file.as_uri() + ("?view=2d" if view == "2d" else ""))

@@ -88,7 +88,9 @@ class PlainActor:
     def _tube(self) -> tuple[Floats, Floats, NDArray[np.int64]]:
         """Directions [K, 3] (z along the limb) and end (0 or 1) [K] of a limb's vertices; triangles."""
         polar = np.linspace(0, np.pi / 2, _CAP + 1)
-        rings = [(-np.cos(p), np.sin(p), 0.0) for p in polar] + [(np.cos(p), np.sin(p), 1.0) for p in polar[::-1]]
+        rings = [(-np.cos(p), np.sin(p), 0.0) for p in polar] + [
+            (np.cos(p), np.sin(p), 1.0) for p in polar[::-1]
+        ]
         turn = 2 * np.pi * np.arange(_AROUND) / _AROUND
         away = np.concatenate(
             [
@@ -113,7 +115,9 @@ class PlainActor:
     def uv(self) -> Floats:
         """The colour of the bone's side."""
         columns = [_COLUMNS[capsule.side] for capsule in self.figure.capsules]
-        return np.column_stack([np.repeat(columns, len(self._tube[0])), np.full(len(columns) * len(self._tube[0]), 0.125)])
+        return np.column_stack(
+            [np.repeat(columns, len(self._tube[0])), np.full(len(columns) * len(self._tube[0]), 0.125)]
+        )
 
     def at(self, frame: int) -> tuple[Floats, Floats]:
         """Vertices and unit normals [V, 3]."""

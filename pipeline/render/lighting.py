@@ -41,11 +41,13 @@ def lit(
     facing = np.maximum(np.einsum("pi,pi->p", normals, toward), 0)
     key = np.maximum((normals @ lamp + 0.2) / 1.2, 0)
     sky = 0.5 + 0.5 * normals[:, 1]
-    light = 0.36 + 0.2 * sky + 0.46 * key + 0.12 * facing
+    light = 0.42 + 0.18 * sky + 0.48 * key + 0.12 * facing
     light = np.where(painted, 0.5 + 0.5 * light, light)
     half = toward + lamp
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    gloss = np.maximum(np.einsum("pi,pi->p", normals, half), 0) ** 28 * np.where(painted, np.float32(0.05), np.float32(0.1))
+    gloss = np.maximum(np.einsum("pi,pi->p", normals, half), 0) ** 28 * np.where(
+        painted, np.float32(0.05), np.float32(0.1)
+    )
     warm = np.clip(key + 0.25, 0, 1)[:, None]
     out = base * (_COOL + warm * (_WARM - _COOL)) * light[:, None]
     rim = 0.6 * (1 - facing[:, None]) ** 3

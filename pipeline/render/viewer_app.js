@@ -302,7 +302,8 @@ function mountViewer(root, data, options) {
     remove, play, setFrame, paint: () => paintAll(cells.filter((cell) => cell.visible)), setView, zoom, turn, toggle: (name) => toggle(name, name),
     get sound() { return player.on; }, get audio() { return player.audio; },
     get segment() { return lead && segmentAt(lead.score, localTime(lead)); },
-    get view() { return stage && stage.ready ? "webgl" : "2d"; }, stage, pace, clips,
+    get view() { return stage && stage.ready ? "webgl" : "2d"; }, stage, pace,
+    bones: (k) => [...bonesAt(clips[k], localFrame(clips[k]))], // what moves the mesh now, for checks from outside
     lens: (k) => lensOf(cells[k], cells[k].canvas.clientWidth, cells[k].canvas.clientHeight),
     setSpeed, setSound, listen: (k) => follow(clips[k]),
   };

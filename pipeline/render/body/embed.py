@@ -2,8 +2,8 @@
 
 The mesh is in the viewer's script, once a page; a motion brings its own bones and each joint's rotation. A
 rotation is one 32-bit number: the three smaller components of its quaternion in 10 bits each, and which one
-is left out. That is 0.1 degrees at worst, 0.6 mm at the end of a thigh; joints stay where they are, because
-positions travel apart.
+is left out. That is a quarter of a degree at worst and a tenth on average, 0.7 mm at the end of a thigh; joints
+stay where they are, because positions travel apart.
 """
 
 from __future__ import annotations

@@ -112,9 +112,7 @@ def body_for(skeleton: Skeleton, faces: Faces = "expressions", detail: Detail = 
 
 
 @cache
-def neutral_body(
-    name: str = "smplx52", faces: Faces = "expressions", detail: Detail = "full"
-) -> Body:
+def neutral_body(name: str = "smplx52", faces: Faces = "expressions", detail: Detail = "full") -> Body:
     """The body on a skeleton that ships with the package."""
     whole = _whole_body(faces, detail)
     if name == "smplx52":

@@ -57,7 +57,9 @@ class Posing:
 def single_bones(skeleton: Skeleton) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Joints that are their parent's only child, and these parents."""
     parents = np.asarray(skeleton.parents)
-    ends = np.array([j for j, p in enumerate(parents) if p >= 0 and (parents == p).sum() == 1], dtype=np.int64)
+    ends = np.array(
+        [j for j, p in enumerate(parents) if p >= 0 and (parents == p).sum() == 1], dtype=np.int64
+    )
     return ends, parents[ends]
 
 
