@@ -1,11 +1,11 @@
-"""What the page's figure costs: frames a second and processor time a frame, in a headless Chromium without a GPU.
+"""What the page's figure costs in a headless Chromium without a GPU: frames a second, processor time a frame.
 
 python benchmarks/viewer.py --figures 1 4 8 --seconds 6
 
-Each line is a page of so many walking figures in a window of one size, in the WebGL2 view (its pixels made by
-SwiftShader, on the processor) or the flat one. Frames a second depend on what else the machine does; processor
-time a frame, summed over all of the browser's processes, hardly does: a view keeps up with 60 frames a second
-on a machine that has as much to give in 16.7 ms, over all cores that the browser may use.
+Each line is a page of so many moving figures in a window of one size, in the WebGL2 view (its pixels made
+by SwiftShader, on the processor) or the flat one. Frames a second depend on what else the machine does.
+Processor time a frame, summed over all processes of the browser, hardly does: a view keeps up with 60 frames
+a second on a machine that has as much to give in 16.7 ms, over all cores that the browser may use.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ FRAMES = """(least) => new Promise((done) => {
         const passed = performance.now() - start, drawn = __viewer.draws - from;
         if (passed < 1000 * least || drawn < 12) return requestAnimationFrame(look);
         const { pace, stage } = __viewer;
-        done({ passed: passed / 1000, drawn, spent: pace ? pace.spent : null, quality: stage ? stage.quality : null });
+        const [spent, quality] = stage ? [pace.spent, stage.quality] : [null, null];
+        done({ passed: passed / 1000, drawn, spent, quality });
     };
     look();
 })"""

@@ -1,7 +1,7 @@
 """Light on the figure and its shadow, the same in film and pictures as the page's programs have it.
 
-One lamp from above, a sky that is brighter than the ground, a little light from where the camera stands, and a
-darker rim. The shadow lies flat on the ground: soft everywhere, and darker where what casts it is near.
+One lamp from above, a sky that is brighter than the ground, a little light from where the camera stands, and
+a darker rim. The shadow lies flat on the ground: soft everywhere, and darker where what casts it is near.
 """
 
 from __future__ import annotations

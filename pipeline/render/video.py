@@ -1,4 +1,4 @@
-"""MP4 of one motion: the body drawn frame by frame, the ffmpeg that ships with imageio-ffmpeg encodes (H.264 and AAC)."""
+"""MP4 of one motion: the body is drawn, imageio-ffmpeg's ffmpeg encodes (H.264 and AAC)."""
 
 from __future__ import annotations
 

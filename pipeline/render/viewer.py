@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.motion.rigid import RigidMotion
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.embed import mesh_data, pose_data
 from motionloom.pipeline.render.body.posing import human_skeleton, posing_of
 from motionloom.pipeline.render.figure import Figure, figure_for
@@ -190,7 +190,8 @@ def viewer_script(bodies: bool = True) -> str:
     """
     body = "\n".join(resource(name) for name in SCRIPTS)
     mesh = safe_json(mesh_data()) if bodies else "null"
-    return f"(function () {{\n'use strict';\nconst BODY = {mesh};\n{body}\nwindow.motionloomViewer = mountViewer;\n}})();"
+    head, foot = f"'use strict';\nconst BODY = {mesh};", "window.motionloomViewer = mountViewer;"
+    return f"(function () {{\n{head}\n{body}\n{foot}\n}})();"
 
 
 def safe_json(data: Any) -> str:

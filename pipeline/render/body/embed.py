@@ -2,8 +2,8 @@
 
 The mesh is in the viewer's script, once a page; a motion brings its own bones and each joint's rotation. A
 rotation is one 32-bit number: the three smaller components of its quaternion in 10 bits each, and which one
-is left out. That is a quarter of a degree at worst and a tenth on average, 0.7 mm at the end of a thigh; joints
-stay where they are, because positions travel apart.
+is left out. That is a quarter of a degree at worst and a tenth on average, 0.7 mm at the end of a thigh;
+joints stay where they are, because positions travel apart.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def mesh_data() -> dict[str, Any]:
 
 
 def pose_data(posing: Posing) -> dict[str, Any]:
-    """What the page needs beside joint positions: bones, and the rotations of joints that turn by themselves."""
+    """What the page needs beside joint positions: bones, and rotations of joints that turn by themselves."""
     skeleton, parents = posing.skeleton, np.asarray(posing.skeleton.parents)
     name = "smplx52" if len(skeleton) == len(Skeleton.named("smplx52")) else "smpl22"
     known = Skeleton.named(name)
@@ -71,10 +71,10 @@ def pack_turns(turns: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def in_reach(body: Body) -> Body:
-    """The same mesh with neighbours side by side: triangles along a space-filling curve, vertices by first use.
+    """The same mesh with neighbours side by side: triangles on a space-filling curve, vertices by first use.
 
-    Renderers keep the last few vertices that they have moved; in the order of the grid, each would be moved for
-    every triangle around it.
+    Renderers keep the last few vertices that they have moved; in the order of the grid, each would be moved
+    for every triangle around it.
     """
     middle = body.vertices[body.triangles].mean(axis=1)
     low, high = middle.min(axis=0), middle.max(axis=0)

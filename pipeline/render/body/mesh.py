@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 Faces = Literal["expressions", "controls", "arkit"]
 """Which shapes a body's face has: those of the synthetic basis, the drawn face's controls, or ARKit's 52."""
 Detail = Literal["full", "near", "far", "shadow"]
-"""How fine the mesh is: for files, for figures that are watched, for many or small ones, for what they cast."""
+"""How fine the mesh is: for files, for figures that are watched, many or small ones, their shadows."""
 
 _SPACING: dict[Detail, tuple[float, float, float, float]] = {
     "full": (0.019, 0.0056, 0.0095, 0.005),

@@ -1,9 +1,9 @@
 """How the body stands in each frame: where its joints are, and how each turns and stretches what hangs on it.
 
-A rigid figure brings its rotations, so page, film and pictures show the same body as its GLB file. Bare joints
-get rotations by the rule that starts a figure's fit (the smallest turn that points each bone the right way, a
-hand's twist shared with its forearm), and their bones may change length from frame to frame: then the body is
-stretched along the bone, so that its joints are exactly where the motion has them.
+A rigid figure brings its rotations, so page, film and pictures show the same body as its GLB file. Bare
+joints get rotations by the rule that starts a figure's fit (the smallest turn that points each bone the right
+way, a hand's twist shared with its forearm), and their bones may change length from frame to frame: then the
+body is stretched along the bone, so that its joints are exactly where the motion has them **[ours]**.
 """
 
 from __future__ import annotations

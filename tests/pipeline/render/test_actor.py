@@ -1,4 +1,4 @@
-"""The body in film and pictures, and as the page carries it: against slow loops, the GLB's own skinning, packing."""
+"""The body in film and pictures, and as the page has it: against slow loops and the GLB's own skinning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The WebGL2 view in a real headless Chromium, its pixels made on the processor; and what stands behind it."""
+"""The WebGL2 view in a real headless Chromium, its pixels made on the processor; and what is behind it."""
 
 from __future__ import annotations
 
