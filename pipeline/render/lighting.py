@@ -16,7 +16,7 @@ from motionloom.pipeline.render.raster import cover
 
 Floats = NDArray[np.float64]
 
-LAMP = np.array([-0.25, 1.0, 0.55]) / np.linalg.norm([-0.25, 1.0, 0.55])
+LAMP = np.array([-0.25, 1.4, 0.55]) / np.linalg.norm([-0.25, 1.4, 0.55])
 """From which side light comes, in the world."""
 _SLOPE = LAMP[[0, 2]] / LAMP[1]
 _SPREAD = 0.11

@@ -3,7 +3,7 @@
    Browsers give a page few contexts, and reports have many cells; so cells stay plain canvases with the ground
    on them, which is also what the flat view draws on where there is no WebGL2 or the context goes away. */
 
-const LAMP_ABOVE = unit([-0.25, 1, 0.55]); // from which side light comes, in the world
+const LAMP_ABOVE = unit([-0.25, 1.4, 0.55]); // from which side light comes, in the world
 const LAMP_SLOPE = [LAMP_ABOVE[0] / LAMP_ABOVE[1], LAMP_ABOVE[2] / LAMP_ABOVE[1]];
 const SHADOW_SPREAD = 0.11; // metres over which the shadow's rim is soft
 const BODY_REACH = 0.15, HEAD_REACH = 0.27; // how far the body goes beyond its joints, metres

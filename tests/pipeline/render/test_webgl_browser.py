@@ -75,9 +75,9 @@ def still(page: Any, frame: int, view: str = "3/4") -> None:
 
 
 def limbs(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the picture is blue, and where orange."""
-    red, blue = image[..., 0], image[..., 2]
-    return blue - red > 60, red - blue > 70
+    """Where the picture is blue, but not the trail's violet, and where orange."""
+    red, green, blue = (image[..., k] for k in range(3))
+    return (blue - red > 60) & (green > red), red - blue > 70
 
 
 def outline(page: Any, actor: Actor, frame: int, view: str) -> np.ndarray:
