@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.pipeline.render.body.shapes import FINGERS
 
 CENTRE, LEFT, RIGHT, SKIN = 0, 1, 2, 3
-FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 
 Blend = tuple[tuple[int, float], ...]
 

@@ -41,7 +41,7 @@ def lit(
     facing = np.maximum(np.einsum("pi,pi->p", normals, toward), 0)
     key = np.maximum((normals @ lamp + 0.2) / 1.2, 0)
     sky = 0.5 + 0.5 * normals[:, 1]
-    light = 0.42 + 0.18 * sky + 0.48 * key + 0.12 * facing
+    light = 0.48 + 0.16 * sky + 0.46 * key + 0.12 * facing
     light = np.where(painted, 0.5 + 0.5 * light, light)
     half = toward + lamp
     half /= np.linalg.norm(half, axis=1, keepdims=True)

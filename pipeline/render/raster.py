@@ -14,13 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from motionloom.pipeline.render.body.palette import Colour
 from motionloom.pipeline.render.camera import NEAR, Camera
 
-Colour = tuple[int, int, int]
 SOLE = 0.03
 """Metres from the foot joints down to the soles."""
-PALETTE: dict[int, Colour] = {0: (119, 130, 154), 1: (47, 143, 196), 2: (229, 121, 63), 3: (237, 199, 163)}
-HAIR: Colour = (90, 68, 54)
 SKY: Colour = (244, 246, 250)
 GRID: Colour = (190, 199, 214)
 TRAIL: Colour = (122, 91, 208)

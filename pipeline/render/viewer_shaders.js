@@ -75,7 +75,7 @@ void main() {
   float facing = max(dot(n, v), 0.0);
   float key = max((dot(n, lamp) + 0.2) / 1.2, 0.0);
   float sky = 0.5 + 0.5 * n.y;
-  float light = 0.42 + 0.18 * sky + 0.48 * key + 0.12 * facing;
+  float light = 0.48 + 0.16 * sky + 0.46 * key + 0.12 * facing;
   if (vRow == 2) light = mix(light, 1.0, 0.5);
   float gloss = pow(max(dot(n, normalize(lamp + v)), 0.0), 28.0) * (vRow == 2 ? 0.05 : 0.1);
   float rim = pow(1.0 - facing, 3.0);

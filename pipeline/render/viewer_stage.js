@@ -67,9 +67,12 @@ function fitCanvas(canvas, width, height) {
 
 /* Whether the processor makes the pixels: smooth edges then come from drawing a still picture twice as large. */
 function drawnInSoftware() {
-  const gl = document.createElement("canvas").getContext("webgl2"), info = gl && gl.getExtension("WEBGL_debug_renderer_info");
-  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
-  if (gl) gl.getExtension("WEBGL_lose_context")?.loseContext();
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return false;
+  let name = gl.getParameter(gl.RENDERER);
+  const info = name === "WebKit WebGL" && gl.getExtension("WEBGL_debug_renderer_info"); // where the name is masked
+  if (info) name = gl.getParameter(info.UNMASKED_RENDERER_WEBGL);
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
   return /swiftshader|llvmpipe|software|basic render/i.test(name);
 }
 

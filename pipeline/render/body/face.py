@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.synth.face import APEX, BASIS
 from motionloom.pipeline.render.body.field import Field
-from motionloom.pipeline.render.face import BLINK_HEIGHT
 
 Floats = NDArray[np.float64]
 Triangles = NDArray[np.int64]
+
+BLINK_HEIGHT = 1.6
+"""Length of a full blink along its column of the synthetic basis."""
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.arkit import ARKIT_SHAPES, Shape
 from motionloom.pipeline.render.body.face import CONTROLS, EXPRESSIONS, Look, features, on_skin, skin_shift
 from motionloom.pipeline.render.body.field import Field, skin_weights
+from motionloom.pipeline.render.body.palette import HAIR, PALETTE
 from motionloom.pipeline.render.body.shapes import hand, head, head_centre, nose, trunk_and_limbs
 from motionloom.pipeline.render.body.surface import mesh_of
-from motionloom.pipeline.render.raster import HAIR, PALETTE
 
 Floats = NDArray[np.float64]
 Faces = Literal["expressions", "controls", "arkit"]

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.render.body.field import Capsule, Field
-from motionloom.pipeline.render.figure import FINGERS
 
 Floats = NDArray[np.float64]
 
+FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 HEAD_SIZE = (0.079, 0.112, 0.094)
 """Half width, half height, half depth of the skull in metres."""
 _KNUCKLE = {"index": 0.0108, "middle": 0.0112, "ring": 0.0104, "pinky": 0.0092, "thumb": 0.0122}
