@@ -28,13 +28,13 @@ from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 SIZES = {"desktop": (1200, 800), "phone": (390, 844)}
-SHORT, LONG = 4, 24
-"""Pictures of the two runs whose difference is measured: what a run costs by itself falls out."""
+WARM, PICTURES = 4, 40
+"""Pictures that are painted before, and while time is taken."""
 FRAMES = """(least) => new Promise((done) => {
     const from = __viewer.draws, start = performance.now();
     const look = () => {
         const passed = performance.now() - start, drawn = __viewer.draws - from;
-        if (passed < 1000 * least || drawn < 8) return requestAnimationFrame(look);
+        if (passed < 1000 * least || drawn < 4) return requestAnimationFrame(look);
         const { stage } = __viewer;
         done({ passed: passed / 1000, drawn, quality: stage ? stage.quality : null });
     };
@@ -96,17 +96,16 @@ def measure(
     page.goto(page_file.as_uri() + ("?view=2d" if view == "2d" else ""))
     page.evaluate(FRAMES, seconds / 2)  # the quality settles
     found, shown = page.evaluate(FRAMES, seconds), page.evaluate("__viewer.view")
-    used = []
-    for count in (SHORT, LONG):
-        before = processor_seconds(os.getpid())
-        page.evaluate(PAINT, [count, found["quality"]])
-        page.wait_for_timeout(200)
-        used.append(processor_seconds(os.getpid()) - before)
+    page.evaluate(PAINT, [WARM, found["quality"]])
+    page.wait_for_timeout(500)
+    before = processor_seconds(os.getpid())
+    page.evaluate(PAINT, [PICTURES, found["quality"]])
+    used = processor_seconds(os.getpid()) - before
     page.close()
     assert shown == view, f"the page shows {shown}"
     return {
         "fps": found["drawn"] / found["passed"],
-        "cpu_ms": 1000 * (used[1] - used[0]) / (LONG - SHORT),
+        "cpu_ms": 1000 * used / PICTURES,
         "quality": found["quality"],
     }
 
