@@ -77,8 +77,9 @@ void main() {
   float sky = 0.5 + 0.5 * n.y;
   float light = 0.48 + 0.16 * sky + 0.46 * key + 0.12 * facing;
   if (vRow == 2) light = mix(light, 1.0, 0.5);
-  float gloss = pow(max(dot(n, normalize(lamp + v)), 0.0), 28.0) * (vRow == 2 ? 0.05 : 0.1);
-  float rim = pow(1.0 - facing, 3.0);
+  float shine = max(dot(n, normalize(lamp + v)), 0.0), far = 1.0 - facing;
+  float four = shine * shine * shine * shine, eight = four * four;
+  float gloss = eight * eight * eight * four * (vRow == 2 ? 0.05 : 0.1), rim = far * far * far;
   vec3 lit = base * mix(vec3(0.86, 0.9, 1.0), vec3(1.03, 1.0, 0.95), clamp(key + 0.25, 0.0, 1.0)) * light;
   lit = mix(lit, lit * 0.72 + vec3(0.1, 0.12, 0.16) * sky, rim * 0.6) + gloss;
   shade = vec4(min(lit, vec3(1.0)), 1.0);
@@ -118,16 +119,18 @@ uniform vec2 spread;
 uniform vec3 tint;
 uniform int taps;
 out vec4 shade;
+const vec2 disc[10] = vec2[](
+  vec2(0.224, 0.000), vec2(-0.286, 0.262), vec2(0.044, -0.498), vec2(0.360, 0.470), vec2(-0.661, -0.117),
+  vec2(0.626, -0.398), vec2(-0.209, 0.779), vec2(-0.399, -0.769), vec2(0.866, 0.316), vec2(-0.901, 0.372));
 vec2 at(vec2 move) { return texture(fallen, tile.xy + tile.zw * clamp(vAt + move * spread, 0.0, 1.0)).rg; }
 void main() {
   float wide = 0.0, close = at(vec2(0.0)).r;
   for (int k = 0; k < 10; k++) {
     if (k >= taps) break;
-    float angle = 2.3999632 * float(k), reach = sqrt((float(k) + 0.5) / float(taps));
-    vec2 move = reach * vec2(cos(angle), sin(angle));
-    wide += at(move).g;
-    if (k % 3 == 0) close += at(0.4 * move).r;
+    wide += at(disc[k * 10 / taps]).g;
+    if (k % 3 == 0) close += at(0.4 * disc[k]).r;
   }
-  float dark = 0.2 * wide / float(taps) + 0.3 * pow(close / float((taps + 2) / 3 + 1), 1.5);
+  close /= float((taps + 2) / 3 + 1);
+  float dark = 0.2 * wide / float(taps) + 0.3 * close * sqrt(close);
   shade = vec4(tint, 1.0) * dark;
 }`];
