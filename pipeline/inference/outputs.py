@@ -15,6 +15,7 @@ from motionloom.datasets.audio.features import beats
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.arkit import ArkitBases, write_arkit_csv
 from motionloom.datasets.motion.bvh import write_bvh
+from motionloom.datasets.motion.rigid import RigidMotion
 from motionloom.datasets.motion.smpl import BodyModel
 from motionloom.datasets.motion.smplx_file import write_smplx
 from motionloom.datasets.schema import UserError
@@ -27,6 +28,7 @@ from motionloom.pipeline.render.body.glb import GlbClip, write_glb
 from motionloom.pipeline.render.body.mesh import Faces
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.score import Score
+from motionloom.pipeline.render.sound import Soundtrack
 from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 from motionloom.pipeline.store.files import require_folder
@@ -85,10 +87,8 @@ def write_motions(
         if "bvh" in formats:
             out.append(write_bvh_of(stem.with_suffix(".bvh"), figures[-1]))
         if "mp4" in formats:
-            path = stem.with_suffix(".mp4")
-            skeleton, fps = motion.layout.skeleton, motion.layout.fps
-            write_mp4(path, figures[-1].joints, skeleton, fps, motion.caption, sound=score.sound)
-            out.append(path)
+            out.append(stem.with_suffix(".mp4"))
+            film(out[-1], figures[-1], score.sound)
         if "glb" in formats:
             out.append(stem.with_suffix(".glb"))
             write_glb(out[-1], [glb_clip(figures[-1], arkit)], faces)
@@ -121,6 +121,26 @@ def score_of(motion: GeneratedMotion) -> Score:
     return Score(sound=sound, beats=found, segments=motion.segments)
 
 
+def film(path: Path, figure: ShownMotion, sound: Soundtrack | None = None) -> None:
+    """Write the figure's MP4, with its face and with `sound` where there is any."""
+    motion = figure.motion
+    write_mp4(
+        path,
+        figure.joints,
+        motion.layout.skeleton,
+        motion.layout.fps,
+        motion.caption,
+        sound=sound,
+        figure=rigid_of(figure),
+        face_controls=None if motion.face is None else synthetic_face_controls(motion.face),
+    )
+
+
+def rigid_of(figure: ShownMotion) -> RigidMotion | None:
+    """The rigid figure, where that is what is shown."""
+    return figure.figure if figure.joints is figure.figure.joints else None
+
+
 def viewer_motion(
     motion: GeneratedMotion | ShownMotion, label: str, group: str = "", score: Score | None = None
 ) -> ViewerMotion:
@@ -138,6 +158,7 @@ def viewer_motion(
         sound=score.sound,
         beats=score.beats,
         segments=score.segments,
+        figure=rigid_of(figure),
     )
 
 

@@ -9,6 +9,7 @@ from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import (
+    film,
     score_of,
     viewer_motion,
     write_bvh_of,
@@ -17,7 +18,6 @@ from motionloom.pipeline.inference.outputs import (
 )
 from motionloom.pipeline.inference.page_words import page_title
 from motionloom.pipeline.inference.shown import shown
-from motionloom.pipeline.render.video import write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, viewer_page
 
 
@@ -38,8 +38,7 @@ def save_glb(path: Path, motion: GeneratedMotion) -> None:
 
 def save_mp4(path: Path, motion: GeneratedMotion) -> None:
     """A film, with its music."""
-    skeleton, sound = motion.layout.skeleton, motion.prompt.sound
-    write_mp4(_place(path), shown(motion).joints, skeleton, motion.fps, motion.caption, sound=sound)
+    film(_place(path), shown(motion), motion.prompt.sound)
 
 
 def save_html(path: Path, motion: GeneratedMotion) -> None:

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.synth.face import APEX, BASIS
-
-BLINK_HEIGHT = 1.6
-"""Length of a full blink along its basis column."""
+from motionloom.pipeline.render.body.face import BLINK_HEIGHT
 
 
 def synthetic_face_controls(expression: NDArray[Any]) -> NDArray[np.float64]:

@@ -1,4 +1,7 @@
-"""What a skeleton looks like: rounded shapes hung on its joints, shared by viewer, video and pictures.
+"""The flat figure: rounded shapes hung on a skeleton's joints.
+
+The page paints it where there is no WebGL2, and all outputs show it of skeletons that have no skinned body
+(`body/`).
 
 * Every drawn point ("node") is a linear blend of joints, so a whole clip's nodes are one matrix product.
   Finger and toe tips, which the skeletons lack, are extrapolated; the trunk's flanks follow the shoulders.
@@ -17,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.pipeline.render.body.shapes import FINGERS
 
 CENTRE, LEFT, RIGHT, SKIN = 0, 1, 2, 3
-FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 
 Blend = tuple[tuple[int, float], ...]
 
@@ -67,15 +70,6 @@ class Figure:
     stature: float = 0.0
     """Sum of all bone lengths the radii were chosen for, metres; 0 where radii need no scaling."""
     parents: tuple[int, ...] = field(default=())
-
-    def nodes(self, joints: NDArray[Any]) -> NDArray[np.float64]:
-        """Joints [..., N, 3] to nodes [..., M, 3]."""
-        weights = np.zeros((len(self.blends), self.num_joints))
-        for row, blend in enumerate(self.blends):
-            for joint, weight in blend:
-                weights[row, joint] += weight
-        out: NDArray[np.float64] = np.einsum("mn,...nc->...mc", weights, np.asarray(joints, np.float64))
-        return out
 
     def scale(self, joints: NDArray[Any]) -> float:
         """Factor on all radii by the first pose of joints [T, N, 3]: small people get thin limbs."""

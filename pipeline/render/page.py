@@ -22,6 +22,7 @@ from motionloom.pipeline.render.matrix import matrix_table
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
     fill,
+    has_bodies,
     media_policy,
     resource,
     safe_json,
@@ -62,6 +63,7 @@ class Page:
         self._contents: list[tuple[str, str]] = []
         self._viewers = 0
         self._sounding = False
+        self._bodies = False
 
     def add_heading(self, text: str) -> Page:
         """Start a section; sections are listed at the head of the page."""
@@ -186,6 +188,7 @@ class Page:
             self.add_text(note)
         content = viewer_data(motions)
         self._sounding |= "sounds" in content
+        self._bodies |= has_bodies(content)
         data = safe_json(content)
         self._blocks.append(
             f'<div class="mlv viewer" id="{name}"></div>'
@@ -216,7 +219,7 @@ class Page:
             TITLE=escape(self.title),
             SUBTITLE=f"<p>{escape(self.subtitle)}</p>" if self.subtitle else "",
             STYLE=resource("page.css") + (resource("viewer.css") if self._viewers else ""),
-            SCRIPT=viewer_script() if self._viewers else "",
+            SCRIPT=viewer_script(self._bodies) if self._viewers else "",
             CONTENTS=contents,
             BODY="\n".join(self._blocks),
             HOVER=resource("page.js"),

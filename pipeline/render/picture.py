@@ -14,10 +14,10 @@ from PIL import Image, ImageDraw
 from motionloom.datasets.base.files import write_bytes
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.actor import Actor, actor_for, draw_actor
 from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of
-from motionloom.pipeline.render.figure import Figure, figure_for
 from motionloom.pipeline.render.lettering import font, wrap
-from motionloom.pipeline.render.raster import Pose, draw_pose, halve
+from motionloom.pipeline.render.raster import halve
 
 SKELETONS = {52: "smplx52", 22: "smpl22"}
 PAPER, INK, SOFT, LINE = (255, 255, 255), (29, 35, 48), (91, 100, 117), (226, 230, 237)
@@ -65,8 +65,7 @@ def contact_sheet(
     stamps = []
     for row, clip in enumerate(rows):
         top = row * (height + heading)
-        figure = _figure(clip, parents)
-        nodes, scale, floor = figure.nodes(clip), figure.scale(clip), floor_of(clip)
+        actor, floor = _actor(clip, parents), floor_of(clip)
         draw.rectangle(
             [0, 2 * (top + heading), sheet.width, 2 * (top + heading + height)], fill=(247, 248, 251)
         )
@@ -75,7 +74,9 @@ def contact_sheet(
         for column, k in enumerate(shown):
             target = np.array([clip[k, 0, 0], floor + 0.47 * tall, clip[k, 0, 2]])
             corner = (2 * column * width, 2 * (top + heading))
-            draw_pose(draw, camera, figure, Pose(nodes[k], target, floor, scale), at=corner)
+            picture = np.array(sheet.crop((*corner, corner[0] + big[0], corner[1] + big[1])))
+            draw_actor(picture, camera, target, floor, actor, k)
+            sheet.paste(Image.fromarray(picture), corner)
             stamps.append((column * width + 8, top + heading + height - 20, f"{k / fps:.1f} s"))
     small = halve(sheet)
     _words(small, labels, captions, stamps, height + heading)
@@ -112,11 +113,11 @@ def _words(
         draw.text((x_at, y_at), text, fill=SOFT, font=tiny)
 
 
-def _figure(clip: NDArray[np.float64], parents: Sequence[int] | None) -> Figure:
+def _actor(clip: NDArray[np.float64], parents: Sequence[int] | None) -> Actor:
     if clip.ndim != 3 or not np.isfinite(clip).all():
         raise UserError(f"contact_sheet draws finite joints [T, N, 3], got {list(clip.shape)}")
     if parents is None:
         if clip.shape[1] not in SKELETONS:
             raise UserError(f"contact_sheet needs parents for a skeleton of {clip.shape[1]} joints")
         parents = Skeleton.named(SKELETONS[clip.shape[1]]).parents
-    return figure_for(parents, clip)
+    return actor_for(clip, parents)

@@ -1,4 +1,4 @@
-"""MP4 of one motion: Pillow draws, the ffmpeg that ships with imageio-ffmpeg encodes (H.264 and AAC)."""
+"""MP4 of one motion: the body is drawn, imageio-ffmpeg's ffmpeg encodes (H.264 and AAC)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from motionloom.datasets.base.files import atomic_path
+from motionloom.datasets.motion.rigid import RigidMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.actor import Actor, actor_for, draw_actor
 from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of, smooth_path
 from motionloom.pipeline.render.figure import figure_for
 from motionloom.pipeline.render.lettering import font, wrap
-from motionloom.pipeline.render.raster import SKY, Pose, draw_ground, draw_pose, halve
+from motionloom.pipeline.render.raster import SKY, draw_ground, halve
 from motionloom.pipeline.render.sound import RATE, Soundtrack, film_sound
 
 Progress = Callable[[int, int], None]
@@ -35,18 +37,31 @@ def write_mp4(
     view: str = "3/4",
     follow: bool = True,
     sound: Soundtrack | None = None,
+    figure: RigidMotion | None = None,
+    face_controls: NDArray[Any] | None = None,
     progress: Progress | None = None,
 ) -> None:
     """Film joints [T, N, 3] (metres, Y up); `progress(done, total)` is called after every frame.
 
     `sound` starts with the first frame; it is cut, or filled up with silence, to the T / fps seconds of the
-    film. The file appears under its name only when it is whole. `size` is rounded up to even numbers for
-    H.264.
+    film. `figure` is the rigid figure whose joints these are, where there is one; `face_controls` [T, 5] are
+    the viewer's. The file appears under its name only when it is whole. `size` is rounded up to even numbers
+    for H.264.
     """
     import imageio_ffmpeg  # the binary is looked up on import: only for those who film
 
     width, height = (side + side % 2 for side in size)
-    frames = render_frames(joints, skeleton, fps, caption, size=(width, height), view=view, follow=follow)
+    frames = render_frames(
+        joints,
+        skeleton,
+        fps,
+        caption,
+        size=(width, height),
+        view=view,
+        follow=follow,
+        figure=figure,
+        face_controls=face_controls,
+    )
     # Named, because the temporary file's ending does not say it.
     form = ["-f", "mp4", "-movflags", "+faststart"]
     with atomic_path(path) as temporary:
@@ -115,8 +130,10 @@ def render_frames(
     size: tuple[int, int] = (512, 512),
     view: str = "3/4",
     follow: bool = True,
+    figure: RigidMotion | None = None,
+    face_controls: NDArray[Any] | None = None,
 ) -> Iterator[Image.Image]:
-    """Yield one RGB picture of `size` per frame of joints [T, N, 3]."""
+    """Yield one RGB picture of `size` per frame of joints [T, N, 3]; see `write_mp4`."""
     exact = np.asarray(joints, np.float64)
     if exact.ndim != 3 or exact.shape[1:] != (len(skeleton), 3) or not len(exact):
         raise UserError(
@@ -126,11 +143,13 @@ def render_frames(
         raise UserError("joints hold NaN or infinity; nothing sensible can be filmed")
     if view not in VIEWS:
         raise UserError(f"no view '{view}'; known: {', '.join(VIEWS)}")
-    return _frames(exact, skeleton, fps, caption, size, view, follow)
+    actor = actor_for(exact, skeleton.parents, figure, face_controls)
+    return _frames(exact, actor, skeleton, fps, caption, size, view, follow)
 
 
 def _frames(
     joints: NDArray[np.float64],
+    actor: Actor,
     skeleton: Skeleton,
     fps: float,
     caption: str,
@@ -138,8 +157,7 @@ def _frames(
     view: str,
     follow: bool,
 ) -> Iterator[Image.Image]:
-    figure = figure_for(skeleton.parents, joints)
-    nodes, scale, floor = figure.nodes(joints), figure.scale(joints), floor_of(joints)
+    scale, floor = figure_for(skeleton.parents, joints).scale(joints), floor_of(joints)
     target = smooth_path(joints[:, 0], fps)
     spread = np.linalg.norm(joints[..., [0, 2]] - target[:, None][..., [0, 2]], axis=-1).max(axis=1)
     travel = 0.0
@@ -157,12 +175,11 @@ def _frames(
     lines = wrap(caption, size[0] - 24, face, 2) if caption else []
     sky = Image.new("RGB", big, SKY)
     for frame in range(len(joints)):
-        image = sky.copy()
-        draw = ImageDraw.Draw(image)
-        pose = Pose(nodes[frame], target[frame], floor, scale)
-        draw_ground(draw, camera, pose, joints[:, 0])
-        draw_pose(draw, camera, figure, pose)
-        small = halve(image)
+        ground = sky.copy()
+        draw_ground(ImageDraw.Draw(ground), camera, target[frame], floor, joints[:, 0])
+        image = np.array(ground)
+        draw_actor(image, camera, target[frame], floor, actor, frame)
+        small = halve(Image.fromarray(image))
         if lines:
             below = ImageDraw.Draw(small)
             step = size[1] // 30 * 1.35

@@ -23,7 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import write_text
+from motionloom.datasets.motion.rigid import RigidMotion
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.body.embed import mesh_data, pose_data
+from motionloom.pipeline.render.body.posing import human_skeleton, posing_of
 from motionloom.pipeline.render.figure import Figure, figure_for
 from motionloom.pipeline.render.score import Segments, score_data
 from motionloom.pipeline.render.sound import Playing, Soundtrack, embed_sounds
@@ -34,6 +37,11 @@ SCRIPTS = (
     "viewer_head.js",
     "viewer_body.js",
     "viewer_clip.js",
+    "viewer_mesh.js",
+    "viewer_bones.js",
+    "viewer_shaders.js",
+    "viewer_gl.js",
+    "viewer_stage.js",
     "viewer_page.js",
     "viewer_score.js",
     "viewer_sound.js",
@@ -52,7 +60,8 @@ class ViewerMotion:
     'generated'); motions with one `group` share a row. `face_controls` [T, 5] are smile, brow (-1 lowered,
     1 raised), eye-open (0 closed, 1 neutral), mouth-open and frown (mouth corners down, inner brows up);
     neutral is (0, 0, 1, 0, 0). `sound` starts with frame 0; `beats` are seconds, ticks on the time line;
-    `segments` are what drives the motion when: (start, end, label) in seconds, or `Segment`s.
+    `segments` are what drives the motion when: (start, end, label) in seconds, or `Segment`s. `figure` is the
+    rigid figure whose joints these are, where there is one: its rotations pose the body.
     """
 
     joints: NDArray[Any]
@@ -65,6 +74,7 @@ class ViewerMotion:
     sound: Soundtrack | None = None
     beats: Sequence[float] = ()
     segments: Segments = ()
+    figure: RigidMotion | None = None
 
 
 def write_viewer(path: Path, motions: Sequence[ViewerMotion], title: str, note: str = "") -> None:
@@ -81,7 +91,7 @@ def viewer_page(motions: Sequence[ViewerMotion], title: str, note: str = "") -> 
         TITLE=escape(title),
         STYLE=resource("viewer.css"),
         DATA=safe_json(data),
-        SCRIPT=viewer_script(),
+        SCRIPT=viewer_script(has_bodies(data)),
     )
 
 
@@ -115,6 +125,7 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
                 "step": [float(v) for v in step],
                 "positions": _base64(positions),
                 "face": face,
+                "pose": _pose(motion, joints),
             }
         )
     tracks = _tracks(motions, clips)
@@ -127,6 +138,11 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
         "motions": clips,
         **tracks,
     }
+
+
+def has_bodies(data: dict[str, Any]) -> bool:
+    """Whether any of `viewer_data`'s motions is one that the body can be posed by."""
+    return any(clip["pose"] is not None for clip in data["motions"])
 
 
 def media_policy(sounding: bool) -> str:
@@ -167,10 +183,15 @@ def quantise(
     return np.round((exact - low) / step).astype("<u2"), low, step
 
 
-def viewer_script() -> str:
-    """The viewer's own scripts as one, defining `motionloomViewer(element, data, options)`."""
+def viewer_script(bodies: bool = True) -> str:
+    """The viewer's own scripts as one, defining `motionloomViewer(element, data, options)`.
+
+    Without `bodies` it lacks the skinned body's mesh (about 0.5 MB) and draws flat figures only.
+    """
     body = "\n".join(resource(name) for name in SCRIPTS)
-    return f"(function () {{\n'use strict';\n{body}\nwindow.motionloomViewer = mountViewer;\n}})();"
+    mesh = safe_json(mesh_data()) if bodies else "null"
+    head, foot = f"'use strict';\nconst BODY = {mesh};", "window.motionloomViewer = mountViewer;"
+    return f"(function () {{\n{head}\n{body}\n{foot}\n}})();"
 
 
 def safe_json(data: Any) -> str:
@@ -213,6 +234,11 @@ def _checked(motion: ViewerMotion, number: int) -> NDArray[np.float64]:
                 f"{where}: face_controls must be finite [T={len(joints)}, 5], got {list(face.shape)}"
             )
     return joints
+
+
+def _pose(motion: ViewerMotion, joints: NDArray[np.float64]) -> dict[str, Any] | None:
+    skeleton = human_skeleton(motion.parents)
+    return None if skeleton is None else pose_data(posing_of(joints, skeleton, motion.figure))
 
 
 def _name(motion: ViewerMotion, number: int) -> str:

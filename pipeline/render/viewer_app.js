@@ -17,7 +17,11 @@ function readTheme(root) {
   const style = getComputedStyle(root);
   const value = (name) => style.getPropertyValue(`--mlv-${name}`).trim();
   const ramp = (name) => toneRamp(value(name), value("fog"), Number(value("fog-strength")));
+  const share = (text) => (text.startsWith("#") ? parseColour(text) : text.match(/\d+/g).slice(0, 3).map(Number)).map((v) => v / 255);
+  // In the order of the body's swatches: limbs and trunk, skin, face.
+  const swatches = ["right", "centre", "left", "skin", "hair", "eye-white", "feature", "hair", "lip", "mouth"];
   return {
+    palette: new Float32Array(swatches.flatMap((name) => share(value(name)))), fallen: share(value("shadow")),
     tones: { 0: ramp("centre"), 1: ramp("left"), 2: ramp("right"), [SKIN]: ramp("skin"), hair: ramp("hair")[2] },
     grid: value("grid"), floorNear: value("floor-near"), floorFar: value("floor-far"), trail: value("trail"),
     shadow: value("shadow"), shadowClear: value("shadow-clear"), eyeWhite: value("eye-white"), feature: value("feature"),
@@ -37,6 +41,7 @@ function mountViewer(root, data, options) {
   const state = { time: 0, playing: !calm, speed: 1, follow: true, loop: false, draws: 0, close: false };
   const camera = { yaw: 0, pitch: 0, zoom: 1, panX: 0, panY: 0 };
   let theme, stale = true, dragging = 0, printing = false;
+  const stage = clips.some((clip) => clip.pose) ? openStage() : null, pace = stage && watchPace(stage);
   const life = new AbortController(), whileHere = { signal: life.signal };
   const refresh = () => { stale = true; };
 
@@ -67,6 +72,7 @@ function mountViewer(root, data, options) {
   const play = (on) => {
     if (on && state.time >= duration) state.time = 0;
     state.playing = on;
+    if (on && pace) pace.begin(clips.length);
     bar.play.textContent = on ? "❚❚" : "▶";
     bar.play.setAttribute("aria-label", on ? "Pause" : "Play");
     bar.play.title = on ? "Pause (space)" : "Play (space)";
@@ -141,10 +147,11 @@ function mountViewer(root, data, options) {
   };
 
   // ---- drawing
+  // Ground, trail and what is written on a cell; its figure too in the flat view, else what the stage is to draw.
   const paint = (cell) => {
     const { canvas, clip } = cell, ratio = Math.min(window.devicePixelRatio || 1, 2);
     const width = canvas.clientWidth, height = canvas.clientHeight;
-    if (!width || !height) return;
+    if (!width || !height) return null;
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
       canvas.width = Math.round(width * ratio);
       canvas.height = Math.round(height * ratio);
@@ -152,20 +159,30 @@ function mountViewer(root, data, options) {
     const ctx = cell.ctx, local = localFrame(clip);
     ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
     ctx.clearRect(0, 0, width, height);
-    const lens = lensOf(cell, width, height), nodes = nodesAt(clip, clip.figure, local);
+    const lens = lensOf(cell, width, height), face = faceAt(clip, local, data.faceNeutral);
     const centre = state.follow ? pathAt(clip, local) : clip.frame.middle;
     drawGround(ctx, lens, centre, clip.floor, theme);
     drawTrail(ctx, lens, clip, local, theme);
-    drawShadow(ctx, lens, clip, nodes, clip.figure, theme);
-    drawFigure(ctx, lens, clip, clip.figure, nodes, faceAt(clip, local, data.faceNeutral), theme);
     cell.now.show(segmentAt(clip.score, localTime(clip)));
     const own = Math.round(local), over = !state.loop && state.time > clip.duration + 0.5 / clip.fps;
     cell.count.textContent = `${own + 1} / ${clip.frames}${over ? " · ended" : ""}`;
+    if (stage && stage.ready && clip.pose) {
+      const item = stageItem(stage, clip, lens, local, face, theme, state.playing && !printing ? stage.quality : 0);
+      return item && Object.assign(item, { ctx });
+    }
+    const nodes = nodesAt(clip, clip.figure, local);
+    drawShadow(ctx, lens, clip, nodes, clip.figure, theme);
+    drawFigure(ctx, lens, clip, clip.figure, nodes, face, theme);
+    return null;
+  };
+  const paintAll = (some) => {
+    const items = some.map(paint).filter(Boolean);
+    if (items.length) stage.draw(items, (item) => item.ctx.drawImage(stage.canvas, ...item.source, ...item.box));
   };
   let before = 0;
   const tick = (now) => {
     if (life.signal.aborted) return;
-    const passed = Math.min((now - before) / 1000, 0.1);
+    const between = now - before, passed = Math.min(between / 1000, 0.1);
     before = now;
     if (state.playing && !dragging && duration > 0) {
       state.time = player.advance(state.time, passed);
@@ -175,7 +192,9 @@ function mountViewer(root, data, options) {
     } else player.rest();
     if (stale && !printing) {
       stale = false;
-      for (const cell of cells) if (cell.visible) paint(cell);
+      const start = performance.now();
+      paintAll(cells.filter((cell) => cell.visible));
+      if (pace && state.playing) pace.note(performance.now() - start, between);
       const shown = Math.min(state.time, duration);
       bar.scrub.value = frame();
       const segment = lead ? segmentAt(lead.score, localTime(lead)) : null;
@@ -248,7 +267,7 @@ function mountViewer(root, data, options) {
     printing = true;
     set.theme = "light";
     theme = readTheme(root);
-    cells.forEach(paint);
+    paintAll(cells);
     if (chosen === undefined) delete set.theme; else set.theme = chosen;
   }, whileHere);
   window.addEventListener("afterprint", () => { printing = false; rethemed(); }, whileHere);
@@ -268,6 +287,10 @@ function mountViewer(root, data, options) {
     life.abort();
     setSound(false);
     for (const observer of [themes, sizes, sight]) observer.disconnect();
+    if (stage) {
+      stage.watchers.delete(refresh);
+      clips.forEach(stage.forget);
+    }
     root.replaceChildren();
     window.__viewers.splice(window.__viewers.indexOf(handle), 1);
     window.__viewer = window.__viewers[0];
@@ -276,15 +299,19 @@ function mountViewer(root, data, options) {
     get frame() { return frame(); }, get time() { return state.time; }, get playing() { return state.playing; },
     get draws() { return state.draws; }, get frames() { return last + 1; }, get camera() { return { ...camera }; },
     get follow() { return state.follow; }, get loop() { return state.loop; },
-    remove, play, setFrame, setView, zoom, turn, toggle: (name) => toggle(name, name),
+    remove, play, setFrame, paint: () => paintAll(cells.filter((cell) => cell.visible)), setView, zoom, turn, toggle: (name) => toggle(name, name),
     get sound() { return player.on; }, get audio() { return player.audio; },
     get segment() { return lead && segmentAt(lead.score, localTime(lead)); },
+    get view() { return stage && stage.ready ? "webgl" : "2d"; }, stage, pace,
+    bones: (k) => [...bonesAt(clips[k], localFrame(clips[k]))], // what moves the mesh now, for checks from outside
+    lens: (k) => lensOf(cells[k], cells[k].canvas.clientWidth, cells[k].canvas.clientHeight),
     setSpeed, setSound, listen: (k) => follow(clips[k]),
   };
   window.__viewers = window.__viewers || [];
   window.__viewers.push(handle);
   window.__viewer = window.__viewers[0];
 
+  if (stage) stage.watchers.add(refresh);
   setView("3/4");
   play(state.playing);
   rethemed();

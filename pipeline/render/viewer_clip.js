@@ -25,6 +25,7 @@ function openClip(raw, figure, faceStep) {
     nodes: new Float32Array(figure.blends.length * 3),
     screen: new Float64Array(figure.blends.length * 4),
   };
+  clip.pose = openPose(raw, raw.joints);
   clip.root = (frame, axis) => positions[clamp(frame, 0, raw.frames - 1) * raw.joints * 3 + axis];
   clip.path = smoothPath(clip);
   clip.frame = frameOf(clip);

@@ -201,6 +201,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 BROWSER_ARGUMENTS = [
     "--no-sandbox",
     "--disable-gpu",
+    "--disable-3d-apis",  # the viewer's flat view, which is quick; its WebGL2 view has tests of its own
     "--no-first-run",
     "--disable-background-networking",
     "--disable-component-update",

@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.synth.face import APEX, BASIS
 from motionloom.pipeline.render.body.field import Field
-from motionloom.pipeline.render.face import BLINK_HEIGHT
 
 Floats = NDArray[np.float64]
 Triangles = NDArray[np.int64]
+
+BLINK_HEIGHT = 1.6
+"""Length of a full blink along its column of the synthetic basis."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,18 @@ EXPRESSIONS: dict[str, Look] = {
 }
 """What each column of the synthetic basis looks like at its apex, in the basis' order."""
 
+_WIDE_EYE = 1.6
+CONTROLS: dict[str, Look] = {
+    "smile": Look(smile=1.0),
+    "frown": Look(frown=1.0),
+    "brow_up": Look(brow=1.0),
+    "brow_down": Look(brow=-1.0),
+    "eye_wide": Look(eye_open=_WIDE_EYE),
+    "eye_shut": Look(eye_open=0.0),
+    "mouth_open": Look(mouth_open=1.0),
+}
+"""One look for each end of the drawn face's controls: what page, film and pictures move the face by."""
+
 _EYE_WIDTH, _EYE_HEIGHT, _EYE_X, _EYE_Y = 0.0165, 0.0108, 0.0325, 0.006
 _RING = 24
 
@@ -65,6 +79,23 @@ def expression_weights(expression: NDArray[Any]) -> Floats:
     out[:, 4] = np.clip(along[:, 4] / BLINK_HEIGHT, 0, 1) * np.maximum(opened, 0)
     out[:, 5:] = np.clip(np.abs(along[:, 5:]), 0, 1)
     return out
+
+
+def control_weights(controls: NDArray[Any]) -> Floats:
+    """The drawn face's controls [T, 5] (`render/face.py`) -> weights [T, 7] of `CONTROLS`, in its order."""
+    smile, brow, eye, mouth, frown = np.asarray(controls, np.float64).T
+    return np.stack(
+        [
+            np.clip(smile, -0.5, 1.5),
+            np.clip(frown, -0.5, 1.5),
+            np.clip(brow, 0, 1.5),
+            np.clip(-brow, 0, 1.5),
+            np.clip((eye - 1) / (_WIDE_EYE - 1), 0, 1.2),
+            np.clip(1 - eye, 0, 1),
+            np.clip(mouth, 0, 1.5),
+        ],
+        axis=-1,
+    )
 
 
 @dataclass(frozen=True)

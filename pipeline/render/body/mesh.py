@@ -1,8 +1,9 @@
 """The whole body: one mesh with weights, colours and expressions, on the neutral skeleton or a motion's own.
 
-Made once a process from `shapes.py` and `face.py` (about a second), always the same. Colours are a strip of
-swatches that `uv` points into: orange is right, blue is left, as on the page; the border between limb and
-trunk lies within triangles, where the strip changes its colour.
+Made once a process from `shapes.py` and `face.py` (half a second), always the same; coarser details are the
+same surface on a wider grid. Colours are a strip of swatches that `uv` points into: orange is right, blue is
+left, as on the page; the border between limb and trunk lies within triangles, where the strip changes its
+colour.
 """
 
 from __future__ import annotations
@@ -17,18 +18,27 @@ from numpy.typing import NDArray
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.arkit import ARKIT_SHAPES, Shape
-from motionloom.pipeline.render.body.face import EXPRESSIONS, Look, features, on_skin, skin_shift
+from motionloom.pipeline.render.body.face import CONTROLS, EXPRESSIONS, Look, features, on_skin, skin_shift
 from motionloom.pipeline.render.body.field import Field, skin_weights
+from motionloom.pipeline.render.body.palette import HAIR, PALETTE
 from motionloom.pipeline.render.body.shapes import hand, head, head_centre, nose, trunk_and_limbs
 from motionloom.pipeline.render.body.surface import mesh_of
-from motionloom.pipeline.render.raster import HAIR, PALETTE
 
 Floats = NDArray[np.float64]
-Faces = Literal["expressions", "arkit"]
-"""Which shapes a body's face has: those of the synthetic basis, or ARKit's 52."""
+Faces = Literal["expressions", "controls", "arkit"]
+"""Which shapes a body's face has: those of the synthetic basis, the drawn face's controls, or ARKit's 52."""
+Detail = Literal["full", "near", "far", "shadow"]
+"""How fine the mesh is: for files, for figures that are watched, many or small ones, their shadows."""
 
-_BODY, _HAND, _HEAD, _NOSE = (0.019, 0.02), (0.0056, 0.004), (0.0095, 0.012), (0.005, 0.01)
-"""Of each mesh: the grid's spacing, and over how many metres weights fall off."""
+_SPACING: dict[Detail, tuple[float, float, float, float]] = {
+    "full": (0.019, 0.0056, 0.0095, 0.005),
+    "near": (0.029, 0.0072, 0.0125, 0.006),
+    "far": (0.036, 0.0125, 0.019, 0.009),
+    "shadow": (0.05, 0.02, 0.032, 0.02),
+}
+"""The grid's spacing of trunk and limbs, hands, head and nose in metres; vertices lie on the surface."""
+_SOFTNESS = (0.02, 0.004, 0.012, 0.01)
+"""Over how many metres their weights fall off."""
 
 _SWATCHES: dict[str, tuple[int, int, int]] = {
     "white": (244, 244, 240),
@@ -66,17 +76,29 @@ class Body:
         """Vertices [T, V, 3] of local rotations [T, N, 3, 3], root [T, 3] and expression weights [T, E]."""
         from motionloom.datasets.motion.kinematics import forward_kinematics
 
-        rest = self.skeleton.rest_joints
         joints, world = forward_kinematics(rotations, root, self.skeleton.offsets, self.skeleton.parents)
+        return self.skinned(world, joints, face)
+
+    def skinned(self, world: NDArray[Any], joints: NDArray[Any], face: NDArray[Any] | None = None) -> Floats:
+        """Vertices [T, V, 3] by linear blend skinning.
+
+        `world` [T, N, 3, 3] turns (and may stretch) what hangs on a joint, `joints` [T, N, 3] is where it
+        hangs; `face` [T, E] weighs the face's shapes.
+        """
         still = np.broadcast_to(self.vertices, (len(joints), *self.vertices.shape))
         if face is not None:
             still = still + np.einsum("te,evc->tvc", face, np.stack(list(self.expressions.values())))
-        shift = joints - np.einsum("tnij,nj->tni", world, rest)
+        shift = joints - np.einsum("tnij,nj->tni", world, self.skeleton.rest_joints)
         turned = np.einsum("vn,tnij,tvj->tvi", self.weights, world, still, optimize=True)
         return np.asarray(turned + np.einsum("vn,tni->tvi", self.weights, shift), dtype=np.float64)
 
+    def turned_normals(self, world: NDArray[Any]) -> Floats:
+        """Normals [T, V, 3] of the skinned vertices, as its joints turn them."""
+        out = np.einsum("vn,tnij,vj->tvi", self.weights, world, self.normals, optimize=True)
+        return np.asarray(out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-9))
 
-def body_for(skeleton: Skeleton, faces: Faces = "expressions") -> Body:
+
+def body_for(skeleton: Skeleton, faces: Faces = "expressions", detail: Detail = "full") -> Body:
     """The body on a skeleton with the joints of `smplx52` or `smpl22`, whatever its bone lengths.
 
     Bones are stretched along themselves, and girth goes with the whole figure's size, that of the hands with
@@ -85,14 +107,14 @@ def body_for(skeleton: Skeleton, faces: Faces = "expressions") -> Body:
     for name in ("smplx52", "smpl22"):
         known = Skeleton.named(name)
         if skeleton.joints == known.joints and skeleton.parents == known.parents:
-            return _on(neutral_body(name, faces), skeleton)
+            return _on(neutral_body(name, faces, detail), skeleton)
     raise UserError(f"skeleton {skeleton.name}: there is a body for smplx52 and smpl22 only")
 
 
 @cache
-def neutral_body(name: str = "smplx52", faces: Faces = "expressions") -> Body:
+def neutral_body(name: str = "smplx52", faces: Faces = "expressions", detail: Detail = "full") -> Body:
     """The body on a skeleton that ships with the package."""
-    whole = _whole_body(faces)
+    whole = _whole_body(faces, detail)
     if name == "smplx52":
         return whole
     skeleton = Skeleton.named(name)
@@ -120,19 +142,21 @@ def colour_strip() -> NDArray[np.uint8]:
 
 
 @cache
-def _whole_body(faces: Faces = "expressions") -> Body:
-    shapes = ARKIT_SHAPES if faces == "arkit" else {name: Shape(look) for name, look in EXPRESSIONS.items()}
+def _whole_body(faces: Faces = "expressions", detail: Detail = "full") -> Body:
+    looks_of = EXPRESSIONS if faces == "expressions" else CONTROLS
+    shapes = ARKIT_SHAPES if faces == "arkit" else {name: Shape(look) for name, look in looks_of.items()}
+    limbs, fingers, skull, bridge = zip(_SPACING[detail], _SOFTNESS, strict=True)
     skeleton = Skeleton.named("smplx52")
     pieces = []
     field = trunk_and_limbs(skeleton)
-    pieces.append(_piece(field, skeleton, _BODY, lambda points: _limb_colour(points, skeleton)))
+    pieces.append(_piece(field, skeleton, limbs, lambda points: _limb_colour(points, skeleton)))
     for side, column in (("left", 5 / 6), ("right", 1 / 6)):
         pieces.append(
-            _piece(hand(skeleton, side), skeleton, _HAND, lambda points, u=column: _flat(points, u, 0))
+            _piece(hand(skeleton, side), skeleton, fingers, lambda points, u=column: _flat(points, u, 0))
         )
     centre, skin = head_centre(skeleton), head(skeleton)
-    pieces.append(_piece(skin, skeleton, _HEAD, lambda points: _skin_colour(points - centre)))
-    pieces.append(_piece(nose(skeleton), skeleton, _NOSE, lambda points: _flat(points, 0.2, 1)))
+    pieces.append(_piece(skin, skeleton, skull, lambda points: _skin_colour(points - centre)))
+    pieces.append(_piece(nose(skeleton), skeleton, bridge, lambda points: _flat(points, 0.2, 1)))
     # Skin moves as far as it is the head's: the neck's stays.
     turn = skeleton.index("head")
     looks = {
@@ -214,21 +238,7 @@ def _skin_colour(local: Floats) -> Floats:
 
 def _on(body: Body, skeleton: Skeleton) -> Body:
     """The mesh with each joint's surroundings stretched as its bones are."""
-    old, new = body.skeleton.offsets, skeleton.offsets
-    parents = np.asarray(skeleton.parents)
-    size = float(np.linalg.norm(new, axis=-1).sum() / np.linalg.norm(old, axis=-1).sum())
-    stretch = np.empty((len(skeleton), 3, 3))
-    for joint in range(len(skeleton)):
-        ends = np.flatnonzero(parents == joint)
-        girth = _hand_size(body.skeleton, skeleton, joint, size)
-        if not len(ends):
-            stretch[joint] = girth * np.eye(3)
-            continue
-        before, after = old[ends], new[ends]
-        firm = 0.02 * np.square(before).sum() / len(ends)
-        stretch[joint] = np.linalg.solve(
-            before.T @ before + firm * np.eye(3), before.T @ after + firm * girth * np.eye(3)
-        ).T
+    stretch = stretches(body.skeleton, skeleton)
     away = body.vertices[:, None] - body.skeleton.rest_joints
     moved = np.einsum("nij,vnj->vni", stretch, away) + skeleton.rest_joints
     vertices = np.einsum("vn,vni->vi", body.weights, moved)
@@ -237,6 +247,34 @@ def _on(body: Body, skeleton: Skeleton) -> Body:
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     looks = {name: np.einsum("vij,vj->vi", local, move) for name, move in body.expressions.items()}
     return replace(body, skeleton=skeleton, vertices=vertices, normals=normals, expressions=looks)
+
+
+def stretches(known: Skeleton, skeleton: Skeleton) -> Floats:
+    """What makes the surroundings of each joint of `known` fit `skeleton` [N, 3, 3]: its bones' stretch along
+    them, the figure's size across.
+    """
+    old, new = known.offsets, skeleton.offsets
+    parents = np.asarray(skeleton.parents)
+    size = figure_size(known, skeleton)
+    stretch = np.empty((len(skeleton), 3, 3))
+    for joint in range(len(skeleton)):
+        ends = np.flatnonzero(parents == joint)
+        girth = _hand_size(known, skeleton, joint, size)
+        if not len(ends):
+            stretch[joint] = girth * np.eye(3)
+            continue
+        before, after = old[ends], new[ends]
+        firm = 0.02 * np.square(before).sum() / len(ends)
+        stretch[joint] = np.linalg.solve(
+            before.T @ before + firm * np.eye(3), before.T @ after + firm * girth * np.eye(3)
+        ).T
+    return stretch
+
+
+def figure_size(known: Skeleton, skeleton: Skeleton) -> float:
+    """Sum of all bone lengths over that of `known`."""
+    old, new = known.offsets, skeleton.offsets
+    return float(np.linalg.norm(new, axis=-1).sum() / np.linalg.norm(old, axis=-1).sum())
 
 
 def _hand_size(old: Skeleton, new: Skeleton, joint: int, size: float) -> float:

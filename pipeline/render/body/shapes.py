@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.render.body.field import Capsule, Field
-from motionloom.pipeline.render.figure import FINGERS
 
 Floats = NDArray[np.float64]
 
+FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 HEAD_SIZE = (0.079, 0.112, 0.094)
 """Half width, half height, half depth of the skull in metres."""
 _KNUCKLE = {"index": 0.0108, "middle": 0.0112, "ring": 0.0104, "pinky": 0.0092, "thumb": 0.0122}
@@ -60,10 +60,10 @@ def trunk_and_limbs(skeleton: Skeleton) -> Field:
         add(f"{side}_elbow", elbow, belly, 0.038, 0.042)
         add(f"{side}_elbow", belly, wrist, 0.042, 0.0285, 0.92)
         hip, knee, ankle, ball = (place(f"{side}_{name}") for name in ("hip", "knee", "ankle", "foot"))
-        add(f"{side}_hip", hip, knee, 0.086, 0.054)
+        add(f"{side}_hip", hip, knee, 0.086, 0.047)
         calf = knee + np.array([0.0, 0.0, -0.014]) + 0.3 * (ankle - knee)
-        add(f"{side}_knee", knee, calf, 0.05, 0.055)
-        add(f"{side}_knee", calf, ankle, 0.055, 0.036)
+        add(f"{side}_knee", knee, calf, 0.045, 0.05)
+        add(f"{side}_knee", calf, ankle, 0.05, 0.035)
         low = ball[1] - 0.012
         heel = np.array([ankle[0], low + 0.008, ankle[2] - 0.03])
         add(f"{side}_ankle", ankle, heel, 0.037, 0.034)

@@ -16,9 +16,9 @@ from motionloom.datasets.synth.face import APEX, BASIS
 from motionloom.pipeline.render.body.face import EXPRESSIONS, expression_weights
 from motionloom.pipeline.render.body.field import Capsule, Field
 from motionloom.pipeline.render.body.mesh import _whole_body, body_for, colour_strip, neutral_body
+from motionloom.pipeline.render.body.palette import PALETTE
 from motionloom.pipeline.render.body.surface import mesh_of, surface_nets
 from motionloom.pipeline.render.face import synthetic_face_controls
-from motionloom.pipeline.render.raster import PALETTE
 
 SKELETON = Skeleton.named("smplx52")
 

@@ -21,6 +21,7 @@ from PIL import Image
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.face import APEX, BASIS
+from motionloom.pipeline.render.body.palette import PALETTE
 from motionloom.pipeline.render.camera import FIELD_OF_VIEW, Camera, fit_distance, smooth_path
 from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.face import synthetic_face_controls
@@ -28,7 +29,7 @@ from motionloom.pipeline.render.figure import CENTRE, LEFT, RIGHT, figure_for, h
 from motionloom.pipeline.render.lettering import font, wrap
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.picture import contact_sheet
-from motionloom.pipeline.render.raster import PALETTE, SKY, outlines
+from motionloom.pipeline.render.raster import SKY
 from motionloom.pipeline.render.video import render_frames, write_mp4
 from motionloom.pipeline.render.viewer import ViewerMotion, quantise, safe_json, viewer_script, write_viewer
 
@@ -76,11 +77,9 @@ def test_human_figure_draws_every_joint_and_both_sides_alike(name: str, hands: b
 
 def test_nodes_mirror_and_scale(walk: Walk) -> None:
     figure, joints = human_figure("smplx52"), walk(3)
-    slow = np.array([[sum(w * pose[j] for j, w in blend) for blend in figure.blends] for pose in joints])
-    np.testing.assert_allclose(figure.nodes(joints), slow, atol=1e-12)
     assert figure.scale(joints) == pytest.approx(1.0, abs=1e-6)
     assert figure.scale(joints * 0.6) == pytest.approx(0.6, abs=1e-6)
-    rest = figure.nodes(SMPLX.rest_joints)
+    rest = np.array([sum(w * SMPLX.rest_joints[j] for j, w in blend) for blend in figure.blends])
     left = {n for c in figure.capsules if c.side == LEFT for n in (c.a, c.b)}
     right = {n for c in figure.capsules if c.side == RIGHT for n in (c.a, c.b)}
     assert all(rest[n, 0] > 0 for n in left) and all(rest[n, 0] < 0 for n in right)
@@ -151,21 +150,6 @@ def test_smooth_path_equals_a_plain_mean() -> None:
         np.testing.assert_allclose(path[k], np.mean(window, axis=0))
 
 
-@given(st.integers(0, 10_000), st.integers(2, 6))
-@settings(max_examples=30, deadline=None)
-def test_outlines_hold_their_circles(seed: int, count: int) -> None:
-    rng = np.random.default_rng(seed)
-    centres, radii = rng.uniform(0, 100, (1, count, 2)), rng.uniform(1, 30, (1, count))
-    ring = outlines(centres, radii)[0]
-    # Between two of 40 tangents the hull lies in a triangle over the chord of the points where they touch: no
-    # higher than half the chord times the tangent of half the angle between them, 0.04 of the chord.
-    slack = 0.04 * np.linalg.norm(np.ptp(centres[0], axis=0) + 2 * radii.max())
-    for direction in rng.normal(size=(20, 2)):
-        direction /= np.linalg.norm(direction)
-        exact = (centres[0] @ direction + radii[0]).max()
-        assert exact - slack < (ring @ direction).max() <= exact + 1e-9
-
-
 # ---- viewer file
 
 
@@ -198,12 +182,12 @@ def test_page_holds_what_was_given(tmp_path: Path, walk: Walk) -> None:
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["v.html"]
 
 
-def test_24_motions_stay_below_3_mb_and_load_nothing(tmp_path: Path, walk: Walk) -> None:
+def test_24_motions_stay_below_3_6_mb_and_load_nothing(tmp_path: Path, walk: Walk) -> None:
     joints = walk(200)
     motions = [ViewerMotion(joints, 20, SMPLX.parents, f"m{k}", "walks", f"g{k // 3}") for k in range(24)]
     write_viewer(tmp_path / "v.html", motions, "many")
     text = (tmp_path / "v.html").read_text("utf-8")
-    assert len(text) < 3_000_000
+    assert len(text) < 3_600_000  # 0.5 MB of it are the body
     assert len(data_of(tmp_path / "v.html")["figures"]) == 1
     tags = Tags(text)
     assert not [a for _, a in tags.seen if "src" in a or "href" in a]
@@ -252,7 +236,8 @@ def test_viewer_refuses_what_it_cannot_draw(tmp_path: Path, change: dict, words:
 
 
 def colour_share(image: np.ndarray, colour: tuple[int, int, int]) -> float:
-    return float((np.abs(image.astype(int) - colour).max(axis=-1) < 40).mean())
+    """Share of pixels of a colour, in light or shade."""
+    return float((np.abs(image.astype(int) - colour).max(axis=-1) < 55).mean())
 
 
 def test_frames_show_the_figure_in_both_colours_and_move(walk: Walk) -> None:
@@ -293,7 +278,7 @@ def test_mp4_has_every_frame_and_reports_progress(tmp_path: Path, walk: Walk) ->
     assert sum(1 for _ in reader) == 40
     assert "yuv420p" in meta["pix_fmt"] and meta["codec"] == "h264"
     assert [p.name for p in path.parent.iterdir()] == ["walk.mp4"]
-    assert spent < 4.0  # about 80 frames a second of this process's time, with room for a busy machine
+    assert spent < 8.0  # about 25 frames a second of this process's time, with room for a busy machine
 
 
 def test_broken_film_leaves_no_file(tmp_path: Path, walk: Walk) -> None:
