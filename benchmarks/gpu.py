@@ -186,6 +186,15 @@ def sampling(run: Path, device: torch.device, batches: list[int]) -> Iterator[li
         yield [str(batch), str(len(made[0].joints)), f"{took:.2f}", f"{60 * batch / took:,.0f}"]
 
 
+def run_all(stages: Mapping[str, Any], where: list[str]) -> list[str]:
+    """Run the stages; of the compiled ones, which depend most on torch's version, those that failed."""
+    trained = {name: stage["train"] for name, stage in stages.items() if stage and "train" in stage}
+    compiled = [name for name, train in trained.items() if train["compile"]]
+    run = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "run", *where, "--until"]
+    subprocess.run([*run, ",".join(name for name in trained if name not in compiled)], check=True)
+    return [name for name in compiled if subprocess.run([*run, name]).returncode]
+
+
 def table(head: list[str], rows: list[list[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
@@ -208,9 +217,9 @@ def main() -> None:
     device = choose_device(args.device)
     args.work.mkdir(parents=True, exist_ok=True)
     path, run = args.work / "gpu.yaml", args.work / "run"
-    path.write_text(yaml.safe_dump(recipe(args.size, args.steps, args.device, args.profile), sort_keys=False))
-    program = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main"]
-    subprocess.run([*program, "run", str(path), "-o", str(run)], check=True)
+    content = recipe(args.size, args.steps, args.device, args.profile)
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    failed = run_all(content["stages"], [str(path), "-o", str(run)])
     stages = finished_stages(run)
     named = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     head = [
@@ -221,6 +230,7 @@ def main() -> None:
         f"{named}, torch {torch.__version__}, `humantomato-{args.size}`, {args.steps} steps each.",
         table(head, list(trainings(run, stages, device, args.peak_tflops))),
         table(["at once", "frames", "seconds", "motions a minute"], [*sampling(run, device, args.batches)]),
+        *([f"Ended with an error: {', '.join(failed)}."] if failed else []),
     ))  # fmt: skip
     print(text)
     (args.work / "gpu.md").write_text(text + "\n")
