@@ -25,6 +25,7 @@ def statistics(x: Tensor) -> tuple[Tensor, Tensor]:
 
 def _root(cov: Tensor) -> Tensor:
     """R [Z, Z] with R R' = `cov`."""
+    factor: Tensor
     factor, failed = torch.linalg.cholesky_ex(cov)
     pivots = factor.diagonal()
     if not failed and pivots.min() > WELL_CONDITIONED * pivots.max():

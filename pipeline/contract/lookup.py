@@ -146,7 +146,8 @@ def generators_of(run: Path) -> list[Finished]:
 
     Those that the recipe lists as a stage's inputs come first, in that order, then those that a finished
     stage such as `generate` has read: a recipe with several says so which it means. Those of other runs are
-    among them where one of these stages reads them.
+    among them where one of these stages reads them. One that another started from is none, unless it is
+    listed or read.
     """
     stages = finished_stages(run)
     makers = {stage.folder.resolve(): stage for stage in stages.values() if stage.gives(GENERATOR)}
@@ -164,7 +165,9 @@ def generators_of(run: Path) -> list[Finished]:
             if found is not None and found.gives(GENERATOR):
                 makers[place] = found
     makers |= {source.folder.resolve(): source for source in read if source.outside}
-    order = dict.fromkeys((*listed, *(source.folder.resolve() for source in read), *makers))
+    named = dict.fromkeys((*listed, *(source.folder.resolve() for source in read)))
+    begun = {stage.inputs["start"].folder.resolve() for stage in makers.values() if "start" in stage.inputs}
+    order = dict.fromkeys((*named, *(place for place in makers if place not in begun)))
     return [makers[place] for place in order if place in makers]
 
 
@@ -174,7 +177,7 @@ def _place(run: Path, name: str) -> Path:
 
 
 def _listed(run: Path) -> list[str]:
-    """Stages that the recipe of a run lists as inputs (`inputs: {generators: [gpt, face_gpt]}`)."""
+    """Stages that the recipe of a run lists as its model (`inputs: {generators: [gpt, face_gpt]}`)."""
     roles = [entry.get("inputs") for entry in stages_of(run).values()]
-    found = [names for given in roles if isinstance(given, dict) for names in given.values()]
+    found = [given.get("generators") for given in roles if isinstance(given, dict)]
     return [str(name) for names in found if isinstance(names, list) for name in names]
