@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.motion.rigid import RigidMotion
@@ -82,7 +83,8 @@ def write_mp4(
         try:
             if sound is not None:
                 wav.write_bytes(film_sound(sound, len(joints) / fps))
-            with closing(writer):
+            # Products of small matrices: several threads would wait for each other longer than they work.
+            with closing(writer), threadpool_limits(1, user_api="blas"):
                 writer.send(None)  # starts ffmpeg, which opens the WAV
                 for done, frame in enumerate(frames, start=1):
                     writer.send(frame.tobytes())

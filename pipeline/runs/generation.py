@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,6 +17,23 @@ from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.runs.shipped import nearest
 from motionloom.pipeline.store.files import require_folder
+
+FEW = 8
+"""Motions that are made at once by one thread: a step of a small batch is over before a second one is awake,
+and where other programs use the machine the threads wait for each other many times as long."""
+
+
+@contextmanager
+def threads_for(motions: int) -> Iterator[None]:
+    """As many threads as so many motions at once can use."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1 if motions < FEW else before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def generate_motions(
@@ -72,40 +90,41 @@ def generate_motions(
         raise UserError("--arkit-bases is what --format arkit is made by: name that format too")
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
-    bundle = Bundle.open(folder, choose_device(device))
-    aside = make_console(aside=True)  # standard output is the list of files
-    if (taken := say_model(folder)) is not None:
-        aside.print(taken, markup=False, highlight=False, soft_wrap=True)
-    if segments is not None:
-        motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
-    else:
-        motions = bundle.generate(
-            [text for text in captions for _ in range(samples)] or None,
-            face=face and [text for text in face for _ in range(samples)],
-            sounds=[sound for sound in sounds for _ in range(samples)] or None,
-            seconds=seconds,
+    with threads_for(samples * max(len(captions), len(audio), 1)):
+        bundle = Bundle.open(folder, choose_device(device))
+        aside = make_console(aside=True)  # standard output is the list of files
+        if (taken := say_model(folder)) is not None:
+            aside.print(taken, markup=False, highlight=False, soft_wrap=True)
+        if segments is not None:
+            motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
+        else:
+            motions = bundle.generate(
+                [text for text in captions for _ in range(samples)] or None,
+                face=face and [text for text in face for _ in range(samples)],
+                sounds=[sound for sound in sounds for _ in range(samples)] or None,
+                seconds=seconds,
+                seed=seed,
+                sampling=drawing,
+                strict=True,
+            )
+        said = captions if segments is None else [segment.prompt.text for segment in segments]
+        for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
+            aside.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
+        title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
+        note = page_note(len(motions), folder.resolve().name, seed)
+        paths = write_motions(
+            out,
+            motions,
+            wanted,  # type: ignore[arg-type]
+            title=title,
+            note=note,
             seed=seed,
-            sampling=drawing,
-            strict=True,
+            figure=posing,
+            say=lambda line: aside.print(line, soft_wrap=True, markup=False),
         )
-    said = captions if segments is None else [segment.prompt.text for segment in segments]
-    for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
-        aside.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
-    title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
-    note = page_note(len(motions), folder.resolve().name, seed)
-    paths = write_motions(
-        out,
-        motions,
-        wanted,  # type: ignore[arg-type]
-        title=title,
-        note=note,
-        seed=seed,
-        figure=posing,
-        say=lambda line: aside.print(line, soft_wrap=True, markup=False),
-    )
-    for path in paths:
-        console.print(str(path), markup=False, soft_wrap=True)
-    if "html" in wanted:
-        place = (out / "index.html").resolve()
-        aside.print(f"watch it in a browser: {place}", markup=False, highlight=False, soft_wrap=True)
-    return paths
+        for path in paths:
+            console.print(str(path), markup=False, soft_wrap=True)
+        if "html" in wanted:
+            place = (out / "index.html").resolve()
+            aside.print(f"watch it in a browser: {place}", markup=False, highlight=False, soft_wrap=True)
+        return paths
