@@ -28,7 +28,7 @@ class LoraConfig(Config):
 
     rank: int = Field(16, ge=1)
     """Width of an adapter."""
-    alpha: float = Field(32.0, gt=0)
+    alpha: int = Field(32, ge=1)
     """What an adapter gives is multiplied by this over `rank`."""
     dropout: float = Field(0.0, ge=0, lt=1)
     """Of an adapter's input."""

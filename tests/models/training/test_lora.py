@@ -54,7 +54,7 @@ def test_merged_weights_give_what_the_adapters_gave() -> None:
     names = list(net.state_dict())
     before = net.stack.blocks[1].ff_in.weight.clone()
     start = net(*inputs())
-    add_lora(net, LoraConfig(rank=4, alpha=6.0))
+    add_lora(net, LoraConfig(rank=4, alpha=6))
     learn(net)
     adapted = net(*inputs())
     finite = start.isfinite()
