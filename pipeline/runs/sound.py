@@ -66,6 +66,7 @@ def require_sound_shards(context: StageContext, team: Team, run: Path) -> None:
 
     Every process of `team` calls this; it returns when all are here, and an error is raised in all.
     """
+    team.meet()  # before: the lead may still be making what is to be compared
     how = context.hardware.verify_shards
     shards: list[LocalShard] = []
     if how != "never" and context.again is None:
@@ -74,7 +75,6 @@ def require_sound_shards(context: StageContext, team: Team, run: Path) -> None:
                 shards += local_shards(stage.folder)
     shards = list({shard.path: shard for shard in shards}.values())
     if not shards:
-        team.meet()
         return
     watch = current()
     if watch is not None:

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,13 @@ from rich.console import Console
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import ShardInfo, UserError
 from motionloom.datasets.shards.checksums import LocalShard
+from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import JointError
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs import sound
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.graph import Selection
-from motionloom.pipeline.runs.sound import FILE_NAME, compare_shards
+from motionloom.pipeline.runs.sound import FILE_NAME, compare_shards, require_sound_shards
 
 QUIET = Console(quiet=True)
 
@@ -173,6 +175,24 @@ def test_processes_share_the_files_that_they_both_see(
     flip(shards[3].path, 7)
     ends = together()
     assert len(set(ends)) == 1 and "000003.tar: the sha256 is not the manifest's" in str(ends[0])
+
+
+def test_processes_look_when_all_are_here(
+    shards: list[LocalShard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that comes before the lead has made the data would see none, and wait for the others for ever."""
+    there: list[LocalShard] = []
+
+    class Late(Team):
+        def meet(self) -> None:
+            there.extend(shards)
+
+    monkeypatch.setattr(sound, "local_shards", lambda folder: list(there))
+    data = SimpleNamespace(gives=lambda what: what == "data", exported=False, folder=tmp_path)
+    context: Any = SimpleNamespace(hardware=Hardware(), again=None, inputs={"data": data}, console=QUIET)
+    flip(shards[1].path, 5)
+    with pytest.raises(JointError, match="000001"):
+        require_sound_shards(context, Late(), tmp_path)
 
 
 RECIPE = """
