@@ -124,7 +124,7 @@ def test_the_resolved_recipe_is_the_same_without_a_start(mine: Mine, tmp_path: P
 @pytest.mark.parametrize(
     ("sets", "says"),
     [
-        (["start=nowhere"], "start = 'nowhere': no model of the package .* no export or run is there"),
+        (["start=nowhere"], "start = 'nowhere': nowhere: no such folder; .*synthetic"),
         (["data.layout=body133"], "layout = body133, but start .* was trained on layout wholebody363"),
         (["data.fps=30"], "stages.data.fps = 30, but start .* was trained on fps 20.0; leave it out"),
         (["gpt.net.heads=2"], "starts from .*model/gpt', which differs in net.heads; give both the same"),
