@@ -35,12 +35,12 @@ class MiniLm:
             longest = json.loads((folder / "sentence_bert_config.json").read_text(encoding="utf-8"))
             self._heads, self._layers = int(facts["num_attention_heads"]), int(facts["num_hidden_layers"])
             self.dim, self._eps = int(facts["hidden_size"]), float(facts["layer_norm_eps"])
-            weights = load_file(folder / "model.safetensors", device=device)
+            weights = load_file(folder / "model.safetensors")
             self.tokenizer = _tokenizer(folder, int(longest["max_seq_length"]))
         except Exception as error:  # a missing file, no JSON, no weights: each library raises its own kind
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
             raise UserError(f"{folder}: not a readable text model: {reason}") from error
-        self._weights = {name: value for name, value in weights.items() if value.is_floating_point()}
+        self._weights = {name: x.to(device) for name, x in weights.items() if x.is_floating_point()}
         self._device = device
 
     @cached_property

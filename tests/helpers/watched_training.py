@@ -44,9 +44,10 @@ def pid_of(out: Path, rank: int) -> int:
 
 
 def wait_for_step(out: Path, step: int, seconds: float = 300) -> None:
-    """Until a checkpoint of that step or a later one is there."""
+    """Until a checkpoint of that step or a later one is there, and the other processes know of it."""
     reached = lambda: any(int(p.stem[5:]) >= step for p in out.glob("checkpoints/s*.ckpt"))  # noqa: E731
     until(reached, "no steps", seconds)
+    time.sleep(3)  # words of what a process does come every second
 
 
 def descendants(*jobs: subprocess.Popen[str]) -> list[int]:
