@@ -41,7 +41,7 @@ class MiniLm:
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
             raise UserError(f"{folder}: not a readable text model: {reason}") from error
         self._weights = {name: x.to(device) for name, x in weights.items() if x.is_floating_point()}
-        self._device = device
+        self.device = device
 
     @cached_property
     def digest(self) -> str:
@@ -56,8 +56,8 @@ class MiniLm:
     def __call__(self, captions: Sequence[str]) -> tuple[Tensor, Tensor, Tensor]:
         """Sentence embeddings [B, E] of unit length; last hidden states [B, S, E]; mask [B, S]."""
         read = self.tokenizer.encode_batch(list(captions))
-        numbers = torch.tensor([row.ids for row in read], device=self._device)
-        mask = torch.tensor([row.attention_mask for row in read], device=self._device)
+        numbers = torch.tensor([row.ids for row in read]).to(self.device)
+        mask = torch.tensor([row.attention_mask for row in read]).to(self.device)
         states = self._states(numbers, mask.bool())
         weight = mask[..., None].float()
         mean = (states * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-9)
