@@ -46,13 +46,14 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.figures import embed_motions, retrieval_figures
+from motionloom.pipeline.evaluation.figures import retrieval_figures
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.graph import Selection
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.stages.training import read_metrics
+from motionloom.pipeline.store.latents import embed_motions
 
 Joints = NDArray[np.float64]
 

@@ -37,10 +37,10 @@ from motionloom.pipeline.contract.generation import GenerationRequest, Prompt
 from motionloom.pipeline.contract.lookup import finished_stages, generators_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, Shelf
-from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.conditions import PromptEncoder
+from motionloom.pipeline.store.latents import embed_motions
 
 matplotlib.use("Agg")
 

@@ -38,6 +38,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
 from motionloom.datasets.synth.truth import ACTIONS, FACES, HANDS
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
@@ -152,6 +153,7 @@ def main() -> None:
     parser.add_argument("--clips", type=int, help="test clips, at most; default: as the card says, or all")
     parser.add_argument("--top-p", type=float, help="default: as the card says, or the export")
     parser.add_argument("--cfg", type=float, help="guidance of body and hands; default: likewise")
+    parser.add_argument("--candidates", type=int, help="draws of which TMA chooses; default: likewise")
     parser.add_argument("--seed", type=int, help="default: as the card says, or 0")
     parser.add_argument("--licence", default="apache-2.0")
     args = parser.parse_args()
@@ -168,7 +170,7 @@ def main() -> None:
     except KeyError as error:
         raise UserError(f"{WORDS.name} has no other words for {error}") from None
     bundle = Bundle.open(model)
-    asked = {"top_p": args.top_p, "cfg_scale": args.cfg}
+    asked = {"top_p": args.top_p, "cfg_scale": args.cfg, "candidates": args.candidates}
     asked = {name: value for name, value in asked.items() if value is not None}
     sampling = bundle.drawing(asked or before.get("sampling"))
     said = {
@@ -177,10 +179,17 @@ def main() -> None:
     }
     order = np.random.default_rng(0).permutation(len(truths))
     fps, hold_out = bundle.layout.fps, data.hold_out
+
+    def measured(how: SamplingConfig) -> dict[str, Shares]:
+        out = {}
+        for title, (captions, faces) in said.items():
+            made = bundle.generate(captions, face=faces, sampling=how, seed=seed)
+            out[title] = judge(truths, ((motion.joints, motion.face) for motion in made), fps, hold_out)
+        return out
+
     shares = {GUESS: judge(truths, ((truths[k].joints, truths[k].face) for k in order), fps, hold_out)}
-    for title, (captions, faces) in said.items():
-        made = bundle.generate(captions, face=faces, sampling=sampling, seed=seed)
-        shares[title] = judge(truths, ((motion.joints, motion.face) for motion in made), fps, hold_out)
+    shares |= measured(sampling)
+    single = measured(sampling.model_copy(update={"candidates": 1})) if sampling.candidates > 1 else {}
     table = Table("right, %", *(f"{title}: {kind}" for title in shares for kind in KINDS))
     for row in rows_of(shares):
         table.add_row(*row)
@@ -194,6 +203,7 @@ def main() -> None:
         "sampling": sampling.model_dump(mode="json", exclude_unset=True),
         "seed": seed,
         "right": shares,
+        "single draws": single,
         "unknown": {title: len(unknown_captions(bundle, captions)) for title, (captions, _) in said.items()},
     }
     if args.write:
@@ -229,6 +239,25 @@ def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     return f"{len(gaps)} shares, at most {gaps[worst]:.1f} points from the card ({worst})"
 
 
+def choice(sampling: Mapping[str, Any]) -> str:
+    """How a motion is chosen, where it is."""
+    count = sampling.get("candidates", 1)
+    if count == 1:
+        return ""
+    return f" Of {count} draws TMA takes the nearest to the caption; it judges nothing here."
+
+
+def single_draws(single: Mapping[str, Shares]) -> str:
+    """What the first draw is worth, where TMA chooses among several."""
+    if not single:
+        return ""
+    rows = [
+        f"{title} {100 * kinds['held out']['every']:.1f} and {100 * kinds['held out']['whole']:.1f} %"
+        for title, kinds in single.items()
+    ]
+    return f" Of the first draw alone, `every` and `whole` of held-out clips are: {'; '.join(rows)}."
+
+
 def card_of(
     figures: Mapping[str, Any], recipe: Recipe, data: SynthConfig, bundle: Bundle,
     other: Sequence[tuple[str, str]], model: Path, licence: str,
@@ -259,6 +288,8 @@ def card_of(
         seed=figures["seed"],
         table="\n".join("| " + " | ".join(line) + " |" for line in lines),
         examples="; ".join(f'"{body}"' for body, _ in other[:3]),
+        chosen=choice(sampling),
+        single=single_draws(figures["single draws"]),
         unknown=f"{strange[OTHER]} of these captions and {strange[FAMILIAR]} of the usual it calls unknown.",
         commands=f"motionloom run {recipe_file}\n"
         f"motionloom export runs/{recipe.name} -o {figures['name']} --half{options}\n"

@@ -41,9 +41,10 @@ from motionloom.pipeline.evaluation.dance_figures import (
 )
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
 from motionloom.pipeline.evaluation.faults import FAULTS, Joints, swapped
-from motionloom.pipeline.evaluation.figures import bodily, embed_motions, obeyed, retrieval_figures, shares
+from motionloom.pipeline.evaluation.figures import bodily, obeyed, retrieval_figures, shares
 from motionloom.pipeline.evaluation.reconstruction import published_errors
 from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
+from motionloom.pipeline.store.latents import embed_motions
 from motionloom.pipeline.store.networks import LoadedTma
 
 HALVES = 10

@@ -23,8 +23,8 @@ from sklearn.linear_model import LogisticRegression
 
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.truth import Truth, has_caption, truth_of
+from motionloom.pipeline.store.latents import embed_motions
 
 ATTRIBUTES = ("action", "direction", "side", "count", "speed", "left_hand", "right_hand")
 

@@ -33,13 +33,13 @@ from motionloom.models.metrics.retrieval import matching_score, r_precision
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.reconstruction import reconstruction_figures
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.shipped import find_recipe
+from motionloom.pipeline.store.latents import embed_motions
 
 FORMS: dict[str, dict[str, Any]] = {
     "tokens alone": {"align_weight": 0.0},

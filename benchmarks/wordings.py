@@ -39,9 +39,10 @@ from torch import Tensor
 
 from motionloom.models.metrics.retrieval import ranks
 from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.figures import Interval, embed_motions
+from motionloom.pipeline.evaluation.figures import Interval
 from motionloom.pipeline.evaluation.retrieval import alignment_stage
 from motionloom.pipeline.evaluation.truth import truth_of
+from motionloom.pipeline.store.latents import embed_motions
 
 TABLES = Path(__file__).with_name("wordings.json")
 CAPTIONS = 4

@@ -37,9 +37,10 @@ from wordings import TABLES, Label, Wordings, caption, joined, read_labels
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, Shelf
-from motionloom.pipeline.evaluation.figures import Interval, embed_motions
+from motionloom.pipeline.evaluation.figures import Interval
 from motionloom.pipeline.evaluation.truth import Truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.store.latents import embed_motions
 
 Joints = NDArray[np.float64]
 

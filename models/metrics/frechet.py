@@ -20,7 +20,14 @@ def statistics(x: Tensor) -> tuple[Tensor, Tensor]:
     if x.dim() != 2 or len(x) < 2:
         raise ValueError(f"a covariance needs at least two rows of embeddings, got {tuple(x.shape)}")
     x = x.double()
-    return x.mean(0), torch.cov(x.T).view(x.shape[1], x.shape[1])
+    mean = x.mean(0)
+    centred = x - mean
+    if x.device.type == "cpu":  # numpy makes one half of a symmetric product: three fifths of the time
+        values = centred.numpy(force=True)
+        product = torch.from_numpy(values.T @ values)
+    else:
+        product = centred.T @ centred
+    return mean, product / (len(x) - 1)
 
 
 def _root(cov: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import typer
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.options import (
+    Candidates,
     CfgScale,
     DenoisingSteps,
     Device,
@@ -63,6 +64,7 @@ def generate(
     temperature: Temperature = None,
     top_k: TopK = None,
     top_p: TopP = None,
+    candidates: Candidates = None,
     cfg_scale: CfgScale = None,
     face_cfg_scale: FaceCfgScale = None,
     music_cfg_scale: MusicCfgScale = None,
@@ -108,6 +110,7 @@ def generate(
             temperature=temperature,
             top_k=top_k,
             top_p=top_p,
+            candidates=candidates,
             cfg_scale=cfg_scale,
             face_cfg_scale=face_cfg_scale,
             music_cfg_scale=music_cfg_scale,

@@ -28,6 +28,7 @@ from motionloom.pipeline.cli.generate import generate
 from motionloom.pipeline.cli.json_output import AsJson, print_json
 from motionloom.pipeline.cli.launch import launch
 from motionloom.pipeline.cli.options import (
+    Candidates,
     CfgScale,
     DenoisingSteps,
     Device,
@@ -262,6 +263,7 @@ def export(
     temperature: Temperature = None,
     top_k: TopK = None,
     top_p: TopP = None,
+    candidates: Candidates = None,
     cfg_scale: CfgScale = None,
     face_cfg_scale: FaceCfgScale = None,
     music_cfg_scale: MusicCfgScale = None,
@@ -282,6 +284,7 @@ def export(
         temperature=temperature,
         top_k=top_k,
         top_p=top_p,
+        candidates=candidates,
         cfg_scale=cfg_scale,
         face_cfg_scale=face_cfg_scale,
         music_cfg_scale=music_cfg_scale,

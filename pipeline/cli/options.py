@@ -37,6 +37,13 @@ TopP = Annotated[
         help="Draw from the likeliest tokens of this total probability. Default: the model's, or 0.95."
     ),
 ]
+Candidates = Annotated[
+    int | None,
+    typer.Option(
+        help="Draw so many motions of each caption and keep the one nearest to it, by TMA. Default: the "
+        "model's, or 1."
+    ),
+]
 CfgScale = Annotated[
     float | None, typer.Option(help="Classifier-free guidance; 1 = off. Default: the model's, or 1.")
 ]

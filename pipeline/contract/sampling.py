@@ -6,6 +6,7 @@ from pydantic import Field
 
 from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.schedule import Sampler
+from motionloom.pipeline.contract.fingerprint import LATER
 
 
 class SamplingConfig(Config):
@@ -16,6 +17,9 @@ class SamplingConfig(Config):
     top_k: int = Field(0, ge=0)
     """0 keeps every token."""
     top_p: float = Field(0.95, gt=0, le=1)
+    candidates: int = Field(1, ge=1, le=64, json_schema_extra=LATER)
+    """Motions drawn for each text, of which the one that TMA finds nearest to it is kept; 1 takes the first.
+    Needs a GPT whose prior is TMA's."""
     cfg_scale: float = Field(1.0, ge=1)
     """Classifier-free guidance; 1 is off. Needs a model trained with `condition_dropout` > 0."""
     music_cfg_scale: float | None = Field(None, ge=1)

@@ -17,7 +17,6 @@ from typing import Any, ClassVar
 
 import torch
 from pydantic import BaseModel, model_validator
-from pydantic.config import JsonDict
 from rich.console import Console
 
 from motionloom.datasets.schema import Config, UserError
@@ -28,13 +27,6 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.run_state import RunState
 
 CPU = torch.device("cpu")
-
-RUNTIME: JsonDict = {"runtime": True}
-"""Marks a config field that changes how a stage runs, not what it makes: it is not fingerprinted."""
-
-LATER: JsonDict = {"later": True}
-"""Marks a config field that is newer than finished runs: its default is what they were made with, and is not
-fingerprinted, so that they stay finished."""
 
 GENERATOR = "generator"
 """What a stage gives that makes motion: `StageKind.generator`."""
@@ -372,18 +364,4 @@ def _over(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     for name, value in given.items():
         if isinstance(value, dict) and isinstance(defaults.get(name), dict):
             out[name] = _over(defaults[name], value)
-    return out
-
-
-def fingerprint_fields(config: BaseModel) -> dict[str, Any]:
-    """The config as plain data without the fields marked RUNTIME, and those marked LATER at their default."""
-    out: dict[str, Any] = {}
-    for name, info in type(config).model_fields.items():
-        extra = info.json_schema_extra
-        if isinstance(extra, dict) and extra.get("runtime"):
-            continue
-        value = getattr(config, name)
-        if isinstance(extra, dict) and extra.get("later") and value == info.default:
-            continue
-        out[name] = fingerprint_fields(value) if isinstance(value, BaseModel) else value
     return out

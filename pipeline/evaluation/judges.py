@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from motionloom.pipeline.evaluation.figures import MotionJudge, embed_motions
 from motionloom.pipeline.evaluation.text_motion import Latents
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
+from motionloom.pipeline.store.latents import MotionJudge, embed_motions
 from motionloom.pipeline.store.networks import LoadedTma
 
 

@@ -16,7 +16,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
 
-_OPTIONS = ("face_cfg_scale", "music_cfg_scale", "sampler", "denoising_steps")
+_OPTIONS = ("candidates", "face_cfg_scale", "music_cfg_scale", "sampler", "denoising_steps")
 """Settings that some generators take; the command line calls them by the same words."""
 
 

@@ -38,6 +38,11 @@ def stream_of(
     """A stream of `MotionModel.stream`'s arguments; `notice` is given captions that are unknown."""
     drawing = sampling_of(sampling)
     require_used(bundle, [face] if face else None, drawing)
+    if drawing.candidates > 1:
+        raise UserError(
+            "a stream shows its motion as it is drawn, so there is none to choose: leave candidates "
+            "(--candidates) out"
+        )
     segments = segments_of(bundle, captions, face=face, sound=sound, seconds=seconds)
     config = StreamConfig.parse({} if streaming is None else streaming, "streaming")
     return MotionStream(bundle, segments, seed=seed, sampling=drawing, config=config, notice=notice)

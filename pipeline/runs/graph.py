@@ -24,14 +24,8 @@ from rich.table import Table
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.stage import (
-    Every,
-    Finished,
-    Shelf,
-    Stage,
-    StageContext,
-    fingerprint_fields,
-)
+from motionloom.pipeline.contract.fingerprint import fingerprint_fields
+from motionloom.pipeline.contract.stage import Every, Finished, Shelf, Stage, StageContext
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team

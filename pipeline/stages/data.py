@@ -16,14 +16,8 @@ from motionloom.datasets.shards.reader import manifest_layout, read_manifest, re
 from motionloom.datasets.shards.reading import CacheConfig, Reading
 from motionloom.datasets.shards.store import is_url, open_store
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.contract.stage import (
-    RUNTIME,
-    Finished,
-    FunctionStage,
-    Given,
-    StageConfig,
-    StageContext,
-)
+from motionloom.pipeline.contract.fingerprint import RUNTIME
+from motionloom.pipeline.contract.stage import Finished, FunctionStage, Given, StageConfig, StageContext
 from motionloom.pipeline.store.data import (
     READER,
     REFERENCE,

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.schema import UserError
@@ -21,7 +21,7 @@ from motionloom.pipeline.contract.stage import (
 from motionloom.pipeline.contract.units import Arrays, as_table, even_slices
 from motionloom.pipeline.evaluation.details import Details
 from motionloom.pipeline.evaluation.face_basis import read_basis
-from motionloom.pipeline.evaluation.figures import bodily, embed_motions, obeyed
+from motionloom.pipeline.evaluation.figures import bodily, obeyed
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.nearest import NearestClip
 from motionloom.pipeline.evaluation.paired import movement, position_row
@@ -42,6 +42,7 @@ from motionloom.pipeline.evaluation.versions import EVALUATE
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.driven import bundle_driven_by
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
+from motionloom.pipeline.store.latents import embed_motions
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 _RECONSTRUCTED, _GENERATED = 16, 64
@@ -71,6 +72,16 @@ class EvaluateConfig(StageConfig):
     face_basis: Path | None = None
     """A head's expression basis, `.npy` of floats [V, 3, 50] in metres (such as the expression part of
     SMPL-X's `shapedirs`, which its licence lets nobody pass on): with it errors of vertices are measured."""
+
+    @field_validator("sampling")
+    @classmethod
+    def _judged_by_others(cls, sampling: SamplingConfig) -> SamplingConfig:
+        if sampling.candidates > 1:
+            raise ValueError(
+                "TMA would choose the motions that it then judges; leave candidates at 1 here, and measure "
+                "chosen motions by what they do"
+            )
+        return sampling
 
 
 class EvaluationUnits:

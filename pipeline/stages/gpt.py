@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,11 +22,13 @@ from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.streaming import TokenStream
 from motionloom.models.training.lora import LoraConfig, add_lora, merge_lora, require_peft
+from motionloom.pipeline.contract.fingerprint import LATER
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, LATER, Finished, Given, Stage
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage
 from motionloom.pipeline.contract.streaming import FrameFlow, StreamConfig, TokenFlow
+from motionloom.pipeline.inference.candidates import candidate_seeds, nearest_candidates, repeated
 from motionloom.pipeline.inference.decoding import Frames
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
@@ -36,7 +38,7 @@ from motionloom.pipeline.stages.starting import START, require_start_layout
 from motionloom.pipeline.stages.streams import require_streams, stream_facts
 from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
-from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer, device_of
+from motionloom.pipeline.store.networks import LoadedGpt, LoadedTma, TrainedTokenizer, device_of
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import TokenBatches
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
@@ -45,6 +47,9 @@ if TYPE_CHECKING:
     from motionloom.models.gpt.module import GptModule
 
 Prior = Literal["tma", "sentence"]
+
+_CANDIDATES_AT_ONCE = 64
+"""Motions sampled together where several are drawn for each text."""
 
 
 class GptStageConfig(TrainedStageConfig):
@@ -290,8 +295,15 @@ class GptGenerator:
     @property
     def settings(self) -> frozenset[str]:
         """How tokens are drawn."""
-        guidance = {"face_cfg_scale"} if self.face else set()
-        return frozenset({"temperature", "top_k", "top_p", "cfg_scale"} | guidance)
+        more = {"face_cfg_scale"} if self.face else set()
+        more |= {"candidates"} if self.judge is not None else set()
+        return frozenset({"temperature", "top_k", "top_p", "cfg_scale"} | more)
+
+    @property
+    def judge(self) -> LoadedTma | None:
+        """The TMA that tells its motions apart: the one its prior comes from, if that reads what it makes."""
+        tma: LoadedTma | None = self.given.get("tma") if self.gpt.prior == "tma" else None
+        return tma if tma is not None and tma.part == self.part else None
 
     @property
     def unit_frames(self) -> int:
@@ -313,25 +325,44 @@ class GptGenerator:
         latent: Tensor = self.given["tma"].embed_text(text.features, text.mask)
         return latent
 
-    @torch.no_grad()
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
-        """Lengths that are no whole groups are made of one group more, and cut."""
-        sampling, unit = request.sampling, self.unit_frames
-        groups = None if request.frames is None else torch.tensor([-(-n // unit) for n in request.frames])
+        """Lengths that are no whole groups are made of one group more, and cut. Of several candidates the
+        one nearest to its text is kept.
+        """
+        prior, judge, count = self.prior(request), self.judge, request.sampling.candidates
+        if judge is None or count == 1:
+            return self._drawn(prior, request.frames, request.seeds, request.sampling)
+        out: list[NDArray[np.float32]] = []
+        at_once = max(1, _CANDIDATES_AT_ONCE // count)
+        for start in range(0, len(prior), at_once):
+            rows = slice(start, start + at_once)
+            frames = None if request.frames is None else repeated(request.frames[rows], count)
+            texts, seeds = prior[rows], candidate_seeds(request.seeds[rows], count)
+            drawn = self._drawn(texts.repeat_interleave(count, dim=0), frames, seeds, request.sampling)
+            out += nearest_candidates(judge, texts, drawn)
+        return out
+
+    @torch.no_grad()
+    def _drawn(
+        self, prior: Tensor, frames: Sequence[int] | None, seeds: Sequence[int], sampling: SamplingConfig
+    ) -> list[NDArray[np.float32]]:
+        """One motion for each row of the prior [B, E]."""
+        unit = self.unit_frames
+        groups = None if frames is None else torch.tensor([-(-n // unit) for n in frames])
         codes = generate(
             self.gpt.net,
-            self.prior(request),
+            prior,
             groups=groups,
             temperature=sampling.temperature,
             top_k=sampling.top_k or None,
             top_p=sampling.top_p,
             cfg_scale=sampling.face_guidance if self.face else sampling.cfg_scale,
-            seed=list(request.seeds),
+            seed=list(seeds),
         )
         motions = self.tokenizer.decode(codes.codes, codes.groups.tolist())
-        if request.frames is None:
+        if frames is None:
             return motions
-        return [motion[:count] for motion, count in zip(motions, request.frames, strict=True)]
+        return [motion[:count] for motion, count in zip(motions, frames, strict=True)]
 
     def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
         """Tokens as they come; a full block, or another text, goes on from the last frames."""

@@ -13,7 +13,8 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.contract.stage import LATER, RUNTIME, StageConfig
+from motionloom.pipeline.contract.fingerprint import LATER, RUNTIME
+from motionloom.pipeline.contract.stage import StageConfig
 from motionloom.pipeline.launch.hardware import Hardware, require_loggers
 
 BatchSource = Callable[[int, int, int], Dataset[Any]]

@@ -14,7 +14,7 @@ from toy_training import toy_recipe
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.stage import fingerprint_fields
+from motionloom.pipeline.contract.fingerprint import fingerprint_fields
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.graph import Selection
 from motionloom.pipeline.stages.train_config import BranchPoint, TrainConfig

@@ -18,11 +18,11 @@ from motionloom.datasets.text.cache import TextCache
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CPU, Shelf
-from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.launch.hardware import Hardware, choose_device
 from motionloom.pipeline.stages.tokens import encode_split
+from motionloom.pipeline.store.latents import embed_motions
 
 CAPTIONS = ["a person waves with the left hand", "a person walks"]
 

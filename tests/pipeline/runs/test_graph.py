@@ -17,7 +17,8 @@ from toy_stages import register_toys
 
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.stage import RUNTIME, Every, FunctionStage, StageConfig, StageContext
+from motionloom.pipeline.contract.fingerprint import RUNTIME
+from motionloom.pipeline.contract.stage import Every, FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.runs.graph import Selection, execute, make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact

@@ -19,11 +19,11 @@ from motionloom.datasets.motion.layout import WRISTS
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.figure_rows import figure_rows
-from motionloom.pipeline.evaluation.figures import embed_motions
 from motionloom.pipeline.evaluation.reconstruction import FINGERS, published_errors
 from motionloom.pipeline.evaluation.text_motion import Latents, distribution
 from motionloom.pipeline.evaluation.truth import drawn, truth_of
 from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.store.latents import embed_motions
 
 RECIPE = """
 extends: t2m-gpt-tiny

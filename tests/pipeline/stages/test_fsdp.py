@@ -32,7 +32,8 @@ from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig
 from motionloom.models.training.stage_module import OptimConfig
-from motionloom.pipeline.contract.stage import Shelf, StageContext, fingerprint_fields
+from motionloom.pipeline.contract.fingerprint import fingerprint_fields
+from motionloom.pipeline.contract.stage import Shelf, StageContext
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.gpt import GptStageConfig
 from motionloom.pipeline.stages.tma import TmaStageConfig

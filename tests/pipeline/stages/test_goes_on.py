@@ -21,7 +21,7 @@ from tiny_players import Duel, train
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.stage import fingerprint_fields
+from motionloom.pipeline.contract.fingerprint import fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import Interrupted
 from motionloom.pipeline.launch.team import lead_finds
