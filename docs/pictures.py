@@ -18,12 +18,15 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.rigid import RigidMotion
 from motionloom.datasets.synth.generate import SynthConfig, make_clip
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Shelf
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import shown
+from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.picture import contact_sheet
 
 CAPTIONS = (
@@ -47,12 +50,23 @@ class Row:
     fps: float
     at: list[int] | None = None
     """Frames to show; None = spread evenly."""
+    figure: RigidMotion | None = None
+    """The rigid figure whose joints these are."""
+    face: NDArray[Any] | None = None
+    """The face's controls [T, 5]."""
+
+    @staticmethod
+    def of(motion: GeneratedMotion, label: str, caption: str, at: list[int] | None = None) -> Row:
+        """A generated motion, as page and film show it."""
+        seen = shown(motion)
+        face = None if motion.face is None else synthetic_face_controls(motion.face)
+        return Row(seen.joints, label, caption, seen.fps, at, seen.figure, face)
 
 
 def generated_rows(run: Path, captions: tuple[str, ...], seed: int) -> list[Row]:
     """Motions that a trained run makes of the captions."""
     motions = Bundle.open(run).generate(captions, seed=seed)
-    return [Row(shown(m).joints, "generated", m.caption, m.layout.fps) for m in motions]
+    return [Row.of(motion, "generated", motion.caption) for motion in motions]
 
 
 def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[Row]:
@@ -77,14 +91,16 @@ def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[Row]:
         at = [min(round(beat * fps), len(motion.joints) - 1) for beat in clip.beats[:frames].tolist()]
         truth = clip.truth or {}
         words = f"{truth.get('genre', clip.song)}, {truth.get('bpm', '?')} beats a minute"
-        rows.append(Row(shown(motion).joints, "to music", words, fps, at))
+        rows.append(Row.of(motion, "to music", words, at))
     return rows
 
 
 def synthetic_rows() -> list[Row]:
     """Clips of the synthetic source, in the captions' own words."""
     clips = [make_clip(index, SYNTHETIC) for index in SYNTHETIC_CLIPS]
-    return [Row(c.joints, "synthetic", c.texts[0], SYNTHETIC.motion_layout.fps) for c in clips]
+    fps = SYNTHETIC.motion_layout.fps
+    faces = [None if c.face is None else synthetic_face_controls(c.face) for c in clips]
+    return [Row(c.joints, "synthetic", c.texts[0], fps, face=f) for c, f in zip(clips, faces, strict=True)]
 
 
 def draw(path: Path, rows: list[Row], frames: int) -> None:
@@ -96,6 +112,8 @@ def draw(path: Path, rows: list[Row], frames: int) -> None:
         [row.caption for row in rows],
         frames,
         at=None if rows[0].at is None else [row.at or [] for row in rows],
+        figures=[row.figure for row in rows],
+        face_controls=[row.face for row in rows],
         fps=rows[0].fps,
     )
 

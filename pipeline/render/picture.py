@@ -5,19 +5,22 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from motionloom.datasets.base.files import write_bytes
+from motionloom.datasets.motion.rigid import RigidMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.actor import Actor, actor_for, draw_actor
 from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of
 from motionloom.pipeline.render.lettering import font, wrap
 from motionloom.pipeline.render.raster import halve
+
+T = TypeVar("T")
 
 SKELETONS = {52: "smplx52", 22: "smpl22"}
 PAPER, INK, SOFT, LINE = (255, 255, 255), (29, 35, 48), (91, 100, 117), (226, 230, 237)
@@ -32,6 +35,8 @@ def contact_sheet(
     *,
     at: Sequence[Sequence[int]] | None = None,
     parents: Sequence[int] | None = None,
+    figures: Sequence[RigidMotion | None] | None = None,
+    face_controls: Sequence[NDArray[Any] | None] | None = None,
     fps: float = 20.0,
     cell: tuple[int, int] = (180, 236),
     view: str = "3/4",
@@ -39,7 +44,9 @@ def contact_sheet(
     """Write a PNG: a row per motion [T, N, 3] (metres) with label, caption and `frames` poses over time.
 
     `at` names the frames of every row, `frames` of them; without it they are spread evenly. `parents` may be
-    left out for 52 or 22 SMPL-X joints. Poses stand in mid-cell, with their times.
+    left out for 52 or 22 SMPL-X joints. `figures` are the rigid figures whose joints these are and
+    `face_controls` [T, 5] those of the viewer, where a row has them. Poses stand in mid-cell, with
+    their times.
     """
     if not len(joints) == len(labels) == len(captions) or not len(joints) or frames < 1:
         raise UserError(
@@ -63,9 +70,10 @@ def contact_sheet(
     sheet = Image.new("RGB", (2 * width * frames, 2 * (height + heading) * len(rows)), PAPER)
     draw = ImageDraw.Draw(sheet)
     stamps = []
-    for row, clip in enumerate(rows):
+    bodies, faces = _each(figures, rows), _each(face_controls, rows)
+    for row, (clip, figure, face) in enumerate(zip(rows, bodies, faces, strict=True)):
         top = row * (height + heading)
-        actor, floor = _actor(clip, parents), floor_of(clip)
+        actor, floor = _actor(clip, parents, figure, face), floor_of(clip)
         draw.rectangle(
             [0, 2 * (top + heading), sheet.width, 2 * (top + heading + height)], fill=(247, 248, 251)
         )
@@ -113,11 +121,20 @@ def _words(
         draw.text((x_at, y_at), text, fill=SOFT, font=tiny)
 
 
-def _actor(clip: NDArray[np.float64], parents: Sequence[int] | None) -> Actor:
+def _each(given: Sequence[T | None] | None, rows: Sequence[Any]) -> Sequence[T | None]:
+    return [None] * len(rows) if given is None else given
+
+
+def _actor(
+    clip: NDArray[np.float64],
+    parents: Sequence[int] | None,
+    figure: RigidMotion | None,
+    face: NDArray[Any] | None,
+) -> Actor:
     if clip.ndim != 3 or not np.isfinite(clip).all():
         raise UserError(f"contact_sheet draws finite joints [T, N, 3], got {list(clip.shape)}")
     if parents is None:
         if clip.shape[1] not in SKELETONS:
             raise UserError(f"contact_sheet needs parents for a skeleton of {clip.shape[1]} joints")
         parents = Skeleton.named(SKELETONS[clip.shape[1]]).parents
-    return actor_for(clip, parents)
+    return actor_for(clip, parents, figure, face)

@@ -326,6 +326,20 @@ def test_contact_sheet_of_named_frames_is_that_of_a_clip_of_them(tmp_path: Path,
         contact_sheet(one, [clip], ["a"], ["b"], frames=3, at=[[0, 39]])
 
 
+def test_contact_sheet_shows_the_face(tmp_path: Path, walk: Walk) -> None:
+    """What differs between a shut and an open mouth lies where the head is."""
+    one, other, clip = tmp_path / "a.png", tmp_path / "b.png", np.repeat(walk(40)[:1], 2, axis=0)
+    shut, wide = np.zeros((2, 5)), np.tile([0.0, 0, 1, 1, 0], (2, 1))
+    for path, face in ((one, shut), (other, wide)):
+        contact_sheet(
+            path, [clip], ["a"], ["b"], frames=1, face_controls=[face], cell=(300, 400), view="front"
+        )
+    apart = (np.asarray(Image.open(one)) != np.asarray(Image.open(other))).any(axis=-1)
+    rows, columns = np.nonzero(apart)
+    assert len(rows) > 5 and np.ptp(rows) < 60 and np.ptp(columns) < 60
+    assert rows.mean() < 30 + 200, "the upper half of the cell, below the heading"
+
+
 def test_text_wraps_within_its_width() -> None:
     face = font(14)
     lines = wrap("word " * 50, 120, face, 3)
