@@ -40,6 +40,7 @@ SCRIPTS = (
     "viewer_mesh.js",
     "viewer_bones.js",
     "viewer_shaders.js",
+    "viewer_skin.js",
     "viewer_gl.js",
     "viewer_stage.js",
     "viewer_page.js",

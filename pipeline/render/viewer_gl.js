@@ -20,10 +20,10 @@ function buildProgram(gl, [vertex, fragment]) {
   return { program, at };
 }
 
-/* All of one context's objects; null where it cannot draw the body. */
-function makePainter(gl) {
-  const body = openBody();
-  const [figures, falls, shadows] = [BODY_PROGRAM, FALL_PROGRAM, SHADOW_PROGRAM].map((source) => buildProgram(gl, source));
+/* All of one context's objects; null where it cannot draw the body. In `software` vertices come skinned. */
+function makePainter(gl, software) {
+  const body = openBody(), skinning = software ? PLACED : SKINNING;
+  const [figures, falls, shadows] = [bodyProgram(skinning), fallProgram(skinning), SHADOW_PROGRAM].map((source) => buildProgram(gl, source));
   if (!body || !figures || !falls || !shadows) return null;
   const details = body.details.map((mesh) => uploadDetail(gl, mesh));
   const clips = new Map();
@@ -48,17 +48,24 @@ function makePainter(gl) {
   const arrayOfClip = (clip, level) => {
     if (!clips.has(clip)) clips.set(clip, []);
     const made = clips.get(clip);
-    if (!made[level]) made[level] = uploadClip(gl, details[level], fitMesh(details[level].mesh, body, clip.pose));
+    if (!made[level]) made[level] = uploadClip(gl, details[level], fitMesh(details[level].mesh, body, clip.pose), software);
     return made[level];
   };
   const skin = (use, item, level) => {
-    gl.uniform4fv(use.at.bones, item.bones);
-    gl.uniform1fv(use.at.face, item.face);
-    gl.uniform1f(use.at.lookSize, 127 * details[level].mesh.moveStep * item.clip.pose.size);
-    gl.uniform1i(use.at.looks, 0);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, details[level].looks);
-    gl.bindVertexArray(arrayOfClip(item.clip, level).array);
+    const own = arrayOfClip(item.clip, level), { mesh, looks } = details[level], { size } = item.clip.pose;
+    gl.bindVertexArray(own.array);
+    if (software) {
+      skinMesh(mesh, own.fitted, item.bones, item.face, size, own.placed);
+      gl.bindBuffer(gl.ARRAY_BUFFER, own.buffer);
+      gl.bufferSubData(gl.ARRAY_BUFFER, 0, own.placed);
+    } else {
+      gl.uniform4fv(use.at.bones, item.bones);
+      gl.uniform1fv(use.at.face, item.face);
+      gl.uniform1f(use.at.lookSize, 127 * mesh.moveStep * size);
+      gl.uniform1i(use.at.looks, 0);
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, looks);
+    }
     gl.drawElements(gl.TRIANGLES, details[level].indices, gl.UNSIGNED_SHORT, 0);
   };
   const aim = (use, { lens, box }) => {
@@ -155,23 +162,26 @@ function uploadDetail(gl, mesh) {
   };
 }
 
-function uploadClip(gl, detail, vertices) {
+/* A clip's own vertices at rest; in software `placed` is where they are moved to. */
+function uploadClip(gl, detail, fitted, software) {
   const array = gl.createVertexArray(), buffer = gl.createBuffer();
   gl.bindVertexArray(array);
   gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-  gl.bufferData(gl.ARRAY_BUFFER, vertices, gl.STATIC_DRAW);
+  gl.bufferData(gl.ARRAY_BUFFER, fitted, software ? gl.DYNAMIC_DRAW : gl.STATIC_DRAW);
   gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 24, 0);
   gl.vertexAttribPointer(1, 3, gl.FLOAT, false, 24, 12);
-  gl.bindBuffer(gl.ARRAY_BUFFER, detail.joints);
-  gl.vertexAttribIPointer(2, 4, gl.UNSIGNED_BYTE, 0, 0);
-  gl.bindBuffer(gl.ARRAY_BUFFER, detail.shares);
-  gl.vertexAttribPointer(3, 4, gl.UNSIGNED_BYTE, true, 0, 0);
   gl.bindBuffer(gl.ARRAY_BUFFER, detail.colour);
   gl.vertexAttribPointer(4, 2, gl.UNSIGNED_BYTE, true, 0, 0);
-  gl.bindBuffer(gl.ARRAY_BUFFER, detail.row);
-  gl.vertexAttribIPointer(5, 1, gl.UNSIGNED_SHORT, 0, 0);
-  for (let k = 0; k < 6; k++) gl.enableVertexAttribArray(k);
+  if (!software) {
+    gl.bindBuffer(gl.ARRAY_BUFFER, detail.joints);
+    gl.vertexAttribIPointer(2, 4, gl.UNSIGNED_BYTE, 0, 0);
+    gl.bindBuffer(gl.ARRAY_BUFFER, detail.shares);
+    gl.vertexAttribPointer(3, 4, gl.UNSIGNED_BYTE, true, 0, 0);
+    gl.bindBuffer(gl.ARRAY_BUFFER, detail.row);
+    gl.vertexAttribIPointer(5, 1, gl.UNSIGNED_SHORT, 0, 0);
+  }
+  for (const k of software ? [0, 1, 4] : [0, 1, 2, 3, 4, 5]) gl.enableVertexAttribArray(k);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, detail.triangles);
   gl.bindVertexArray(null);
-  return { array, remove: () => { gl.deleteVertexArray(array); gl.deleteBuffer(buffer); } };
+  return { array, buffer, fitted, placed: software ? new Float32Array(fitted.length) : null, remove: () => { gl.deleteVertexArray(array); gl.deleteBuffer(buffer); } };
 }

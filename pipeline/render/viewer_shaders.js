@@ -1,5 +1,15 @@
 /* The programs of the WebGL2 view: the skinned body, its fall onto the ground, and the soft shadow there. */
 
+/* Where vertices are, and how they are turned: as they were skinned before (viewer_skin.js), or skinned here. */
+const PLACED = `#version 300 es
+precision highp float;
+layout(location = 0) in vec3 place;
+layout(location = 1) in vec3 normal;
+layout(location = 4) in vec2 colour;
+vec3 skinned() { return place; }
+vec3 turned() { return normal; }
+`;
+
 const SKINNING = `#version 300 es
 precision highp float;
 layout(location = 0) in vec3 place;
@@ -27,6 +37,7 @@ vec3 skinned() {
   vec4 p = vec4(still, 1.0);
   return vec3(dot(x, p), dot(y, p), dot(z, p));
 }
+vec3 turned() { return vec3(dot(x.xyz, normal), dot(y.xyz, normal), dot(z.xyz, normal)); }
 `;
 
 /* The lens of viewer_space.js: `onto` scales and moves its pixels into the box that is drawn, `depths` is near and far. */
@@ -42,14 +53,14 @@ vec4 seen(vec3 p) {
 }
 `;
 
-const BODY_PROGRAM = [`${SKINNING}${LENS}
+const bodyProgram = (skinning) => [`${skinning}${LENS}
 out vec3 vNormal;
 out vec3 vPlace;
 out float vColumn;
 flat out int vRow;
 void main() {
   vPlace = skinned();
-  vNormal = vec3(dot(x.xyz, normal), dot(y.xyz, normal), dot(z.xyz, normal));
+  vNormal = turned();
   vColumn = colour.x;
   vRow = int(colour.y * 255.0 + 0.5);
   gl_Position = seen(vPlace);
@@ -86,7 +97,7 @@ void main() {
 }`];
 
 /* Height above the ground where the light meets it: red falls off within half a metre, green is all of the figure. */
-const FALL_PROGRAM = [`${SKINNING}
+const fallProgram = (skinning) => [`${skinning}
 uniform vec4 field;
 uniform vec3 fall;
 out float vHeight;
