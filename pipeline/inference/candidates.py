@@ -42,8 +42,7 @@ def nearest_candidates(
         text: The texts' latents, float [B, Z].
         motions: B * K motions, a text's K draws one behind another.
     """
-    latents = F.normalize(embed_motions(judge, motions).double(), dim=-1)
-    near = latents.view(len(text), -1, latents.shape[-1]) * F.normalize(text.cpu().double(), dim=-1)[:, None]
-    best = near.sum(-1).argmax(1)
     count = len(motions) // len(text)
-    return [motions[row * count + int(draw)] for row, draw in enumerate(best)]
+    latents = F.normalize(embed_motions(judge, motions).double(), dim=-1).view(len(text), count, -1)
+    near = (latents * F.normalize(text.cpu().double(), dim=-1)[:, None]).sum(-1)
+    return [motions[row * count + draw] for row, draw in enumerate(near.argmax(1).tolist())]

@@ -1,5 +1,5 @@
 /* Skinning on the processor, where the processor makes the pixels too: there a vertex that is moved by the
-   shader costs ten times as much, because each of its bones is fetched by itself. */
+   shader costs many times as much, because each of its bones is fetched by itself. */
 
 /* Vertices [x, y, z, nx, ny, nz] each of `fitted`, moved by three rows [m, m, m, shift] a joint, into `out`. */
 function skinMesh(mesh, fitted, bones, face, size, out) {
