@@ -26,7 +26,8 @@ from motionloom.datasets.synth.generate import SynthConfig, make_clip
 from motionloom.pipeline.render.face import synthetic_face_controls
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+FLAGS = ["--no-sandbox", "--disable-gpu", "--use-angle=swiftshader-webgl", "--enable-unsafe-swiftshader"]
+"""As a browser without a GPU is: WebGL by SwiftShader, the page itself put together in plain software."""
 SIZES = {"desktop": (1200, 800), "phone": (390, 844)}
 WARM, PICTURES = 4, 40
 """Pictures that are painted before, and while time is taken."""

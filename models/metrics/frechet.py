@@ -3,11 +3,12 @@
 tr sqrt(A B) of two covariances equals the sum of square roots of the eigenvalues of R' B R for any R with
 A = R R', which is symmetric: no general matrix square root, no imaginary parts to drop, and singular
 covariances need no epsilon. R is the Cholesky factor where A is well conditioned, which is the fastest, and
-else the symmetric root.
+else the symmetric root. On a CPU LAPACK makes R' B R of the factor in a quarter of two products' operations.
 """
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,24 +31,37 @@ def statistics(x: Tensor) -> tuple[Tensor, Tensor]:
     return mean, product / (len(x) - 1)
 
 
-def _root(cov: Tensor) -> Tensor:
-    """R [Z, Z] with R R' = `cov`."""
-    factor: Tensor
-    factor, failed = torch.linalg.cholesky_ex(cov)
-    pivots = factor.diagonal()
-    if not failed and pivots.min() > WELL_CONDITIONED * pivots.max():
-        return factor
-    values, vectors = torch.linalg.eigh(cov)
-    root: Tensor = (vectors * values.clamp(min=0).sqrt()) @ vectors.T
-    return root
+def _eigenvalues(a: Tensor, b: Tensor) -> Tensor:
+    """Those of `a` `b` [Z], both symmetric and not negative, by R' `b` R of an R with R R' = `a`."""
+    if a.device.type == "cpu":
+        from scipy.linalg import lapack
+
+        factor, failed = lapack.dpotrf(a.numpy(force=True), lower=1)
+        if not failed and _sure(torch.from_numpy(factor.diagonal().copy())):
+            product, _ = lapack.dsygst(b.numpy(force=True), factor, itype=2, lower=1)
+            return torch.from_numpy(np.linalg.eigvalsh(product, "L"))
+    else:
+        root, failed = torch.linalg.cholesky_ex(a)
+        if not failed and _sure(root.diagonal()):
+            return _symmetric(root.T @ b @ root)
+    values, vectors = torch.linalg.eigh(a)
+    root = (vectors * values.clamp(min=0).sqrt()) @ vectors.T
+    return _symmetric(root.T @ b @ root)
+
+
+def _symmetric(matrix: Tensor) -> Tensor:
+    out: Tensor = torch.linalg.eigvalsh(matrix)
+    return out
+
+
+def _sure(pivots: Tensor) -> bool:
+    return bool(pivots.min() > WELL_CONDITIONED * pivots.max())
 
 
 def frechet_distance(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tensor) -> Tensor:
     """Squared Frechet distance of two Gaussians; scalar float64, never negative."""
     mean_a, cov_a, mean_b, cov_b = (x.double() for x in (mean_a, cov_a, mean_b, cov_b))
-    root = _root(cov_a)
-    product = root.T @ cov_b @ root
-    shared = torch.linalg.eigvalsh((product + product.T) / 2).clamp(min=0).sqrt().sum()
+    shared = _eigenvalues(cov_a, cov_b).clamp(min=0).sqrt().sum()
     distance = (mean_a - mean_b).square().sum() + cov_a.trace() + cov_b.trace() - 2 * shared
     out: Tensor = distance.clamp(min=0)
     return out

@@ -99,7 +99,7 @@ def test_stages_are_those_of_the_model(mine: Mine) -> None:
     data, gpt = recipe.stage("data").config, recipe.stage("gpt").config
     assert (data.layout, data.fps, data.fingers) == ("wholebody363", 20.0, "resting")
     assert gpt.net.dump() == kept["gpt"].config["net"] and gpt.prior == "tma"
-    assert gpt.loss.align_weight == 0 and gpt.train.steps == 6 and gpt.optim.lr == 7.5e-4
+    assert gpt.loss.align_weight == 0 and gpt.train.steps == 6 and gpt.optim.lr == 2e-3
     assert recipe.stage("tokenizer").kind.name == kept["tokenizer"].kind == "h2vq"
 
 
