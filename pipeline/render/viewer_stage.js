@@ -8,10 +8,11 @@ const LAMP_SLOPE = [LAMP_ABOVE[0] / LAMP_ABOVE[1], LAMP_ABOVE[2] / LAMP_ABOVE[1]
 const SHADOW_SPREAD = 0.11; // metres over which the shadow's rim is soft
 const BODY_REACH = 0.15, HEAD_REACH = 0.27; // how far the body goes beyond its joints, metres
 const NEAR_DETAIL = 400; // a figure of so many pixels is drawn with all vertices
-const BUSY = 13, SLOW = 21; // milliseconds of drawing, and between frames, from which on quality is traded for pace
+const SLOW = 21, OURS = 4; // milliseconds between frames from which on quality is traded for pace, where drawing takes so many of them
 
 /* Pixels a CSS pixel at most, and whether only the far detail is drawn; what stands still has the first. */
 const QUALITIES = [{ ratio: 2, coarse: false }, { ratio: 1, coarse: false }, { ratio: 1, coarse: true }, { ratio: 0.7, coarse: true }];
+const FIRST = 8; // pictures that say nothing yet: programs are compiled, meshes fitted, buffers made
 const FEW = 2; // without a GPU, more figures than that start with the far detail
 
 /* The page's stage, or null: no WebGL2, no body, or `?view=2d` in the address. */
@@ -141,19 +142,19 @@ function figureBox(lens, clip, [x, z, width, depth], level) {
   return end[0] > start[0] && end[1] > start[1] ? [...start, end[0] - start[0], end[1] - start[1]] : null;
 }
 
-/* Steps down through the qualities where drawing takes too long, a step a second at most; starts again with `begin`. */
+/* Steps down through the qualities where pictures come late, a step a second at most; starts again with `begin`. */
 function watchPace(stage) {
   let spent = 0, gap = 0, count = 0;
-  const begin = (figures) => { stage.quality = !stage.software ? 0 : figures > FEW ? 2 : 1; spent = gap = count = 0; };
+  const begin = (figures) => { stage.quality = !stage.software ? 0 : figures > FEW ? 2 : 1; spent = gap = 0; count = -FIRST; };
   const note = (milliseconds, between) => {
     count += 1;
+    if (count <= 0) return;
     const weight = Math.max(1 / count, 0.08);
     spent += weight * (milliseconds - spent);
     gap += weight * (Math.min(between, 100) - gap);
-    const late = spent > BUSY || (gap > SLOW && spent > BUSY / 3);
-    if (count >= 24 && late && stage.quality < QUALITIES.length - 1) {
+    if (count >= 24 && gap > SLOW && spent > OURS && stage.quality < QUALITIES.length - 1) {
       stage.quality += 1;
-      count = 0;
+      count = -FIRST;
     }
   };
   return { begin, note, get spent() { return spent; }, get gap() { return gap; } };
