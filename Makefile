@@ -7,15 +7,17 @@ BIN := $(abspath $(VENV))/bin
 STAMP := $(VENV)/installed
 RECIPE ?= humantomato-tiny
 DEMO_ARGS ?=
-NUMERIC_TESTS := tests/models tests/datasets/motion
 
-.PHONY: demo test test-numeric lint dist test-dist install clean help
+FAST := not slow and not browser and not slurm
+
+.PHONY: demo test test-all test-older lint dist test-dist install clean help
 
 help:
 	@echo "make demo   whole pipeline on synthetic data, ends with the path of a page to watch"
-	@echo "make test   the tests"
+	@echo "make test   the tests, without the long ones; a few minutes"
+	@echo "make test-all   all tests: trainings, kills, clusters and browsers too"
 	@echo "make lint   ruff and mypy"
-	@echo "make test-numeric   the numeric tests as older processors compute: AVX2 and none, one thread and two"
+	@echo "make test-older   the same tests as an older processor computes, without AVX-512"
 	@echo "make dist   sdist and wheel, in dist/"
 	@echo "make test-dist   the wheel in an environment of its own, away from the tree"
 
@@ -26,7 +28,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "motionloom needs Python 3.11 or newer; name one: make PYTHON=python3.12 demo"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip -c constraints.txt
-	$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[lora,remote,slurm]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[film,glb,lora,remote,tensorboard]'
 	@touch $(STAMP)
 
 # On a CPU, two processes of one thread train these small networks faster than one of two threads, and do not slow
@@ -35,14 +37,19 @@ demo: $(STAMP)
 	@$(BIN)/motionloom run $(RECIPE) --set hardware.cpu_devices=2 --set hardware.threads=1 $(DEMO_ARGS)
 
 test: $(STAMP)
+	$(BIN)/python -P -m pytest -n auto --maxprocesses 4 --dist loadfile -m "$(FAST)" $(PYTEST_ARGS)
+
+test-all: $(STAMP)
 	$(BIN)/python -P -m pytest -n auto --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)
 
-# Sums are taken in another order there: a bound that only one processor keeps fails here. Both passes take one
-# process: workers would need as much processor time for their imports as for the tests. Threads that wait passively
-# leave the core to others.
-test-numeric: $(STAMP)
-	ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2 OMP_NUM_THREADS=1 $(BIN)/python -P -m pytest -q -m numeric $(NUMERIC_TESTS)
-	ATEN_CPU_CAPABILITY=default ONEDNN_MAX_CPU_ISA=AVX2 OMP_NUM_THREADS=2 OMP_WAIT_POLICY=passive $(BIN)/python -P -m pytest -q -m numeric $(NUMERIC_TESTS)
+# The tests as a processor with AVX2 and without AVX-512 computes: sums are taken in another order there, so a bound or a
+# digest that only one kind of processor keeps fails here.
+OLDER := NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" OPENBLAS_CORETYPE=Haswell NUMBA_CPU_NAME=haswell \
+  ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2 \
+  GLIBC_TUNABLES=glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX512DQ,-AVX512CD
+
+test-older: $(STAMP)
+	$(OLDER) $(BIN)/python -P -m pytest -q -n auto --maxprocesses 4 --dist loadfile -m "$(FAST)" $(PYTEST_ARGS)
 
 # mypy reads the folders as the namespace package `motionloom`, so it gets a folder of that name that links to them.
 lint: $(STAMP)

@@ -28,17 +28,16 @@ from motionloom.models.gpt.tokens import deinterleave
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Given, Shelf
-from motionloom.pipeline.stages.gpt_data import gpt_clips
+from motionloom.pipeline.contract.stage import Inputs, StageCache
 from motionloom.pipeline.store.networks import LoadedTma
-from motionloom.pipeline.store.tokens import TokenBatches
+from motionloom.pipeline.store.tokens import TokenBatches, gpt_clips
 
 THRESHOLDS = (0.85, None)
 ROWS = ("truth", "predicted after the truth", "own samples")
 
 
 def batches(
-    given: Given, tokenizer: Tokenizer, gpt: InterleavedGPT, tma: LoadedTma, size: int
+    given: Inputs, tokenizer: Tokenizer, gpt: InterleavedGPT, tma: LoadedTma, size: int
 ) -> TokenBatches:
     """Validation clips with all their captions, endless, as the GPT stage trains on others."""
     text, store = given["text"].cache, given["tokens"].open("val")
@@ -60,10 +59,10 @@ def batches(
 @torch.no_grad()
 def measure(run: Path, stage: str, size: int, count: int) -> dict[tuple[str, float | None], float]:
     """(row, threshold of the filter) -> mean L_align over `count` batches."""
-    stages, shelf = finished_stages(run), Shelf()
+    stages, stage_cache = finished_stages(run), StageCache()
     if stage not in stages:
         raise SystemExit(f"{run}: stage '{stage}' has not finished; run it first")
-    given, loaded = shelf.given(stages[stage].inputs), shelf.get(stages[stage])
+    given, loaded = stage_cache.given(stages[stage].inputs), stage_cache.get(stages[stage])
     if loaded.prior != "tma":
         raise SystemExit(f"{run}: {stage} reads the prior '{loaded.prior}'; this script asks GPTs with TMA's")
     tokenizer, tma, gpt = given["tokenizer"].net, given["tma"], loaded.net

@@ -25,10 +25,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from motionloom.datasets.convert.bvh.convert import BvhConfig, prepare_bvh
-from motionloom.datasets.convert.common.archives import list_batches
-from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
-from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.convert.bvh.convert import BvhConfig
+from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.common.scan import list_batches
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.schema import Manifest
 
 
@@ -142,7 +143,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.convert:
         config, workers = config_of(args.source), args.convert
-        prepared = prepare_bvh(config, workers=workers, scan=args.work / SCAN_FILE)
+        prepared = prepare(config, workers=workers, out=args.work)
         run_conversion(prepared, args.work, workers=workers, progress=False)
         return
     args.work.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.canonical import canonicalize
-from motionloom.datasets.motion.features import decode, encode
+from motionloom.datasets.motion.features.codec import decode, encode
 from motionloom.datasets.motion.layout import Family, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 

@@ -1,7 +1,7 @@
 """Does a trained model's help last? Fine-tuning against training from nothing, for equal processor time.
 
     motionloom data convert bvh mocap shards --captions mocap/captions.jsonl --licence CC-BY-NC-4.0 \
-      --layout wholebody363 --fingers resting
+      --layout wholebody363 --set fingers=resting
     python benchmarks/finetuning.py LABELS WORK --data shards --start synthetic --judge runs/bvh-body
 
 `scratch` trains tokenizer, TMA and GPT from new weights, with the data's own statistics. `whole` and `lora`
@@ -40,20 +40,20 @@ from torch import Tensor
 from wordings import Label, read_labels
 
 from motionloom.datasets.motion.canonical import canonicalize
-from motionloom.datasets.motion.features import encode
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.figures import retrieval_figures
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.latent_metrics import LatentRow, recalls
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.graph import Selection
+from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.stages.training import read_metrics
-from motionloom.pipeline.store.latents import embed_motions
+from motionloom.pipeline.store.networks import embed_motions
+from motionloom.pipeline.store.training_log import read_training_log
 
 Joints = NDArray[np.float64]
 
@@ -83,9 +83,9 @@ class Clips:
         self.fps: float = dataset.layout.fps
         self.layout = MotionLayout.named("body133", fps=self.fps)
         judge = finished_stages(args.judge)["tma"]
-        shelf = Shelf()
-        self._tma = shelf.get(judge)
-        self._text = self._tma.embed_captions(self.captions, shelf.given(judge.inputs)["text"].cache)
+        stage_cache = StageCache()
+        self._tma = stage_cache.get(judge)
+        self._text = self._tma.embed_captions(self.captions, stage_cache.given(judge.inputs)["text"].cache)
         self._recorded = self.latents([t.joints for t in self.truths])
 
     def latents(self, joints: Sequence[Joints]) -> Tensor:
@@ -96,7 +96,7 @@ class Clips:
     def figures(self, joints: Sequence[Joints], skip_own: bool = False) -> dict[str, float]:
         """Shares of motions [n], one for each clip; `skip_own` where they are the clips themselves."""
         latent = self.latents(joints)
-        found = retrieval_figures(self._text, latent, size=SIZE, repeats=10, seed=0)
+        found = [recalls(LatentRow(self._text, latent, latent, seed, SIZE)) for seed in range(10)]
         near = latent @ self._recorded.T
         if skip_own:
             near.fill_diagonal_(-2)
@@ -106,7 +106,7 @@ class Clips:
             for j, (content, _) in zip(joints, self.labels, strict=True)
             if content in BY_CONTENT
         ]
-        out = {name: interval.mean for name, interval in found.items()}
+        out = {name: float(np.mean([one[name] for one in found])) for name in found[0]}
         return out | {
             "content": float(right[:, 0].mean()),
             "style": float(right[:, 1].mean()),
@@ -245,7 +245,7 @@ def best_rate(args: argparse.Namespace, arm: str, steps: Mapping[str, int], cons
     for rate in args.rates:
         if str(rate) not in rows:
             train(arm_recipe(args, arm, args.search_seed, steps, rate), folder, console)
-            losses = [row["val/ce"] for row in read_metrics(folder / "stages/gpt") if "val/ce" in row]
+            losses = [row["val/ce"] for row in read_training_log(folder / "stages/gpt") if "val/ce" in row]
             rows[str(rate)] = losses[-1]
             kept.write_text(json.dumps(found, indent=1))
     return float(min(rows, key=lambda rate: rows[rate]))
@@ -309,7 +309,7 @@ def main() -> None:
     if args.show:
         show(found, console)
         return
-    data = Shelf().get(finished_stages(base(args, console))["data"])
+    data = StageCache().get(finished_stages(base(args, console))["data"])
     clips = Clips(args, data, read_labels(args.labels))
 
     def keep(arm: str, seed: int, row: dict[str, float]) -> None:

@@ -3,8 +3,8 @@
     python benchmarks/frechet.py
 
 The public evaluators take scipy's square root of the product of the covariances, which is no symmetric
-matrix; ours takes eigenvalues of a symmetric one (`models/metrics/frechet.py`). Floor: the covariances, which
-both need; what comes behind them is also timed alone.
+matrix; ours takes eigenvalues of a symmetric one (`models/metrics/distributions.py`). Floor: the covariances,
+which both need; what comes behind them is also timed alone.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
-from motionloom.models.metrics.frechet import fid, frechet_distance, statistics
+from motionloom.models.metrics.distributions import fid, frechet_distance, statistics
 
 Array = NDArray[np.float64]
 

@@ -39,12 +39,12 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished, Shelf
+from motionloom.pipeline.contract.stage import Finished, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.launch.hardware import choose_device
-from motionloom.pipeline.runs.estimate import estimate
+from motionloom.pipeline.runs.dry_run import estimate
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.store.flight_log import read_flight
+from motionloom.pipeline.store.training_log import read_flight
 
 PEAKS = {
     "H100 PCIe": (756, 51),
@@ -94,9 +94,9 @@ def recipe(size: str, steps: int, device: str, profile: int) -> dict[str, Any]:
 
 def flops(stage: Finished) -> int:
     """Of a step: forward and backward pass over the first batch that it trained on."""
-    shelf, kind, config = Shelf(), stage.kind, stage.config
-    given = shelf.given(stage.inputs)
+    stage_cache, kind, config = StageCache(), stage.kind, stage.config
     dry: Any = kind
+    given = dry.inputs.of(stage_cache.given(stage.inputs))
     facts = dry.facts(config, given)
     net = dry.network(facts, given)
     batch = dry.batches(config, net, given, 0, lambda _: None).train(config.train.local_batch(1), 0, 1)[0]

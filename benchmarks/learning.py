@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.synth.face import read
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.gpt.drawing import sample_seeds
@@ -36,11 +36,11 @@ from motionloom.models.metrics.retrieval import recall
 from motionloom.pipeline.contract.generation import GenerationRequest, Prompt
 from motionloom.pipeline.contract.lookup import finished_stages, generators_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished, Shelf
+from motionloom.pipeline.contract.stage import Finished, StageCache
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.conditions import PromptEncoder
-from motionloom.pipeline.store.latents import embed_motions
+from motionloom.pipeline.inference.requests import PromptEncoder
+from motionloom.pipeline.store.networks import embed_motions
 
 matplotlib.use("Agg")
 
@@ -70,7 +70,7 @@ def finished(run: Path, stage: str) -> bool:
 
 
 def test_truths(run: Path) -> list[Truth]:
-    dataset = Shelf().get(finished_stages(run)["data"]).split("test")
+    dataset = StageCache().get(finished_stages(run)["data"]).split("test")
     return [truth_of(dataset, i) for i in range(len(dataset))]
 
 
@@ -89,8 +89,8 @@ def retrieval(
 ) -> dict[str, float]:
     """Mean recall over draws of 32 clips with different truths; `motions` made for their captions instead of
     their own."""
-    found_stage, shelf = finished_stages(run)[stage], Shelf()
-    tma, cache = shelf.get(found_stage), shelf.given(found_stage.inputs)["text"].cache
+    found_stage, stage_cache = finished_stages(run)[stage], StageCache()
+    tma, cache = stage_cache.get(found_stage), stage_cache.given(found_stage.inputs)["text"].cache
     text = tma.embed_captions([t.caption for t in truths], cache)
     motion = embed_motions(tma, [t.features for t in truths] if motions is None else motions)
     kinds: dict[str, list[int]] = defaultdict(list)
@@ -108,8 +108,8 @@ def retrieval(
 
 def similarities(run: Path, stage: str = "tma") -> list[tuple[str, str, float, float]]:
     """(caption, caption, cosine of the sentence encoder, cosine of TMA)."""
-    found, shelf = finished_stages(run)[stage], Shelf()
-    tma, encoder = shelf.get(found), shelf.given(found.inputs)["text"].encoder
+    found, stage_cache = finished_stages(run)[stage], StageCache()
+    tma, encoder = stage_cache.get(found), stage_cache.given(found.inputs)["text"].encoder
     rows = []
     for one, other in PAIRS:
         encoded = encoder.encode([one, other])
@@ -145,8 +145,8 @@ def generation(
 ) -> tuple[dict[str, Shares], dict[str, dict[str, float]]]:
     """Shares of a guess, of the tokenizer's reconstructions and of every GPT of the run; and how well TMA
     finds the motions of every GPT (R-precision, Tables 5 and 8)."""
-    stages, makers, shelf = finished_stages(run), generators_of(run), Shelf()
-    tokenizer, face_makers = shelf.get(stages["tokenizer"]), makers_of_faces(makers, shelf)
+    stages, makers, stage_cache = finished_stages(run), generators_of(run), StageCache()
+    tokenizer, face_makers = stage_cache.get(stages["tokenizer"]), makers_of_faces(makers, stage_cache)
     captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
     layout, fps = tokenizer.layout, tokenizer.layout.fps
     order = np.random.default_rng(0).permutation(len(truths))
@@ -159,20 +159,20 @@ def generation(
     found = {}
     for name, title in GPTS.items():
         if finished(run, name):
-            bundle = Bundle([stages[name], *face_makers], shelf)
+            bundle = Bundle([stages[name], *face_makers], stage_cache)
             made = bundle.generate(captions, face=faces, sampling=sampling)
             out[title] = judge(truths, ((m.joints, m.face) for m in made), fps, hold_out)
             found[title] = retrieval(run, "tma", truths, draws, [m.features for m in made])
     return out, found
 
 
-def makers_of_faces(makers: Iterable[Finished], shelf: Shelf) -> list[Finished]:
-    return [stage for stage in makers if shelf.generator(stage).part == "face"]
+def makers_of_faces(makers: Iterable[Finished], stage_cache: StageCache) -> list[Finished]:
+    return [stage for stage in makers if stage_cache.generator(stage).part == "face"]
 
 
 def facial(run: Path, truths: list[Truth]) -> dict[str, float]:
     """Share of expressions that show what the caption says, for each generator (Table 4 in miniature)."""
-    shelf = Shelf()
+    stage_cache = StageCache()
     shown = [t for t in truths if t.face is not None and (t.truth or {}).get("face")]
     prompts = [Prompt(t.face_caption) for t in shown]
     frames, seeds = [len(t.features) for t in shown], sample_seeds(0, len(shown))
@@ -181,9 +181,9 @@ def facial(run: Path, truths: list[Truth]) -> dict[str, float]:
     out = {
         "another clip's face": float(np.mean([wanted[k] == w for k, w in zip(order, wanted, strict=True)]))
     }
-    for stage in makers_of_faces(generators_of(run), shelf):
-        generator = shelf.generator(stage)
-        encoder = PromptEncoder(shelf.given(stage.inputs)["text"], shelf.device)
+    for stage in makers_of_faces(generators_of(run), stage_cache):
+        generator = stage_cache.generator(stage)
+        encoder = PromptEncoder(stage_cache.given(stage.inputs)["text"], stage_cache.device)
         conditions = encoder.encode(
             prompts, [p.words for p in prompts], generator.modalities, generator.layout.fps
         )

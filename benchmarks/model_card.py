@@ -1,7 +1,7 @@
 """What a model of synthetic clips knows, measured: the card of its exported folder, and its figures again.
 
     motionloom run humantomato-synthetic
-    motionloom export runs/humantomato-synthetic -o model --half --cfg-scale 1.5 --top-p 0.9
+    motionloom export runs/humantomato-synthetic -o model --half --sampling cfg_scale=1.5
     python benchmarks/model_card.py model --write
 
 The test clips are made here, from the data settings and the seed of the recipe, so nothing is needed but the
@@ -32,17 +32,16 @@ from learning import Shares, judge
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.motion.features import face_of
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.features.codec import face_of
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.synth.actions.truth import ACTIONS, FACES, HANDS
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
-from motionloom.datasets.synth.truth import ACTIONS, FACES, HANDS
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.evaluation.truth import Truth
-from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
-from motionloom.pipeline.inference.unknown import unknown_captions
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 
 RECIPE = "humantomato-synthetic"

@@ -3,7 +3,7 @@
     motionloom run ude-learning
     python benchmarks/perturbation.py runs/ude-learning
 
-Recorded test clips, each with a fault of `pipeline/evaluation/faults.py`, or with another clip's motion, are
+Recorded test clips, each with a fault of `FAULTS`, or with another clip's motion, are
 judged as generated motion is. Distances are to as many training clips, so that recorded motion has a value
 too. Everything is measured on ten random halves of the clips. A metric has noticed a fault ("+") where it is
 worse than for the recorded motion of the same half in all ten, by more than twice the deviation that
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,26 +26,108 @@ from rich.progress import track
 from rich.table import Table
 from torch.nn.functional import normalize
 
-from motionloom.datasets.motion.features import encode
-from motionloom.models.metrics.diversity import diversity
-from motionloom.models.metrics.frechet import fid
+from motionloom.datasets.motion.canonical import mirror
+from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.models.metrics.distributions import diversity, fid
 from motionloom.models.metrics.retrieval import matching_score
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.dance_figures import (
-    Matched,
-    alignment_of,
-    distribution_of,
-    features_of,
-    recognition_of,
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.clip_metrics import (
+    BEAT_ALIGN,
+    RECOGNITION,
+    Performance,
+    agreement,
+    floor_and_jerk,
+    measure_clip,
 )
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
-from motionloom.pipeline.evaluation.faults import FAULTS, Joints, swapped
-from motionloom.pipeline.evaluation.figures import bodily, obeyed, retrieval_figures, shares
+from motionloom.pipeline.evaluation.estimate import row_estimates
+from motionloom.pipeline.evaluation.latent_metrics import LatentRow, recalls
+from motionloom.pipeline.evaluation.movement import all_features, distances
 from motionloom.pipeline.evaluation.reconstruction import published_errors
 from motionloom.pipeline.evaluation.truth import Truth, drawn, has_caption, spread_any, truth_of
-from motionloom.pipeline.store.latents import embed_motions
-from motionloom.pipeline.store.networks import LoadedTma
+from motionloom.pipeline.store.networks import LoadedTma, embed_motions
+
+Joints = NDArray[np.float64]
+Fault = Callable[[Joints, float, np.random.Generator], Joints]
+"""Of joints, frames a second and random numbers."""
+
+
+def noise(metres: float) -> Fault:
+    """Every joint of every frame elsewhere, by a normal deviate."""
+    return lambda joints, fps, rng: joints + rng.normal(0.0, metres, joints.shape)
+
+
+def frozen(joints: Joints, fps: float, rng: np.random.Generator) -> Joints:
+    """The first frame for the whole time."""
+    return np.repeat(joints[:1], len(joints), axis=0)
+
+
+def late(seconds: float) -> Fault:
+    """The motion begins later and ends where time is up; until then it stands in its first frame."""
+
+    def change(joints: Joints, fps: float, rng: np.random.Generator) -> Joints:
+        wait = min(len(joints) - 1, round(seconds * fps))
+        return np.concatenate([np.repeat(joints[:1], wait, axis=0), joints[: len(joints) - wait]])
+
+    return change
+
+
+def backwards(joints: Joints, fps: float, rng: np.random.Generator) -> Joints:
+    """From the last frame to the first."""
+    return joints[::-1].copy()
+
+
+def mirrored(joints: Joints, fps: float, rng: np.random.Generator) -> Joints:
+    """Left and right exchanged."""
+    name = {22: "smpl22", 52: "smplx52"}[joints.shape[1]]
+    return np.asarray(mirror(joints, Skeleton.named(name)))
+
+
+def gliding(metres_a_second: float) -> Fault:
+    """The whole figure glides forward over the floor beside what it does."""
+
+    def change(joints: Joints, fps: float, rng: np.random.Generator) -> Joints:
+        out = joints.copy()
+        out[..., 2] += (np.arange(len(joints)) * metres_a_second / fps)[:, None]
+        return out
+
+    return change
+
+
+def raised(metres: float) -> Fault:
+    """Above the floor, or below it where negative."""
+
+    def change(joints: Joints, fps: float, rng: np.random.Generator) -> Joints:
+        out = joints.copy()
+        out[..., 1] += metres
+        return out
+
+    return change
+
+
+FAULTS: Mapping[str, Fault] = {
+    "noise of 1 cm": noise(0.01),
+    "noise of 5 cm": noise(0.05),
+    "frozen": frozen,
+    "0.3 s late": late(0.3),
+    "backwards": backwards,
+    "mirrored": mirrored,
+    "gliding 0.6 m/s": gliding(0.6),
+    "5 cm above the floor": raised(0.05),
+    "3 cm in the floor": raised(-0.03),
+}
+"""By name, as tables have it."""
+
+
+def swapped(count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Whose motion each of `count` clips has: nobody its own, [n]."""
+    order = rng.permutation(count)
+    out = np.empty(count, dtype=np.int64)
+    out[order] = np.roll(order, 1)
+    return out
+
 
 HALVES = 10
 SWAPPED = "another clip's motion"
@@ -73,8 +155,9 @@ class Captioned:
         layout, fps = self.tma.layout, self.tma.layout.fps
         columns = layout.part("bodyhand")
         latent = embed_motions(self.tma, [encode(m, layout)[:, columns] for m in motions])
-        kept = [obeyed(t, m, None, fps) for t, m in zip(self.truths, motions, strict=True)]
-        bodies = [bodily(m, fps) for m in motions]
+        pairs = zip(self.truths, motions, strict=True)
+        made = [Performance(m, t.joints, fps, truth=t.truth) for t, m in pairs]
+        kept, bodies = [agreement(one) for one in made], [floor_and_jerk(one) for one in made]
         errors = [
             published_errors(torch.from_numpy(m), torch.from_numpy(t.joints))[""].means()
             for t, m in zip(self.truths, motions, strict=True)
@@ -82,19 +165,20 @@ class Captioned:
 
         def of(rows: NDArray[np.int64]) -> Figures:
             text, motion = self.text[rows], latent[rows]
-            found = retrieval_figures(text, motion, size=size, repeats=5, seed=0)
-            obeys = shares({k: v for k, v in kept[r].items() if k != "everything"} for r in rows)
+            draws = [recalls(LatentRow(text, text, motion, seed, size)) for seed in range(5)]
+            obeys = means([kept[r] for r in rows])
+            obeys.pop("agreement.everything", None)
             out = {
-                "R@1": found["t2m_r1"].mean,
+                "R@1": float(np.mean([found["t2m_r1"] for found in draws])),
                 "Matching score": float(matching_score(unit(text), unit(motion))),
                 "FID": float(fid(self.others, motion)),
                 "FID, length 1": float(fid(unit(self.others), unit(motion))),
                 "Diversity": float(diversity(motion, seed=0)),
             }
             out |= {"obeys its caption": float(np.mean(list(obeys.values())))} if obeys else {}
-            mean = shares(errors[r] for r in rows)
+            mean = means([errors[r] for r in rows])
             out |= {"MPJPE": mean["mpjpe"], "PA-MPJPE": mean["pa_mpjpe"], "ACCEL": mean["accel"]}
-            return out | shares(bodies[r] for r in rows)
+            return out | {k.partition(".")[2]: v for k, v in means([bodies[r] for r in rows]).items()}
 
         return of
 
@@ -109,18 +193,23 @@ class Dances:
     def figures(self, motions: Sequence[Joints]) -> Callable[[NDArray[np.int64]], Figures]:
         """Figures of any of the clips, by their numbers."""
         fps = self.clips[0].fps
-        true = features_of(self.pool, fps, 60.0)
-        found = features_of(motions, fps, 60.0)
+        true, found = all_features(self.pool, fps), all_features(motions, fps)
 
         def of(rows: NDArray[np.int64]) -> Figures:
-            matched = [Matched(motions[r], self.clips[r]) for r in rows]
-            beats = alignment_of(matched)
-            apart = distribution_of(true, {kind: values[rows] for kind, values in found.items()})
-            out = {f"Beat Align ({'UDE' if n == 'ude' else 'MINT'})": beats[n] for n in ("ude", "mint")}
-            out |= {"FID_k": apart["fid_k"], "FID_m": apart["fid_m"]}
-            return out | {k: v for k, v in recognition_of(matched).items() if k == "genre"}
+            clips = [(motions[r], self.clips[r]) for r in rows]
+            each = [Performance(m, c.joints, fps, truth=c.truth, beats=c.beats) for m, c in clips]
+            mean = means([measure_clip((BEAT_ALIGN, RECOGNITION), one) for one in each])
+            apart = distances(true, {kind: values[rows] for kind, values in found.items()})
+            out = {f"Beat Align ({n.upper()})": mean[f"beat_align.{n}"] for n in ("ude", "mint")}
+            out |= {f"FID_{kind}": apart[f"movement.fid_{kind}"] for kind in "km"}
+            return out | {k.partition(".")[2]: v for k, v in mean.items() if k == "recognition.genre"}
 
         return of
+
+
+def means(rows: Sequence[Mapping[str, float]]) -> Figures:
+    """Mean of each value over the clips that have it."""
+    return {name: found.value for name, found in row_estimates([rows]).items()}
 
 
 def unit(latents: torch.Tensor) -> torch.Tensor:
@@ -147,8 +236,8 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=400, help="captioned test clips, and dances, at most")
     parser.add_argument("--size", type=int, default=32, help="candidates of retrieval")
     args = parser.parse_args()
-    stages, shelf = finished_stages(args.run), Shelf()
-    tma, data = shelf.get(stages["tma"]), shelf.get(stages["data"])
+    stages, stage_cache = finished_stages(args.run), StageCache()
+    tma, data = stage_cache.get(stages["tma"]), stage_cache.get(stages["data"])
     test, train = data.held_out(prefer="test"), data.split("train")
     captioned = has_caption(train).nonzero()[0]
     truths = [truth_of(test, i) for i in sorted(drawn(test, args.clips))]

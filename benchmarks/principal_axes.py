@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.layers.basis import Basis
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.nearest import local_joints
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.answers import local_joints
 from motionloom.pipeline.evaluation.reconstruction import pose_errors
 from motionloom.pipeline.evaluation.truth import truth_of
 
@@ -43,9 +43,9 @@ def main() -> None:
     parser.add_argument("--components", type=int, nargs="*", default=[16, 32, 48, 64, 96])
     parser.add_argument("--clips", type=int, default=100, help="test clips")
     args = parser.parse_args()
-    stages, shelf = finished_stages(args.run), Shelf()
-    train, test = (shelf.get(stages["data"]).split(split) for split in ("train", "test"))
-    stats, layout = shelf.get(stages["stats"]), train.layout
+    stages, stage_cache = finished_stages(args.run), StageCache()
+    train, test = (stage_cache.get(stages["data"]).split(split) for split in ("train", "test"))
+    stats, layout = stage_cache.get(stages["stats"]), train.layout
     columns = train.layout.part("bodyhand")
     mean, std = stats.mean[columns], stats.std[columns]
     chosen = np.random.default_rng(0).permutation(len(train))[:1000]

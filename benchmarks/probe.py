@@ -22,9 +22,9 @@ from rich.table import Table
 from sklearn.linear_model import LogisticRegression
 
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.truth import Truth, has_caption, truth_of
-from motionloom.pipeline.store.latents import embed_motions
+from motionloom.pipeline.store.networks import embed_motions
 
 ATTRIBUTES = ("action", "direction", "side", "count", "speed", "left_hand", "right_hand")
 
@@ -67,14 +67,14 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--train", type=int, default=3000, help="training captions the reader learns from")
     args = parser.parse_args()
-    stages, shelf = finished_stages(args.run), Shelf()
+    stages, stage_cache = finished_stages(args.run), StageCache()
     hold_out = [c for stage in stages.values() for c in getattr(stage.config, "hold_out", [])]
-    split = shelf.get(stages["data"]).split("train")
+    split = stage_cache.get(stages["data"]).split("train")
     captioned = has_caption(split).nonzero()[0]
     chosen = np.random.default_rng(1).permutation(captioned)[: args.train]
     asked = [t for t in test_truths(args.run) if t.caption and t.truth and t.truth["action"] != "dance"]
     truths = [truth_of(split, int(i)) for i in chosen], asked
-    tma, cache = shelf.get(stages["tma"]), shelf.get(stages["text"]).cache
+    tma, cache = stage_cache.get(stages["tma"]), stage_cache.get(stages["text"]).cache
     readers: dict[str, list[NDArray[np.float32]]] = {
         "TMA, captions": [], "TMA, motions": [], "sentence encoder": []
     }  # fmt: skip

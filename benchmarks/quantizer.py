@@ -16,7 +16,8 @@ from collections.abc import Callable
 import torch
 from vector_quantize_pytorch import VectorQuantize
 
-from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, cluster_sums, nearest
+from motionloom.models.quantize.base import nearest
+from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, cluster_sums
 
 
 def interleaved_medians(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:

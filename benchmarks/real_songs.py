@@ -23,7 +23,8 @@ from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.models.metrics.dance_beats import beat_align
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.dances import dances_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.script import read_music
@@ -65,7 +66,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     bundle = Bundle.from_run(args.run)
-    dataset = Shelf().get(finished_stages(args.run)["data"]).held_out(prefer="test")
+    dataset = StageCache().get(finished_stages(args.run)["data"]).held_out(prefer="test")
     fps = bundle.generator.layout.fps
     real = [
         (path.name, piece) for path in args.songs for piece in stretches(read_music(path), args.stretches)
@@ -79,7 +80,7 @@ def main() -> None:
             sounds=[sound for _, sound in sounds],
             seconds=[sound.seconds for _, sound in sounds],
             seed=args.seed,
-            sampling={"temperature": 0.8, "top_p": 0.9},
+            sampling=SamplingConfig(temperature=0.8, top_p=0.9),
         )
         heard = [(name, np.asarray(beats(sound.samples, sound.rate))) for name, sound in sounds]
         found = scores([motion.joints for motion in motions], heard, fps)

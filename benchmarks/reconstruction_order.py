@@ -27,8 +27,8 @@ from rich.table import Table
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.reconstruction import reconstruction_figures
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.reconstruction import reconstruction_errors
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.api import run_recipe
 
@@ -86,11 +86,11 @@ def measure(run: Path, clips: int) -> dict[str, float]:
     kept = run / "figures.json"
     if kept.is_file():
         return dict(json.loads(kept.read_text()))
-    stages, shelf = finished_stages(run), Shelf()
-    tokenizer, data = shelf.get(stages["tokenizer"]), shelf.get(stages["data"])
+    stages, stage_cache = finished_stages(run), StageCache()
+    tokenizer, data = stage_cache.get(stages["tokenizer"]), stage_cache.get(stages["data"])
     test = data.split("test")
     truths = [truth_of(test, i) for i in range(min(clips, len(test)))]
-    figures = reconstruction_figures(tokenizer, data.split("train"), truths)
+    figures = reconstruction_errors(tokenizer, data.split("train"), truths)
     figures["bits"] = tokenizer.net.bits_per_second
     kept.write_text(json.dumps(figures))
     return figures

@@ -3,7 +3,7 @@
     python benchmarks/reliability.py WORK [--parts kills,preemption,...] [--kills 20] [--cells '*-1-0']
 
 Every part leaves what it has seen as JSON in WORK; started again, the command does what is missing, then
-prints all of it as the tables of docs/reliability.md. A SLURM of two nodes needs root and slurm-wlm; without
+prints all of it as tables. A SLURM of two nodes needs root and slurm-wlm; without
 them that part says so and is left out. The trainings are those of
 `benchmarks/reliability/*.yaml`: 60 steps each, a checkpoint every third.
 """
@@ -34,11 +34,11 @@ from slurm_cluster import Cluster, why_not  # noqa: E402
 
 from motionloom.datasets.schema import UserError  # noqa: E402
 from motionloom.datasets.shards.checksums import LocalShard  # noqa: E402
+from motionloom.datasets.shards.options import Reading  # noqa: E402
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest  # noqa: E402
-from motionloom.datasets.shards.reading import Reading  # noqa: E402
 from motionloom.pipeline.launch.team import Team  # noqa: E402
-from motionloom.pipeline.runs.sound import compare_shards  # noqa: E402
-from motionloom.pipeline.store.checkpoints import DamagedError, read_checkpoint  # noqa: E402
+from motionloom.pipeline.runs.verify_shards import compare_shards  # noqa: E402
+from motionloom.pipeline.training.checkpointing import DamagedError, read_checkpoint  # noqa: E402
 
 RECIPES = ROOT / "benchmarks/reliability"
 FAMILIES = {
@@ -165,8 +165,8 @@ def preemption_table(work: Path) -> list[str]:
     equal = "equal" if not seen["unequal"] else f"differ: {seen['unequal']}"
     rows += [
         "",
-        f"{seen['steps']} steps, {seen['repeated']} trained twice, {seen['wrong']} with another sample or "
-        f"loss; files {equal}.",
+        f"{seen['steps']} steps, {seen['repeated']} trained twice, {seen['wrong_samples']} with another "
+        f"sample, {seen['wrong_losses']} with another loss; files {equal}.",
     ]
     return rows
 

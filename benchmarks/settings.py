@@ -27,19 +27,19 @@ from learning import Shares, judge, test_truths
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.motion.joints import joints_of
-from motionloom.models.metrics.frechet import fid
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.models.metrics.distributions import fid
 from motionloom.models.metrics.retrieval import matching_score, r_precision
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.judges import Judge
-from motionloom.pipeline.evaluation.reconstruction import reconstruction_figures
+from motionloom.pipeline.evaluation.reconstruction import reconstruction_errors
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.shipped import find_recipe
-from motionloom.pipeline.store.latents import embed_motions
+from motionloom.pipeline.runs.resolve import find_recipe
+from motionloom.pipeline.store.networks import embed_motions
 
 FORMS: dict[str, dict[str, Any]] = {
     "tokens alone": {"align_weight": 0.0},
@@ -157,14 +157,14 @@ def measure(folder: Path, base: Path, truths: list[Truth], sampling: SamplingCon
     kept = folder / "figures.json"
     if kept.is_file():
         return dict(json.loads(kept.read_text()))
-    stages, shelf = finished_stages(folder), Shelf()
-    found = Shelf().get(finished_stages(base)["evaluator"])
+    stages, stage_cache = finished_stages(folder), StageCache()
+    found = StageCache().get(finished_stages(base)["evaluator"])
     text, real = (
         Judge.evaluator(found).texts(truths),
         embed_motions(found, [t.features for t in truths], [t.present for t in truths]),
     )
     hold_out = [dict(c) for c in finished_stages(base)["data"].config.hold_out]
-    tokenizer, data = shelf.get(stages["tokenizer"]), shelf.get(stages["data"])
+    tokenizer, data = stage_cache.get(stages["tokenizer"]), stage_cache.get(stages["data"])
     layout, fps = tokenizer.layout, tokenizer.layout.fps
 
     def judged(motions: list[Any], shares: Shares) -> dict[str, float]:
@@ -191,11 +191,11 @@ def measure(folder: Path, base: Path, truths: list[Truth], sampling: SamplingCon
     }
     captions = [truth.caption for truth in truths]
     for form in FORMS:
-        made = Bundle([stages[slug(form)]], shelf).generate(captions, sampling=sampling)
+        made = Bundle([stages[slug(form)]], stage_cache).generate(captions, sampling=sampling)
         rows[form] = judged(
             [m.features for m in made], judge(truths, ((m.joints, None) for m in made), fps, hold_out)
         )
-    errors = reconstruction_figures(tokenizer, data.split("train"), truths[:100])
+    errors = reconstruction_errors(tokenizer, data.split("train"), truths[:100])
     figures = {"rows": rows, "reconstruction": {k: errors[k] for k in ("mpjpe", "mpjpe_body", "mpjpe_hand")}}
     kept.write_text(json.dumps(figures, indent=1))
     return figures

@@ -22,8 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.motion.smpl import BodyModel, SkeletonName, smpl_joints
 
 SHAPES = 10
 CASES: tuple[tuple[str, SkeletonName, int, int], ...] = (

@@ -37,14 +37,14 @@ NEW_RECIPE = "humantomato-tiny"
 BVH_TO_NPZ = """
 from pathlib import Path
 import sys, numpy
-from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.motion.bvh.motion import read_bvh
 numpy.savez(sys.argv[2], joints=read_bvh(Path(sys.argv[1])).positions())
 """
 
 TO_BVH = """
 from pathlib import Path
 import sys, numpy
-from motionloom.datasets.motion.bvh import write_bvh
+from motionloom.datasets.motion.bvh.motion import write_bvh
 from motionloom.datasets.motion.skeleton import Skeleton
 body = Skeleton.named("smpl22")
 turns = numpy.tile(numpy.eye(3), (60, len(body), 1, 1))

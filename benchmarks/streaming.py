@@ -25,7 +25,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.model import MotionModel
 
 CAPTIONS = ("a person walks forward", "a person waves with the left hand", "a person squats")
 CAPTION_SECONDS = 10.0

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from motionloom.datasets.motion.joints import joints_of, local_joints_of
+from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
 from motionloom.datasets.synth.measure import agrees
 from motionloom.models.diffusion.dmd_sampling import decode_motions
 from motionloom.models.gpt.drawing import sample_seeds
@@ -34,19 +34,14 @@ from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.pipeline.contract.generation import Prompt, Stretch
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.dance_figures import (
-    Matched,
-    alignment_of,
-    feet_of,
-    others,
-    recognition_of,
-)
-from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.clip_metrics import BEAT_ALIGN, DANCE_METRICS, Performance, measure_clip
+from motionloom.pipeline.evaluation.dances import DanceClip, dances_of, other_songs
+from motionloom.pipeline.evaluation.estimate import row_estimates
 from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
-from motionloom.pipeline.inference.conditions import PromptEncoder
-from motionloom.pipeline.inference.timeline import TokenTimeline
-from motionloom.pipeline.stages.ude import UdeConfig
+from motionloom.pipeline.inference.generators.timeline import TokenTimeline
+from motionloom.pipeline.inference.generators.ude import UdeConfig
+from motionloom.pipeline.inference.requests import PromptEncoder
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 Motion = NDArray[np.float32]
@@ -63,14 +58,14 @@ class Engine:
 
     @staticmethod
     def of(run: Path, utts: Sequence[str]) -> Engine:
-        stages, shelf = finished_stages(run), Shelf()
+        stages, stage_cache = finished_stages(run), StageCache()
         if "tokenizer" not in stages:
             raise SystemExit(f"{run}: stage 'tokenizer' has not finished; run it first")
         ude = stages["ude"].config if "ude" in stages else UdeConfig()
         return Engine(
-            shelf.get(stages["tokenizer"]),
-            {name: shelf.get(stages[name]) for name in utts if name in stages},
-            shelf.get(stages["dmd"]) if "dmd" in stages else None,
+            stage_cache.get(stages["tokenizer"]),
+            {name: stage_cache.get(stages[name]) for name in utts if name in stages},
+            stage_cache.get(stages["dmd"]) if "dmd" in stages else None,
             ude,
         )
 
@@ -93,7 +88,7 @@ class Engine:
             utt.net,
             window=utt.max_frames // GROUP_FRAMES,
             context=self.ude.context_frames // GROUP_FRAMES,
-            audio=utt.given.get("audio"),
+            prepared={name: utt.given.get(name) for name in utt.modalities},
             inject_z=inject_z,
         )
         return line.tokens([Stretch(conditions, frames)], sample_seeds(seed, len(prompts)), sampling)
@@ -151,15 +146,23 @@ def dance_figures(
     clips: Sequence[DanceClip], motions: Sequence[NDArray[Any]], apart: Sequence[Sequence[int]]
 ) -> dict[str, float]:
     """Of one motion a clip."""
-    own = [Matched(m, c) for m, c in zip(motions, clips, strict=True)]
-    crossed = [Matched(m, clips[k]) for m, row in zip(motions, apart, strict=True) for k in row]
-    right, wrong = alignment_of(own), alignment_of(crossed)
+    own = _means([measure_clip(DANCE_METRICS, _held(m, c)) for m, c in zip(motions, clips, strict=True)])
+    crossed = [(m, clips[k]) for m, row in zip(motions, apart, strict=True) for k in row]
+    wrong = _means([measure_clip((BEAT_ALIGN,), _held(m, c)) for m, c in crossed])
+    names = ("bailando", "mint")
     return {
-        **{f"beats_{name}": right[name] for name in ("bailando", "mint")},
-        **{f"other_music_{name}": wrong[name] for name in ("bailando", "mint")},
-        **recognition_of(own),
-        **feet_of(motions, clips[0].fps),
+        **{f"beats_{name}": own[f"beat_align.{name}"] for name in names},
+        **{f"other_music_{name}": wrong[f"beat_align.{name}"] for name in names},
+        **{k.partition(".")[2]: v for k, v in own.items() if k.startswith(("recognition.", "feet."))},
     }
+
+
+def _held(joints: NDArray[Any], clip: DanceClip) -> Performance:
+    return Performance(joints, clip.joints, clip.fps, truth=clip.truth, beats=clip.beats)
+
+
+def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {name: found.value for name, found in row_estimates([rows]).items()}
 
 
 def caption_figures(
@@ -220,21 +223,21 @@ def main() -> None:
     console, engine = Console(width=220), Engine.of(args.run, args.utt)
     if args.no_dmd:
         engine.dmd = None
-    stages, shelf = finished_stages(args.run), Shelf()
-    dataset = shelf.get(stages["data"]).split(args.split)
+    stages, stage_cache = finished_stages(args.run), StageCache()
+    dataset = stage_cache.get(stages["data"]).split(args.split)
     layout, fps = dataset.layout, dataset.layout.fps
     sampling = SamplingConfig(
         temperature=args.temperature,
         top_p=args.top_p,
         cfg_scale=args.cfg_scale,
-        music_cfg_scale=args.music_cfg_scale,
+        guidance={} if args.music_cfg_scale is None else {"audio": args.music_cfg_scale},
     )
     out: dict[str, Any] = {"arguments": {k: str(v) for k, v in vars(args).items()}}
     if not args.no_dances:
         clips = dances_of(dataset, args.clips, unit=GROUP_FRAMES)
-        apart = others(clips, 5, args.seed)
+        apart = other_songs(clips, 5, args.seed)
         recorded = [np.asarray(dataset.motion(c.index))[: len(c.joints)] for c in clips]
-        prompts = [Prompt(sound=c.sound, music=c.music) for c in clips]
+        prompts = [Prompt(sound=c.sound, conditions={"audio": c.music}) for c in clips]
         out["dances"] = {}
         for name, *both in engine.stations(recorded, prompts, sampling, args.seed):
             one, other = ([joints_of(m, layout) for m in motions] for motions in both)

@@ -3,7 +3,7 @@
 python benchmarks/viewer.py --figures 1 4 8 --seconds 6
 
 Each line is a page of so many moving figures in a window of one size, in the WebGL2 view (its pixels made by
-SwiftShader, on the processor) or the flat one.
+SwiftShader, on the processor) or as sticks.
 
 * Frames a second, of the page as it plays, depend on what else the machine does.
 * Processor time a picture of all figures, over all of the browser's processes, hardly does: it is that of
@@ -23,7 +23,7 @@ from typing import Any
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.synth.generate import SynthConfig, make_clip
-from motionloom.pipeline.render.face import synthetic_face_controls
+from motionloom.pipeline.render.body.face import synthetic_face_controls
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
 FLAGS = ["--no-sandbox", "--disable-gpu", "--use-angle=swiftshader-webgl", "--enable-unsafe-swiftshader"]
@@ -48,7 +48,7 @@ PAINT = """([count, quality]) => {
         __viewer.setFrame(k);
         if (stage) stage.quality = quality;
         __viewer.paint();
-        // What is only painted over is never made of a flat picture; what WebGL is told, it does.
+        // What is only painted over is never made of a plain picture; what WebGL is told, it does.
         if (stage && k < count - 1) continue;
         for (const canvas of canvases) canvas.getContext("2d").getImageData(0, 0, 1, 1);
     }

@@ -38,11 +38,12 @@ from rich.table import Table
 from torch import Tensor
 
 from motionloom.models.metrics.retrieval import ranks
-from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.figures import Interval
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.estimate import estimate
+from motionloom.pipeline.evaluation.figures import Estimate
 from motionloom.pipeline.evaluation.retrieval import alignment_stage
 from motionloom.pipeline.evaluation.truth import truth_of
-from motionloom.pipeline.store.latents import embed_motions
+from motionloom.pipeline.store.networks import embed_motions
 
 TABLES = Path(__file__).with_name("wordings.json")
 CAPTIONS = 4
@@ -142,10 +143,10 @@ def figures(
 def measure(
     run: Path, stage: str | None, labels: dict[str, Label], wordings: Mapping[str, Wordings],
     *, size: int, seeds: int, split: str,
-) -> dict[str, dict[str, Interval]]:  # fmt: skip
+) -> dict[str, dict[str, Estimate]]:  # fmt: skip
     """Wording -> figure -> mean and interval over the seeds, of one TMA."""
-    found, shelf = alignment_stage(run, stage), Shelf()
-    tma, given = shelf.get(found), shelf.given(found.inputs)
+    found, stage_cache = alignment_stage(run, stage), StageCache()
+    tma, given = stage_cache.get(found), stage_cache.given(found.inputs)
     dataset = given["data"].split(split)
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
     motion = embed_motions(tma, [t.features for t in truths], [t.present for t in truths])
@@ -163,24 +164,24 @@ def measure(
                 [tma.embed_text(torch.from_numpy(e.tokens), torch.from_numpy(e.mask)).cpu() for e in encoded]
             )
             rows.append(figures(text, motion, mine, unseen, size, seed))
-        out[name] = {key: Interval.of([row[key] for row in rows]) for key in rows[0]}
+        out[name] = {key: estimate([row[key] for row in rows]) for key in rows[0]}
     return out
 
 
-def report(found: Mapping[str, Mapping[str, Interval]], size: int) -> Table:
+def report(found: Mapping[str, Mapping[str, Estimate]], size: int) -> Table:
     """One row a wording."""
     first = next(iter(found.values()))
     shown = [name for name in SHOWN if name in first]
     table = Table("wordings", *shown, title=f"among {size}", title_justify="left")
     guesses = {name: int(name[-1]) / size for name in shown if "R@" in name}
-    guesses |= {name: first[f"guess {name}"].mean for name in ("content", "style", "both")}
-    best = dict.fromkeys(("t2m R@1", "m2t R@1"), first["labels known R@1"].mean)
+    guesses |= {name: first[f"guess {name}"].value for name in ("content", "style", "both")}
+    best = dict.fromkeys(("t2m R@1", "m2t R@1"), first["labels known R@1"].value)
     if "unseen labels known R@1" in first:
-        best["unseen t2m R@1"] = first["unseen labels known R@1"].mean
+        best["unseen t2m R@1"] = first["unseen labels known R@1"].value
     for title, values in (("a guess", guesses), ("labels known", best)):
         table.add_row(title, *(f"{values[name]:.3f}" if name in values else "" for name in shown))
     for name, row in found.items():
-        table.add_row(name, *(f"{row[key].mean:.3f} ± {row[key].half_width:.3f}" for key in shown))
+        table.add_row(name, *(f"{row[key].value:.3f} ± {row[key].interval or 0.0:.3f}" for key in shown))
     return table
 
 

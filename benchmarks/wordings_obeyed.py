@@ -36,11 +36,12 @@ from wordings import TABLES, Label, Wordings, caption, joined, read_labels
 
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished, Shelf
-from motionloom.pipeline.evaluation.figures import Interval
+from motionloom.pipeline.contract.stage import Finished, StageCache
+from motionloom.pipeline.evaluation.estimate import estimate
+from motionloom.pipeline.evaluation.figures import Estimate
 from motionloom.pipeline.evaluation.truth import Truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.store.latents import embed_motions
+from motionloom.pipeline.store.networks import embed_motions
 
 Joints = NDArray[np.float64]
 
@@ -79,8 +80,8 @@ class MotionLabels:
         found = np.array([self._clips.labels[i] for i in near])
         right = found == np.array(self._clips.labels)
         return {
-            "content": float(right[:, 0].mean()),
-            "style": float(right[:, 1].mean()),
+            "content": float(right[:, 0].value()),
+            "style": float(right[:, 1].value()),
             "both": float(right.all(1).mean()),
         }
 
@@ -89,17 +90,17 @@ def shares(clips: Clips, joints: Sequence[Joints]) -> dict[str, float]:
     """Shares of motions that do what was said, all and of new pairs of labels."""
     good = clips.obeyed(joints)
     out = {"obeys": float(good.mean())}
-    return out | ({"unseen: obeys": float(good[clips.unseen].mean())} if clips.unseen.any() else {})
+    return out | ({"unseen: obeys": float(good[clips.unseen].value())} if clips.unseen.any() else {})
 
 
 def measure(
     bundle: Bundle, clips: Clips, wordings: Mapping[str, Wordings], judge: MotionLabels | None,
     *, seeds: int, sampling: SamplingConfig,
-) -> dict[str, dict[str, Interval]]:  # fmt: skip
+) -> dict[str, dict[str, Estimate]]:  # fmt: skip
     """Row -> share -> mean and interval over the seeds."""
-    real, out = clips.truths, dict[str, dict[str, Interval]]()
+    real, out = clips.truths, dict[str, dict[str, Estimate]]()
     known = shares(clips, [t.joints for t in real])
-    out["recorded"] = {name: Interval(value, 0.0) for name, value in known.items()}
+    out["recorded"] = {name: Estimate(value) for name, value in known.items()}
     guesses = []
     for seed in range(seeds):
         other = np.random.default_rng(seed).permutation(len(real))
@@ -119,8 +120,8 @@ def measure(
     return out
 
 
-def over(rows: Sequence[Mapping[str, float]]) -> dict[str, Interval]:
-    return {name: Interval.of([row[name] for row in rows]) for name in rows[0]}
+def over(rows: Sequence[Mapping[str, float]]) -> dict[str, Estimate]:
+    return {name: estimate([row[name] for row in rows]) for name in rows[0]}
 
 
 def generators(run: Path, names: Sequence[str] | None) -> list[Finished | None]:
@@ -134,7 +135,7 @@ def generators(run: Path, names: Sequence[str] | None) -> list[Finished | None]:
     return [known[name] for name in names]
 
 
-def report(found: Mapping[str, Mapping[str, Interval]], title: str) -> Table:
+def report(found: Mapping[str, Mapping[str, Estimate]], title: str) -> Table:
     """One row a wording."""
     columns = list(dict.fromkeys(name for row in found.values() for name in row))
     table = Table("wordings", *columns, title=title, title_justify="left")
@@ -143,9 +144,9 @@ def report(found: Mapping[str, Mapping[str, Interval]], title: str) -> Table:
     return table
 
 
-def said(value: Interval) -> str:
+def said(value: Estimate) -> str:
     """With an interval where something was drawn more than once."""
-    return f"{value.mean:.3f} ± {value.half_width:.3f}" if value.half_width else f"{value.mean:.3f}"
+    return f"{value.value:.3f} ± {value.interval:.3f}" if value.interval else f"{value.value:.3f}"
 
 
 def main() -> None:
@@ -170,13 +171,13 @@ def main() -> None:
         if name not in tables:
             parser.error(f"{args.tables}: no table '{name}'; it has {', '.join(tables)}")
     wordings = {"known": joined(tables, args.known), **{name: tables[name] for name in args.new}}
-    stages, shelf = finished_stages(args.data or args.run), Shelf()
-    clips = Clips(shelf.get(stages["data"]), read_labels(args.labels), args.split)
-    judge = MotionLabels(shelf.get(stages[args.judge]), clips) if args.judge else None
+    stages, stage_cache = finished_stages(args.data or args.run), StageCache()
+    clips = Clips(stage_cache.get(stages["data"]), read_labels(args.labels), args.split)
+    judge = MotionLabels(stage_cache.get(stages[args.judge]), clips) if args.judge else None
     sampling = SamplingConfig(top_p=args.top_p, cfg_scale=args.cfg_scale)
     console, results = Console(width=160), {}
     for stage in generators(args.run, args.stage):
-        bundle = Bundle.open(args.run) if stage is None else Bundle([stage], shelf)
+        bundle = Bundle.open(args.run) if stage is None else Bundle([stage], stage_cache)
         name = args.run.name if stage is None else stage.name
         found = measure(bundle, clips, wordings, judge, seeds=args.seeds, sampling=sampling)
         title = f"{name}: {len(clips.truths)} {args.split} clips, {int(clips.unseen.sum())} of unseen pairs"

@@ -1,8 +1,7 @@
 """What a motion is conditioned on: one `Condition` a modality, in one mapping from shards to networks.
 
 A row of a batch that lacks a modality has no true position in that modality's mask, so clips with text, with
-music, with both and with neither lie in one batch. `MODALITIES` is the table of what there is: a third
-modality is one line here and one encoder (`models/condition/`).
+music, with both and with neither share one batch. `datasets/modalities/` says what there is.
 
 Legend: B batch, L positions, E features.
 """
@@ -10,7 +9,6 @@ Legend: B batch, L positions, E features.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from torch import Tensor
@@ -34,23 +32,3 @@ class Condition(NamedTuple):
 
 Conditions = Mapping[str, Condition]
 """Modality -> its part of the batch. All share B."""
-
-
-@dataclass(frozen=True)
-class Modality:
-    """One line of the table of modalities."""
-
-    name: str
-    member: str
-    """The shard member whose presence says that a clip has it."""
-    timed: bool
-    """Whether its positions lie on the motion's time line, frame for frame."""
-
-
-MODALITIES: dict[str, Modality] = {
-    modality.name: modality
-    for modality in (
-        Modality("text", "texts.json", timed=False),
-        Modality("audio", "audio.npy", timed=True),
-    )
-}

@@ -12,7 +12,13 @@ import json
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
 
 SCHEMA_VERSION = 2
 
@@ -21,6 +27,12 @@ HANDS, FACE = 1, 2
 PRESENT_ALL = HANDS | FACE
 
 Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
+MotionType = Literal["float32", "float16"]
+"""How shards store motion."""
+
+MANIFEST_FILE, INDEX_FILE = "manifest.json", "index.npz"
+"""In the folder of a data set, beside its shards."""
 
 
 class UserError(Exception):
@@ -127,6 +139,13 @@ class ClipMeta(Config):
     mirror_of: str | None = None
     truth: dict[str, Any] | None = None
     """What a synthetic clip really does (action, direction, side, count, hand, face)."""
+    song: str | None = None
+    """The piece of music of a recorded dance, by the source's name; several clips may have one."""
+
+    @model_serializer(mode="wrap")
+    def _without_no_song(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Clips without music are written as they always were."""
+        return {name: value for name, value in handler(self).items() if name != "song" or value is not None}
 
     @property
     def present(self) -> int:

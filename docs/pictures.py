@@ -14,20 +14,20 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+from contact_sheet import contact_sheet
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.rigid import RigidMotion
+from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.synth.generate import SynthConfig, make_clip
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import shown
-from motionloom.pipeline.render.face import synthetic_face_controls
-from motionloom.pipeline.render.picture import contact_sheet
+from motionloom.pipeline.render.body.face import synthetic_face_controls
 
 CAPTIONS = (
     "a person waves with the left hand",
@@ -44,7 +44,7 @@ SYNTHETIC_CLIPS = (44, 11, 10, 12)
 class Row:
     """One row of a picture: joints [T, N, 3] in metres, what to call them, and their caption."""
 
-    joints: NDArray[Any]
+    joints: NDArray[np.floating]
     label: str
     caption: str
     fps: float
@@ -52,7 +52,7 @@ class Row:
     """Frames to show; None = spread evenly."""
     figure: RigidMotion | None = None
     """The rigid figure whose joints these are."""
-    face: NDArray[Any] | None = None
+    face: NDArray[np.floating] | None = None
     """The face's controls [T, 5]."""
 
     @staticmethod
@@ -72,17 +72,17 @@ def generated_rows(run: Path, captions: tuple[str, ...], seed: int) -> list[Row]
 def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[Row]:
     """Dances that a trained run makes to songs of its test split, of different kinds first, on the beats."""
     stages, bundle = finished_stages(run), Bundle.open(run)
-    dataset = Shelf().get(stages["data"]).split("test")
+    dataset = StageCache().get(stages["data"]).split("test")
     unit = bundle.generator.unit_frames
     fps, found = dataset.layout.fps, dances_of(dataset, 1000, unit=unit)
-    kinds: dict[Any, DanceClip] = {}
+    kinds: dict[object, DanceClip] = {}
     for clip in found:
         if len(clip.beats) >= frames:
             kinds.setdefault((clip.truth or {}).get("genre"), clip)
     clips = list(kinds.values())[:count]
     motions = bundle.generate(
         sounds=[c.sound for c in clips],
-        music=[c.music for c in clips],
+        conditions={"audio": [c.music for c in clips]},
         seconds=[c.seconds for c in clips],
         seed=seed,
     )

@@ -1,6 +1,6 @@
 """Command line, recipes, the stage graph, training, generation and pages.
 
-The names below are the Python API (`docs/python.md`). Each is imported when it is first asked for: `import
+The names below are the Python API (`docs/generating.md`). Each is imported on first use: `import
 motionloom.pipeline` alone brings in no torch.
 """
 
@@ -12,21 +12,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
     from motionloom.datasets.schema import UserError
-    from motionloom.pipeline.compare.command import compare_runs
     from motionloom.pipeline.contract.generation import Prompt
-    from motionloom.pipeline.contract.registry import register
-    from motionloom.pipeline.contract.sampling import SamplingConfig
-    from motionloom.pipeline.contract.stage import StageKind
-    from motionloom.pipeline.contract.streaming import StreamConfig
+    from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+    from motionloom.pipeline.contract.stage import StageKind, register
+    from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.motion import GeneratedMotion
     from motionloom.pipeline.inference.outputs import write_motions
-    from motionloom.pipeline.inference.pretrained import MotionModel
-    from motionloom.pipeline.inference.streaming import MotionChunk, MotionStream, joined
-    from motionloom.pipeline.published.compare import compare_with_paper
+    from motionloom.pipeline.inference.stream import MotionChunk, MotionStream, joined
+    from motionloom.pipeline.results.compare.command import compare_runs
+    from motionloom.pipeline.results.paper.compare import compare_with_paper
     from motionloom.pipeline.runs.api import evaluate_run, export_run, report_run, run_recipe
     from motionloom.pipeline.runs.recipe import Recipe, load_recipe
-    from motionloom.pipeline.runs.sweep import run_sweep
-    from motionloom.pipeline.stages.trained import TrainedStage
+    from motionloom.pipeline.training.trained_stage import TrainedStage
 
 __all__ = [
     "GeneratedMotion",
@@ -50,33 +47,31 @@ __all__ = [
     "register",
     "report_run",
     "run_recipe",
-    "run_sweep",
     "write_motions",
 ]
 
 _HOMES = {
     "GeneratedMotion": "pipeline.inference.motion",
-    "MotionChunk": "pipeline.inference.streaming",
-    "MotionModel": "pipeline.inference.pretrained",
-    "MotionStream": "pipeline.inference.streaming",
+    "MotionChunk": "pipeline.inference.stream",
+    "MotionModel": "pipeline.inference.model",
+    "MotionStream": "pipeline.inference.stream",
     "Prompt": "pipeline.contract.generation",
     "Recipe": "pipeline.runs.recipe",
     "SamplingConfig": "pipeline.contract.sampling",
     "Sound": "datasets.audio.sound",
     "StageKind": "pipeline.contract.stage",
-    "StreamConfig": "pipeline.contract.streaming",
-    "TrainedStage": "pipeline.stages.trained",
+    "StreamConfig": "pipeline.contract.sampling",
+    "TrainedStage": "pipeline.training.trained_stage",
     "UserError": "datasets.schema",
-    "compare_runs": "pipeline.compare.command",
-    "compare_with_paper": "pipeline.published.compare",
+    "compare_runs": "pipeline.results.compare.command",
+    "compare_with_paper": "pipeline.results.paper.compare",
     "evaluate_run": "pipeline.runs.api",
     "export_run": "pipeline.runs.api",
-    "joined": "pipeline.inference.streaming",
+    "joined": "pipeline.inference.stream",
     "load_recipe": "pipeline.runs.recipe",
-    "register": "pipeline.contract.registry",
+    "register": "pipeline.contract.stage",
     "report_run": "pipeline.runs.api",
     "run_recipe": "pipeline.runs.api",
-    "run_sweep": "pipeline.runs.sweep",
     "write_motions": "pipeline.inference.outputs",
 }
 

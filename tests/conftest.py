@@ -18,7 +18,7 @@ os.environ["NUMBA_CACHE_DIR"] = str(
 )
 
 # As many test processes as cores leave no core for a second thread: threads that wait for one that does not
-# run take several times as long as one thread alone. `make test-numeric` also runs with two. It works because
+# run take several times as long as one thread alone. It works because
 # torch is not imported yet.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -26,18 +26,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 # The tests import the helper modules by their bare names, and so do spawned workers, which inherit the path.
 sys.path.append(str(Path(__file__).parent / "helpers"))
-
-
-_NUMERIC = ("models", "datasets/motion")
-"""Folders whose tests compare numbers that torch computes."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks what `make test-numeric` runs once more with other instructions and numbers of threads."""
-    folders = [Path(__file__).parent / name for name in _NUMERIC]
-    for item in items:
-        if any(folder in item.path.parents for folder in folders) and not item.get_closest_marker("slow"):
-            item.add_marker("numeric")
 
 
 @pytest.fixture(scope="session")

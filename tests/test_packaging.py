@@ -12,7 +12,7 @@ import tomllib
 import zipfile
 from configparser import ConfigParser
 from email import message_from_bytes
-from importlib.metadata import packages_distributions
+from importlib.metadata import packages_distributions, requires
 from pathlib import Path
 
 import pytest
@@ -24,6 +24,9 @@ PROJECT = CONFIG["project"]
 
 # Imported by Lightning's loggers, which are what we import.
 THROUGH_LIGHTNING = {"tensorboard", "wandb", "mlflow"}
+
+BROUGHT = {"tokenizers": "transformers", "soxr": "librosa"}
+"""Imported by us too, and required by a package that we require."""
 
 
 def canonical(name: str) -> str:
@@ -90,7 +93,7 @@ def uses() -> dict[tuple[str, bool], set[str]]:
 
 def test_every_import_is_declared() -> None:
     for (owner, inside), files in uses().items():
-        allowed = REQUIRED | OPTIONAL if inside else REQUIRED
+        allowed = (REQUIRED | OPTIONAL if inside else REQUIRED) | BROUGHT.keys()
         where = "in a function" if inside else "at the top of the file"
         assert owner in allowed, f"{owner} is imported {where} by {sorted(files)}, but not declared for that"
 
@@ -112,6 +115,12 @@ def test_everything_declared_is_imported() -> None:
         f"never imported: {REQUIRED - THROUGH_LIGHTNING - imported}"
     )
     assert imported >= OPTIONAL - THROUGH_LIGHTNING, f"never imported: {OPTIONAL - imported}"
+
+
+def test_what_others_bring_they_require() -> None:
+    for name, other in BROUGHT.items():
+        needed = [one for one in requires(other) or () if "extra ==" not in one]
+        assert other in REQUIRED and name in declared(needed)
 
 
 def test_nothing_is_both_required_and_optional() -> None:
@@ -181,7 +190,7 @@ def test_the_wheel_has_every_file_of_the_packages(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         inside = {name for name in archive.namelist() if ".dist-info/" not in name}
     assert inside == {f"motionloom/{name}" for name in files_of(*FOLDERS)}
-    kinds = {".py", ".yaml", ".json", ".css", ".js", ".html", ".typed"}
+    kinds = {".py", ".yaml", ".json", ".css", ".js", ".html", ".npz", ".typed"}
     if any((ROOT / "models" / "pretrained").glob("*/bundle.json")):
         kinds |= {".safetensors", ".md"}  # a trained model and its card
     assert {Path(name).suffix or Path(name).name for name in inside} == kinds

@@ -5,7 +5,7 @@ then seconds in each process. Processes that fill one cache of numba's at once c
 (numba issue 10128), which the workers of a first conversion would do. So the first process compiles all
 that audio features use behind a lock and leaves a mark beside the cache; whoever finds the mark just imports.
 A cache holds for one installation and one type of processor, and so does a mark: a new environment, a cleared
-cache and another node of a cluster begin anew.
+cache and another node of a cluster start over.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import fcntl
 import importlib.util
 import os
+import platform
 import tempfile
 from functools import lru_cache
 from importlib.metadata import version
@@ -37,15 +38,13 @@ def load_librosa() -> Any:
 
 
 def _mark() -> Path:
-    """Where it says that the cache is filled: in the cache's folder, chosen as numba chooses it."""
-    from llvmlite.binding import get_host_cpu_name
-
+    """The file whose existence means that the cache is filled, in the folder that numba would choose."""
     spec = importlib.util.find_spec("librosa")
     if spec is None or spec.origin is None:
         raise ModuleNotFoundError("No module named 'librosa'", name="librosa")
     source = Path(spec.origin)
     about = source.stat()
-    which = crc32(f"{source.resolve()} {about.st_mtime_ns} {about.st_size} {get_host_cpu_name()}".encode())
+    which = crc32(f"{source.resolve()} {about.st_mtime_ns} {about.st_size} {_processor()}".encode())
     name = f"motionloom-librosa-{version('librosa')}-numba-{version('numba')}-{which:08x}.compiled"
     wanted = os.environ.get("NUMBA_CACHE_DIR")
     for folder in (Path(wanted) if wanted else source.parent / "__pycache__", _own_temporary()):
@@ -56,6 +55,15 @@ def _mark() -> Path:
         if os.access(folder, os.W_OK):
             return folder / name
     raise PermissionError(f"no folder to write to; set TMPDIR to one that user {os.getuid()} may write")
+
+
+def _processor() -> str:
+    """The model of this machine's processor, as far as the system knows it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line for line in lines if line.startswith("model name")), platform.machine())
 
 
 def _own_temporary() -> Path:

@@ -48,7 +48,6 @@ VERSION = 2
 """Raised whenever the same sound and settings give other numbers: cached features are then made again."""
 
 _MFCC = 20
-_AIST_KINDS = ("mBR", "mPO", "mLO", "mMH", "mLH", "mWA", "mKR", "mJS", "mJB")
 _SHORTEST = 3
 """Frames; fewer have no change of MFCC."""
 
@@ -117,7 +116,7 @@ def audio_features(
 def baseline_features(
     samples: NDArray[np.float32], rate: int, settings: AudioSettings | None = None
 ) -> NDArray[np.float32]:
-    """Mono samples [n] at `rate` Hz -> float32 [T, 35]; give `start_bpm` as published (`aist_bpm`)."""
+    """Mono samples [n] at `rate` Hz -> float32 [T, 35]; published with a `start_bpm` for each music."""
     settings = settings or AudioSettings()
     samples = _prepared(samples, rate, settings)
     octaves = _octaves(settings)
@@ -146,17 +145,6 @@ def beats(
     with _no_remarks():
         onsets = rhythm.onset_strength(separate(samples, settings.rate).percussive_mel)
         return np.asarray(_beat_frames(onsets, settings) / settings.fps)
-
-
-def aist_bpm(music: str) -> float:
-    """Beats a minute that the name of an AIST music states (`mBR0` -> 80, `mHO5` -> 135)."""
-    kind, digit = music[:3], music[3:]
-    if len(digit) == 1 and digit.isascii() and digit.isdigit():
-        if kind == "mHO":
-            return 110.0 + 5 * int(digit)
-        if kind in _AIST_KINDS:
-            return 80.0 + 10 * int(digit)
-    raise UserError(f"'{music}' is no AIST music: expected such as mBR0, of {', '.join(_AIST_KINDS)} or mHO")
 
 
 def fitting_octaves(rate: int, most: int = 7) -> int:

@@ -39,6 +39,25 @@ def motion_frame_features(
     return rows_at(audio_features(samples, rate, settings), settings.fps, fps, frames)
 
 
+def features_of(sound: Sound, fps: float) -> NDArray[np.float32]:
+    """Features [T, 438] of a sound, a row for each motion frame, by all of the piece that it is a slice of.
+
+    Tempo and beats are read from many seconds around a frame, in training too: a slice heard alone would
+    look different. A piece is analysed once; the sound keeps what was found.
+    """
+    piece = sound.piece or sound
+    # The piece is heard from within a frame's length on, so that its rows lie on the motion's frames.
+    first = int(sound.begin * fps + 1e-6)
+    lead = max(0.0, sound.begin - first / fps)
+    known = piece.analysed.get((lead, fps))
+    if known is None:
+        whole = piece.slice(lead) if round(lead * piece.rate) else piece
+        known = motion_frame_features(whole, None, fps, max(1, round(whole.seconds * fps)))
+        piece.analysed[lead, fps] = known
+    frames = max(1, round(sound.seconds * fps))
+    return known[np.minimum(np.arange(first, first + frames), len(known) - 1)]
+
+
 def settings_at(fps: float) -> AudioSettings:
     """Features with a row for each frame at `fps`; at 60 rows a second where `fps` is none of theirs."""
     if 5 <= fps <= 240 and fps * HOP == int(fps * HOP):

@@ -1,23 +1,29 @@
 """Sound files -> mono float32 samples, and resampling.
 
 Notable choices:
-- libsndfile decodes (WAV of 8, 16, 24, 32 bit and float, FLAC, OGG, MP3); what it lets pass is caught by
-  `headers`.
+- libsndfile decodes (WAV of 8, 16, 24, 32 bit and float, FLAC, OGG, MP3). It reads a WAV or an MP3 that was
+  cut short without complaint, so headers are compared with the size of the file first.
+- Where an MP3 does not state its length, libsndfile guesses it from the size and reads no further, which cuts
+  varying bit rates short. From a pipe it reads to the end, and refuses one that ends within a frame.
 - Sound is read, mixed to mono and resampled in blocks: memory is twice that of the samples that come out.
 - Several channels become their mean. Float sound and lossy decoders overshoot a little: clipped to -1..1.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
+import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from threading import Thread
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.headers import check_sound_header, mp3_samples
 from motionloom.datasets.schema import UserError
 
 MAX_SAMPLES = 2**28
@@ -27,9 +33,10 @@ MAX_PEAK = 8.0
 """Float sound may overshoot 1; beyond this it is in another unit (integers stored as floats)."""
 
 _BLOCK = 2**18
+_UNKNOWN = 2**63 - 1
+"""libsndfile's length of a pipe."""
 
-_MP3_SLACK = 4 * 1152
-"""Samples that an MP3's frames may hold more than its sound: a description, and silence at both ends."""
+_WAV_SUFFIXES = (".wav", ".wave")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +51,8 @@ class Sound:
     """The longer sound that this is a slice of; features of music are made of whole pieces."""
     begin: float = 0.0
     """Second of the piece at which it begins."""
+    analysed: dict[tuple[float, float], NDArray[np.float32]] = field(default_factory=dict, repr=False)
+    """Features of the piece from a second on, at frames a second (`lineup.features_of`)."""
 
     def __post_init__(self) -> None:
         samples = np.asarray(self.samples, dtype=np.float32)
@@ -63,7 +72,6 @@ class Sound:
 
     @property
     def seconds(self) -> float:
-        """Its length."""
         return len(self.samples) / self.rate
 
     def slice(self, start: float, end: float | None = None) -> Sound:
@@ -93,22 +101,15 @@ def read_sound(
     empty, not what its name says, without a sample rate, or that holds NaN or infinity. `name` stands for the
     path in errors.
     """
-    import soundfile  # only data with sound pays for the import
-
     name = str(path) if name is None else name
-    check_sound_header(path, name)
-    try:
-        with soundfile.SoundFile(path) as file:
-            found = int(file.samplerate)
-            wanted = _length(path, name, file.frames, found, file.format)
-            blocks = _mono(file, name, wanted)
-            if rate is None or rate == found:
-                made = list(blocks)
-            else:
-                wanted = resampled_length(wanted, found, rate)
-                made = list(_resampled(blocks, found, rate))
-    except (soundfile.SoundFileError, RuntimeError, OSError) as error:
-        raise UserError(f"{name}: not readable sound ({_reason(error)})") from None
+    wanted, found = _length(path, name)
+    with _opened(path, name) as file:
+        blocks = _mono(file, name, wanted)
+        if rate is None or rate == found:
+            made = list(blocks)
+        else:
+            wanted = resampled_length(wanted, found, rate)
+            made = list(_resampled(blocks, found, rate))
     samples = np.concatenate(made)
     if len(samples) < wanted:
         raise UserError(f"{name}: cut short: {len(samples)} samples of {wanted}")
@@ -126,16 +127,11 @@ def require_audible(samples: NDArray[np.float32], path: Path | str, *, quietest:
 
 
 def sound_seconds(path: Path, name: str | None = None) -> float:
-    """Length of a sound file by its header, without decoding it; `UserError` where that shows a fault."""
-    import soundfile
-
-    name = str(path) if name is None else name
-    check_sound_header(path, name)
-    try:
-        info: Any = soundfile.info(path)
-    except (soundfile.SoundFileError, RuntimeError, OSError) as error:
-        raise UserError(f"{name}: not readable sound ({_reason(error)})") from None
-    return _length(path, name, info.frames, info.samplerate, info.format) / float(info.samplerate)
+    """Length of a sound file by its header, or by decoding an MP3 that does not state it; `UserError` where
+    that shows a fault.
+    """
+    samples, rate = _length(path, str(path) if name is None else name)
+    return samples / rate
 
 
 def resample_sound(samples: NDArray[np.float32], rate_in: int, rate_out: int) -> NDArray[np.float32]:
@@ -164,9 +160,9 @@ def resampled_length(samples: int, rate_in: int, rate_out: int) -> int:
 
 
 def _mono(file: Any, name: str, count: int) -> Iterator[NDArray[np.float32]]:
-    """The first `count` samples as mono blocks [n], checked and clipped; tags behind them are not decoded."""
+    """The first `count` samples as mono blocks [n], checked and clipped; tags after them are not decoded."""
     at = 0
-    for block in file.blocks(blocksize=_BLOCK, frames=count, dtype="float32", always_2d=True):
+    while len(block := file.read(min(_BLOCK, count - at), dtype="float32", always_2d=True)):
         samples = block.mean(axis=1)
         finite = np.isfinite(samples)
         if not finite.all():
@@ -191,29 +187,134 @@ def _resampled(
     yield np.zeros(1, dtype=np.float32)
 
 
-def _length(path: Path, name: str, claimed: int, rate: int, kind: str) -> int:
-    """Samples of sound; `UserError` for a length that cannot be, or that the file does not bear out."""
+def _length(path: Path, name: str) -> tuple[int, int]:
+    """(samples, rate) of a sound file; `UserError` for those that cannot be."""
+    _check_header(path, name)
+    with _opened(path, name) as file:
+        samples, rate = int(file.frames), int(file.samplerate)
+        if samples == _UNKNOWN:
+            samples = sum(len(block) for block in _mono(file, name, MAX_SAMPLES + 1))
     if rate <= 0:
         raise UserError(f"{name}: sample rate {rate}")
-    if claimed <= 0:
+    if samples <= 0:
         raise UserError(f"{name}: no sound in it, or cut short (0 samples)")
-    if claimed > MAX_SAMPLES:
-        raise UserError(f"{name}: {claimed} samples; the longest sound read is {MAX_SAMPLES}")
-    if kind != "MP3" or (frames := mp3_samples(path)) is None:
-        return claimed
-    there, stated = frames
-    if stated and there < claimed:
-        raise UserError(f"{name}: cut short: {there} samples of {claimed}")
-    if not stated and there > claimed + max(_MP3_SLACK, there // 50):
-        raise UserError(
-            f"{name}: an MP3 of varying bit rate that does not state its length; write it as WAV or FLAC"
-        )
-    return min(there, claimed)  # an unstated length is a guess from the size, which tags add to
+    if samples > MAX_SAMPLES:
+        raise UserError(f"{name}: {samples} samples; the longest sound read is {MAX_SAMPLES}")
+    return samples, rate
+
+
+@contextmanager
+def _opened(path: Path, name: str) -> Iterator[Any]:
+    """A `soundfile.SoundFile`, of length `_UNKNOWN` where an MP3 does not state it; `UserError` for all that
+    libsndfile finds wrong.
+    """
+    import soundfile  # only data with sound pays for the import
+
+    try:
+        with soundfile.SoundFile(path) as file:
+            if file.format != "MP3":
+                yield file
+                return
+            with _pipe(path) as end, soundfile.SoundFile(end, closefd=False) as piped:
+                yield piped if piped.frames == _UNKNOWN else file
+    except (soundfile.SoundFileError, RuntimeError, OSError) as error:
+        raise UserError(f"{name}: not readable sound ({_reason(error)})") from None
+
+
+@contextmanager
+def _pipe(path: Path) -> Iterator[int]:
+    """The reading end of a pipe through which a thread sends a file."""
+    out, into = os.pipe()
+
+    def send() -> None:
+        with suppress(BrokenPipeError), path.open("rb") as source, os.fdopen(into, "wb") as target:
+            shutil.copyfileobj(source, target)
+
+    thread = Thread(target=send)
+    thread.start()
+    try:
+        yield out
+    finally:
+        os.close(out)
+        thread.join()
+
+
+def _check_header(path: Path, name: str) -> None:
+    """`UserError` for files that libsndfile reads without complaint: a WAV or MP3 that is cut short, a `.wav`
+    that is none; and for missing and empty files.
+    """
+    if not path.is_file():
+        raise UserError(f"{name}: no such file")
+    size = path.stat().st_size
+    if size == 0:
+        raise UserError(f"{name}: empty file (0 bytes)")
+    with path.open("rb") as file:
+        head = file.read(12)
+        if head[:4] in (b"RIFF", b"RF64") and head[8:] == b"WAVE":
+            _check_wave_chunks(file, name, size)
+        elif path.suffix.lower() in _WAV_SUFFIXES:
+            raise UserError(f"{name}: not a WAV file (it does not begin with RIFF ... WAVE)")
+        elif (missing := _missing_mp3_bytes(file, head, size)) > 0:
+            raise UserError(f"{name}: cut short: {missing} bytes of the MP3 are missing")
+
+
+def _check_wave_chunks(file: BinaryIO, name: str, size: int) -> None:
+    """Walk the chunks up to the samples: a format with a rate, and as many bytes as the file promises."""
+    long_data: int | None = None
+    formatted = False
+    while len(head := file.read(8)) == 8:
+        kind, length = struct.unpack("<4sI", head)
+        start = file.tell()
+        if kind == b"ds64":  # 64-bit lengths of RF64
+            body = file.read(min(length, 16))
+            long_data = struct.unpack("<Q", body[8:16])[0] if len(body) == 16 else None
+        elif kind == b"fmt ":
+            body = file.read(min(length, 16))
+            if len(body) < 16:
+                raise UserError(f"{name}: the format chunk is cut short")
+            channels, rate = struct.unpack("<HI", body[2:8])
+            if not rate:
+                raise UserError(f"{name}: sample rate 0")
+            if not channels:
+                raise UserError(f"{name}: 0 channels")
+            formatted = True
+        elif kind == b"data":
+            if long_data is not None and length == 0xFFFFFFFF:
+                length = long_data
+            if not formatted:
+                raise UserError(f"{name}: samples before the format chunk")
+            if not length:
+                raise UserError(f"{name}: no sound in it (0 samples)")
+            if length > size - start:
+                raise UserError(f"{name}: cut short: {size - start} bytes of sound, {length} expected")
+            return
+        file.seek(start + length + length % 2)  # chunks lie at even places
+    raise UserError(f"{name}: no data chunk, or cut short before it")
+
+
+def _missing_mp3_bytes(file: BinaryIO, head: bytes, size: int) -> int:
+    """Bytes that an MP3 lacks of the length stated in its first frame; 0 where none is stated.
+
+    libsndfile fills what is missing with silence.
+    """
+    # An ID3 tag precedes the first frame; its length is four bytes of seven bits.
+    start = (
+        10 + sum((byte & 127) << 7 * (3 - i) for i, byte in enumerate(head[6:10]))
+        if head[:3] == b"ID3"
+        else 0
+    )
+    file.seek(start)
+    frame = file.read(256)
+    at = max(frame.find(b"Xing"), frame.find(b"Info"))
+    if at < 0 or frame[:1] != b"\xff" or len(frame) < at + 16:
+        return 0
+    flags, _, stated = struct.unpack(">III", frame[at + 4 : at + 16])
+    return int(stated) - (size - start) if flags & 3 == 3 else 0
 
 
 def _reason(error: Exception) -> str:
-    """libsndfile's own words, without the path that soundfile puts before them; two of them say nothing."""
+    """libsndfile's own words, without the path that soundfile puts before them, and clearer for two."""
     words = str(getattr(error, "error_string", error)).rstrip(".")
     if words.startswith("File does not exist"):
         return "of no known format"
-    return "damaged" if words.startswith("Unspecified internal error") else words
+    return "damaged or cut short" if words.startswith("Unspecified internal error") else words

@@ -50,7 +50,7 @@ class _Piece:
     samples: NDArray[np.float32]
     """Margins included."""
     frames: slice
-    """Of the sound: without margins."""
+    """Frames of the sound, without margins."""
     inside: slice
     """The same frames, counted from the first of the piece."""
 

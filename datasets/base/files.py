@@ -23,13 +23,11 @@ class HashingFile:
         self._sha256 = hashlib.sha256()
 
     def write(self, data: bytes) -> int:
-        """Write and hash."""
         self._sha256.update(data)
         return self._file.write(data)
 
     @property
     def hexdigest(self) -> str:
-        """sha256 so far."""
         return self._sha256.hexdigest()
 
 
@@ -83,7 +81,7 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
-def write_json(path: Path, data: Any, *, sort_keys: bool = False, allow_nan: bool = False) -> None:
+def write_json(path: Path, data: object, *, sort_keys: bool = False, allow_nan: bool = False) -> None:
     """Write JSON atomically; the same data gives the same bytes.
 
     Keys stay in their order (a manifest reads best as its schema lists it) unless `sort_keys`.
@@ -113,6 +111,14 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
 
 
-def sha256_of_json(value: Any) -> str:
+def sha256_of_json(value: object) -> str:
     """sha256 of plain JSON data, hex; the order of keys makes no difference."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def sorted_header(raw: bytes) -> bytes:
+    """The same safetensors file, its header's keys in order: the library writes metadata in random order."""
+    end = 8 + int.from_bytes(raw[:8], "little")
+    header = json.dumps(json.loads(raw[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + raw[end:]

@@ -21,7 +21,6 @@ _WORDS: dict[int, str] = {
     errno.ENOTDIR: "a file stands where a folder is needed; choose another name",
     errno.EISDIR: "is a folder, and a file is needed; choose another name",
     errno.EEXIST: "exists already; choose another name, or move it away",
-    errno.ENOTEMPTY: "is not empty; choose another name, or move it away",
     errno.ENAMETOOLONG: "the name is too long for the file system; choose a shorter one",
     errno.ENOENT: "no such file or folder",
     errno.ELOOP: "its symbolic links go in a circle; name the file itself",
@@ -30,24 +29,11 @@ _WORDS: dict[int, str] = {
     errno.EIO: f"the disk could not be read or written (input/output error); check it: {_AGAIN}",
     errno.EFBIG: f"the file is larger than its file system or a limit (ulimit -f) allows: {_AGAIN}",
     errno.ENOMEM: f"the machine is out of memory: {_AGAIN}",
-    errno.ENODEV: "there is no such device; choose another place",
-    errno.ENXIO: "there is no such device; choose another place",
-    errno.EBUSY: "is in use by another program; end that, or choose another place",
     errno.ESTALE: f"its network file system has gone away; mount that again: {_AGAIN}",
-    errno.EINVAL: "the file system does not take this name or operation; choose another place",
-}
-
-_OF_THE_MACHINE = {
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EMFILE,
-    errno.ENFILE,
-    errno.EIO,
-    errno.ENOMEM,
-    errno.EFBIG,
 }
 
 _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_OF_THE_MACHINE = {*_NO_MORE, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM}
 
 _RUST = re.compile(r"\(os error (\d+)\)")
 _NUMPY_SHORT = re.compile(r"\d+ requested and \d+ written")
@@ -84,7 +70,6 @@ def sentence_of(error: BaseException) -> str | None:
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
-    """What an error was raised from or while handling, nearest first."""
     seen = {id(error)}
     cause = error.__cause__ or error.__context__
     while cause is not None and id(cause) not in seen:

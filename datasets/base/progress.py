@@ -41,7 +41,6 @@ class Pace:
         return True
 
     def speed(self, done: int) -> float:
-        """Of what was done here, a second."""
         return (done - self.first) / max(1e-9, self._clock() - self._began)
 
     def left(self, done: int) -> str:
@@ -80,7 +79,6 @@ class Meter:
         self._bar.stop()
 
     def advance(self, count: int = 1) -> None:
-        """So many more are done."""
         self._done += count
         self._bar.update(self._task, completed=self._done)
         if self._shown and not self._console.is_terminal and self._pace.due(self._done):

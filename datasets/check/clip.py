@@ -6,7 +6,6 @@ The first thing that makes the clip unusable raises; what is merely odd is retur
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +16,9 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, ShardInfo, UserError
-from motionloom.datasets.shards.sample import captions_from_json, require_finite
-from motionloom.datasets.shards.tar import TarClip, read_npy_header
+from motionloom.datasets.schema import Caption, ClipMeta, ShardInfo
+from motionloom.datasets.shards.sample import captions_from_json, meta_from_json, require_finite
+from motionloom.datasets.shards.tar import TarClip, npy_from_bytes
 
 END_TOLERANCE = 0.5
 """Seconds a caption may reach past its clip: sources round their times."""
@@ -45,17 +44,12 @@ def read_member(file: BinaryIO, clip: TarClip, name: str) -> bytes:
 
 def read_meta(file: BinaryIO, path: Path, clip: TarClip) -> ClipMeta:
     """`meta.json` of a clip of an open shard; `UserError` when it is not one."""
-    where = f"{path}: '{clip.key}.meta.json'"
-    try:
-        data = json.loads(read_member(file, clip, "meta.json"))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{where}: not valid JSON ({error})") from None
-    return ClipMeta.parse(data, where)
+    return meta_from_json(read_member(file, clip, "meta.json"), f"{path}: '{clip.key}.meta.json'")
 
 
 def read_motion(file: BinaryIO, path: Path, clip: TarClip) -> NDArray[np.floating]:
     """`motion.npy` of a clip of an open shard, as stored."""
-    return _array(read_member(file, clip, "motion.npy"), f"{path}: '{clip.key}.motion.npy'")
+    return npy_from_bytes(read_member(file, clip, "motion.npy"), f"{path}: '{clip.key}.motion.npy'")
 
 
 def check_clip(
@@ -115,7 +109,7 @@ def _check_audio(file: BinaryIO, path: Path, clip: TarClip) -> int | None:
         _check_sound(read_member(file, clip, "audio.flac"))
     if "audio.npy" not in clip.members:
         return None
-    audio = _array(read_member(file, clip, "audio.npy"), f"{path}: '{clip.key}.audio.npy'")
+    audio = npy_from_bytes(read_member(file, clip, "audio.npy"), f"{path}: '{clip.key}.audio.npy'")
     if audio.ndim != 2 or not len(audio):
         raise ValueError(f"audio.npy is {list(audio.shape)}, not [T_audio >= 1, features]")
     require_finite("audio.npy", audio)
@@ -131,10 +125,3 @@ def _check_sound(raw: bytes) -> None:
         raise ValueError(f"audio.flac: not readable sound ({error})") from None
     if info.frames < 1 or info.channels != 1:
         raise ValueError(f"audio.flac: {info.frames} samples in {info.channels} channels, wanted mono sound")
-
-
-def _array(raw: bytes, where: str) -> NDArray[np.floating]:
-    header = read_npy_header(io.BytesIO(raw), where)
-    if header.data + int(np.prod(header.shape)) * header.dtype.itemsize != len(raw):
-        raise UserError(f"{where}: the array is cut short or too long")
-    return np.frombuffer(raw, header.dtype, offset=header.data).reshape(header.shape)

@@ -2,8 +2,9 @@
 
 Errors: manifest or index absent or contradicting the tars, stray or missing shards, size and sha256, tar
 structure, members that do not parse, NaN, values no motion can have (`ranges.py`), figures that are no people
-standing on a floor (`figures.py`), empty captions, sound that cannot be read, and clips that leak from one
-split into another (`duplicates.py`).
+standing on a floor in more than half of the clips (`datasets/motion/plausibility.py`; in more than a fifth a
+warning), empty captions, sound that cannot be read, and clips that leak from one split into another
+(`duplicates.py`).
 
 Warnings: values beyond what a person can do, clips without captions, captions that reach past their clip, the
 same motion twice in one split, a licence the manifest does not know, no training split.
@@ -18,26 +19,58 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.progress import track
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.check.clip import CheckedClip, check_clip
 from motionloom.datasets.check.duplicates import ClipTable
-from motionloom.datasets.check.figures import Figures
 from motionloom.datasets.check.findings import Findings, Problem
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Manifest, ShardInfo, Split, UserError
-from motionloom.datasets.shards.index import (
-    INDEX_FILE,
-    SPLITS,
-    ShardIndex,
-    SplitIndex,
-    clip_entries,
-    index_path,
-    load_index,
-)
+from motionloom.datasets.motion.plausibility import PlausibilityStats, measure
+from motionloom.datasets.schema import INDEX_FILE, SPLITS, ClipMeta, Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.shards.checksums import LocalShard, require_intact
+from motionloom.datasets.shards.index import ShardIndex, SplitIndex, clip_entries, index_path, load_index
 from motionloom.datasets.shards.reader import load_manifest, manifest_layout
 from motionloom.datasets.shards.tar import scan_tar
+
+_MOST_FOLDERS = 64
+"""Folders of the source that are judged by themselves."""
+_LEAST_CLIPS = 10
+"""Clips in such a folder."""
+
+
+class Figures:
+    """Collects the clips of a set."""
+
+    def __init__(self, layout: MotionLayout) -> None:
+        self._layout = layout
+        self._all, self._folders = PlausibilityStats(), dict[str, PlausibilityStats]()
+        # Parameters may stay on the floor of their source.
+        self._on_zero = layout.family != "raw"
+
+    def add(self, meta: ClipMeta, motion: NDArray[np.floating]) -> None:
+        joints = joints_of(motion, self._layout)
+        clip = measure(joints, self._layout.fps)
+        self._all.add(clip)
+        folder = meta.source.split("/", 1)[0] if "/" in meta.source else ""
+        if folder in self._folders or len(self._folders) < _MOST_FOLDERS:
+            self._folders.setdefault(folder, PlausibilityStats()).add(clip)
+
+    def report(self, root: Path, findings: Findings) -> None:
+        oddities = self._all.oddities(floor_at_zero=self._on_zero)
+        for oddity in oddities:
+            if oddity.is_error:
+                findings.error("no people standing on a floor", str(root), oddity.text)
+            else:
+                findings.warn("odd figures", str(root), oddity.text)
+        known = {oddity.kind for oddity in oddities}
+        for folder, stats in sorted(self._folders.items()):
+            if len(self._folders) == 1 or len(stats) < _LEAST_CLIPS:
+                continue
+            for oddity in stats.oddities(floor_at_zero=self._on_zero):
+                if oddity.is_error and oddity.kind not in known:
+                    findings.warn("odd figures", str(root), f"source '{folder or '.'}': {oddity.text}")
 
 
 @dataclass(frozen=True)
@@ -69,7 +102,7 @@ def examine(root: Path, *, progress: bool = False) -> CheckReport:
     findings, frames = Findings(), 0
     _stray_files(root, manifest, findings)
     table = ClipTable(root, manifest.shards, layout)
-    figures = Figures(layout, sum(shard.samples for shard in manifest.shards))
+    figures = Figures(layout)
     widths: dict[int, str] = {}
     for number, shard in enumerate(track(manifest.shards, "checking shards", disable=not progress)):
         indexed = _indexed_present(root / shard.name)
@@ -117,15 +150,12 @@ def _checked_clips(
     path: Path, shard: ShardInfo, layout: MotionLayout, findings: Findings
 ) -> Iterator[tuple[int, str, CheckedClip]]:
     """(row, key, clip) of every sound clip of one shard; what is wrong on the way goes to `findings`."""
-    if not path.exists():
-        findings.error("shard", shard.name, "the shard is missing")
-        return
-    size = path.stat().st_size
-    if size != shard.bytes:
-        changed = f"{size} bytes, the manifest says {shard.bytes}: truncated or changed"
-        findings.error("shard", shard.name, changed)
-    elif sha256_of(path) != shard.sha256:
-        findings.error("shard", shard.name, "the sha256 is not the manifest's: damaged")
+    try:
+        require_intact(LocalShard(path, shard))
+    except UserError as error:
+        findings.error("shard", shard.name, str(error).removeprefix(f"{path}: "))
+        if not path.exists():
+            return
     clips = scan_tar(path)
     if len(clips) != shard.samples:
         findings.error("shard", shard.name, f"{len(clips)} samples, the manifest says {shard.samples}")
@@ -147,7 +177,6 @@ def _checked_clips(
 def _against_manifest(
     where: str, clip: CheckedClip, manifest: Manifest, widths: dict[int, str], findings: Findings
 ) -> None:
-    """Whether a sound clip fits what the manifest says of all clips."""
     licence = clip.meta.licence
     if licence not in {manifest.licence, *manifest.licences}:
         findings.warn("licence", where, f"licence '{licence}' is not in the manifest")
@@ -168,7 +197,6 @@ def _indexed_present(path: Path) -> list[int]:
 
 
 def _check_index(root: Path, split: Split, shards: list[ShardInfo], findings: Findings) -> None:
-    """Whether both indices say what the tars say."""
     before = findings.error_kinds["index"]
     # A generator: the JSON indices of a large split would not fit into memory together.
     rebuilt = SplitIndex.build(_sound_indices(root, shards, findings))

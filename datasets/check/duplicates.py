@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.check.clip import read_meta, read_motion
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.motion.canonical import mirror
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import ClipMeta, ShardInfo
 from motionloom.datasets.shards.tar import TarClip, scan_tar
@@ -63,7 +63,6 @@ class ClipTable:
         self._row.append(row)
 
     def report(self, findings: Findings) -> None:
-        """Compare everything with everything and report what is found."""
         self._same_ids(findings)
         self._families_apart(findings)
         self._same_motions(findings)
@@ -77,14 +76,10 @@ class ClipTable:
                     return
                 if (meta := self._meta(row)).id != first.id:
                     continue  # two ids with one hash
-                kind = (
-                    "also"
-                    if self._split(row) == self._split(rows[0])
-                    else f"of split '{self._split(rows[0])}' also"
-                )
-                findings.error(
-                    "repeated id", self._where(row), f"id '{meta.id}' is {kind} {self._where(rows[0])}"
-                )
+                here, there = self._split(row), self._split(rows[0])
+                kind = "also" if here == there else f"of split '{there}' also"
+                message = f"id '{meta.id}' is {kind} {self._where(rows[0])}"
+                findings.error("repeated id", self._where(row), message)
 
     def _families_apart(self, findings: Findings) -> None:
         """An original and its mirror images, or the mirror images alone, in two splits."""

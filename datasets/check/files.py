@@ -24,16 +24,15 @@ from motionloom.datasets.audio.sound import read_sound
 from motionloom.datasets.check.foreign import inspect_tar
 from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
+from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import load_array, read_array_header
 from motionloom.datasets.convert.common.features import require_human
 from motionloom.datasets.convert.common.files import read_text_file
-from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
-from motionloom.datasets.convert.common.smpl_npz import read_motion, read_motion_header
-from motionloom.datasets.convert.common.splits import check_id, read_split_files
-from motionloom.datasets.motion.bvh import read_bvh
+from motionloom.datasets.convert.common.splits import read_ids, read_split_files
+from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
-from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.schema import SPLITS, UserError
 from motionloom.datasets.text.clean import usable_caption
 
 TEXTS = ("auto", "humanml", "plain", "ids")
@@ -80,7 +79,6 @@ class Verdict:
 
     @property
     def ok(self) -> bool:
-        """Whether the file may be used."""
         return not self.problems
 
     def __str__(self) -> str:
@@ -97,7 +95,8 @@ def check_file(path: Path, rules: FileRules | None = None) -> Verdict:
     try:
         return reader(path, rules or FileRules())
     except UserError as error:
-        return Verdict(path, problems=[str(error).removeprefix(f"{path}: ")])
+        told = str(error).removeprefix(f"{path}: ").replace(f"{path}:", "line ", 1)
+        return Verdict(path, problems=[told])
     except OSError as error:
         return Verdict(path, problems=[f"cannot be read ({error.strerror or error})"])
 
@@ -152,7 +151,6 @@ def _check_npy(path: Path, rules: FileRules) -> Verdict:
 
 
 def _layout_hint(path: Path, layout: MotionLayout) -> str:
-    """The layout that a whole array of another width seems to have."""
     try:
         shape, _ = read_array_header(path)
     except UserError:
@@ -211,25 +209,8 @@ def _check_text(path: Path, rules: FileRules) -> Verdict:
 
 
 def _check_ids(path: Path) -> Verdict:
-    seen: dict[str, int] = {}
-    problems, notes = [], []
-    for number, line in enumerate(read_text_file(path).split("\n"), start=1):
-        clip_id = line.strip()
-        if not clip_id:
-            continue
-        try:
-            check_id(clip_id, f"line {number}")
-        except UserError as error:
-            problems.append(str(error))
-            continue
-        if clip_id in seen:
-            notes.append(
-                f"line {number}: id '{clip_id}' is also in line {seen[clip_id]}; the first one counts"
-            )
-        seen.setdefault(clip_id, number)
-    if not seen and not problems:
-        problems.append("no ids")
-    return Verdict(path, f"{len(seen)} ids", problems, notes)
+    ids, notes = read_ids(path)
+    return Verdict(path, f"{len(ids)} ids", [] if ids else ["no ids"], notes)
 
 
 _READERS: dict[str, Callable[[Path, FileRules], Verdict]] = {

@@ -47,7 +47,6 @@ class Findings:
         return [*self.errors, *_unlisted(root, self.error_kinds)]
 
     def all_warnings(self, root: str) -> list[Problem]:
-        """The warnings, likewise."""
         return [*self.warnings, *_unlisted(root, self.warning_kinds)]
 
 

@@ -50,8 +50,6 @@ class TarReport:
 
 @dataclass
 class _Group:
-    """Neighbouring members of one key: field -> (offset, size)."""
-
     key: str
     members: dict[str, tuple[int, int]] = field(default_factory=dict)
     whole: bool = True
@@ -120,7 +118,6 @@ def _read_directory(
 
 
 def _cut(groups: list[_Group], how: str, report: TarReport) -> None:
-    """The file ends within its last sample."""
     last = f"the last whole key is '{groups[-2].key}'" if len(groups) > 1 else "no key is whole"
     report.problems.append(f"{how}; {last}")
     groups[-1].whole = False
@@ -129,13 +126,7 @@ def _cut(groups: list[_Group], how: str, report: TarReport) -> None:
 def _refusal(info: tarfile.TarInfo) -> str:
     """Why an entry is not a plain file with a harmless name; empty when it is."""
     parts = info.name.split("/")
-    if (
-        info.name.startswith("/")
-        or "\\" in info.name
-        or ".." in parts
-        or ":" in parts[0]
-        or "\0" in info.name
-    ):
+    if info.name.startswith("/") or ".." in parts or ":" in parts[0] or {"\\", "\0"} & set(info.name):
         return "is a path that leaves the shard (path traversal); shards hold plain relative names"
     if info.issym() or info.islnk():
         return f"is a link to '{info.linkname}', which is never followed; shards hold plain files"
@@ -177,7 +168,6 @@ def _check_order(groups: list[_Group], report: TarReport) -> None:
 
 
 def _missing(group: _Group) -> list[str]:
-    """Required fields that a sample lacks."""
     missing = [] if _MOTION in group.members else [_MOTION]
     return missing if any(name in group.members for name in _META) else [*missing, _META[0]]
 
@@ -193,19 +183,15 @@ def _sample_problems(
     for name, (start, size) in group.members.items():
         file.seek(start)
         if name.endswith("json"):
-            yield from _json_problems(f"'{group.key}.{name}'", file.read(size))
+            try:
+                json.loads(file.read(size))
+            except (ValueError, RecursionError) as error:
+                yield f"'{group.key}.{name}' is not valid JSON ({error})"
         elif name.endswith("npy"):
             raw = file.read(size)
             yield from _array_problems(f"'{group.key}.{name}'", raw, name == _MOTION, layout)
             if name == _MOTION:
                 motions[hashlib.blake2b(raw, digest_size=16).digest()] += 1
-
-
-def _json_problems(where: str, raw: bytes) -> Iterator[str]:
-    try:
-        json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        yield f"{where} is not valid JSON ({error})"
 
 
 def _array_problems(where: str, raw: bytes, motion: bool, layout: MotionLayout | None) -> Iterator[str]:

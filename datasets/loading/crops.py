@@ -17,18 +17,54 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.loading.spans import CaptionSpan
-from motionloom.datasets.loading.statistics import FeatureStats
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.motion.layout import require_layout
+from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.reader import require_layout
+
+
+class CaptionSpan(NamedTuple):
+    """A caption and its stretch of a clip, in frames."""
+
+    text: str
+    first: int
+    end: int
+    """The frame after the last."""
+    tokens: tuple[str, ...] = ()
+    """Its `word/POS` tags, where the source brings them."""
+
+    @property
+    def frames(self) -> int:
+        return self.end - self.first
+
+
+def frame_span(caption: Caption, fps: float, frames: int) -> tuple[int, int]:
+    """(first frame, frame after the last) of a caption's stretch in a clip of `frames`; all when empty."""
+    first = min(max(round(caption.start * fps), 0), frames)
+    end = frames if caption.end is None else min(max(round(caption.end * fps), 0), frames)
+    return (first, end) if end > first else (0, frames)
+
+
+def caption_spans(
+    captions: Sequence[Caption], fps: float, frames: int, min_frames: int = 1
+) -> list[CaptionSpan]:
+    """The captions that cover `min_frames` or more of a clip of `frames`.
+
+    When none does, the one that covers most: a clip with a caption always gives one.
+    """
+    spans = [
+        CaptionSpan(caption.text, *frame_span(caption, fps, frames), tuple(caption.tokens or ()))
+        for caption in captions
+    ]
+    long = [span for span in spans if span.frames >= min_frames]
+    return long or ([max(spans, key=lambda span: span.frames)] if spans else [])
 
 
 class Cut(NamedTuple):
     """Stretches of clips as one batch."""
 
     motion: NDArray[np.float32]
-    """[B, T, C], zeros behind each row's `length`."""
+    """[B, T, C], zeros after each row's `length`."""
     begin: NDArray[np.int64]
     """First frame in the clip, [B]."""
     length: NDArray[np.int64]

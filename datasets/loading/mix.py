@@ -52,55 +52,44 @@ class MixedDataset:
 
     @cached_property
     def frames(self) -> NDArray[np.int64]:
-        """T of every clip, [n]."""
         return np.concatenate([dataset.frames for dataset in self._datasets])
 
     @cached_property
     def present(self) -> NDArray[np.uint8]:
-        """What every clip holds beside its body, bits of `ClipMeta.present`, [n]."""
         return np.concatenate([dataset.present for dataset in self._datasets])
 
     @cached_property
     def ids(self) -> list[str]:
-        """Source id of every clip, as its own data set has it."""
         return [source for dataset in self._datasets for source in dataset.ids]
 
     def has(self, member: str) -> NDArray[np.bool_]:
-        """Which clips hold a member such as `texts.json`, [n]."""
         return np.concatenate([dataset.has(member) for dataset in self._datasets])
 
     def motion(self, i: int) -> NDArray[np.float32]:
-        """Features of clip `i`, [T, D]."""
         dataset, own = self._find(i)
         return dataset.motion(own)
 
     def meta(self, i: int) -> ClipMeta:
-        """Metadata of clip `i`."""
         dataset, own = self._find(i)
         return dataset.meta(own)
 
     def texts(self, i: int) -> list[Caption]:
-        """Captions of clip `i`."""
         dataset, own = self._find(i)
         return dataset.texts(own)
 
     def face_texts(self, i: int) -> list[Caption]:
-        """Captions about the face of clip `i`."""
         dataset, own = self._find(i)
         return dataset.face_texts(own)
 
-    def audio(self, i: int) -> NDArray[np.float32] | None:
-        """Audio features of clip `i`, [T_audio, 438]."""
+    def array(self, i: int, member: str) -> NDArray[np.float32] | None:
         dataset, own = self._find(i)
-        return dataset.audio(own)
+        return dataset.array(own, member)
 
     def wav(self, i: int) -> tuple[NDArray[np.float32], int] | None:
-        """Sound of clip `i`: (mono samples [S], rate in Hz)."""
         dataset, own = self._find(i)
         return dataset.wav(own)
 
     def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
-        """Passes each data set the clips that are its own."""
         for dataset, begin, end in self._ranges():
             dataset.prefetch([i - begin for i in clips if begin <= i < end], members)
 
@@ -118,7 +107,6 @@ class MixedDataset:
         return tuple(sources)
 
     def parts(self) -> list[tuple[ClipDataset, float]]:
-        """(data set, weight)."""
         return self._parts
 
     def _ranges(self) -> list[tuple[ClipDataset, int, int]]:

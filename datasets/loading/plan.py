@@ -66,7 +66,6 @@ class BatchPlan:
 
     @property
     def _used(self) -> int:
-        """Places of an epoch."""
         return self.batches_per_epoch * self.batch_items
 
     def batch(self, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -116,7 +115,7 @@ class BatchPlan:
             order[start:end], turns[start:end] = order[dealt], turns[dealt]
         return order, turns
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         names = ("num_items", "batch_items", "seed", "lengths", "sources")
         return {name: getattr(self, name) for name in names}
 

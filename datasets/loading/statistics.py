@@ -1,6 +1,6 @@
-"""`FeatureStats`: per-column mean and standard deviation, computed in one pass.
+"""Mean and standard deviation of each column of motion (`FeatureStats`) and of a modality, in one pass.
 
-A column counts the clips that hold it: what a clip without hands or face stores there plays no part. A column
+A column counts the clips that hold it: what a clip without hands or face stores there is ignored. A column
 that no clip holds gets mean 0 and standard deviation 1.
 
 `Moments` holds (count, mean, sum of squared deviations) and merges by Chan's formula, so clips, shards and
@@ -10,31 +10,20 @@ decides that by the dataset it passes.
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TypeVar
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from rich.progress import track
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
-from torch import Tensor
 
-from motionloom.datasets.base.files import atomic_file
+from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.modalities.modality import FrameStats, Modality
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, in_order
-from motionloom.datasets.shards.reader import require_layout
 
 STD_FLOOR = 1e-4
 """Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
-
-Values = TypeVar("Values", NDArray[np.float32], Tensor)
-Columns = NDArray[np.int64] | slice
-"""Columns of a layout: by number, or a field's slice."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +36,11 @@ class Moments:
 
     @staticmethod
     def none(width: int) -> Moments:
-        """No rows yet."""
         return Moments(np.zeros(width), np.zeros(width), np.zeros(width))
 
     @staticmethod
     def of(rows: NDArray[np.floating], present: NDArray[np.bool_] | None = None) -> Moments:
-        """Of one array [T, D]; `present` [D] says which columns count (all when None)."""
+        """Moments of one array [T, D]; `present` [D] marks the columns that count (None: all)."""
         mean = rows.mean(axis=0, dtype=np.float64)
         m2 = np.square(rows - mean).sum(axis=0)
         count = np.full(len(mean), float(len(rows)))
@@ -61,7 +49,6 @@ class Moments:
         return Moments(*(np.where(present, values, 0.0) for values in (count, mean, m2)))
 
     def merge(self, other: Moments) -> Moments:
-        """Of both together."""
         count = self.count + other.count
         rows = np.where(count > 0, count, 1.0)
         delta = other.mean - self.mean
@@ -77,97 +64,6 @@ class Moments:
     def std(self) -> NDArray[np.float64]:
         """Population standard deviation, [D]; 0 of a column without rows."""
         return np.sqrt(self.m2 / np.where(self.count > 0, self.count, 1.0))
-
-
-@dataclass(frozen=True)
-class FeatureStats:
-    """Mean and std, [D] float32, of the columns of a layout."""
-
-    mean: NDArray[np.float32]
-    std: NDArray[np.float32]
-    layout: MotionLayout
-    frames: int = 0
-    """Frames they were computed from."""
-    _tensors: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = field(
-        default_factory=dict, repr=False, compare=False
-    )
-
-    def normalize(self, values: Values, columns: Columns | None = None) -> Values:
-        """(values - mean) / std over the last axis; numpy or torch. `columns`: which ones `values` holds."""
-        if isinstance(values, Tensor):
-            mean, std = self._on(values, columns)
-            return (values - mean) / std
-        return (values - self._take(self.mean, columns)) / self._take(self.std, columns)
-
-    def denormalize(self, values: Values, columns: Columns | None = None) -> Values:
-        """values * std + mean over the last axis; numpy or torch, differentiable."""
-        if isinstance(values, Tensor):
-            mean, std = self._on(values, columns)
-            return values * std + mean
-        return values * self._take(self.std, columns) + self._take(self.mean, columns)
-
-    def save(self, path: Path) -> None:
-        """Write a safetensors file, with the layout in its metadata, atomically."""
-        layout = self.layout
-        about = {
-            "layout": layout.name,
-            "family": layout.family,
-            "fps": repr(layout.fps),
-            "frames": str(self.frames),
-        }
-        with atomic_file(path) as file:
-            file.write(sorted_header(save({"mean": self.mean, "std": self.std}, metadata=about)))
-
-    @staticmethod
-    def load(path: Path, *, expect: MotionLayout | None = None) -> FeatureStats:
-        """Read what `save` wrote; `UserError` when it is not that or not of the expected layout."""
-        try:
-            with safe_open(path, framework="numpy") as stored:
-                about = stored.metadata() or {}
-                mean, std = stored.get_tensor("mean"), stored.get_tensor("std")
-            layout = MotionLayout.named(about["layout"], fps=float(about["fps"]), family=about["family"])
-            frames = int(about["frames"])
-        except FileNotFoundError:
-            raise UserError(f"{path}: no such file; run the statistics stage") from None
-        except (SafetensorError, OSError, KeyError, ValueError) as error:
-            raise UserError(
-                f"{path}: not a statistics file ({error}); run the statistics stage again"
-            ) from None
-        if mean.shape != (layout.dim,) or std.shape != (layout.dim,) or not (std > 0).all():
-            raise UserError(
-                f"{path}: not {layout.dim} columns with positive std; run the statistics stage again"
-            )
-        if expect is not None:
-            require_layout(layout, expect, str(path))
-        return FeatureStats(mean, std, layout, frames)
-
-    def _on(self, like: Tensor, columns: Columns | None) -> tuple[Tensor, Tensor]:
-        key = (like.device, like.dtype)
-        if key not in self._tensors:
-            self._tensors[key] = (
-                torch.from_numpy(self.mean).to(like),
-                torch.from_numpy(self.std).to(like),
-            )
-        mean, std = self._tensors[key]
-        if columns is None:
-            return mean, std
-        chosen = columns if isinstance(columns, slice) else torch.as_tensor(columns, device=like.device)
-        return mean[chosen], std[chosen]
-
-    @staticmethod
-    def _take(values: NDArray[np.float32], columns: Columns | None) -> NDArray[np.float32]:
-        return values if columns is None else values[columns]
-
-    def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_tensors": {}}
-
-
-def sorted_header(raw: bytes) -> bytes:
-    """The same safetensors file, its header's keys in order: the library writes metadata in random order."""
-    end = 8 + int.from_bytes(raw[:8], "little")
-    header = json.dumps(json.loads(raw[8:end]), sort_keys=True, separators=(",", ":")).encode()
-    header += b" " * (-len(header) % 8)
-    return len(header).to_bytes(8, "little") + header + raw[end:]
 
 
 def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -> FeatureStats:
@@ -210,3 +106,52 @@ def _columns_of(layout: MotionLayout, name: str) -> NDArray[np.bool_]:
     mask = np.zeros(layout.dim, dtype=np.bool_)
     mask[layout.slice(name)] = True
     return mask
+
+
+_CONSTANT = 1e-6
+"""A column whose standard deviation is below this share of its size (or of 1) does not change."""
+
+
+def frame_statistics(dataset: ClipDataset, modality: Modality, progress: bool = False) -> FrameStats:
+    """Statistics of a modality's features over every clip of `dataset` that has them, in one pass.
+
+    In a mix each data set counts as often as its weight has it drawn, as in `statistics.compute`.
+    """
+    parts, member = dataset.parts(), modality.members[0]
+    total = sum(weight for _, weight in parts)
+    moments: Moments | None = None
+    for part, weight in parts:
+        own: Moments | None = None
+        heard = np.flatnonzero(part.has(member)).tolist()
+        for i in track(
+            in_order(part, member, clips=heard),
+            f"{modality.name} statistics",
+            total=len(heard),
+            disable=not progress,
+        ):
+            rows = part.array(i, member)
+            if rows is None:
+                continue
+            found = Moments.of(rows)
+            if own is not None and len(own.mean) != len(found.mean):
+                raise UserError(
+                    f"{part.where}: clip {part.ids[i]} has {len(found.mean)} {modality.name} features a "
+                    f"frame, others {len(own.mean)}; convert the data set again"
+                )
+            own = found if own is None else own.merge(found)
+        if own is None:
+            continue
+        if len(parts) > 1:
+            own = own.counted(weight / total * len(dataset) / len(part))
+        moments = own if moments is None else moments.merge(own)
+    if moments is None:
+        raise UserError(
+            f"{dataset.where}: no clip of split '{dataset.split}' has {modality.name} features; convert a "
+            f"source with {modality.name}, or leave it out"
+        )
+    std = moments.std
+    constant = std <= _CONSTANT * np.maximum(1.0, np.abs(moments.mean))
+    std = np.where(constant, 1.0, std)
+    return FrameStats(
+        moments.mean.astype(np.float32), std.astype(np.float32), round(float(moments.count.max()))
+    )

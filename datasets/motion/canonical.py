@@ -15,13 +15,15 @@ Choices:
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
+
+Float = TypeVar("Float", bound=np.floating)
 
 SMOOTH_SECONDS = 1.0
 """Standard deviation of the heading's Gaussian: HumanML3D's 20 frames at 20 fps."""
@@ -32,7 +34,7 @@ LEFT_SHOULDER, RIGHT_SHOULDER = _NAMED.index("left_shoulder"), _NAMED.index("rig
 _LEG = (_NAMED.index("right_knee"), _NAMED.index("right_ankle"))
 
 
-def ground(joints: NDArray[Any]) -> NDArray[np.complex128]:
+def ground(joints: NDArray[np.floating]) -> NDArray[np.complex128]:
     """`z + i x` of points [..., 3] -> complex [...]; multiplying by `exp(i a)` turns them left by `a`."""
     plane = np.empty_like(joints[..., 0], dtype=np.complex128)
     plane.real = joints[..., 2]
@@ -40,7 +42,7 @@ def ground(joints: NDArray[Any]) -> NDArray[np.complex128]:
     return plane
 
 
-def facing(joints: NDArray[Any]) -> NDArray[np.float64]:
+def facing(joints: NDArray[np.floating]) -> NDArray[np.float64]:
     """Raw heading of every frame: joints [..., T, N, 3] -> radians [..., T], unwrapped along T.
 
     The direction is perpendicular to hips plus shoulders. Frames where these have no horizontal extent (a
@@ -64,7 +66,7 @@ def _hold(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.f
     return np.where(known.any(axis=-1, keepdims=True), held, 0.0)
 
 
-def heading(joints: NDArray[Any], fps: float) -> NDArray[np.float64]:
+def heading(joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
     """Smoothed heading: joints [..., T, N, 3] -> radians [..., T], unwrapped (a full turn left is 2 pi).
 
     Gaussian of `SMOOTH_SECONDS`, extended by point reflection at both ends, so that the first and the last
@@ -84,7 +86,7 @@ def heading(joints: NDArray[Any], fps: float) -> NDArray[np.float64]:
     return np.asarray(line + smooth[..., : last + 1], dtype=np.float64)
 
 
-def canonicalize(joints: NDArray[Any]) -> NDArray[Any]:
+def canonicalize(joints: NDArray[Float]) -> NDArray[Float]:
     """Move a clip [..., T, N, 3] to the canonical place; the float type is kept.
 
     Floor (lowest joint of all frames) at y = 0, first root above the origin, first heading +Z.
@@ -98,7 +100,7 @@ def canonicalize(joints: NDArray[Any]) -> NDArray[Any]:
     return out.astype(kind, copy=False)
 
 
-def turn(joints: NDArray[Any], angle: float) -> NDArray[Any]:
+def turn(joints: NDArray[Float], angle: float) -> NDArray[Float]:
     """Turn points [..., 3] left about the Y axis by `angle` radians."""
     out = np.array(joints, dtype=np.result_type(joints, np.float32))
     plane = ground(out) * np.exp(1j * angle)
@@ -106,13 +108,14 @@ def turn(joints: NDArray[Any], angle: float) -> NDArray[Any]:
     return out
 
 
-def mirror(joints: NDArray[Any], skeleton: Skeleton) -> NDArray[Any]:
+def mirror(joints: NDArray[Float], skeleton: Skeleton) -> NDArray[Float]:
     """Mirror image of joints [..., N, 3]: left and right swapped, x negated."""
     _check_joints(joints, skeleton)
-    return np.asarray(joints[..., skeleton.mirror, :] * np.array([-1, 1, 1], dtype=joints.dtype))
+    mirrored: NDArray[Float] = joints[..., skeleton.mirror, :] * np.array([-1, 1, 1], dtype=joints.dtype)
+    return mirrored
 
 
-def resample(values: NDArray[Any], fps_in: float, fps_out: float) -> NDArray[Any]:
+def resample(values: NDArray[Float], fps_in: float, fps_out: float) -> NDArray[Float]:
     """Linear resampling in time of [T, ...] from one frame rate to another; frame 0 stays at time 0.
 
     Frames that fall on input frames (30 from 60 fps) are taken as they are. The result ends at or before the
@@ -127,7 +130,9 @@ def resample(values: NDArray[Any], fps_in: float, fps_out: float) -> NDArray[Any
     return np.asarray((1.0 - weight) * values[left] + weight * values[right], dtype=kind)
 
 
-def resample_quaternions(quaternions: NDArray[Any], fps_in: float, fps_out: float) -> NDArray[np.float64]:
+def resample_quaternions(
+    quaternions: NDArray[np.floating], fps_in: float, fps_out: float
+) -> NDArray[np.float64]:
     """Spherical resampling in time of unit quaternions [T, ..., 4] (x, y, z, w), along the shorter arc."""
     import roma
     import torch
@@ -162,7 +167,7 @@ def _source_frames(
 
 
 def retarget(
-    joints: NDArray[Any], skeleton: Skeleton, offsets: NDArray[Any] | None = None
+    joints: NDArray[np.floating], skeleton: Skeleton, offsets: NDArray[np.floating] | None = None
 ) -> NDArray[np.float64]:
     """One uniform skeleton (HumanTOMATO's H3D-Format): joints [..., T, N, 3] -> the same poses with given
     bones.
@@ -185,7 +190,7 @@ def retarget(
     return np.moveaxis(points, (0, 1), (-1, -2))
 
 
-def _check_joints(joints: NDArray[Any], skeleton: Skeleton) -> None:
+def _check_joints(joints: NDArray[np.floating], skeleton: Skeleton) -> None:
     if joints.ndim < 2 or joints.shape[-2:] != (len(skeleton), 3):
         raise UserError(
             f"skeleton {skeleton.name} needs joints [..., {len(skeleton)}, 3], not {list(joints.shape)}"

@@ -7,7 +7,6 @@ offsets in metres, parents come before their children.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,10 @@ _NO_BONE = 1e-9
 
 
 def forward_kinematics(
-    rotations: NDArray[Any], root: NDArray[Any], offsets: NDArray[Any], parents: Sequence[int]
+    rotations: NDArray[np.floating],
+    root: NDArray[np.floating],
+    offsets: NDArray[np.floating],
+    parents: Sequence[int],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Local rotations [..., N, 3, 3], root positions [..., 3] -> joints [..., N, 3], global rotations.
 
@@ -54,7 +56,7 @@ def forward_kinematics(
     return np.ascontiguousarray(np.moveaxis(joints[:, 0], (0, 1), (-1, -2))), axes_last(world)
 
 
-def joints_to_rotations(joints: NDArray[Any], skeleton: Skeleton) -> NDArray[np.float64]:
+def joints_to_rotations(joints: NDArray[np.floating], skeleton: Skeleton) -> NDArray[np.float64]:
     """Local rotations [..., N, 3, 3] that pose `skeleton` like joints [..., N, 3] (any units).
 
     A joint with one child gets the smallest rotation that points the bone the right way (no twist, which

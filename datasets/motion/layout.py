@@ -122,12 +122,10 @@ class MotionLayout:
 
     @cached_property
     def skeleton(self) -> Skeleton:
-        """The skeleton the joints belong to."""
         return Skeleton.named(self.skeleton_name)
 
     @property
     def num_joints(self) -> int:
-        """N."""
         return len(self.skeleton)
 
     @cached_property
@@ -136,11 +134,9 @@ class MotionLayout:
         return sum(size for _, size in self.fields)
 
     def has(self, field: str) -> bool:
-        """Whether the layout holds a field."""
         return any(name == field for name, _ in self.fields)
 
     def slice(self, field: str) -> slice:
-        """Columns of one field."""
         start = 0
         for name, size in self.fields:
             if name == field:
@@ -169,7 +165,7 @@ class MotionLayout:
     def present_columns(self) -> NDArray[np.bool_]:
         """Row b: which columns mean something in a clip that holds the bits b (`ClipMeta.present`), [4, D].
 
-        The body's always do. The others are masked in training: what a file stores there plays no part.
+        The body's always do. The others are masked in training: what a file stores there is ignored.
         """
         needs = np.zeros(self.dim, dtype=np.uint8)
         needs[self._hand_columns()] = HANDS
@@ -198,5 +194,15 @@ class MotionLayout:
         raise UserError(f"layout {self.name} has no counterpart without the face")
 
     def has_part(self, part: Part) -> bool:
-        """Whether the layout has columns for a part."""
         return self.has("face") if part == "face" else len(self.part(part)) > 0
+
+
+def require_layout(found: MotionLayout, wanted: MotionLayout, where: str) -> None:
+    """`UserError` naming both when data does not have the layout, family and frame rate a config expects."""
+    have = (found.name, found.family, found.fps)
+    want = (wanted.name, wanted.family, wanted.fps)
+    if have != want:
+        raise UserError(
+            f"{where}: holds layout {have[0]} ({have[1]}, {have[2]:g} fps), the config expects "
+            f"{want[0]} ({want[1]}, {want[2]:g} fps); convert the data again or change the config"
+        )

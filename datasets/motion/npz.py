@@ -36,7 +36,6 @@ class ArrayHeader:
 
     @property
     def size(self) -> int:
-        """Bytes of the data."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
@@ -90,8 +89,7 @@ class NpzFile:
             )
         return header
 
-    def array(self, name: str, *, limit: int = MAX_BYTES) -> NDArray[Any]:
-        """An array of at most `limit` bytes."""
+    def array(self, name: str, *, limit: int = MAX_BYTES) -> NDArray[np.floating]:
         header = self.header(name)
         if header.size > limit:
             raise UserError(

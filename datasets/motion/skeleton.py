@@ -51,7 +51,6 @@ class Skeleton:
 
     @cached_property
     def offsets(self) -> NDArray[np.float64]:
-        """Rest offsets [N, 3], metres."""
         return np.asarray(self.rest, dtype=np.float64)
 
     @cached_property
@@ -63,7 +62,6 @@ class Skeleton:
         return out
 
     def index(self, joint: str) -> int:
-        """Position of a joint by name."""
         try:
             return self.joints.index(joint)
         except ValueError:

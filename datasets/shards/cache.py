@@ -16,9 +16,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from pydantic import Field
+
 from motionloom.datasets.base.lock import file_lock
-from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.reading import CacheConfig
+from motionloom.datasets.schema import Config, UserError
 
 _OURS = re.compile(r"[0-9a-f]{64}\.(tar|index\.npz|manifest\.json)")
 """Names of what is kept. Nothing else is ever deleted: a recipe may name any folder for the cache."""
@@ -31,6 +32,20 @@ def default_folder() -> Path:
     """`motionloom/shards` in the user's cache folder."""
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "motionloom" / "shards"
+
+
+class CacheConfig(Config):
+    """Where shards from a server are kept on this machine. Folders are read in place, without a cache."""
+
+    folder: str | None = None
+    """A folder that processes and runs may share; unset means `motionloom/shards` in the user's cache."""
+    gigabytes: float = Field(50.0, ge=0)
+    """Size limit (10^9 bytes); the shards unused for longest go first. 0 keeps no shard: every clip is a
+    range request of its own."""
+
+    @property
+    def limit(self) -> int:
+        return int(self.gigabytes * 1e9)
 
 
 class FileCache:

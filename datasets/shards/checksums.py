@@ -37,7 +37,7 @@ class LocalShard(NamedTuple):
         return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
 
 
-def require_sound(shard: LocalShard, *, content: bool = True) -> None:
+def require_intact(shard: LocalShard, *, content: bool = True) -> None:
     """Refuse a shard that is missing, has another size or, where `content` is compared, another sha256."""
     path, info = shard
     try:
@@ -69,7 +69,7 @@ def problems(
 
     def problem(shard: LocalShard) -> str | None:
         try:
-            require_sound(shard)
+            require_intact(shard)
         except UserError as error:
             return str(error)
         return None

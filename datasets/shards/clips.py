@@ -46,9 +46,7 @@ class ClipDataset(Protocol):
         """Features of clip `i`, [T, D]."""
         ...
 
-    def meta(self, i: int) -> ClipMeta:
-        """Metadata of clip `i`."""
-        ...
+    def meta(self, i: int) -> ClipMeta: ...
 
     def texts(self, i: int) -> list[Caption]:
         """Captions of clip `i`."""
@@ -58,8 +56,8 @@ class ClipDataset(Protocol):
         """Captions about the face of clip `i`."""
         ...
 
-    def audio(self, i: int) -> NDArray[np.float32] | None:
-        """Audio features of clip `i`, [T_audio, 438]."""
+    def array(self, i: int, member: str) -> NDArray[np.float32] | None:
+        """A modality's features of clip `i`, [L, E], such as `audio.npy`."""
         ...
 
     def wav(self, i: int) -> tuple[NDArray[np.float32], int] | None:

@@ -23,20 +23,16 @@ import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, get_args
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from motionloom.datasets.base.files import write_with
-from motionloom.datasets.schema import PRESENT_ALL, Config, Dropped, ShardInfo, Split, UserError
+from motionloom.datasets.schema import INDEX_FILE, PRESENT_ALL, Config, Dropped, ShardInfo, Split, UserError
 from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.tar import TarClip, read_npy_header, scan_tar
-
-INDEX_FILE = "index.npz"
-MANIFEST_FILE = "manifest.json"
-SPLITS: tuple[Split, ...] = get_args(Split)
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "frames": (np.int32, 1),
@@ -132,7 +128,6 @@ class SplitIndex:
         return len(self.frames)
 
     def id(self, i: int) -> str:
-        """Source id of clip `i`."""
         start = int(self.id_ends[i - 1]) if i else 0
         return self.id_bytes[start : int(self.id_ends[i])].tobytes().decode()
 
@@ -179,7 +174,6 @@ def save_index(root: Path, splits: dict[Split, SplitIndex]) -> None:
 
 
 def _stored_name(split: Split, name: str) -> str:
-    """Name of an array in `index.npz`."""
     return f"{split}.{_STORED_AS.get(name, name)}"
 
 
@@ -204,6 +198,10 @@ def read_index(file: BinaryIO, where: str, split: Split, shards: list[ShardInfo]
             arrays = {name: stored[_stored_name(split, name)] for name in _ARRAYS}
     except (KeyError, ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise UserError(f"{where}: not a readable index ({error}); convert the dataset again") from None
+    for name in ("offsets", "sizes"):  # a data set may be older than a modality that was added
+        missing = len(MEMBERS) - arrays[name].shape[-1]
+        if arrays[name].ndim == 2 and 0 < missing < len(MEMBERS):
+            arrays[name] = np.pad(arrays[name], ((0, 0), (0, missing)))
     index = SplitIndex(**arrays)
     problem = _index_problem(index, shards)
     if problem:
@@ -245,7 +243,6 @@ def _index_problem(index: SplitIndex, shards: list[ShardInfo]) -> str | None:
 
 
 def _wrong_frames(index: SplitIndex, shards: list[ShardInfo], firsts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Per shard: frames that are not positive or do not add up."""
     totals = np.add.reduceat(index.frames.astype(np.int64), firsts)
     least = np.minimum.reduceat(index.frames, firsts)
     stated = np.array([shard.frames for shard in shards], dtype=np.int64)

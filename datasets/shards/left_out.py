@@ -33,7 +33,6 @@ class Group:
 
     @property
     def count(self) -> int:
-        """How many there are."""
         return len(self.members)
 
     def __str__(self) -> str:
@@ -43,7 +42,6 @@ class Group:
         return f"{self.count} x {self._common()} (the first: {first.source})"
 
     def _common(self) -> str:
-        """The reason, with `…` for the words that are not the same in all."""
         first, *others = [member.reason.split(" ") for member in self.members]
         if any(len(words) != len(first) for words in others):
             return self.kind

@@ -1,14 +1,16 @@
-"""What a data set is and how it is written: the two records that `write_dataset` takes."""
+"""How a data set is written, and how it is read."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SCHEMA_VERSION, Dropped, UserError
-from motionloom.datasets.shards.sample import MotionType
+from motionloom.datasets.schema import SCHEMA_VERSION, Config, Dropped, MotionType, UserError
+from motionloom.datasets.shards.cache import CacheConfig
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,6 @@ class Part:
             )
 
     def has(self, position: int) -> bool:
-        """Whether the task at `position` of all tasks is this part's."""
         return position % self.count == self.index
 
 
@@ -42,19 +43,19 @@ class DatasetFacts:
     licence: str
     converter: str
     converter_version: int
-    options: dict[str, Any]
+    options: dict[str, object]
     """What the output depends on, as plain JSON; never a local path."""
     motion_type: MotionType = "float32"
     """How `motion.npy` is stored."""
     licences: dict[str, int] = field(default_factory=dict)
     """Clips under each licence, for sources that mix several."""
-    audio: dict[str, Any] | None = None
+    audio: dict[str, object] | None = None
     """Settings the audio features are made with."""
     dropped: Sequence[Dropped] = ()
     """Clips that the plan has left out already."""
     notes: Sequence[str] = ()
 
-    def made_from(self) -> dict[str, Any]:
+    def made_from(self) -> dict[str, object]:
         """What the bytes of every shard depend on, beside its items."""
         layout = self.layout
         return {
@@ -83,9 +84,26 @@ class WriteOptions:
 
     @property
     def features_only(self) -> bool:
-        """Whether this is a part that writes no shards."""
         return self.part is not None and self.part.step == "features"
 
     def has(self, position: int) -> bool:
-        """Whether the task at `position` is to be made now."""
         return self.part is None or self.part.has(position)
+
+
+class Reading(Config):
+    """Reader and order of one data set."""
+
+    mode: Literal["indexed", "streamed"] = "indexed"
+    """`indexed` reads clips where they lie; `streamed` reads whole shards front to back (WebDataset)."""
+    order: Literal["global", "streamed"] = "global"
+    """`global` shuffles all clips each epoch; `streamed` shuffles shards, and the clips of
+    `shards_per_group` shards at a time. Both readers give the same batches in the streamed order."""
+    shards_per_group: int = Field(8, ge=1)
+    """Shards whose clips are mixed in the streamed order; the streaming reader holds two groups in memory."""
+    cache: CacheConfig = CacheConfig()
+
+    @model_validator(mode="after")
+    def _streams_need_their_order(self) -> Self:
+        if self.mode == "streamed" and self.order != "streamed":
+            raise ValueError("mode: streamed reads shard after shard and needs order: streamed")
+        return self

@@ -21,19 +21,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SCHEMA_VERSION, Caption, ClipMeta, Manifest, Split, UserError
-from motionloom.datasets.shards.access import Access, MappedShards, RangedShards
-from motionloom.datasets.shards.checksums import LocalShard, require_sound
+from motionloom.datasets.motion.layout import MotionLayout, require_layout
+from motionloom.datasets.schema import (
+    INDEX_FILE,
+    MANIFEST_FILE,
+    SCHEMA_VERSION,
+    SPLITS,
+    Caption,
+    ClipMeta,
+    Manifest,
+    Split,
+    UserError,
+)
+from motionloom.datasets.shards.access import Access, MappedShards, RangedShards, StreamedShards
+from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.index import INDEX_FILE, MANIFEST_FILE, SPLITS, read_index
+from motionloom.datasets.shards.index import read_index
+from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.order import Source
-from motionloom.datasets.shards.reading import Reading
-from motionloom.datasets.shards.retry import MissingFileError
-from motionloom.datasets.shards.sample import MEMBERS, captions_from_json
-from motionloom.datasets.shards.store import LocalStore, Store, open_store
-from motionloom.datasets.shards.stream import StreamedShards
-from motionloom.datasets.shards.tar import read_npy_header
+from motionloom.datasets.shards.sample import MEMBERS, captions_from_json, meta_from_json
+from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store
+from motionloom.datasets.shards.tar import npy_from_bytes
 
 _MOTION = MEMBERS.index("motion.npy")
 _SHARD_NAME = re.compile(r"[A-Za-z0-9_-]+-(?:train|val|test)-(\d{6,})\.tar")
@@ -121,7 +129,7 @@ class ShardDataset:
             raise UserError(f"{store.place}: split '{split}' has no clips")
         if isinstance(store, LocalStore):
             for shard in shards:
-                require_sound(LocalShard(store.root / shard.name, shard), content=verify)
+                require_intact(LocalShard(store.root / shard.name, shard), content=verify)
         dataset = ShardDataset(store, known, manifest, digest, reading)
         dataset._check_motion_sizes()
         return dataset
@@ -131,7 +139,6 @@ class ShardDataset:
 
     @cached_property
     def frames(self) -> NDArray[np.int64]:
-        """T of every clip, [n]."""
         return self._index.frames.astype(np.int64)
 
     @property
@@ -141,7 +148,6 @@ class ShardDataset:
 
     @cached_property
     def ids(self) -> list[str]:
-        """Source id of every clip."""
         return [self._index.id(i) for i in range(len(self))]
 
     def has(self, member: str) -> NDArray[np.bool_]:
@@ -159,32 +165,18 @@ class ShardDataset:
         return np.ndarray(shape, np.float16, buffer, start).astype(np.float32)
 
     def meta(self, i: int) -> ClipMeta:
-        """Metadata of clip `i`."""
-        where = self._where(i, "meta.json")
-        try:
-            data = json.loads(self._member(i, "meta.json"))
-        except ValueError as error:
-            raise UserError(f"{where}: not valid JSON ({error})") from None
-        return ClipMeta.parse(data, where)
+        return meta_from_json(self._member(i, "meta.json"), self._where(i, "meta.json"))
 
     def texts(self, i: int) -> list[Caption]:
-        """Captions of clip `i`; empty when it has none."""
         return self._captions(i, "texts.json")
 
     def face_texts(self, i: int) -> list[Caption]:
-        """Captions about the face of clip `i`."""
         return self._captions(i, "face_texts.json")
 
-    def audio(self, i: int) -> NDArray[np.float32] | None:
-        """Audio features of clip `i`, [T_audio, 438], if it has any."""
-        raw = self._member(i, "audio.npy")
-        if not raw:
-            return None
-        where = self._where(i, "audio.npy")
-        header = read_npy_header(io.BytesIO(raw), where)
-        if header.data + int(np.prod(header.shape)) * header.dtype.itemsize != len(raw):
-            raise UserError(f"{where}: the array is cut short")
-        return np.frombuffer(raw, header.dtype, offset=header.data).reshape(header.shape).astype(np.float32)
+    def array(self, i: int, member: str) -> NDArray[np.float32] | None:
+        """A modality's features of clip `i`, [L, E], if it has any."""
+        raw = self._member(i, member)
+        return npy_from_bytes(raw, self._where(i, member)).astype(np.float32) if raw else None
 
     def wav(self, i: int) -> tuple[NDArray[np.float32], int] | None:
         """Sound of clip `i`: (mono samples [S], rate in Hz), if it has any."""
@@ -204,7 +196,6 @@ class ShardDataset:
         return captions_from_json(raw, self._where(i, member)) if raw else []
 
     def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
-        """Announce what a batch will read, so that a server is asked for it at once; changes no result."""
         if self._ahead:
             self._access.prefetch([(self._shard_of(i), i) for i in clips], members)
 
@@ -222,7 +213,6 @@ class ShardDataset:
         )
 
     def parts(self) -> list[tuple[ClipDataset, float]]:
-        """Itself."""
         return [(self, 1.0)]
 
     def _make_access(self) -> Access:
@@ -274,14 +264,3 @@ class ShardDataset:
         store = open_store(place, reading.cache)
         manifest, _ = read_manifest(store, digest)
         ShardDataset.__init__(self, store, split, manifest, digest, reading)
-
-
-def require_layout(found: MotionLayout, wanted: MotionLayout, where: str) -> None:
-    """`UserError` naming both when data does not have the layout, family and frame rate a config expects."""
-    have = (found.name, found.family, found.fps)
-    want = (wanted.name, wanted.family, wanted.fps)
-    if have != want:
-        raise UserError(
-            f"{where}: holds layout {have[0]} ({have[1]}, {have[2]:g} fps), the config expects "
-            f"{want[0]} ({want[1]}, {want[2]:g} fps); convert the data again or change the config"
-        )

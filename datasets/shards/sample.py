@@ -14,20 +14,19 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
+from motionloom.datasets.schema import Caption, ClipMeta, MotionType, Split, UserError
 
-MEMBERS = ("audio.flac", "audio.npy", "face_texts.json", "meta.json", "motion.npy", "texts.json")
-"""Every member name a sample may have, in the order they stand in the tar."""
-
-MotionType = Literal["float32", "float16"]
+_OURS = ("audio.flac", "audio.npy", "face_texts.json", "meta.json", "motion.npy", "texts.json")
+MEMBERS = (*_OURS, *(m for record in MODALITIES.values() for m in record.members if m not in _OURS))
+"""Every member name a sample may have: columns of an index, those of further modalities last."""
 
 
 class DropClip(Exception):  # noqa: N818 (a decision, not an error)
@@ -44,6 +43,8 @@ class Sample:
     face_texts: list[Caption] = field(default_factory=list)
     audio: NDArray[np.float32] | None = None
     wav: tuple[NDArray[np.float32], int] | None = None
+    arrays: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    """Features [T, E] of further modalities, by member name."""
 
 
 def encode_sample(
@@ -76,6 +77,9 @@ def encode_sample(
             raise ValueError(f"audio features are {list(audio.shape)}, not [T_audio, features]")
         require_finite("audio features", audio)
         members["audio.npy"] = npy_bytes(audio)
+    for name, values in sample.arrays.items():
+        require_finite(name, values)
+        members[name] = npy_bytes(np.ascontiguousarray(values, dtype=np.float32))
     if sample.wav is not None:
         members["audio.flac"] = flac_bytes(*sample.wav)
     return members
@@ -113,12 +117,22 @@ def flac_bytes(signal: NDArray[np.float32], rate: int) -> bytes:
     return buffer.getvalue()
 
 
-def captions_from_json(raw: bytes, where: str) -> list[Caption]:
-    """The captions of a `texts.json` member; `UserError` naming `where` otherwise."""
+def _decoded(raw: bytes, where: str) -> object:
     try:
-        data = json.loads(raw)
+        decoded: object = json.loads(raw)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{where}: not valid JSON ({error})") from None
+    return decoded
+
+
+def meta_from_json(raw: bytes, where: str) -> ClipMeta:
+    """The metadata of a `meta.json` member; `UserError` naming `where` otherwise."""
+    return ClipMeta.parse(_decoded(raw, where), where)
+
+
+def captions_from_json(raw: bytes, where: str) -> list[Caption]:
+    """The captions of a `texts.json` member; `UserError` naming `where` otherwise."""
+    data = _decoded(raw, where)
     if not isinstance(data, Sequence) or isinstance(data, str):
         raise UserError(f"{where}: expected a list of captions")
     return [Caption.parse(item, where) for item in data]

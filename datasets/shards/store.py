@@ -1,27 +1,27 @@
 """Where the files of a data set lie: a folder, a web server or an S3 bucket, behind one interface.
 
 Only the schemes of `SCHEMES` are opened, and the check comes before anything else: no `pipe:`, no chained or
-shell URL ever reaches a library. Requests go through fsspec and are repeated by `retry.persist`. Credentials
+shell URL ever reaches a library. Requests go through fsspec and are repeated by `persist`. Credentials
 come from the environment alone; a URL that carries some is refused.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import os
+import random
 import re
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol, cast
+from typing import Any, BinaryIO, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
-from motionloom.datasets.schema import ShardInfo, UserError
-from motionloom.datasets.shards.cache import FileCache
-from motionloom.datasets.shards.index import INDEX_FILE, MANIFEST_FILE
-from motionloom.datasets.shards.reading import CacheConfig
-from motionloom.datasets.shards.retry import MissingFileError, persist
+from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, UserError
+from motionloom.datasets.shards.cache import CacheConfig, FileCache
 
 SCHEMES = ("file", "http", "https", "s3")
 CHUNK = 8 * 2**20
@@ -31,35 +31,6 @@ _CONNECT_SECONDS, _READ_SECONDS = 15, 60
 
 Piece = tuple[str, int, int]
 """(file name, first byte, byte behind the last)."""
-
-
-class Store(Protocol):
-    """The files of one data set, by name."""
-
-    place: str
-    """The folder or URL it was opened with."""
-    mappable: bool
-    """Whether `open_shard` gives a file of this machine, which can be memory-mapped."""
-
-    def where(self, name: str) -> str:
-        """Path or URL of a file, for messages."""
-        ...
-
-    def read_manifest(self, digest: str | None = None) -> bytes:
-        """Content of `manifest.json`; with `digest` (sha256, hex) that content or a `UserError`."""
-        ...
-
-    def open_index(self, digest: str) -> BinaryIO:
-        """`index.npz` of the manifest with that sha256, seekable."""
-        ...
-
-    def open_shard(self, shard: ShardInfo) -> BinaryIO:
-        """A whole shard, buffered, from its beginning."""
-        ...
-
-    def read_pieces(self, pieces: Sequence[Piece]) -> list[bytes]:
-        """Pieces of files, each of exactly the length asked for."""
-        ...
 
 
 def is_url(place: Path | str) -> bool:
@@ -100,30 +71,31 @@ class LocalStore:
     """A folder of this machine."""
 
     mappable = True
+    """Whether `open_shard` gives a file of this machine, which can be memory-mapped."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self.place = str(root)
 
     def where(self, name: str) -> str:
-        """The path."""
+        """Path or URL of a file, for messages."""
         return str(self.root / name)
 
     def read_manifest(self, digest: str | None = None) -> bytes:
-        """See `Store`."""
+        """Content of `manifest.json`; with `digest` (sha256, hex) that content or a `UserError`."""
         with self._open(MANIFEST_FILE) as file:
             return _as_before(file.read(), digest, self.where(MANIFEST_FILE))
 
     def open_index(self, digest: str) -> BinaryIO:
-        """See `Store`."""
+        """`index.npz` of the manifest with that sha256, seekable."""
         return self._open(INDEX_FILE)
 
     def open_shard(self, shard: ShardInfo) -> BinaryIO:
-        """See `Store`."""
+        """A whole shard, buffered, from its beginning."""
         return self._open(shard.name)
 
     def read_pieces(self, pieces: Sequence[Piece]) -> list[bytes]:
-        """See `Store`."""
+        """Pieces of files, each of exactly the length asked for."""
         found = []
         for name, start, end in pieces:
             with self._open(name) as file:
@@ -154,11 +126,9 @@ class RemoteStore:
         self.mappable = cache.limit > 0
 
     def where(self, name: str) -> str:
-        """The URL."""
         return f"{self.place}/{name}"
 
     def read_manifest(self, digest: str | None = None) -> bytes:
-        """See `Store`."""
         if digest is not None:
             found = self.cache.find(f"{digest}.manifest.json")
             if found is not None:
@@ -171,18 +141,18 @@ class RemoteStore:
         return raw
 
     def open_index(self, digest: str) -> BinaryIO:
-        """See `Store`. The manifest holds the shards' checksums, so its own decides the index's content."""
+        """The manifest holds the shards' checksums, so its own decides the index's content."""
         return self.cache.get(f"{digest}.index.npz", 0, lambda path: self._download(INDEX_FILE, path))
 
     def open_shard(self, shard: ShardInfo) -> BinaryIO:
-        """See `Store`. A shard in the cache was checked against the manifest's sha256 when it arrived."""
+        """A shard in the cache was checked against the manifest's sha256 when it arrived."""
         if self.mappable:
             return self.cache.get(f"{shard.sha256}.tar", shard.bytes, lambda path: self._fetch(shard, path))
         raw = _RangeFile(self, shard.name, shard.bytes)
         return cast(BinaryIO, io.BufferedReader(raw, CHUNK))
 
     def read_pieces(self, pieces: Sequence[Piece]) -> list[bytes]:
-        """See `Store`. All at once; those that failed are then repeated one by one."""
+        """All at once; those that failed are then repeated one by one."""
         if len(pieces) > 1:
             names, starts, ends = zip(*pieces, strict=True)
             urls = [self.where(name) for name in names]
@@ -227,9 +197,12 @@ class RemoteStore:
         persist(url, fetch)
 
     def _system(self) -> Any:
-        """This process's connections."""
         settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith("AWS_")))
         return _connect(cast(str, _scheme(self.place)), os.getpid(), settings)
+
+
+Store = LocalStore | RemoteStore
+"""The files of one data set, by name."""
 
 
 @lru_cache(maxsize=4)
@@ -274,17 +247,13 @@ def _as_before(raw: bytes, digest: str | None, where: str) -> bytes:
 
 
 class _RangeFile(io.RawIOBase):
-    """A file on a server, read front to back by range requests."""
-
     def __init__(self, store: RemoteStore, name: str, size: int) -> None:
         self._store, self._name, self._size, self._at = store, name, size, 0
 
     def readable(self) -> bool:
-        """Yes."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """The next bytes."""
         end = min(self._at + len(buffer), self._size)
         if end == self._at:
             return 0
@@ -292,3 +261,82 @@ class _RangeFile(io.RawIOBase):
         buffer[: len(data)] = data
         self._at = end
         return len(data)
+
+
+ATTEMPTS = 8
+FIRST_PAUSE, LONGEST_PAUSE = 0.2, 15.0
+"""Seconds between tries: doubled each time, at random between half and whole."""
+
+_LIBRARIES = {"aiohttp", "aiobotocore", "botocore", "fsspec", "s3fs", "urllib3"}
+_ABSENT = "no such file on the server"
+
+T = TypeVar("T")
+
+
+class MissingFileError(UserError):
+    """A data set has no file of that name."""
+
+
+def persist(what: str, action: Callable[[], T]) -> T:
+    """Run `action`, again after failures that may pass; `UserError` naming `what` when it stays refused."""
+    failure: BaseException = OSError("never tried")
+    for attempt in range(ATTEMPTS):
+        if attempt:
+            pause = min(FIRST_PAUSE * 2 ** (attempt - 1), LONGEST_PAUSE)
+            # Not the global generator: a retry must not shift the run's own random draws.
+            time.sleep(pause * random.SystemRandom().uniform(0.5, 1.0))
+        try:
+            return action()
+        except Exception as error:
+            if isinstance(error, UserError) or not _from_outside(error):
+                raise
+            refusal = _refusal(error)
+            if isinstance(error, FileNotFoundError) or refusal == _ABSENT:
+                raise MissingFileError(f"{what}: {_ABSENT}") from None
+            if refusal is not None:
+                raise UserError(f"{what}: {refusal}") from None
+            failure = error
+    reason = " ".join(str(failure).split()) or type(failure).__name__
+    raise UserError(f"{what}: {reason[:300]} (tried {ATTEMPTS} times)") from None
+
+
+def _from_outside(error: Exception) -> bool:
+    """Whether an error is the network's or the disk's, not a mistake in a program."""
+    return isinstance(error, OSError) or type(error).__module__.partition(".")[0] in _LIBRARIES
+
+
+def _refusal(error: Exception) -> str | None:
+    """Why repeating cannot help, or None when it may."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "the disk of the cache folder is full; free space or lower the cache's gigabytes"
+    if isinstance(error, TimeoutError):
+        return None
+    status = _status(error)
+    if isinstance(error, PermissionError) or status in (401, 403):
+        return (
+            "the server refuses access; set the credentials in the environment (AWS_ACCESS_KEY_ID and "
+            "AWS_SECRET_ACCESS_KEY, or AWS_PROFILE) and check that they may read here"
+        )
+    if "Credentials" in type(error).__name__ or type(error).__name__ in (
+        "ProfileNotFound",
+        "TokenRetrievalError",
+    ):
+        return f"no usable credentials in the environment ({error})"
+    if status in (404, 410):
+        return _ABSENT
+    if status is not None and 400 <= status < 500 and status not in (408, 425, 429):
+        return f"the server refuses the request (HTTP {status}: {' '.join(str(error).split())[:200]})"
+    return None
+
+
+def _status(error: BaseException | None) -> int | None:
+    """HTTP status behind an error or one of its causes."""
+    while error is not None:
+        status = getattr(error, "status", None)
+        response = getattr(error, "response", None)
+        if isinstance(response, dict):
+            status = response.get("ResponseMetadata", {}).get("HTTPStatusCode", status)
+        if isinstance(status, int):
+            return status
+        error = error.__cause__ or error.__context__
+    return None

@@ -15,6 +15,7 @@ from typing import BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy_format
+from numpy.typing import NDArray
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import MEMBERS
@@ -77,6 +78,14 @@ def _checked_name(path: Path, info: tarfile.TarInfo) -> tuple[str, str]:
     if member not in MEMBERS:
         raise UserError(f"{path}: '{info.name}' is not a known member; known: {', '.join(MEMBERS)}")
     return key, member
+
+
+def npy_from_bytes(raw: bytes, where: str) -> NDArray[np.floating]:
+    """The array of a whole .npy member, a view of its bytes; `UserError` also when it is cut."""
+    header = read_npy_header(io.BytesIO(raw), where)
+    if header.data + int(np.prod(header.shape)) * header.dtype.itemsize != len(raw):
+        raise UserError(f"{where}: the array is cut short or too long")
+    return np.frombuffer(raw, header.dtype, offset=header.data).reshape(header.shape)
 
 
 def read_npy_header(file: BinaryIO, where: str) -> NpyHeader:

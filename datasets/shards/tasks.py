@@ -16,10 +16,10 @@ from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of, 
 from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Dropped, ShardInfo, Split, UserError
-from motionloom.datasets.shards.index import SPLITS, ShardIndex, clip_entries, index_path, shard_stem
+from motionloom.datasets.schema import SPLITS, Dropped, MotionType, ShardInfo, Split, UserError
+from motionloom.datasets.shards.index import ShardIndex, clip_entries, index_path, shard_stem
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
-from motionloom.datasets.shards.sample import DropClip, MotionType, Sample, encode_sample
+from motionloom.datasets.shards.sample import DropClip, Sample, encode_sample
 
 T = TypeVar("T")
 Convert = Callable[[T], Sample | list[Sample]]

@@ -20,22 +20,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from motionloom.datasets.base.files import remove_temporaries, sync_folder, write_json
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Manifest, ShardInfo, Split, UserError
-from motionloom.datasets.shards.index import (
-    MANIFEST_FILE,
-    SPLITS,
-    ShardIndex,
-    SplitIndex,
-    index_path,
-    save_index,
-)
+from motionloom.datasets.schema import MANIFEST_FILE, SPLITS, Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.tasks import (
@@ -139,7 +132,6 @@ class DatasetWriter(Generic[T]):
         return self.out / WORK_FOLDER
 
     def pending(self) -> list[T]:
-        """The items of the shards that are not finished."""
         return [item for at in self._todo for _, item in self._tasks[at].named_items]
 
     def write(self, convert: Convert[T]) -> Manifest:
@@ -180,7 +172,6 @@ class DatasetWriter(Generic[T]):
         return manifest
 
     def _shards(self, convert: Convert[T]) -> list[Result]:
-        """Results of all tasks, in their order."""
         done = len(self._tasks) - len(self._todo)
         with Meter("writing shards", len(self._tasks), done=done, shown=self._how.progress) as meter:
             tasks = [self._tasks[at] for at in self._todo]
@@ -203,7 +194,7 @@ def _check_arguments(facts: DatasetFacts, how: WriteOptions) -> None:
         raise UserError(f"converter options must be plain JSON values: {error}") from None
 
 
-def _check_same_dataset(out: Path, name: str, layout: MotionLayout, options: dict[str, Any]) -> None:
+def _check_same_dataset(out: Path, name: str, layout: MotionLayout, options: dict[str, object]) -> None:
     """Never write over another dataset, or over a finished one that was made with other options."""
     try:
         manifest = json.loads((out / MANIFEST_FILE).read_bytes())
@@ -242,7 +233,6 @@ def _remove_strays(out: Path, name: str, keep: set[Path]) -> None:
 
 
 def _finish_index(out: Path, shards: list[ShardInfo]) -> None:
-    """Concatenate the shard indices into `index.npz`; refuse an id that two clips share."""
     splits: dict[Split, SplitIndex] = {}
     owners: dict[str, str] = {}
     for split in SPLITS:

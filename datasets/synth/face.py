@@ -9,10 +9,11 @@ has length about `APEX`, so single values are of the order of a standard normal.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import FACE_DIMS
-from motionloom.datasets.synth.maths import Array, ease, wander
-from motionloom.datasets.synth.truth import FACES
+from motionloom.datasets.synth.actions.maths import Array, ease, wander
+from motionloom.datasets.synth.actions.truth import FACES
 
 APEX = 6.0
 THRESHOLD = 0.35 * APEX
@@ -65,7 +66,7 @@ def _idle(t: Array, rng: np.random.Generator) -> Array:
     return weights
 
 
-def read(face: Array) -> str:
+def read(face: NDArray[np.floating]) -> str:
     """The emotion of expression values [T, 50]: the direction with the longest apex, or neutral."""
     along = np.percentile(np.asarray(face) @ BASIS[:, :4], 75, axis=0)
     best = int(np.argmax(along))

@@ -10,47 +10,46 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    ValidationInfo,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from motionloom.datasets.audio.features import VERSION as AUDIO_VERSION
-from motionloom.datasets.motion.canonical import canonicalize
-from motionloom.datasets.motion.features import encode
+from motionloom.datasets.audio.lineup import settings_at
+from motionloom.datasets.motion.canonical import canonicalize, facing
+from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Config, Manifest, Split
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
-from motionloom.datasets.synth import arms, legs, locomotion
-from motionloom.datasets.synth.choreography import choreograph, dancing_face, dancing_hands
-from motionloom.datasets.synth.dance import dance
-from motionloom.datasets.synth.dance_plan import Dance, DanceConfig, DanceTruth, plan_dance
-from motionloom.datasets.synth.dance_words import dance_captions
+from motionloom.datasets.synth.actions import arms, legs, locomotion
+from motionloom.datasets.synth.actions.maths import Array, rot_y
+from motionloom.datasets.synth.actions.pose import Track
+from motionloom.datasets.synth.actions.truth import ACTIONS, HANDS, Record, Span, Truth, draw, require_known
+from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions
+from motionloom.datasets.synth.dances import (
+    Dance,
+    DanceConfig,
+    DanceTruth,
+    choreograph,
+    dance,
+    dancing_face,
+    dancing_hands,
+    plan_dance,
+)
 from motionloom.datasets.synth.face import express
-from motionloom.datasets.synth.grammar import body_captions, face_captions
 from motionloom.datasets.synth.hands import shape_hand
-from motionloom.datasets.synth.maths import Array
-from motionloom.datasets.synth.music import SAMPLE_RATE, render
-from motionloom.datasets.synth.music_rows import settings_for, song_rows
-from motionloom.datasets.synth.pose import Track
-from motionloom.datasets.synth.smpl75 import smpl75_of
-from motionloom.datasets.synth.song import render_song
-from motionloom.datasets.synth.truth import ACTIONS, HANDS, Span, Truth, draw
-from motionloom.datasets.synth.wordings import many_body_captions, many_face_captions
+from motionloom.datasets.synth.song import render_song, song_features
 
 CONVERTER_VERSION = 2  # the face's words are about the body's person
 LICENCE = "CC0-1.0"
 _GOLDEN = 0.6180339887498949
+_SMPL_JOINTS = 24
+_REST_ROOT = Skeleton.named("smpl22").rest_joints[0]
 
 Animator = Callable[[Truth, Span, float, np.random.Generator], Track]
 ANIMATORS: dict[str, Animator] = {
@@ -89,49 +88,31 @@ class SynthConfig(Config):
     test_fraction: float = Field(0.15, ge=0, lt=1)
     captions: int = Field(3, ge=1, le=8)
     """Different wordings per clip."""
-    wordings: Literal["few", "many"] = "few"
+    wordings: Wordings = "few"
     """Words that captions are made of: two or three for each thing in sentences of one form, or a dozen in
     many forms, for models that shall take more words than their training's. Dances of `dances` have few."""
-    music: bool = False
-    """Give every dance its audio: a click on every beat over chords. For music that decides the dance, see
-    `dances`."""
     size_spread: float = Field(0.02, ge=0, le=0.15)
     """Standard deviation of body size, as a fraction; 0 = all clips on the uniform skeleton, as always in
     `smpl75`, which holds no shape."""
-    hold_out: list[dict[str, Any]] = Field(default_factory=list)
+    hold_out: list[Record] = Field(default_factory=list)
     """Combinations of truth values kept for testing, for example `[{"action": "kick", "side": "left"}]`."""
+    hold_out_val: list[Record] = Field(default_factory=list)
+    """Others kept for validation, so that nothing that new combinations decide is chosen on test clips."""
     dances: DanceConfig | None = None
-    """Dances to songs of several genres, each genre with its own way of dancing. None = to clicks."""
-
-    @model_serializer(mode="wrap")
-    def _as_before(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without newer settings a config says what it did before there were any: its shards stay."""
-        data: dict[str, Any] = handler(self)
-        if data.get("dances") is None:
-            data.pop("dances", None)
-        if data.get("wordings") == "few":
-            data.pop("wordings")
-        return data
+    """Dances to songs of several genres, each with its own way of dancing. None = dances without music."""
 
     @field_validator("actions", "hand_shapes")
     @classmethod
     def _known(cls, names: list[str] | None, info: ValidationInfo) -> list[str] | None:
-        known, what = (ACTIONS, "action") if info.field_name == "actions" else (HANDS[1:], "hand shape")
-        wrong = sorted(set(names or []) - set(known))
-        if wrong or names == []:
-            raise ValueError(f"no {what} {', '.join(wrong) or 'given'}; known: {', '.join(known)}")
-        return names
+        if info.field_name == "actions":
+            return require_known(names, ACTIONS, "action")
+        return require_known(names, HANDS[1:], "hand shape")
 
-    @field_validator("hold_out")
+    @field_validator("hold_out", "hold_out_val")
     @classmethod
-    def _attributes(cls, combinations: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        known = DanceTruth.__dataclass_fields__
+    def _attributes(cls, combinations: list[Record]) -> list[Record]:
         for combination in combinations:
-            wrong = sorted(set(combination) - set(known))
-            if wrong or not combination:
-                raise ValueError(
-                    f"no truth attribute {', '.join(wrong) or 'given'}; known: {', '.join(known)}"
-                )
+            require_known(list(combination), tuple(DanceTruth.__dataclass_fields__), "truth attribute")
         return combinations
 
     @model_validator(mode="after")
@@ -147,8 +128,6 @@ class SynthConfig(Config):
         return self
 
     def _check_dances(self, dances: DanceConfig) -> None:
-        if self.music:
-            raise ValueError("dances have their own music: leave `music` out where `dances` is given")
         danced = self.actions is None or "dance" in self.actions
         if not danced and dances.share is None:
             raise ValueError("`dances` is given but `actions` has no dance; add it, or give dances.share")
@@ -159,7 +138,6 @@ class SynthConfig(Config):
 
     @property
     def other_actions(self) -> list[str]:
-        """The actions without dance."""
         return [action for action in self.actions or ACTIONS if action != "dance"]
 
     @property
@@ -178,7 +156,7 @@ class Clip:
     """Expression values [T, 50]."""
     texts: list[str]
     face_texts: list[str]
-    truth: dict[str, Any]
+    truth: Record
     wav: tuple[NDArray[np.float32], int] | None
     """Mono samples and their rate; only dances have it."""
     audio: NDArray[np.float32] | None = None
@@ -193,7 +171,7 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
     planned = dance_of(index, config)
     truth = planned.truth if planned else truth_of(index, config)
     hands, has_face = layout.num_joints > BODY_JOINTS, layout.has("face")
-    motion, shape, words, sound = (np.random.default_rng([config.seed, index, k]) for k in range(1, 5))
+    motion, shape, words = (np.random.default_rng([config.seed, index, k]) for k in range(1, 4))
     if planned:
         begin = planned.seconds(layout.fps)
         track = choreograph(planned.song, begin, planned.frames, layout.fps, motion)
@@ -208,37 +186,46 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
     size = float(np.clip(1 + config.size_spread * shape.standard_normal(), 0.8, 1.2))
     smpl = None
     if layout.name == "smpl75":
-        size, smpl = 1.0, smpl75_of(track.rotations(), solved)
+        size, smpl = 1.0, _smpl75(track.rotations(), solved)
     face = (
         dancing_face(planned.song, begin, track.t, shape) if planned else express(truth.face, track.t, shape)
     )
-    audio, wav = None, None
-    if planned:
-        audio, wav = _music_of(planned, layout.fps, config)
-    elif config.music and truth.action == "dance":
-        seconds = len(solved) / layout.fps
-        wav = (render(float(truth.bpm or 120), track.first_beat, seconds, sound), SAMPLE_RATE)
-    if isinstance(truth, DanceTruth):
-        texts = dance_captions(truth, words, config.captions)
-    elif config.wordings == "many":
-        texts = many_body_captions(truth, words, config.captions, hands)
-    else:
-        texts = body_captions(truth, words, config.captions, hands)
-    if config.wordings == "many" and not isinstance(truth, DanceTruth):
-        face_texts = many_face_captions(truth, words)
-    else:
-        face_texts = face_captions(truth, words, body=texts)
-    said = planned is None or planned.comes in ("text", "both")
+    audio, wav = _music_of(planned, layout.fps, config) if planned else (None, None)
+    texts = body_captions(truth, words, config.captions, hands, config.wordings)
+    face_texts = face_captions(truth, words, body=texts, wordings=config.wordings)
+    captioned = planned is None or planned.comes in ("text", "both")
     return Clip(
         joints=canonicalize(solved[:, : layout.num_joints] * size),
         face=face,
-        texts=texts if said else [],
-        face_texts=face_texts if has_face and said else [],
+        texts=texts if captioned else [],
+        face_texts=face_texts if has_face and captioned else [],
         truth=truth.record(hands=hands, face=has_face),
         wav=wav,
         audio=audio,
         smpl=smpl,
     )
+
+
+def _smpl75(rotations: Array, joints: Array) -> NDArray[np.float32]:
+    """UDE's 75 SMPL columns [T, 75] (translation 3, 24 axis-angles; section 4.1) of local rotations
+    [T, N >= 22, 3, 3] and the joints [T, N, 3] they pose.
+
+    The rotations are stored as they are, twists included, not fitted to the joints. Canonical: floor at 0,
+    the first root above the origin, the first heading +Z. SMPL's last two joints, the hands, stay at rest
+    [ours].
+    """
+    import roma
+    import torch
+
+    body = joints[:, :BODY_JOINTS]
+    local = rotations[:, :BODY_JOINTS].copy()
+    local[:, 0] = rot_y(-float(facing(body[:1])[0])) @ local[:, 0]
+    turns = roma.rotmat_to_rotvec(torch.from_numpy(np.ascontiguousarray(local))).numpy()
+    out = np.zeros((len(joints), 3 + 3 * _SMPL_JOINTS))
+    # SMPL adds the translation to every joint: the root is at its rest place + translation.
+    out[:, :3] = canonicalize(body)[:, 0] - _REST_ROOT
+    out[:, 3 : 3 + 3 * BODY_JOINTS] = turns.reshape(len(joints), -1)
+    return out.astype(np.float32)
 
 
 def _music_of(
@@ -248,7 +235,7 @@ def _music_of(
     if config.dances is None or dance.comes not in ("audio", "both"):
         return None, None
     rate = config.dances.sample_rate
-    rows = song_rows(dance.song, rate, fps)[dance.start : dance.start + dance.frames]
+    rows = song_features(dance.song, rate, fps)[dance.start : dance.start + dance.frames]
     if not config.dances.sound:
         return rows, None
     first = round(dance.start / fps * rate)
@@ -291,13 +278,15 @@ def _action_of(index: int, config: SynthConfig) -> tuple[str, int]:
 
 
 def split_of(index: int, config: SynthConfig) -> Split:
-    """Split of a clip: held-out combinations test, dances to songs by their song, the others by a
+    """Split of a clip: held-out combinations test or validate, dances to songs by their song, the others by a
     low-discrepancy sequence."""
     planned = dance_of(index, config)
     truth = planned.truth if planned else truth_of(index, config)
-    for combination in config.hold_out:
-        if all(getattr(truth, key, None) == value for key, value in combination.items()):
-            return "test"
+    kept: tuple[tuple[Split, list[Record]], ...] = (("test", config.hold_out), ("val", config.hold_out_val))
+    for split, combinations in kept:
+        for combination in combinations:
+            if all(getattr(truth, key, None) == value for key, value in combination.items()):
+                return split
     if planned and config.dances:
         return config.dances.split(planned.song, config.test_fraction, config.val_fraction)
     share = (index * _GOLDEN + 0.5 + config.seed * 0.7548776662466927) % 1.0
@@ -340,7 +329,7 @@ def synthesize(config: SynthConfig, out: Path, workers: int = 1, progress: bool 
     audio = None
     if config.dances is not None:
         options["audio_version"] = AUDIO_VERSION
-        audio = settings_for(config.motion_layout.fps).dump()
+        audio = settings_at(config.motion_layout.fps).dump()
     return write_dataset(
         out,
         [(split_of(index, config), index) for index in range(config.clips)],

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from motionloom.datasets.motion.resting_hands import RELAXED_FAN, RELAXED_FLEX, RELAXED_THUMB
-from motionloom.datasets.synth.maths import Array, ease, rot_y, rot_z, wander
+from motionloom.datasets.motion.body.resting_hands import RELAXED_FAN, RELAXED_FLEX, RELAXED_THUMB
+from motionloom.datasets.synth.actions.maths import Array, ease, rot_y, rot_z, wander
 
 # Flexion of (knuckle, middle joint, last joint) for index, middle, pinky, ring; radians.
 _FLEX: dict[str, tuple[tuple[float, float, float], ...]] = {

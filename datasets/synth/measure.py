@@ -4,6 +4,12 @@
 whose foot or hand leaves its place) and then reads direction, side, count and speed. `agrees` compares with a
 truth record, reading each attribute as the *claimed* action defines it, so one wrong action does not hide a
 right limb.
+
+`measure_dance` tells style, genre, tempo and beats of a dance. Style is what the legs do (feet that leave the
+floor, a root that goes down or aside); the two genres of a style differ in where the hands are on average by
+0.2 arm lengths or more, whatever the section of the song and whether the arms go together.
+
+`hand_shape` reads the shape of a hand: finger curl, fan, thumb distance and rhythm.
 """
 
 from __future__ import annotations
@@ -17,10 +23,10 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth import face as faces
-from motionloom.datasets.synth.measure_dance import measure_dance
-from motionloom.datasets.synth.measure_hands import hand_shape
+from motionloom.datasets.synth.actions.maths import Array
+from motionloom.datasets.synth.actions.truth import SIDES, Record
+from motionloom.datasets.synth.genres import Style
 from motionloom.datasets.synth.signals import Signals, rise_time, runs, signals_of, tempo
-from motionloom.datasets.synth.truth import SIDES
 
 CIRCLE = 4.0
 """Net turn (radians) of a walk from which it is a circle."""
@@ -52,7 +58,7 @@ class Measured:
     """Fall of the root below standing, metres."""
 
 
-def measure(joints: NDArray[Any], fps: float) -> Measured:
+def measure(joints: NDArray[np.floating], fps: float) -> Measured:
     """Recognise what joints [T, 22 or 52, 3] (metres, Y up) do."""
     signals = signals_of(joints, fps)
     action = _action(signals)
@@ -72,7 +78,10 @@ def measure(joints: NDArray[Any], fps: float) -> Measured:
 
 
 def agrees(
-    truth: Mapping[str, Any], joints: NDArray[Any], face: NDArray[Any] | None = None, fps: float = 30.0
+    truth: Mapping[str, Any],
+    joints: NDArray[np.floating],
+    face: NDArray[np.floating] | None = None,
+    fps: float = 30.0,
 ) -> dict[str, bool]:
     """For each attribute of a truth record that applies: does the motion do it?
 
@@ -146,7 +155,7 @@ def _arm_action(s: Signals) -> str:
     return "clap" if _claps(s) >= 1 else "reach"
 
 
-def _attributes(s: Signals, action: str) -> dict[str, Any]:
+def _attributes(s: Signals, action: str) -> Record:
     """Attributes as `action` defines them."""
     if action == "walk":
         backward = s.travel[-1] < 0
@@ -232,3 +241,110 @@ def _speed(value: float, slow: float, quick: float) -> str | None:
 
 def _both(hands: NDArray[np.bool_]) -> str | None:
     return "both" if hands.all() else SIDES[int(np.argmax(hands))] if hands.any() else None
+
+
+# ---- dances
+
+STEP_LIFT = 0.03
+"""Metres that the ball of a foot is lifted at least by someone who steps."""
+_WRIST_HEIGHTS: dict[str, tuple[float, str, str]] = {
+    # Mean height of the wrists over the shoulders, in arm lengths: limit, genre below, genre above.
+    "step": (-0.1, "house", "disco"),
+    "bounce": (-0.08, "hiphop", "rock"),
+    "sway": (-0.35, "reggae", "ballad"),
+}
+
+
+@dataclass(frozen=True)
+class MeasuredDance:
+    """What a motion dances."""
+
+    style: Style
+    genre: str
+    bpm: float
+    """Beats a minute, of the strongest rhythm of the body's speed."""
+    beats: Array
+    """Seconds of the kinetic beats: minima of the body's speed."""
+
+
+def measure_dance(joints: NDArray[np.floating], fps: float) -> MeasuredDance:
+    """The dance of joints [T, N >= 22, 3] (metres, Y up)."""
+    signals = signals_of(joints, fps)
+    style = _style(signals)
+    limit, low, high = _WRIST_HEIGHTS[style]
+    genre = high if float(signals.wrists[..., 1].mean()) > limit else low
+    return MeasuredDance(style, genre, tempo(signals), kinetic_beats(joints, fps))
+
+
+def kinetic_beats(joints: NDArray[np.floating], fps: float) -> Array:
+    """Seconds at which the mean speed of the body joints [T, N >= 22, 3] is at a minimum."""
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.signal import find_peaks
+
+    body = np.asarray(joints, dtype=np.float64)[:, :22]
+    speed = np.linalg.norm(np.diff(body, axis=0), axis=-1).mean(1)
+    speed = gaussian_filter1d(speed, max(0.04 * fps, 0.3), mode="nearest")
+    found = find_peaks(-speed, prominence=0.1 * max(float(np.ptp(speed)), 1e-12))[0]
+    # Speed t lies between frames t and t + 1.
+    return np.asarray((found + 0.5) / fps, dtype=np.float64)
+
+
+def _style(s: Signals) -> Style:
+    if float(np.percentile(s.balls, 95)) > STEP_LIFT:
+        return "step"
+    root = s.joints[:, 0]
+    aside = (root[:, 0] - root[:, 0].mean()) * np.cos(s.heading)
+    aside -= (root[:, 2] - root[:, 2].mean()) * np.sin(s.heading)
+    return "bounce" if float(np.std(root[:, 1])) > float(np.std(aside)) else "sway"
+
+
+# ---- hands
+
+_INDEX, _MIDDLE, _PINKY, _RING, _THUMB = range(5)
+
+
+def curls(joints: NDArray[np.floating], side: int) -> Array:
+    """Curl [T, 4] of index, middle, pinky, ring in radians: the turn from the palm to the last bone."""
+    wrist, hand = _hand(joints, side)
+    palm = hand[:, :4, 0] - wrist[:, None]
+    last = hand[:, :4, 2] - hand[:, :4, 1]
+    return _angle(palm, last)
+
+
+def hand_shape(joints: NDArray[np.floating], side: int, fps: float) -> str:
+    """Shape of the left (0) or right (1) hand over a clip of joints [T, 52, 3]; a name of `truth.HANDS`."""
+    from scipy.ndimage import gaussian_filter1d
+
+    x = gaussian_filter1d(np.asarray(joints, dtype=np.float64), max(0.03 * fps, 0.3), axis=0, mode="nearest")
+    curl = curls(x, side)
+    start = min(int(0.5 * fps), len(curl) // 4)
+    curl = curl[start:]
+    if curl.std(0).mean() > 0.3:
+        return "wave_fingers"
+    wrist, hand = (part[start:] for part in _hand(x, side))
+    index, middle, pinky, ring = np.median(curl, axis=0)
+    size = np.linalg.norm(hand[:, _MIDDLE, 0] - wrist, axis=-1)
+    pinch = np.median(
+        np.linalg.norm(hand[:, _THUMB, 2] - hand[:, _INDEX, 2], axis=-1) / np.maximum(size, 1e-6)
+    )
+    fan = np.median(_angle(hand[:, _INDEX, 1] - hand[:, _INDEX, 0], hand[:, _PINKY, 1] - hand[:, _PINKY, 0]))
+    others = (middle + pinky + ring) / 3
+    if others > 1.7:
+        return "point" if index < 1.2 else "fist"
+    if pinch < 0.5 and index > others + 0.3:
+        return "pinch"
+    if others < 0.45 and index < 0.45 and fan > 0.45:
+        return "spread"
+    return "relaxed"
+
+
+def _hand(joints: NDArray[np.floating], side: int) -> tuple[Array, Array]:
+    """Wrist [T, 3] and finger joints [T, 5, 3, 3] (index, middle, pinky, ring, thumb)."""
+    start = 22 + 15 * side
+    x = np.asarray(joints, dtype=np.float64)
+    return x[:, 20 + side], x[:, start : start + 15].reshape(len(x), 5, 3, 3)
+
+
+def _angle(a: Array, b: Array) -> Array:
+    norm = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+    return np.asarray(np.arccos(np.clip((a * b).sum(-1) / np.maximum(norm, 1e-12), -1.0, 1.0)))

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.synth.maths import Array
-from motionloom.datasets.synth.pose import SHIN, STAND, THIGH
+from motionloom.datasets.synth.actions.maths import Array
+from motionloom.datasets.synth.actions.pose import SHIN, STAND, THIGH
 
 _BALLS, _ANKLES, _SHOULDERS, _WRISTS = (10, 11), (7, 8), (16, 17), (20, 21)
 
@@ -68,7 +67,7 @@ def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-def signals_of(joints: NDArray[Any], fps: float) -> Signals:
+def signals_of(joints: NDArray[np.floating], fps: float) -> Signals:
     """Signals of joints [T, N >= 22, 3] in metres, Y up."""
     from scipy.ndimage import gaussian_filter1d
 

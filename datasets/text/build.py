@@ -86,7 +86,6 @@ class SentencesOnly:
         self.name, self.dim = f"{encoder.name}:sentences", encoder.dim
 
     def encode(self, captions: Sequence[str]) -> EncodedText:
-        """See `TextEncoder`."""
         sentence = self._encoder.encode(captions).sentence
         return EncodedText(sentence, sentence[:, None], np.ones((len(sentence), 1), dtype=bool))
 

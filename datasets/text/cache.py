@@ -68,7 +68,6 @@ class TextCache:
 
     @staticmethod
     def open(folder: Path | str) -> TextCache:
-        """Open a finished cache."""
         folder = Path(folder)
         if not (folder / "cache.json").exists():
             raise UserError(f"{folder}: no finished text cache here; run the text stage")
@@ -99,16 +98,13 @@ class TextCache:
         return {row.tobytes() for row in self._keys}
 
     def captions_by_key(self) -> dict[bytes, str]:
-        """Every caption here."""
         lines = (self.folder / "captions.jsonl").read_text(encoding="utf-8").splitlines()
         return {key_of(text): text for text in map(json.loads, lines)}
 
     def lengths(self) -> NDArray[np.int64]:
-        """Number of tokens of each row, [n]."""
         return np.asarray(np.diff(self._offsets))
 
     def row(self, key: bytes) -> int | None:
-        """Row of a caption's key, or None."""
         head = np.uint64(int.from_bytes(key[:8], "big"))
         first = int(np.searchsorted(self._heads, head, side="left"))
         while first < len(self._heads) and self._heads[first] == head:

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
@@ -25,6 +25,10 @@ from torch import Tensor, nn
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.minilm import MiniLm
+
+if TYPE_CHECKING:
+    from sentence_transformers import SentenceTransformer
+    from transformers import CLIPTextModelWithProjection, PreTrainedTokenizerBase
 
 
 @dataclass(frozen=True)
@@ -60,36 +64,32 @@ class MiniLmEncoder:
 
     @cached_property
     def name(self) -> str:
-        """See `TextEncoder`; made when it is asked for, since it reads all weights."""
+        """Name of the model with a digest of its weights, computed on first use."""
         return f"minilm:{self._model.digest}"
 
     def encode(self, captions: Sequence[str]) -> EncodedText:
-        """See `TextEncoder`."""
         return _pack(*self._model(captions))
 
     def vocabulary(self) -> list[str]:
-        """The pieces its tokenizer knows."""
         return list(self._model.tokenizer.get_vocab())
 
 
 class SentenceEncoder:
     """A sentence-transformers model: last hidden states and the model's own sentence embedding."""
 
-    def __init__(self, spec: str, model: Any) -> None:
+    def __init__(self, spec: str, model: SentenceTransformer) -> None:
         self._model = model.eval()
         self.name = f"{spec}:{_weights_digest(model)}"
-        self.dim = int(model.get_embedding_dimension())
+        self.dim = int(model.get_embedding_dimension() or 0)
 
     @torch.inference_mode()
     def encode(self, captions: Sequence[str]) -> EncodedText:
-        """See `TextEncoder`."""
         features = self._model.preprocess(list(captions))
         features = {key: _to(value, self._model.device) for key, value in features.items()}
         out = self._model(features)
         return _pack(out["sentence_embedding"], out["token_embeddings"], out["attention_mask"])
 
     def vocabulary(self) -> list[str]:
-        """The pieces its tokenizer knows."""
         return list(self._model.tokenizer.get_vocab())
 
 
@@ -100,15 +100,16 @@ class ClipEncoder:
     itself, so that both share E.
     """
 
-    def __init__(self, spec: str, model: Any, tokenizer: Any) -> None:
-        self._model = model.eval()
+    def __init__(
+        self, spec: str, model: CLIPTextModelWithProjection, tokenizer: PreTrainedTokenizerBase
+    ) -> None:
+        self._model = model.eval()  # type: ignore[no-untyped-call]
         self._tokenizer = tokenizer
         self.name = f"{spec}:{_weights_digest(model)}"
         self.dim = int(model.config.hidden_size)
 
     @torch.inference_mode()
     def encode(self, captions: Sequence[str]) -> EncodedText:
-        """See `TextEncoder`."""
         limit = self._model.config.max_position_embeddings
         features = self._tokenizer(
             list(captions), padding=True, truncation=True, max_length=limit, return_tensors="pt"
@@ -121,7 +122,6 @@ class ClipEncoder:
         return _pack(sentence, out.last_hidden_state, features["attention_mask"])
 
     def vocabulary(self) -> list[str]:
-        """The pieces its tokenizer knows."""
         return list(self._tokenizer.get_vocab())
 
 
@@ -164,7 +164,7 @@ def _model_type(folder: Path) -> str:
         ) from None
 
 
-def _sentence_model(where: Path | str, *, device: str, local: bool) -> Any:
+def _sentence_model(where: Path | str, *, device: str, local: bool) -> SentenceTransformer:
     from sentence_transformers import SentenceTransformer
 
     try:
@@ -180,7 +180,9 @@ def _sentence_model(where: Path | str, *, device: str, local: bool) -> Any:
         raise _not_loadable(where, local, error) from error
 
 
-def _clip_model(where: Path | str, *, device: str, local: bool) -> tuple[Any, Any]:
+def _clip_model(
+    where: Path | str, *, device: str, local: bool
+) -> tuple[CLIPTextModelWithProjection, PreTrainedTokenizerBase]:
     from transformers import AutoTokenizer, CLIPTextModelWithProjection
 
     here = local or hub_is_away()
@@ -227,7 +229,7 @@ def _pack(sentence: Tensor, tokens: Tensor, mask: Tensor) -> EncodedText:
     return EncodedText(sentence.cpu().numpy(), tokens.cpu().numpy(), keep.cpu().numpy())
 
 
-def _to(value: Any, device: torch.device) -> Any:
+def _to(value: object, device: torch.device) -> object:
     return value.to(device) if isinstance(value, Tensor) else value
 
 

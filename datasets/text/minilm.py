@@ -23,7 +23,7 @@ from torch.nn import functional as F
 from motionloom.datasets.schema import UserError
 
 _PREFIX = "0.model."
-"""Of the weights' names in sentence-transformers, which the digest goes by: caches made by it stay good."""
+"""Prefix of the weights' names in sentence-transformers, which the digest is made of."""
 
 
 class MiniLm:

@@ -19,41 +19,31 @@ Legend: B batch, L positions of one modality, S positions of all, F its features
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from itertools import accumulate
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field
 from torch import Tensor, nn
 
-from motionloom.datasets.conditions import MODALITIES, Condition, Conditions
-from motionloom.datasets.schema import Config, UserError
-from motionloom.models.layers import draws
-from motionloom.models.layers.draws import Dropout
-from motionloom.models.layers.transformer import Transformer, sinusoid
+from motionloom.datasets.conditions import Condition, Conditions
+from motionloom.datasets.schema import UserError
+from motionloom.models.layers import random
+from motionloom.models.layers.transformer import StackConfig, Transformer, sinusoid
 
 _RANGE = 16
-"""Bits of a position within its modality, for draws by sample."""
+"""Bits of a position within its modality, for random numbers by sample."""
 
 
-class MateConfig(Config):
+class MateConfig(StackConfig):
     """Sizes; the defaults are the paper's (section 4.2)."""
 
     dim: int = Field(default=256, ge=2, multiple_of=2)
     layers: int = Field(default=6, ge=1)
-    heads: int = Field(default=8, ge=1)
-    ff: int = Field(default=1024, ge=1)
-    dropout: float = Field(default=0.1, ge=0, lt=1)
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
     stride: Literal[1, 2, 4] = 1
     """Frames of music that one position reads; 1 is the paper's, more make its sequence shorter [ours]."""
-
-    @model_validator(mode="after")
-    def _heads_divide(self) -> Self:
-        if self.dim % self.heads:
-            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
-        return self
 
 
 class Encoded(NamedTuple):
@@ -68,29 +58,29 @@ class Encoded(NamedTuple):
     timed: Tensor | None = None
     """[B, T, E], the part of `seq` that lies on the motion's time line, that of music, a position for
     `stride` frames; zero where a row has none. None = no row has any."""
-    places: Tensor | None = None
-    """int64 [S], for draws by sample: where each column of `seq` stands, whatever pads the others."""
+    positions: Tensor | None = None
+    """int64 [S], for random numbers by sample: the position of each column of `seq`, which the padding of
+    others does not change."""
 
     def rows(self, index: Tensor | slice) -> Encoded:
-        """Some rows."""
         timed = None if self.timed is None else self.timed[index]
-        return Encoded(self.glob[index], self.seq[index], self.mask[index], timed, self.places)
+        return Encoded(self.glob[index], self.seq[index], self.mask[index], timed, self.positions)
 
 
 class Mate(nn.Module):
     """Conditions of any modalities to one embedding space.
 
     Args:
-        config: Sizes.
         widths: Modality -> F, e.g. {"text": 384, "audio": 438}; their order is that of the sequence.
+        timed: Modalities whose positions are the motion's frames, e.g. {"audio"}.
     """
 
-    def __init__(self, config: MateConfig, widths: Mapping[str, int]) -> None:
+    def __init__(self, config: MateConfig, widths: Mapping[str, int], *, timed: Collection[str]) -> None:
         super().__init__()
         if not widths:
             raise UserError("MATE needs at least one modality to read")
         self.config = config
-        self.widths = dict(widths)
+        self.widths, self.timed = dict(widths), frozenset(timed)
         dim = config.dim
         self.project = nn.ModuleDict(
             {name: nn.Linear(width * self._stride(name), dim) for name, width in widths.items()}
@@ -98,15 +88,8 @@ class Mate(nn.Module):
         self.modality = nn.ParameterDict({name: _token(dim) for name in widths})
         self.aggregate = _token(dim)
         self.aggregate_of = nn.ParameterDict({name: _token(dim) for name in widths})
-        self.dropout = Dropout(config.dropout)
-        self.stack = Transformer(
-            config.layers,
-            dim,
-            config.heads,
-            config.ff,
-            dropout=config.dropout,
-            attention_dropout=config.attention_dropout,
-        )
+        self.dropout = random.Dropout(config.dropout)
+        self.stack = Transformer.of(config, config.layers, attention_dropout=config.attention_dropout)
 
     def forward(self, conditions: Conditions, batch: int | None = None) -> Encoded:
         """Encode the conditions of a batch; modalities that the mapping lacks count as absent in every row.
@@ -133,12 +116,13 @@ class Mate(nn.Module):
         x = torch.cat([(first + origin)[:, None], *pieces], dim=1)
         mask = torch.cat(masks, dim=1)
         sizes = [piece.shape[1] for piece in pieces]
-        places = _places(sizes, x.device) if draws.by_sample() else None
-        draws.columns(places)
-        x = self.stack(self.dropout(x), torch.cat([mask.new_ones(size, 1), mask], dim=1))
-        draws.columns(None)
+        positions = _positions(sizes, x.device) if random.by_sample() else None
+        with random.positions(positions):
+            x = self.stack(self.dropout(x), torch.cat([mask.new_ones(size, 1), mask], dim=1))
         seq = x[:, 1:].masked_fill(~mask[..., None], 0.0)
-        return Encoded(x[:, 0], seq, mask, self._timed(seq, sizes), None if places is None else places[1:])
+        return Encoded(
+            x[:, 0], seq, mask, self._timed(seq, sizes), None if positions is None else positions[1:]
+        )
 
     def unconditional(self, batch: int) -> Encoded:
         """What rows without any modality are encoded as, S = 0."""
@@ -151,7 +135,7 @@ class Mate(nn.Module):
         found = [
             seq[:, end - size : end]
             for name, size, end in zip(self.widths, sizes, ends, strict=True)
-            if size and _timed(name)
+            if size and name in self.timed
         ]
         size = max((part.shape[1] for part in found), default=0)
         out: Tensor | None = None
@@ -187,7 +171,7 @@ class Mate(nn.Module):
 
     def _stride(self, name: str) -> int:
         """Frames of a modality that one position reads."""
-        return self.config.stride if _timed(name) else 1
+        return self.config.stride if name in self.timed else 1
 
 
 def drop_conditions(conditions: Conditions, drop: Tensor) -> dict[str, Condition]:
@@ -205,16 +189,12 @@ def drop_conditions(conditions: Conditions, drop: Tensor) -> dict[str, Condition
     return out
 
 
-def _places(sizes: list[int], device: torch.device) -> Tensor:
-    """Of the aggregation token and the positions of each modality: every one has a range of its own, so that
-    the padding of one moves no other.
+def _positions(sizes: list[int], device: torch.device) -> Tensor:
+    """Positions of the aggregation token and of each modality; every modality has a range of its own, so that
+    the padding of one does not shift another.
     """
     ranges = [torch.arange(size, device=device) + (n << _RANGE) for n, size in enumerate(sizes, start=1)]
     return torch.cat([torch.zeros(1, dtype=torch.int64, device=device), *ranges])
-
-
-def _timed(name: str) -> bool:
-    return name in MODALITIES and MODALITIES[name].timed
 
 
 def _token(dim: int) -> nn.Parameter:

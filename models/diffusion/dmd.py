@@ -1,7 +1,7 @@
 """`Dmd`: UDE's diffusion motion decoder (section 3.4), which turns motion tokens into varied motions.
 
 A token encoder reads the code streams once; a diffusion decoder reads the noisy frames, the time step and
-what the encoder said, and predicts the noise.
+the encoder's output, and predicts the noise.
 
 Notable choices:
 - Encoded tokens join the frames by place, not by cross-attention [ours]: each group of tokens belongs to
@@ -19,30 +19,26 @@ Legend: B batch, T frames, D motion features, G groups of four frames, P slots o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Self
 
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.network import step_waves
-from motionloom.models.diffusion.schedule import ScheduleConfig
+from motionloom.models.diffusion.schedule import ScheduleConfig, Scheduler
 from motionloom.models.gpt.tokens import stream_names
-from motionloom.models.layers.transformer import Transformer, length_mask, sinusoid
+from motionloom.models.layers.transformer import StackConfig, Transformer, length_mask, sinusoid
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
 from motionloom.models.training.distributed import masked_mean
 
 
-class DmdConfig(Config):
+class DmdConfig(StackConfig):
     """Sizes; the defaults are the paper's (section 4.2), at the public demo's width of 512."""
 
     dim: int = Field(default=512, ge=2, multiple_of=2)
-    ff: int = Field(default=1024, ge=1)
     encoder_layers: int = Field(default=8, ge=1)
     decoder_layers: int = Field(default=8, ge=1)
-    heads: int = Field(default=8, ge=1)
-    dropout: float = Field(default=0.1, ge=0, lt=1)
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
     hide: float = Field(default=0.0, ge=0, le=1)
     """Share of training windows in which a stretch of tokens is hidden [ours]; 0 is the paper's."""
@@ -53,8 +49,6 @@ class DmdConfig(Config):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        if self.dim % self.heads:
-            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
         if self.velocity_weight and self.schedule.predicts != "sample":
             raise ValueError("velocity_weight is for schedule: {predicts: sample}; noise has no velocity")
         return self
@@ -64,8 +58,6 @@ class Dmd(nn.Module):
     """Denoiser of normalised motions [B, T, D] given the tokens of each.
 
     Args:
-        config: Sizes and the noising process.
-        streams: The tokenizer's streams.
         pattern: Stream of every slot of a group.
         motion_dim: D.
     """
@@ -113,7 +105,7 @@ class Dmd(nn.Module):
         absent: Mapping[str, Tensor] | None = None,
         hidden: Tensor | None = None,
     ) -> Tensor:
-        """What the tokens say about each frame, [B, 4 G, C]; once a motion, not at each step.
+        """Condition of each frame from the tokens, [B, 4 G, C]; computed once a motion, not at each step.
 
         Args:
             codes: Per stream int64 [B, G * per_group].
@@ -140,7 +132,7 @@ class Dmd(nn.Module):
         return out
 
     def denoise(self, noisy: Tensor, step: Tensor, condition: Tensor, mask: Tensor) -> Tensor:
-        """The noise in `noisy` (or the clean motion, as the schedule says); zero where masked.
+        """The noise in `noisy` (or the clean motion, as the schedule predicts); zero where masked.
 
         Args:
             noisy: [B, T, D].
@@ -163,19 +155,12 @@ class Dmd(nn.Module):
 
     def _stack(self, layers: int) -> Transformer:
         config = self.config
-        return Transformer(
-            layers,
-            config.dim,
-            config.heads,
-            config.ff,
-            dropout=config.dropout,
-            attention_dropout=config.attention_dropout,
-        )
+        return Transformer.of(config, layers, attention_dropout=config.attention_dropout)
 
 
 def dmd_loss(
     net: Dmd,
-    noiser: Any,
+    noiser: Scheduler,
     motion: Tensor,
     codes: Mapping[str, Tensor],
     length: Tensor,
@@ -190,15 +175,12 @@ def dmd_loss(
     is predicted between frames, by `velocity_weight`.
 
     Args:
-        net: The denoiser.
         noiser: `config.schedule.noiser()`.
         motion: [B, T, D], normalised.
         codes: Its tokens, per stream int64 [B, G * per_group], 4 G >= T.
         length: int64 [B], frames.
         step: int64 [B], time steps.
         noise: [B, T, D], standard normal.
-        absent: As in `Dmd.encode_tokens`.
-        hidden: As there.
         present: bool [B, D], columns that count (None = all).
     """
     found = net(noiser.add_noise(motion, noise, step), step, codes, length, absent, hidden)

@@ -6,16 +6,14 @@ make large, the path and the shapes of hands, is large here too [ours]. Without 
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from motionloom.models.diffusion.dmd import Dmd, dmd_loss
 from motionloom.models.gpt.frozen import Frozen
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
-from motionloom.models.training.stage_module import OptimConfig, StageModule
+from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 
 
 class DmdModule(StageModule):
@@ -31,12 +29,11 @@ class DmdModule(StageModule):
         self.tokenizer = Frozen(tokenizer)
 
     def on_fit_start(self) -> None:
-        """The frozen tokenizer follows to this module's device."""
         self.tokenizer.to(self.device)
 
-    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D] (the tokenizer's columns), "length" [B], "present" bool
-        [B, D] (optional: all). Time steps and noise are drawn anew each call.
+        [B, D] (optional: all). Time steps and noise are drawn in each call.
         """
         motion, present = batch["motion"], batch.get("present")
         groups = (batch["length"] // GROUP_FRAMES).clamp(min=1)
@@ -44,8 +41,8 @@ class DmdModule(StageModule):
         with torch.no_grad():
             codes = self.tokenizer.module.encode(motion, length, present)
             seen = self.tokenizer.module.coordinates(motion, present)
-        step = draws.integers(self.net.config.schedule.steps, len(motion), motion.device)
-        noise = draws.normal_like(seen)
+        step = random.integers(self.net.config.schedule.steps, len(motion), motion.device)
+        noise = random.normal_like(seen)
         hidden = hidden_stretch(groups, -(-motion.shape[1] // GROUP_FRAMES), self.net.config.hide)
         loss = dmd_loss(
             self.net, self.noiser, seen, codes, length, step, noise, hidden=hidden, present=present
@@ -59,7 +56,7 @@ def hidden_stretch(groups: Tensor, size: int, share: float) -> Tensor | None:
     """
     if not share:
         return None
-    chance, length, place = draws.uniforms(3, len(groups), groups.device)
+    chance, length, place = random.uniforms(3, len(groups), groups.device)
     count = 1 + (length * (groups // 2)).long().clamp(max=(groups // 2 - 1).clamp(min=0))
     first = (place * (groups - count + 1)).long()
     at = torch.arange(size, device=groups.device)

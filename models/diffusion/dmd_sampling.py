@@ -49,7 +49,6 @@ def decode_motions(
         codes: Tokens, n rows.
         seeds: One per row; repeat a row with other seeds for more motions of one token sequence.
         frames: Frames of each motion (default: all of its tokens').
-        sampler: One of diffusers'.
         steps: Denoising steps, at most those of the training.
         window: Frames denoised at once, a multiple of 4: what the network was trained on.
         overlap: Frames that neighbouring windows share, a multiple of 4 below `window`.
@@ -200,13 +199,7 @@ def _denoised(
 
 @torch.no_grad()
 def decode_window(
-    net: Dmd,
-    codes: Mapping[str, Tensor],
-    x: Tensor,
-    *,
-    seed: int,
-    sampler: Sampler,
-    steps: int,
+    net: Dmd, codes: Mapping[str, Tensor], x: Tensor, *, seed: int, sampler: Sampler, steps: int
 ) -> Tensor:
     """One window [T, D] of tokens [1, G * per], denoised from x [T, D] as it is; `net` in evaluation mode."""
     windows = _Windows(net, codes, None, None, len(x), len(x), 0)

@@ -28,11 +28,7 @@ class DmdStream:
     """Decodes one motion's tokens as they come, to the coordinates of training.
 
     Args:
-        net: The denoiser, in evaluation mode.
         per_group: Tokens of each stream in a group.
-        seed: Of all noise.
-        sampler: One of diffusers'.
-        steps: Denoising steps.
         window: Frames denoised at once, a multiple of 4.
         overlap: Frames that neighbouring windows share, a multiple of 4 and at most half a window.
     """

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from torch import Tensor
 
 from motionloom.models.diffusion.network import MotionDiffusion
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.distributed import masked_mean
-from motionloom.models.training.stage_module import OptimConfig, StageModule
+from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 
 
 class DiffusionModule(StageModule):
-    """Trains a `MotionDiffusion` on the batches of `CaptionBatches`."""
+    """Trains a `MotionDiffusion` on captioned `ConditionBatches`."""
 
     net: MotionDiffusion
 
@@ -22,19 +20,19 @@ class DiffusionModule(StageModule):
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
         self.noiser = net.config.schedule.noiser()
 
-    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
         [B, D] (optional: all).
 
-        Time steps and noise are drawn anew each call; in evaluation no caption is dropped.
+        Time steps and noise are drawn in each call; in evaluation no caption is dropped.
         """
         motion, length, text = batch["motion"], batch["length"], batch["conditions"]["text"].pooled
         schedule = self.net.config.schedule
         mask = length_mask(length, motion.shape[1])
-        step = draws.integers(schedule.steps, len(motion), motion.device)
-        noise = draws.normal_like(motion)
+        step = random.integers(schedule.steps, len(motion), motion.device)
+        noise = random.normal_like(motion)
         hidden = self.net.config.condition_dropout if self.training else 0.0
-        conditioned = draws.uniform(len(motion), device=motion.device) >= hidden
+        conditioned = random.uniform(len(motion), device=motion.device) >= hidden
         noisy = self.noiser.add_noise(motion, noise, step)
         found = self.net(noisy, step, text, mask, conditioned)
         target = motion if schedule.predicts == "sample" else noise

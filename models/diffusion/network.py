@@ -1,7 +1,7 @@
 """`MotionDiffusion`: a transformer encoder that denoises a motion given a text (HumanTOMATO B.5.2, MDM).
 
 The condition, projected text plus embedded time step, is one token in front of the frames; every frame is
-one more token. The output at the frames is the clean motion (or the noise, as the schedule says).
+one more token. The output at the frames is the clean motion (or the noise, as the schedule predicts).
 `condition_dropout` hides the text from some samples, for classifier-free guidance.
 
 Legend: B batch, T frames, D motion features, E text width.
@@ -10,36 +10,26 @@ Legend: B batch, T frames, D motion features, E text width.
 from __future__ import annotations
 
 import math
-from typing import Self
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field
 from torch import Tensor, nn
 
-from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.schedule import ScheduleConfig
-from motionloom.models.layers.transformer import Norm, Transformer, sinusoid
+from motionloom.models.layers.transformer import Norm, StackConfig, Transformer, sinusoid
 
 
-class DiffusionConfig(Config):
+class DiffusionConfig(StackConfig):
     """Sizes; the defaults are MDM's, "all parameter settings follow" it (B.5.2)."""
 
     dim: int = Field(default=512, ge=2, multiple_of=2)
-    ff: int = Field(default=1024, ge=1)
     layers: int = Field(default=8, ge=1)
     heads: int = Field(default=4, ge=1)
-    dropout: float = Field(default=0.1, ge=0, lt=1)
     norm: Norm = "pre"
     """`post` is MDM's; `pre` needs no warm-up [ours]."""
     condition_dropout: float = Field(default=0.1, ge=0, lt=1)
     """Share of samples trained without text; 0 turns guidance off."""
     schedule: ScheduleConfig = ScheduleConfig()
-
-    @model_validator(mode="after")
-    def _heads_divide(self) -> Self:
-        if self.dim % self.heads:
-            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
-        return self
 
 
 class MotionDiffusion(nn.Module):
@@ -55,9 +45,7 @@ class MotionDiffusion(nn.Module):
         self.time = nn.Sequential(
             nn.Linear(config.dim, config.dim), nn.SiLU(), nn.Linear(config.dim, config.dim)
         )
-        self.stack = Transformer(
-            config.layers, config.dim, config.heads, config.ff, dropout=config.dropout, norm=config.norm
-        )
+        self.stack = Transformer.of(config, config.layers, norm=config.norm)
         self.leave = nn.Linear(config.dim, motion_dim)
 
     def forward(self, noisy: Tensor, step: Tensor, text: Tensor, mask: Tensor, conditioned: Tensor) -> Tensor:

@@ -6,13 +6,35 @@ starts without it.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 from pydantic import Field
+from torch import Tensor
 
 from motionloom.datasets.schema import Config, UserError
 
 Sampler = Literal["ddpm", "ddim", "dpm++"]
+
+
+class StepOutput(Protocol):
+    """Result of a denoising step."""
+
+    prev_sample: Tensor
+
+
+class Scheduler(Protocol):
+    """What is used of diffusers' schedulers."""
+
+    timesteps: Tensor
+    init_noise_sigma: float
+
+    def scale_model_input(self, sample: Tensor, timestep: Tensor) -> Tensor: ...
+
+    def add_noise(self, original_samples: Tensor, noise: Tensor, timesteps: Tensor) -> Tensor: ...
+
+    def set_timesteps(self, num_inference_steps: int) -> None: ...
+
+    def step(self, model_output: Tensor, timestep: Tensor, sample: Tensor, **more: object) -> StepOutput: ...
 
 
 class ScheduleConfig(Config):
@@ -34,31 +56,32 @@ class ScheduleConfig(Config):
             "prediction_type": self.predicts,
         }
 
-    def noiser(self) -> Any:
+    def noiser(self) -> Scheduler:
         """For training: `add_noise`. Motion is not bounded, so nothing is clipped."""
         from diffusers import DDPMScheduler
 
-        return DDPMScheduler(clip_sample=False, **self.arguments())  # type: ignore[no-untyped-call]
+        made: Scheduler = DDPMScheduler(clip_sample=False, **self.arguments())  # type: ignore
+        return made
 
-    def sampler(self, kind: Sampler, steps: int) -> Any:
+    def sampler(self, kind: Sampler, steps: int) -> Scheduler:
         """A sampler set to `steps` denoising steps, at most those of the training."""
         if steps > self.steps:
             raise UserError(
                 f"{steps} denoising steps are more than the {self.steps} of this model's training; take fewer"
             )
-        made: Any
+        made: Scheduler
         if kind == "ddpm":
             made = self.noiser()
         elif kind == "ddim":
             from diffusers import DDIMScheduler
 
-            made = DDIMScheduler(  # type: ignore[no-untyped-call]
+            made = DDIMScheduler(  # type: ignore
                 clip_sample=False, set_alpha_to_one=True, **self.arguments()
             )
         else:
             from diffusers import DPMSolverMultistepScheduler
 
-            made = DPMSolverMultistepScheduler(  # type: ignore[no-untyped-call]
+            made = DPMSolverMultistepScheduler(  # type: ignore
                 algorithm_type="dpmsolver++", **self.arguments()
             )
         made.set_timesteps(steps)

@@ -29,7 +29,7 @@ class AdversarialConfig(Config):
     gradient_penalty: float = Field(default=0.0, ge=0)
     """Weight of R1 in the discriminator's loss [ours]."""
     gumbel_temperature: float = Field(default=1.0, gt=0)
-    """Of the straight-through draw of tokens [ours]."""
+    """Temperature of the straight-through draw of tokens [ours]."""
     sample: bool = True
     """Draw the tokens that are decoded for the discriminator; false takes the likeliest [ours]."""
 

@@ -4,7 +4,7 @@ Temporal convolutions bring a motion to a quarter of its frames; a linear layer 
 the same width and is added to every patch; two transformer layers and one linear layer give a validity score
 a patch, after PatchGAN.
 
-Frames behind a clip's length are zeroed before anything reads them, so padding says nothing about which
+Frames after a clip's length are zeroed before anything reads them, so padding does not reveal which
 motions were generated, and a clip in a padded batch gives what it gives alone.
 
 Legend: B batch, T frames, D motion features, E condition width, P = ceil(T / 4) patches, C width.
@@ -12,46 +12,35 @@ Legend: B batch, T frames, D motion features, E condition width, P = ceil(T / 4)
 
 from __future__ import annotations
 
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm
 
-from motionloom.datasets.schema import Config
 from motionloom.models.layers.strided import StridedEncoder
-from motionloom.models.layers.transformer import Transformer, length_mask, sinusoid
+from motionloom.models.layers.transformer import StackConfig, Transformer, length_mask, sinusoid
 
 PATCH = 4
 """Frames of a patch."""
 
 
-class DiscriminatorConfig(Config):
-    """Sizes; two transformer layers and patches of 4 frames are the paper's, the rest the public code's."""
+class DiscriminatorConfig(StackConfig):
+    """Sizes: layers and patches of 4 frames are the paper's, widths the public code's but for `ff` (2048)."""
 
     dim: int = Field(default=1024, ge=2, multiple_of=2)
     """Width of convolutions and transformer."""
     depth: int = Field(default=1, ge=0)
-    """Residual blocks behind each strided convolution."""
+    """Residual blocks after each strided convolution."""
     layers: int = Field(default=2, ge=1)
-    heads: int = Field(default=8, ge=1)
-    ff: int = Field(default=1024, ge=1)
-    """Width of the transformer's feed-forward layers."""
-    dropout: float = Field(default=0.1, ge=0, lt=1)
     spectral_norm: bool = False
     """Divide every linear and convolution weight by its largest singular value [ours]."""
 
-    @model_validator(mode="after")
-    def _heads_divide(self) -> Self:
-        if self.dim % self.heads:
-            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
-        return self
-
 
 class Validity(NamedTuple):
-    """What the discriminator says."""
+    """Scores of patches."""
 
     score: Tensor
     """float32 [B, P], higher is more real; zero where `mask` is false."""
@@ -68,7 +57,7 @@ class PatchDiscriminator(nn.Module):
         self.motion_dim = motion_dim
         self.patches = StridedEncoder(motion_dim, config.dim, width=config.dim, depth=config.depth)
         self.condition = nn.Linear(glob_dim, config.dim)
-        self.stack = Transformer(config.layers, config.dim, config.heads, config.ff, dropout=config.dropout)
+        self.stack = Transformer.of(config, config.layers)
         self.score = nn.Linear(config.dim, 1)
         if config.spectral_norm:
             for layer in [m for m in self.modules() if isinstance(m, nn.Linear | nn.Conv1d)]:

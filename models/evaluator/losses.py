@@ -45,7 +45,6 @@ def movement_loss(
         units: [B, T / 4, C], what the encoder makes of `target`.
         count: Real units, int64 [B].
         present: bool [B, D]; None = all.
-        config: Weights.
     """
     units = units.float()
     frames = length_mask(count * (pred.shape[1] // units.shape[1]), pred.shape[1])

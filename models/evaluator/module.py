@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from torch import Tensor
 
@@ -17,10 +16,11 @@ from motionloom.models.evaluator.losses import (
 from motionloom.models.evaluator.network import UNIT, Evaluator
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
+from motionloom.models.training.stage_module import Batch
 
 
 class EvaluatorModule(PlayersModule):
-    """Trains an `Evaluator` on the batches of `CaptionBatches`.
+    """Trains an `Evaluator` on captioned `ConditionBatches`.
 
     For the first `movement_steps` the movement encoder is trained with a decoder that no latent needs, from
     then on the two GRUs on units that stay as they are.
@@ -45,7 +45,7 @@ class EvaluatorModule(PlayersModule):
         self.loss_config = loss or EvaluatorLossConfig()
 
     def players(self) -> Sequence[Player]:
-        """One behind the other, not in turn."""
+        """The movement encoder first, then the pairs; not in turn."""
         net = self.net
         texts = (
             (net.text_encoder,) if net.class_embedding is None else (net.text_encoder, net.class_embedding)
@@ -60,16 +60,16 @@ class EvaluatorModule(PlayersModule):
             Player(MATCHING, (net.motion_encoder, *texts), self.optim_config, start_step=self.movement_steps),
         )
 
-    def play(self, player: str, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+    def play(self, player: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """Losses of a batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
         [B, D] (optional: all).
         """
         net, motion, length, present = self.net, batch["motion"], batch["length"], batch.get("present")
         if player == MATCHING:
-            words = batch["conditions"]["text"]
-            latents = net.encode_text(words.features, words.mask), net.encode_motion(motion, length, present)
+            text = batch["conditions"]["text"]
+            latents = net.encode_text(text.features, text.mask), net.encode_motion(motion, length, present)
             return matching_loss(*latents, margin=self.loss_config.margin)
         target, count = net.whole_units(motion, length, present)
         target = target[:, : target.shape[1] // UNIT * UNIT]
-        units = net.movement_encoder(target[..., net.read], dropout=True)
+        units = net.movement_encoder(target[..., net.read_columns], dropout=True)
         return movement_loss(self.decoder(units), target, units, count, present, config=self.loss_config)

@@ -7,11 +7,11 @@ plain Euclidean ones.
 
 Notable choices:
 - Foot contacts are not read, as published (`dim - 4`); the autoencoder reconstructs them.
-- `root_gain` multiplies the root's columns and the contacts behind the normalisation. The published code
+- `root_gain` multiplies the root's columns and the contacts after the normalisation. The published code
   divides their deviations by 5 instead, which is the same.
-- Frames behind the last whole unit are 0, the mean, and a motion shorter than `max_frames` is followed by
+- Frames after the last whole unit are 0, the mean, and a motion shorter than `max_frames` is followed by
   such frames, as in the published evaluation, which pads all motions to one length. Only the four frames
-  behind a motion reach its last unit, so no more are added, and what a motion is batched with plays no part.
+  after a motion reach its last unit, so no more are added, and a motion's result is independent of its batch.
 - The backward GRU reads each sequence reversed within its own length instead of packed sequences: equal, and
   no length has to be known on the CPU.
 - GRUs compute in the type of their weights, autocast or not: a state is carried over a whole motion.
@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import Config
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.layers.transformer import length_mask
 
 PART: Part = "bodyhand"
@@ -40,7 +40,7 @@ UNIT = 4
 """Frames of a unit."""
 
 _SLOPE = 0.2
-"""Of the leaky ReLUs."""
+"""Slope of the leaky ReLUs below zero."""
 
 _GAINED = ("root_yaw_velocity", "root_xz_velocity", "root_height", "foot_contacts")
 _UNREAD = "foot_contacts"
@@ -56,7 +56,7 @@ class EvaluatorConfig(Config):
     text_hidden: int = Field(default=512, ge=1)
     latent: int = Field(default=512, ge=1)
     dropout: float = Field(default=0.2, ge=0, lt=1)
-    """Of the movement encoder while it is trained."""
+    """Dropout of the movement encoder while it is trained."""
     root_gain: float = Field(default=5.0, gt=0)
     """How much more the root's columns and foot contacts count than others."""
 
@@ -76,7 +76,7 @@ class MovementEncoder(nn.Module):
         """[B, T, D] -> units [B, T // 4, C]; `dropout` in training mode alone, of the autoencoder."""
         x, drop = x.mT, dropout and self.training
         for layer in (self.first, self.second):
-            x = F.leaky_relu(draws.dropout(layer(x), self.rate, drop), _SLOPE)
+            x = F.leaky_relu(random.dropout(layer(x), self.rate, drop), _SLOPE)
         out: Tensor = self.out(x.mT)
         return out
 
@@ -92,7 +92,6 @@ class MovementDecoder(nn.Module):
         _start(self)
 
     def forward(self, units: Tensor) -> Tensor:
-        """[B, U, C] -> [B, 4 U, D]."""
         x = units.mT
         for layer in (self.first, self.second):
             x = F.leaky_relu(layer(x), _SLOPE)
@@ -118,9 +117,9 @@ class SequenceEncoder(nn.Module):
         """x [B, L, dim], length int64 [B] of at least 1 -> [B, Z] in the type of the weights."""
         with torch.autocast(x.device.type, enabled=False):
             x = self.project(x.to(self.project.weight.dtype))
-            places = torch.arange(x.shape[1], device=x.device)[None]
-            turned = torch.where(places < length[:, None], length[:, None] - 1 - places, places)
-            reverse = x.gather(1, turned[..., None].expand_as(x))
+            position = torch.arange(x.shape[1], device=x.device)[None]
+            mirrored = torch.where(position < length[:, None], length[:, None] - 1 - position, position)
+            reverse = x.gather(1, mirrored[..., None].expand_as(x))
             last = (length - 1)[:, None, None].expand(-1, 1, self.start.shape[1])
             ends = []
             for gru, sequence, first in ((self.ahead, x, self.start[0]), (self.back, reverse, self.start[1])):
@@ -135,14 +134,13 @@ class Evaluator(nn.Module):
     """Movement encoder, motion encoder and text encoder over one latent space.
 
     Args:
-        config: Sizes.
         layout: Of the motions; the columns of `PART` are read, normalised.
         text_dim: E.
         max_frames: Frames that every motion is padded to, a multiple of four; longer ones are refused.
         classes: G, of words that come with a class each (part of speech); 0 = none.
     """
 
-    read: Tensor
+    read_columns: Tensor
     gain: Tensor
 
     def __init__(
@@ -165,7 +163,7 @@ class Evaluator(nn.Module):
         gain = np.where(np.isin(columns, np.concatenate([*gained, unread])), config.root_gain, 1.0)
         read = np.flatnonzero(~np.isin(columns, unread))
         self.register_buffer("gain", torch.from_numpy(gain).float(), persistent=False)
-        self.register_buffer("read", torch.from_numpy(read), persistent=False)
+        self.register_buffer("read_columns", torch.from_numpy(read), persistent=False)
         self.movement_encoder = MovementEncoder(config, len(read))
         self.motion_encoder = SequenceEncoder(config.movement, config.motion_hidden, config.latent)
         self.class_embedding = nn.Linear(classes, text_dim) if classes else None
@@ -174,11 +172,10 @@ class Evaluator(nn.Module):
         self.text_encoder = SequenceEncoder(text_dim, config.text_hidden, config.latent)
 
     def decoder(self) -> MovementDecoder:
-        """A new decoder for the movement encoder."""
         return MovementDecoder(self.config, self.motion_dim)
 
     def whole_units(self, x: Tensor, length: Tensor, present: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Motions [B, T, D] with the gains on and 0 behind whole units and where `present` bool [B, D] is
+        """Motions [B, T, D] with the gains on and 0 after whole units and where `present` bool [B, D] is
         false, followed by as many frames of 0 as can matter; and their numbers of units, int64 [B].
         """
         if x.shape[-1] != self.motion_dim:
@@ -198,7 +195,7 @@ class Evaluator(nn.Module):
         frames = x.shape[1]
         x, units = self.whole_units(x, length, present)
         with torch.no_grad():
-            movements = self.movement_encoder(x[..., self.read])[:, : max(1, frames // UNIT)]
+            movements = self.movement_encoder(x[..., self.read_columns])[:, : max(1, frames // UNIT)]
         latent: Tensor = self.motion_encoder(movements, units)
         return latent
 

@@ -94,7 +94,7 @@ def uniform_numbers(seeds: Sequence[int], count: int, device: torch.device) -> T
 
 
 def as_codes(network: TokenNetwork, tokens: Tensor, groups: Tensor) -> Codes:
-    """Tokens int64 [B, N, P] of `groups` [B] groups a row as streams; 0 behind a shorter row."""
+    """Tokens int64 [B, N, P] of `groups` [B] groups a row as streams; 0 after a shorter row."""
     longest = int(groups.max()) if len(groups) else 0
     inside = torch.arange(longest, device=tokens.device)[None, :, None] < groups[:, None, None]
     rows = torch.where(inside, tokens[:, :longest], 0)
@@ -112,5 +112,53 @@ def draw(
     scaled = filter_logits(logits.double() / temperature, top_k=top_k, top_p=top_p)
     mass = scaled.softmax(-1).cumsum(-1)
     at = torch.searchsorted(mass, uniform[:, None] * mass[:, -1:], right=True)[:, 0]
-    # Rounding can push the last number onto the total; no token lies beyond it.
+    # Rounding can push the last number onto the total; there is no token after it.
     return torch.where(at < logits.shape[-1], at, best)
+
+
+def next_token(
+    network: TokenNetwork,
+    hidden: Tensor,
+    slot: int,
+    *,
+    may_end: Tensor,
+    how: Drawing,
+    uniform: Tensor,
+    scale: Tensor | None = None,
+) -> Tensor:
+    """The tokens of one slot of B rows, int64 [B].
+
+    Args:
+        hidden: The network's output at that position [B, 1, D]; under guidance [2B, 1, D], the conditional
+            rows before the unconditional ones.
+        may_end: Rows that may draw End, bool [B].
+        uniform: The draws, float64 [B] in [0, 1).
+        scale: Each row's guidance [B]; None without.
+    """
+    kind, nothing = network.slots[slot], torch.zeros_like(may_end)
+    legal = network.legal_at(network.ends[kind].expand(len(may_end)), may_end, nothing)
+    rows = legal if scale is None else legal.repeat(2, 1)
+    logits = network.logits(hidden, kind.expand(len(rows), 1), rows[:, None])[:, 0]
+    return how(logits if scale is None else guide(logits, legal, scale), uniform)
+
+
+def requested_groups(
+    groups: Tensor | None, batch: int, *, most: int, limit: int | None, device: torch.device
+) -> Tensor:
+    """Where each of `batch` rows stops at the latest, int64 [B].
+
+    Args:
+        groups: Requested lengths [B]; None takes `most` for all.
+        limit: Longest length that is possible; None without a limit.
+    """
+    if groups is None:
+        found = torch.full((batch,), most, dtype=torch.int64, device=device)
+    else:
+        found = groups.to(device=device, dtype=torch.int64)
+        if found.shape != (batch,):
+            raise UserError(f"{tuple(found.shape)} requested lengths were given for {batch} texts")
+    low, high = (int(found.min()), int(found.max())) if batch else (1, 1)
+    if low < 1 or (limit is not None and high > limit):
+        span = "1 or more" if limit is None else f"1 to {limit}"
+        raise UserError(f"requested lengths must be {span} groups; got {low} to {high}")
+    return found

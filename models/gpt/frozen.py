@@ -17,13 +17,7 @@ class Frozen(Generic[M]):
     """
 
     def __init__(self, module: M) -> None:
-        self._module = module.eval().requires_grad_(False)
+        self.module = module.eval().requires_grad_(False)
 
     def to(self, device: torch.device) -> None:
-        """Move to the device of the module that owns this."""
-        self._module.to(device)
-
-    @property
-    def module(self) -> M:
-        """The network."""
-        return self._module
+        self.module.to(device)

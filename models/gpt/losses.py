@@ -19,7 +19,7 @@ from motionloom.datasets.schema import Config
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import PAD
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
@@ -38,7 +38,7 @@ class GptLossConfig(Config):
     samples: int = Field(default=2, ge=2)
     """Motions sampled for each caption, for `align_on: samples`."""
     gumbel_temperature: float = Field(default=1.0, gt=0)
-    """Of the codes, for `align_on: predictions`."""
+    """Temperature of the drawn codes, for `align_on: predictions`."""
     temperature: float = Field(default=0.1, gt=0)
     threshold: float | None = Field(default=0.85, ge=-1, le=1)
     """Captions with a higher sBERT cosine are not negatives of each other; null keeps all negatives."""
@@ -72,9 +72,9 @@ def corrupt(tokens: Tensor, kinds: Tensor, ends: Tensor, pkeep: float) -> Tensor
     """
     end = ends[kinds]
     replace = (
-        (draws.uniform(*tokens.shape, device=tokens.device) >= pkeep) & (tokens != PAD) & (tokens != end)
+        (random.uniform(*tokens.shape, device=tokens.device) >= pkeep) & (tokens != PAD) & (tokens != end)
     )
-    draw = (draws.uniform(*tokens.shape, device=tokens.device) * end).long()
+    draw = (random.uniform(*tokens.shape, device=tokens.device) * end).long()
     return torch.where(replace, torch.minimum(draw, end - 1), tokens)
 
 
@@ -91,7 +91,7 @@ def soft_codes(
     through.
 
     `sample` adds Gumbel noise (a draw from the model); without it the most likely codes are taken. Rows
-    behind `groups` hold arbitrary codes.
+    after `groups` hold arbitrary codes.
     """
     # As many groups as fit, not as many as there are: reading a maximum back would wait for the device.
     batch, size = len(logits), len(gpt.pattern)
@@ -104,7 +104,7 @@ def soft_codes(
         here = steps[:, :, slots, : gpt.num_codes[name]]
         here = torch.where(valid, here, 0.0).flatten(1, 2)
         if sample:
-            out[name] = draws.gumbel_softmax(here, temperature)
+            out[name] = random.gumbel_softmax(here, temperature)
         else:
             soft = (here / temperature).softmax(-1)
             out[name] = F.one_hot(here.argmax(-1), here.shape[-1]).to(soft) + soft - soft.detach()

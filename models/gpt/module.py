@@ -14,10 +14,10 @@ from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import GptLossConfig, accuracy, align_loss, corrupt, cross_entropy
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.samples import log_likelihood, policy_loss, rewards, sample
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.training.stage_module import OptimConfig, StageModule
+from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 
 
 class GptModule(StageModule):
@@ -50,12 +50,11 @@ class GptModule(StageModule):
         self.tokenizer, self.tma = Frozen(tokenizer), Frozen(tma)
 
     def on_fit_start(self) -> None:
-        """The frozen networks follow this one to its device."""
         for frozen in (self.tokenizer, self.tma):
             if frozen is not None:
                 frozen.to(self.device)
 
-    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch.
 
         "tokens" int64 [B, L] padded with -1, "kinds" int64 [B, L], "text" float32 [B, E] (the prior); for
@@ -69,7 +68,7 @@ class GptModule(StageModule):
         known = batch.get("known")
         inputs, drop = None, None
         if self.training:
-            drop = draws.uniform(len(text), device=text.device) < config.condition_dropout
+            drop = random.uniform(len(text), device=text.device) < config.condition_dropout
             if config.pkeep < 1:
                 inputs = corrupt(tokens, kinds, net.ends, config.pkeep)
         logits = net(tokens, kinds, text, inputs=inputs, drop_text=drop, known=known)
@@ -83,10 +82,10 @@ class GptModule(StageModule):
         return values
 
     def _align(
-        self, batch: dict[str, Any], logits: Tensor, drop: Tensor | None, tokenizer: Tokenizer, tma: Tma
+        self, batch: Batch, logits: Tensor, drop: Tensor | None, tokenizer: Tokenizer, tma: Tma
     ) -> Tensor:
         config, similarity = self.loss_config, batch.get("similarity")
-        latent = batch.get("tma_text", batch["text"])
+        latent: Tensor = batch["tma_text"] if "tma_text" in batch else batch["text"]
         if latent.shape[-1] != tma.config.latent:
             raise UserError(
                 f"L_align compares TMA latents of width {tma.config.latent} and the text prior has "
@@ -117,7 +116,7 @@ class GptModule(StageModule):
         )
 
     def _align_samples(
-        self, batch: dict[str, Any], latent: Tensor, similarity: Tensor | None, judge: dict[str, Any]
+        self, batch: Batch, latent: Tensor, similarity: Tensor | None, judge: dict[str, Any]
     ) -> Tensor:
         known = batch.get("known")
         count = self.loss_config.samples if self.training else 1

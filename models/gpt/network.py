@@ -20,21 +20,20 @@ Legend: B batch, L tokens, D width, E text width, V largest vocabulary (K + 1).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field
 from torch import Tensor, nn
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
-from motionloom.models.layers.draws import Dropout
-from motionloom.models.layers.transformer import KVCache, Transformer
+from motionloom.models.layers.random import Dropout
+from motionloom.models.layers.transformer import KVCache, StackConfig, Transformer
 from motionloom.models.tokenizer.base import Stream
 
 
-class GptConfig(Config):
+class GptConfig(StackConfig):
     """Sizes and regularisation of a GPT; the defaults are the paper config."""
 
     layers: int = Field(default=18, ge=1)
@@ -42,7 +41,6 @@ class GptConfig(Config):
     dim: int = Field(default=1024, ge=2)
     heads: int = Field(default=16, ge=1)
     ff: int = Field(default=4096, ge=1)
-    dropout: float = Field(default=0.1, ge=0, lt=1)
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
     block_size: int = Field(default=150, ge=2)
     """Text input + tokens: 149 + 1."""
@@ -53,19 +51,11 @@ class GptConfig(Config):
     0.5).
     """
 
-    @model_validator(mode="after")
-    def _heads_divide(self) -> Self:
-        if self.dim % self.heads:
-            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
-        return self
-
 
 class InterleavedGPT(TokenNetwork):
     """Autoregressive model of token sequences whose slots belong to several codebooks.
 
     Args:
-        config: Sizes.
-        streams: The tokenizer's streams.
         pattern: Stream of every slot of a group, e.g. ("body", "body", "hand").
         text_dim: Width of the text prior (256 for TMA).
     """
@@ -87,14 +77,7 @@ class InterleavedGPT(TokenNetwork):
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
         self.embeddings = self._tables(config.dim)
         self.dropout = Dropout(config.dropout)
-        self.stack = Transformer(
-            config.layers,
-            config.dim,
-            config.heads,
-            config.ff,
-            dropout=config.dropout,
-            attention_dropout=config.attention_dropout,
-        )
+        self.stack = Transformer.of(config, config.layers, attention_dropout=config.attention_dropout)
         self.heads = self._outputs(config.dim)
         self._start_tables()
 
@@ -126,8 +109,8 @@ class InterleavedGPT(TokenNetwork):
         Returns:
             float32 [B, L, V]; -inf where a token is illegal. At padded positions the values mean nothing.
         """
-        read = self.read(tokens, kinds, inputs, known, self.config.block_size)
-        x = torch.cat([self.embed_text(text, drop_text), read], dim=1)
+        embedded = self.embed_inputs(tokens, kinds, inputs, known, self.config.block_size)
+        x = torch.cat([self.embed_text(text, drop_text), embedded], dim=1)
         return self.logits(self.hidden(x), kinds, self.legal(tokens, kinds))
 
     def embed_text(self, text: Tensor, drop: Tensor | None = None) -> Tensor:

@@ -17,7 +17,14 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.drawing import Drawing, as_codes, guide, seeds_of, uniform_numbers
+from motionloom.models.gpt.drawing import (
+    Drawing,
+    as_codes,
+    next_token,
+    requested_groups,
+    seeds_of,
+    uniform_numbers,
+)
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes
 
@@ -44,18 +51,19 @@ def generate(
         groups: int64 [B], requested lengths: End is forbidden before and forced there. None: the model
             decides.
         temperature: 0 is greedy.
-        top_k: Keep the k most likely tokens.
         top_p: Keep the smallest set of tokens with this mass.
         cfg_scale: Guidance; 1 is off. Needs a model trained with condition dropout.
         seed: One seed, from which `sample_seeds` makes one per row, or one per sample. Pass slices of
             `sample_seeds` to get the same results whatever the batch size is.
 
     Returns:
-        Codes per stream int64 [B, G * per_group], 0 behind each sample's `groups`; G is the longest sample's
+        Codes per stream int64 [B, G * per_group], 0 after each sample's `groups`; G is the longest sample's
         length.
     """
     batch, device = len(text), text.device
-    limit = _limits(gpt, batch, max_groups, groups, device)
+    most_groups = gpt.max_groups if max_groups is None else max_groups
+    allowed = min(most_groups, gpt.max_groups)
+    limit = requested_groups(groups, batch, most=most_groups, limit=allowed, device=device)
     how = Drawing(temperature, top_k, top_p)
     if cfg_scale != 1 and gpt.config.condition_dropout == 0:
         raise UserError(
@@ -85,7 +93,7 @@ def _decode(
     """Tokens int64 [B, G * P] and group counts int64 [B]; `limit` [B] is where each sample must stop."""
     batch, size, device = len(text), len(gpt.pattern), text.device
     guided = cfg_scale != 1
-    scale = torch.full((batch,), cfg_scale, device=device)
+    scale = torch.full((batch,), cfg_scale, device=device) if guided else None
     x = gpt.embed_text(text)
     if guided:
         x = torch.cat([x, gpt.embed_text(text, torch.ones(batch, dtype=torch.bool, device=device))])
@@ -100,42 +108,16 @@ def _decode(
             alive = alive & (group < limit)
             if not bool(alive.any()):
                 break
-        kinds = gpt.slots[slot].expand(len(x), 1)
         # An empty motion is never a result, so the first group cannot be End.
         may_end = yes if free and slot == 0 and group > 0 else no
-        legal = gpt.legal_at(gpt.ends[gpt.slots[slot]].expand(batch), may_end, no)
         hidden = gpt.hidden(x, cache)
-        rows = legal.repeat(2, 1) if guided else legal
-        logits = gpt.logits(hidden, kinds, rows[:, None])[:, 0]
-        if guided:
-            logits = guide(logits, legal, scale)
-        token = how(logits, uniform[:, step])
+        token = next_token(gpt, hidden, slot, may_end=may_end, how=how, uniform=uniform[:, step], scale=scale)
         if slot == 0:
             alive = alive & (token != gpt.ends[gpt.slots[0]])
             counts = counts + alive
         token = torch.where(alive, token, 0)
         tokens[:, step] = token
-        x = gpt.embed(token[:, None], kinds[:batch])
+        x = gpt.embed(token[:, None], gpt.slots[slot].expand(batch, 1))
         if guided:
             x = torch.cat([x, x])
     return tokens, counts
-
-
-def _limits(
-    gpt: InterleavedGPT, batch: int, max_groups: int | None, groups: Tensor | None, device: torch.device
-) -> Tensor:
-    """Where each sample stops at the latest, int64 [B]."""
-    most = gpt.max_groups if max_groups is None else max_groups
-    if groups is None:
-        limit = torch.full((batch,), most, dtype=torch.int64, device=device)
-    else:
-        limit = groups.to(device=device, dtype=torch.int64)
-        if limit.shape != (batch,):
-            raise UserError(f"{tuple(limit.shape)} requested lengths were given for {batch} texts")
-    allowed = min(most, gpt.max_groups)
-    if batch and (int(limit.min()) < 1 or int(limit.max()) > allowed):
-        raise UserError(
-            f"requested lengths must be 1 to {allowed} groups (block size {gpt.config.block_size}); "
-            f"got {int(limit.min())} to {int(limit.max())}"
-        )
-    return limit

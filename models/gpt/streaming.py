@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.drawing import Drawing, guide
+from motionloom.models.gpt.drawing import Drawing, next_token
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.layers.transformer import KVCache
 
@@ -25,11 +25,9 @@ class TokenStream:
     """One motion's tokens.
 
     Args:
-        gpt: The model, in evaluation mode.
         how: How a token is taken.
         context: Groups that a new block goes on from; at most one less than a block has.
         cfg_scale: Guidance; 1 is off. Needs a model trained with condition dropout.
-        seed: Of all draws.
     """
 
     def __init__(
@@ -66,13 +64,12 @@ class TokenStream:
         no = torch.zeros(1, dtype=torch.bool, device=device)
         drawn = []
         for slot in range(size):
-            legal = gpt.legal_at(gpt.ends[gpt.slots[slot]].expand(1), no, no)
             hidden = gpt.hidden(self._inputs, self._cache)[:, -1:]
-            rows = legal.expand(len(hidden), -1)
-            logits = gpt.logits(hidden, gpt.slots[slot].expand(len(hidden), 1), rows[:, None])[:, 0]
-            if len(hidden) == 2:
-                logits = guide(logits, legal, logits.new_full((1,), self._scale))
-            token = self.how(logits, uniform[slot : slot + 1])[:, None]
+            scale = hidden.new_full((1,), self._scale) if len(hidden) == 2 else None
+            draw = uniform[slot : slot + 1]
+            token = next_token(gpt, hidden, slot, may_end=no, how=self.how, uniform=draw, scale=scale)[
+                :, None
+            ]
             drawn.append(token)
             self._inputs = gpt.embed(token, gpt.slots[slot].expand(1, 1)).expand(len(hidden), -1, -1)
         group = torch.cat(drawn, dim=1)

@@ -22,7 +22,6 @@ class TokenNetwork(nn.Module):
     """Base of autoregressive networks whose slots belong to several codebooks.
 
     Args:
-        streams: The tokenizer's streams.
         pattern: Stream of every slot of a group, e.g. ("body", "body", "hand").
     """
 
@@ -52,7 +51,6 @@ class TokenNetwork(nn.Module):
         return nn.ModuleList(nn.Embedding(k + 1, dim) for k in self.num_codes.values())
 
     def _outputs(self, dim: int) -> nn.ModuleList:
-        """One head a stream."""
         return nn.ModuleList(nn.Linear(dim, k + 1) for k in self.num_codes.values())
 
     def _start_tables(self) -> None:
@@ -70,7 +68,7 @@ class TokenNetwork(nn.Module):
         assert out is not None  # a pattern has at least one stream
         return out
 
-    def read(
+    def embed_inputs(
         self, tokens: Tensor, kinds: Tensor, inputs: Tensor | None, known: Tensor | None, block_size: int
     ) -> Tensor:
         """What training reads before each token but the first: embeddings [B, L - 1, D].
@@ -80,7 +78,6 @@ class TokenNetwork(nn.Module):
             kinds: int64 [B, L], stream of each token.
             inputs: Read instead of `tokens`; None reads those.
             known: Bool [B, L], false where zeros are read. None = all.
-            block_size: Longest sequence.
         """
         size = tokens.shape[1]
         if size > block_size:
@@ -112,7 +109,7 @@ class TokenNetwork(nn.Module):
         return self.legal_at(end, first, closing)
 
     def legal_at(self, end: Tensor, first: Tensor, closing: Tensor) -> Tensor:
-        """Bool [..., V] for positions with End token `end`, at a group's first slot or not, behind an End or
+        """Bool [..., V] for positions with End token `end`, at a group's first slot or not, after an End or
         not.
         """
         code = torch.arange(self.vocabulary, device=end.device)

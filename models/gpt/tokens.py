@@ -33,9 +33,9 @@ class TokenSequence(NamedTuple):
     """Interleaved tokens of a batch."""
 
     tokens: Tensor
-    """int64 [B, L], `PAD` behind `length`."""
+    """int64 [B, L], `PAD` after `length`."""
     kinds: Tensor
-    """int64 [B, L], stream of each token; 0 behind `length`."""
+    """int64 [B, L], stream of each token; 0 after `length`."""
     length: Tensor
     """int64 [B], number of tokens, End tokens included."""
 
@@ -44,7 +44,7 @@ class Codes(NamedTuple):
     """Code streams of a batch."""
 
     codes: dict[str, Tensor]
-    """Per stream int64 [B, G * per_group]; 0 behind `groups`, so that every entry is a valid code."""
+    """Per stream int64 [B, G * per_group]; 0 after `groups`, so that every entry is a valid code."""
     groups: Tensor
     """int64 [B], number of groups."""
 
@@ -79,7 +79,7 @@ def interleave(
         pattern: Stream of every slot of a group.
         ends: End token per stream (its number of codes); None leaves the sequences open, for clips that were
             cropped.
-        groups: Valid groups per clip, [B] (default: all G). Codes behind them are ignored.
+        groups: Valid groups per clip, [B] (default: all G). Codes after them are ignored.
 
     Raises:
         ValueError: Streams disagree about the number of groups, or a code is not below its stream's End.

@@ -7,7 +7,7 @@ of an encoder, go. Two things that people see at once are small there:
   the public HumanML3D code does (its `feat_bias` is 5).
 - What a hand does: finger positions are relative to the root, so nearly all their spread is where the arm is
   and how the wrist is turned. With a `finger_gain` they are read as bones in units of the bone's length /
-  gain: the knuckles from their wrist, which say how the hand is turned, and the bones behind them in the
+  gain: the knuckles from their wrist, which tell how the hand is turned, and the bones after them in the
   palm's own frame, where a fist is the same numbers wherever the hand points. Velocities are read relative
   to the parent joint's.
 
@@ -35,9 +35,7 @@ class Basis(nn.Module):
     """Normalised features of some columns of a layout <-> a network's coordinates.
 
     Args:
-        layout: Layout of the full frames.
         columns: Those of its columns that are modelled, ascending.
-        root_gain: Factor of the root's columns.
         finger_gain: Bone lengths per unit of a finger bone; 0 leaves the fingers as they are.
     """
 
@@ -78,12 +76,12 @@ class Basis(nn.Module):
 
     @property
     def knuckles(self) -> Tensor:
-        """Columns of the knuckles' positions, which say how a hand is turned; needs a `finger_gain`."""
+        """Columns of the knuckles' positions, which tell how a hand is turned; needs a `finger_gain`."""
         return self.fingers[0].reshape(*FINGERS, 3)[:, :, 0].flatten()
 
     @property
     def bent(self) -> Tensor:
-        """Columns of the bones behind them, which say what the hand does; needs a `finger_gain`."""
+        """Columns of the bones after them, which tell what the hand does; needs a `finger_gain`."""
         return self.fingers[0].reshape(*FINGERS, 3)[:, :, 1:].flatten()
 
     @torch.no_grad()
@@ -163,7 +161,7 @@ def _palm(knuckles: Tensor) -> Tensor:
     """Axes of the palm as rows, [..., 2, 1, 3, 3], from its knuckles [..., 2, 5, 1, 3].
 
     Along the middle finger, across towards the index finger, and out of the hand's back or its palm.
-    Knuckles do not move against each other, so three of them say how the hand is turned.
+    Knuckles do not move against each other, so three of them determine how the hand is turned.
     """
     along = normalize(knuckles[..., MIDDLE, :, :], dim=-1)
     across = knuckles[..., INDEX, :, :] - knuckles[..., PINKY, :, :]

@@ -70,7 +70,6 @@ class ResidualStack(nn.Module):
         """Positions to either side that one of its outputs looks at."""
 
     def forward(self, x: Tensor, padding: Tensor | None) -> Tensor:
-        """[B, C, T] -> [B, C, T]."""
         for block in self.blocks:
             x = block(x, padding)
         return x
@@ -84,6 +83,7 @@ class ConvEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.enter = nn.Conv1d(dim, width, 3, padding=1)
+        # Kernel 4 with stride 2 and padding 1 halves T exactly and covers every frame equally often (twice).
         self.down = nn.ModuleList(nn.Conv1d(width, width, 4, stride=2, padding=1) for _ in range(halvings))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(halvings))
         self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
@@ -111,6 +111,7 @@ class ConvDecoder(nn.Module):
         """Frames of one latent."""
         self.enter = nn.Conv1d(dim, width, 3, padding=1)
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(doublings))
+        # Nearest up-sampling, then a convolution: a transposed one leaves a pattern of uneven overlaps.
         self.up = nn.ModuleList(nn.Conv1d(width, width, 3, padding=1) for _ in range(doublings))
         self.refine = nn.Conv1d(width, width, 3, padding=1)
         self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
@@ -133,7 +134,7 @@ class ConvDecoder(nn.Module):
 
     def needs(self, first: int, last: int) -> tuple[int, int]:
         """First and last of the latents that frames `first` to `last` are made of; no others play a role."""
-        first, last = first - 2, last + 2  # refine, leave
+        first, last = first - 2, last + 2  # refine and leave have kernel 3: one frame to either side each
         for stack in reversed(self.stacks):
             assert isinstance(stack, ResidualStack)
             first, last = (first - 1) // 2 - stack.reach, (last + 1) // 2 + stack.reach

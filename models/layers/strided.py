@@ -1,9 +1,9 @@
 """Plain strided 1-D convolutions between frames and a quarter of their rate (UDE sections 3.1 and 3.3).
 
 UDE names "three-layer temporal 1D convolution networks": down are two stride-2 layers and one that keeps the
-rate, up is the mirror. Behind each stride-2 layer stand `depth` residual blocks (one in public UDE code, none
-is the bare text). Borders, padding and the residual blocks are those of `layers/conv.py`: a clip in a padded
-batch gives what it gives alone. Activations are leaky ReLU with slope 0.2, as public.
+rate, up is the mirror. Each stride-2 layer is followed by `depth` residual blocks (one in public UDE code,
+none is the bare text). Borders, padding and the residual blocks are those of `layers/conv.py`: a clip in a
+padded batch gives what it gives alone. Activations are leaky ReLU with slope 0.2, as public.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch.nn import functional
 from motionloom.models.layers.conv import ResidualStack, frame_padding
 
 SLOPE = 0.2
-"""Of the leaky ReLU below zero."""
+"""Slope of the leaky ReLU below zero."""
 
 
 def _active(x: Tensor) -> Tensor:

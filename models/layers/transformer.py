@@ -1,11 +1,11 @@
 """Transformer blocks shared by all networks: GELU, scaled-dot-product attention, optional KV cache.
 
 Notable choices:
-- LayerNorm stands before attention and feed-forward ("pre"), as in the GPTs. With "post" it stands behind
-  their sums, as in torch's own encoder, which TEMOS, TMR and MDM are made of.
+- LayerNorm comes before attention and feed-forward ("pre"), as in the GPTs. With "post" it comes after their
+  sums, as in torch's own encoder, which TEMOS, TMR and MDM are made of.
 - Attention is always `F.scaled_dot_product_attention`, so fused kernels are used wherever the device has
   them.
-- Masks are boolean and say what *may* be attended (True = visible), as SDPA wants them.
+- Masks are boolean and mark what *may* be attended (True = visible), as SDPA wants them.
 - A causal stack needs no padding mask when sequences are padded on the right: real positions never see
   padding.
 - Dropout acts on the residual branches (`dropout`) and on the attention weights (`attention_dropout`); CPUs
@@ -17,17 +17,19 @@ Legend: B batch, L positions, S visible positions, D width, H heads.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Literal, Self
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field, model_validator
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
+from torch.utils.checkpoint import checkpoint, noop_context_fn
 
-from motionloom.models.layers import draws
+from motionloom.datasets.schema import Config
+from motionloom.models.layers import random
 
 Norm = Literal["pre", "post"]
-"""Where LayerNorm stands: before attention and feed-forward, or behind their sums."""
+"""Position of LayerNorm: before attention and feed-forward, or after their sums."""
 
 
 def length_mask(length: Tensor, size: int) -> Tensor:
@@ -41,6 +43,27 @@ def sinusoid(size: int, dim: int, device: torch.device | None = None) -> Tensor:
     rate = torch.exp(torch.arange(0, dim, 2, device=device, dtype=torch.float32) * (-math.log(10000.0) / dim))
     angle = position * rate
     return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(1)[:, :dim]
+
+
+class StackConfig(Config):
+    """What configs of transformers share; subclasses choose defaults and have a width `dim`."""
+
+    heads: int = Field(default=8, ge=1)
+    ff: int = Field(default=1024, ge=1)
+    """Width of the feed-forward layers."""
+    dropout: float = Field(default=0.1, ge=0, lt=1)
+
+    @property
+    def width(self) -> tuple[str, int] | None:
+        """Name and value of the width that `heads` must divide; None where there are no heads."""
+        return "dim", int(getattr(self, "dim"))  # noqa: B009 - not every width is a field of this name
+
+    @model_validator(mode="after")
+    def _heads_divide(self) -> Self:
+        if self.width is not None and self.width[1] % self.heads:
+            name, value = self.width
+            raise ValueError(f"{name} {value} must be a multiple of heads {self.heads}")
+        return self
 
 
 class LayerCache:
@@ -76,7 +99,6 @@ class KVCache:
 
     @property
     def length(self) -> int:
-        """Positions stored."""
         return self.layers[0].length
 
 
@@ -107,7 +129,7 @@ class SelfAttention(nn.Module):
                 mask = seen.tril(diagonal=before)
             # A single new position sees everything stored; a first block is plainly causal.
             causal = causal and before == 0 and length > 1
-        out = draws.attention(
+        out = random.attention(
             query, key, value, mask, causal, self.attention_dropout if self.training else 0.0
         )
         merged: Tensor = self.out(out.transpose(1, 2).reshape(batch, length, dim))
@@ -127,12 +149,11 @@ class Block(nn.Module):
         self.norm_ff = nn.LayerNorm(dim)
         self.ff_in = nn.Linear(dim, ff)
         self.ff_out = nn.Linear(ff, dim)
-        self.dropout = draws.Dropout(dropout)
+        self.dropout = random.Dropout(dropout)
 
     def forward(
         self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: LayerCache | None = None
     ) -> Tensor:
-        """[B, L, D] -> [B, L, D]; arguments as `SelfAttention`."""
         if self.post:
             x = self.norm_attention(x + self.dropout(self.attention(x, mask, causal, cache)))
             last: Tensor = self.norm_ff(x + self.dropout(self._feed(x)))
@@ -179,6 +200,21 @@ class Transformer(nn.Module):
             elif name.endswith("bias"):
                 nn.init.zeros_(parameter)
 
+    @classmethod
+    def of(
+        cls, config: StackConfig, layers: int, *, attention_dropout: float | None = None, norm: Norm = "pre"
+    ) -> Self:
+        assert config.width is not None
+        return cls(
+            layers,
+            config.width[1],
+            config.heads,
+            config.ff,
+            dropout=config.dropout,
+            attention_dropout=attention_dropout,
+            norm=norm,
+        )
+
     def forward(
         self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: KVCache | None = None
     ) -> Tensor:
@@ -188,8 +224,8 @@ class Transformer(nn.Module):
         again = self.checkpointed and torch.is_grad_enabled() and cache is None
         for index, block in enumerate(self.blocks):
             if again:
-                drawn: Any = {"context_fn": draws.again} if draws.by_sample() else {}
-                x = checkpoint(block, x, mask, causal, use_reentrant=False, **drawn)
+                contexts = random.checkpoint_contexts if random.by_sample() else noop_context_fn
+                x = checkpoint(block, x, mask, causal, use_reentrant=False, context_fn=contexts)
             else:
                 x = block(x, mask, causal, None if cache is None else cache.layers[index])
         out: Tensor = self.norm(x)

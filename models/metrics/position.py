@@ -31,25 +31,13 @@ KINDS = ("joints", "pose", "root", "path")
 
 
 class PositionErrors(NamedTuple):
-    """Sums, so that clips can be added up; `means()` divides."""
+    """Of one motion; means over joints."""
 
-    ape: Tensor
-    """[4] over frames, of `KINDS`; means over joints."""
-    ave: Tensor
-    """[4] over clips."""
-    frames: Tensor
-    clips: Tensor
-
-    def __add__(self, other: object) -> PositionErrors:  # type: ignore[override]
-        if not isinstance(other, PositionErrors):
-            return NotImplemented
-        return PositionErrors(*(a + b for a, b in zip(self, other, strict=True)))
-
-    def means(self) -> dict[str, float]:
-        """`ape_joints`, … in m, a mean over frames; `ave_joints`, … in m², a mean over clips."""
-        ape, ave = self.ape / self.frames.clamp(min=1), self.ave / self.clips.clamp(min=1)
-        each = {"ape": ape.tolist(), "ave": ave.tolist()}
-        return {f"{name}_{kind}": v for name, row in each.items() for kind, v in zip(KINDS, row, strict=True)}
+    ape: dict[str, float]
+    """By `KINDS`, in m; mean over frames. Of several motions the mean over all frames counts."""
+    ave: dict[str, float]
+    """In m²; of several motions the mean over motions counts."""
+    frames: int
 
 
 def position_errors(
@@ -71,9 +59,9 @@ def position_errors(
         raise ValueError("APE and AVE need two frames or more")
     ape, ave = [], []
     for one, other in zip(_views(made, sides), _views(real, sides), strict=True):
-        ape.append(torch.linalg.vector_norm(one - other, dim=-1).sum(0).mean())
-        ave.append(torch.linalg.vector_norm(one.var(0) - other.var(0), dim=-1).mean())
-    return PositionErrors(torch.stack(ape), torch.stack(ave), torch.tensor(len(made)), torch.tensor(1))
+        ape.append(torch.linalg.vector_norm(one - other, dim=-1).mean().item())
+        ave.append(torch.linalg.vector_norm(one.var(0) - other.var(0), dim=-1).mean().item())
+    return PositionErrors(dict(zip(KINDS, ape, strict=True)), dict(zip(KINDS, ave, strict=True)), len(made))
 
 
 def _views(joints: Tensor, sides: tuple[tuple[int, int], ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

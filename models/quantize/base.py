@@ -1,4 +1,10 @@
-"""The one contract of all quantizers: vectors in, a typed result out, codes <-> vectors."""
+"""What all quantizers share: their result, usage metrics, and random rows that every rank agrees on.
+
+Random rows of the global batch are chosen by a hash of (salt, step, row number) instead of a generator's
+state. The step is a registered buffer, so a resumed run repeats the undisturbed one; no rank needs to
+broadcast, nothing is read back from the device, and one process that sees the concatenated batch picks the
+same rows as many that see its parts.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +12,12 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+
+from motionloom.models.layers.random import hash32
+from motionloom.models.training.distributed import gather_rows, rank
+
+_LAST = 2**62
+"""Key of a row that must not be drawn; greater than every real key (at most 56 bits)."""
 
 
 class QuantizerOutput(NamedTuple):
@@ -49,3 +61,38 @@ def usage_metrics(counts: Tensor, *, eps: float = 1e-7) -> dict[str, Tensor]:
         "perplexity": torch.exp(-(share * torch.log(share + eps)).sum()),
         "usage": (counts > 0).float().mean(),
     }
+
+
+def draw_rows(rows: Tensor, mask: Tensor | None, count: int, *, salt: int, step: Tensor) -> Tensor:
+    """This rank's share [count, d] of `count` random rows of the global batch; summed over ranks, the draw.
+
+    Rows are drawn without replacement; when fewer than `count` exist they repeat in the same order.
+
+    Args:
+        rows: [n, d] of this rank; the global batch is the ranks' rows in rank order.
+        mask: [n], False = never drawn; None = all may be.
+        salt: Tells quantizers apart, so that two of them do not draw the same rows.
+        step: int64 scalar, a new one for every draw.
+    """
+    n = len(rows)
+    number = torch.arange(n, device=rows.device) + rank() * n
+    hashed = hash32(number ^ hash32(step ^ hash32(torch.full_like(step, salt + 1))))
+    keys = hashed * 2**24 + number  # the row number makes keys unique, so the order is total
+    if mask is not None:
+        keys = keys.masked_fill(~mask, _LAST)
+    smallest, local = keys.topk(min(count, n), largest=False)
+    if n < count:
+        smallest = torch.cat([smallest, smallest.new_full((count - n,), _LAST)])
+    everyone = gather_rows(smallest)
+    chosen, slot = everyone.topk(count, largest=False)
+    usable = (chosen < _LAST).sum().clamp(min=1)
+    slot = slot[torch.arange(count, device=rows.device) % usable]
+    mine = slot - rank() * count
+    picked = rows[local[mine.clamp(0, len(local) - 1)]]
+    return torch.where(((mine >= 0) & (mine < len(local)))[:, None], picked, 0.0)
+
+
+def nearest(z: Tensor, codebook: Tensor) -> Tensor:
+    """Index of the nearest code by squared distance; z [n, d], codebook [K, d] -> int64 [n]."""
+    # |z|^2 does not change the order, so one matmul with |e|^2 as its bias is the whole distance.
+    return torch.addmm(codebook.square().sum(1), z, codebook.t(), alpha=-2).argmin(1)

@@ -17,7 +17,7 @@ batch, or most of the codebook is replaced at every step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import torch
 from pydantic import Field
@@ -25,8 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import Config
-from motionloom.models.quantize.base import QuantizerOutput, usage_metrics
-from motionloom.models.quantize.draws import draw_rows
+from motionloom.models.quantize.base import QuantizerOutput, draw_rows, nearest, usage_metrics
 from motionloom.models.training.distributed import is_distributed, sum_over_ranks, world_size
 
 
@@ -39,12 +38,6 @@ class QuantizerConfig(Config):
     """EMA constant lambda."""
     reset_below: float = Field(default=1.0, gt=0)
     """A code whose EMA count falls below this is reset."""
-
-
-def nearest(z: Tensor, codebook: Tensor) -> Tensor:
-    """Index of the nearest code by squared distance; z [n, d], codebook [K, d] -> int64 [n]."""
-    # |z|^2 does not change the order, so one matmul with |e|^2 as its bias is the whole distance.
-    return torch.addmm(codebook.square().sum(1), z, codebook.t(), alpha=-2).argmin(1)
 
 
 def cluster_sums(z: Tensor, codes: Tensor, num_codes: int) -> Tensor:
@@ -65,7 +58,6 @@ class EmaQuantizer(nn.Module):
     whatever the model is cast to; the arithmetic is float32 under autocast too.
 
     Args:
-        config: Sizes and rates.
         salt: Number of this quantizer among those of one network (each draws its own random rows).
     """
 
@@ -91,7 +83,6 @@ class EmaQuantizer(nn.Module):
         self._is_initialised = False
 
     def freeze(self) -> None:
-        """Stop updating for good, in training mode too."""
         self.frozen = True
 
     def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
@@ -129,7 +120,6 @@ class EmaQuantizer(nn.Module):
         return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
 
     def vectors(self, codes: Tensor) -> Tensor:
-        """Code vectors, int64 [...] -> float32 [..., d]."""
         return functional.embedding(codes, self.codebook)
 
     @torch.no_grad()
@@ -172,10 +162,7 @@ class EmaQuantizer(nn.Module):
 
     @torch.no_grad()
     def _metrics(self, counts: Tensor) -> dict[str, Tensor]:
-        return {
-            **usage_metrics(counts),
-            "dead": (self.ema_count <= self.config.reset_below).sum().float(),
-        }
+        return {**usage_metrics(counts), "dead": (self.ema_count <= self.config.reset_below).sum().float()}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Follow moves between devices, refuse casts: a bfloat16 EMA would stop moving."""
@@ -190,3 +177,49 @@ class EmaQuantizer(nn.Module):
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
         self._is_initialised = bool(self.initialised)
+
+
+class ResidualQuantizer(nn.Module):
+    """A stack of `EmaQuantizer`s; every level has its own codebook and its own commitment penalty.
+
+    Args:
+        salt: Number of the first level among the quantizers of one network.
+    """
+
+    def __init__(self, config: QuantizerConfig, levels: int, *, salt: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        self.levels = nn.ModuleList(EmaQuantizer(config, salt=salt + i) for i in range(levels))
+
+    def level(self, index: int) -> EmaQuantizer:
+        return cast(EmaQuantizer, self.levels[index])
+
+    def freeze(self) -> None:
+        for index in range(len(self.levels)):
+            self.level(index).freeze()
+
+    def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
+        """Quantize z [B, L, d]; codes [B, L, levels], penalty summed over levels, metrics [levels] each.
+
+        The residual subtracts *detached* codes, so every level's penalty pulls z towards the sum of the codes
+        so far.
+        """
+        total = torch.zeros_like(z, dtype=torch.float32)
+        outputs = []
+        for level in self.levels:
+            residual = z.float() - total
+            output = level(residual, mask, update=update)
+            total = total + output.quantized.detach()
+            outputs.append(output)
+        full = z.float()
+        return QuantizerOutput(
+            (full + (total - full).detach()).to(z.dtype),
+            torch.stack([output.codes for output in outputs], dim=-1),
+            torch.stack([output.penalty for output in outputs]).sum(),
+            {name: torch.stack([o.metrics[name] for o in outputs]) for name in outputs[0].metrics},
+        )
+
+    def vectors(self, codes: Tensor) -> Tensor:
+        """Sum of the levels' code vectors, int64 [..., levels] -> float32 [..., d]."""
+        parts = [self.level(i).vectors(codes[..., i]) for i in range(len(self.levels))]
+        return torch.stack(parts).sum(0)

@@ -1,4 +1,4 @@
-"""`FsqQuantizer`: finite scalar quantization (Mentzer et al. 2023), a modern option beside codebooks.
+"""`FsqQuantizer`: finite scalar quantization (Mentzer et al. 2023), an alternative to codebooks.
 
 A latent is projected to a few scalars, each bounded by tanh and rounded to one of its steps; the code is the
 mixed-radix number of the roundings. There is no codebook to learn, hence no commitment, no dead codes, no
@@ -24,7 +24,6 @@ class FsqQuantizer(nn.Module):
     """Projection, rounding, projection.
 
     Args:
-        dim: Width d of the latents.
         steps: Number of values of each scalar; the number of codes is their product.
     """
 
@@ -42,7 +41,6 @@ class FsqQuantizer(nn.Module):
 
     @property
     def codebook(self) -> Tensor:
-        """All code vectors, [K, d]."""
         return self.vectors(torch.arange(self.num_codes, device=self.steps.device))
 
     def freeze(self) -> None:
@@ -70,7 +68,6 @@ class FsqQuantizer(nn.Module):
         return QuantizerOutput(quantized.to(z.dtype), codes, zero, metrics)
 
     def vectors(self, codes: Tensor) -> Tensor:
-        """Code vectors, int64 [...] -> float32 [..., d]."""
         digits = codes[..., None] // self.radix % self.steps
         half = self.steps // 2
         return _linear(self.leave, (digits - half) / half)

@@ -21,9 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import Config
-from motionloom.models.quantize.base import QuantizerOutput, usage_metrics
-from motionloom.models.quantize.draws import draw_rows
-from motionloom.models.quantize.ema import nearest
+from motionloom.models.quantize.base import QuantizerOutput, draw_rows, nearest, usage_metrics
 from motionloom.models.training.distributed import sum_over_ranks, world_size
 
 Start = Literal["uniform", "data"]
@@ -53,7 +51,6 @@ class GradientQuantizer(nn.Module):
     on to z. A vector that is not finite counts as padding, as in `EmaQuantizer`.
 
     Args:
-        config: Sizes and weights.
         salt: Number of this quantizer among those of one network, for the draws of `start: data`.
     """
 
@@ -75,7 +72,6 @@ class GradientQuantizer(nn.Module):
         self._is_initialised = config.start == "uniform"
 
     def freeze(self) -> None:
-        """Stop updating for good, in training mode too."""
         self.frozen = True
         self.codebook.requires_grad_(False)
 
@@ -137,7 +133,7 @@ class GradientQuantizer(nn.Module):
 
     @torch.no_grad()
     def _count(self, counts: Tensor) -> None:
-        # A batch without vectors says nothing about which codes are used.
+        # A batch without vectors does not tell which codes are used.
         rate = torch.where(counts.sum() > 0, 1 - self.config.decay, 0.0).to(self.ema_count.dtype)
         self.ema_count.lerp_(counts.to(self.ema_count.dtype), rate)
 

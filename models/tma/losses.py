@@ -66,7 +66,7 @@ def latent_loss(text: Tensor, motion: Tensor) -> Tensor:
 
 
 def false_negatives(sentence: Tensor, threshold: float) -> Tensor:
-    """Bool [N, N]: pairs whose captions say the same, cosine of sBERT embeddings [N, E] above `threshold`.
+    """Pairs of captions with the same meaning, bool [N, N]: cosine of sBERT embeddings [N, E] > `threshold`.
 
     Exact duplicates are included (OpenTMA keeps those whose cosine rounds to 1.0 as negatives), the diagonal
     never is.

@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from torch import Tensor
 
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tma.losses import TmaLossConfig, info_nce, kl_four, latent_loss, reconstruction_loss
 from motionloom.models.tma.network import Tma
-from motionloom.models.training.stage_module import OptimConfig, StageModule
+from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 
 
 class TmaModule(StageModule):
-    """Trains a `Tma` on the batches of `CaptionBatches`."""
+    """Trains a `Tma` on captioned `ConditionBatches`."""
 
     net: Tma
 
     def __init__(
-        self,
-        net: Tma,
-        optim: OptimConfig,
-        *,
-        seed: int,
-        max_steps: int,
-        loss: TmaLossConfig | None = None,
+        self, net: Tma, optim: OptimConfig, *, seed: int, max_steps: int, loss: TmaLossConfig | None = None
     ) -> None:
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
         self.loss_config = loss or TmaLossConfig()
 
-    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "similarity" [B, S]
         (sBERT embeddings, for the filter), "present" bool [B, D] (optional: all).
 
@@ -39,43 +31,41 @@ class TmaModule(StageModule):
         Latents are sampled in training and are the means in evaluation. InfoNCE contrasts the means, as the
         published HumanTOMATO code does (TMR contrasts samples): retrieval uses the means too.
         """
-        net, weight = self.net, self.loss_config
-        motion, length = batch["motion"], batch["length"]
-        words = batch["conditions"]["text"]
-        text = net.encode_text(words.features, words.mask)
-        present = batch.get("present")
-        moved = net.encode_motion(motion, length, present)
-        z_text, z_motion = self._latent(*text), self._latent(*moved)
-        target, frames = net.strided(motion, length)
-        target, mask = net.read(target, present), length_mask(frames, target.shape[1])
-        size = motion.shape[1]
-        rec_text = reconstruction_loss(net.write(z_text, length, size), target, mask, present)
-        rec_motion = reconstruction_loss(net.write(z_motion, length, size), target, mask, present)
-        kl = kl_four(text, moved)
-        latent = latent_loss(z_text, z_motion)
-        contrastive = info_nce(
-            text[0],
-            moved[0],
-            batch["similarity"],
-            temperature=weight.temperature,
-            threshold=weight.threshold,
-        )
-        loss = (
-            weight.reconstruction * (rec_text + rec_motion)
-            + weight.kl * kl
-            + weight.latent * latent
-            + weight.contrastive * contrastive
-        )
-        return {
-            "loss": loss,
-            "rec_text": rec_text,
-            "rec_motion": rec_motion,
-            "kl": kl,
-            "latent": latent,
-            "contrastive": contrastive,
-        }
+        net, config = self.net, self.loss_config
+        motion, length, present = batch["motion"], batch["length"], batch.get("present")
+        text_features = batch["conditions"]["text"]
+        text = net.encode_text(text_features.features, text_features.mask)
+        encoded_motion = net.encode_motion(motion, length, present)
+        z_text, z_motion = self._sample(*text), self._sample(*encoded_motion)
 
-    def _latent(self, mu: Tensor, logvar: Tensor) -> Tensor:
+        # Both latents are decoded and compared with the motion that the encoder saw.
+        subsampled, frames = net.subsample(motion, length)
+        target, mask = net.coordinates(subsampled, present), length_mask(frames, subsampled.shape[1])
+        from_text = net.decode_coordinates(z_text, length, motion.shape[1])
+        from_motion = net.decode_coordinates(z_motion, length, motion.shape[1])
+        losses = {
+            "rec_text": reconstruction_loss(from_text, target, mask, present),
+            "rec_motion": reconstruction_loss(from_motion, target, mask, present),
+            "kl": kl_four(text, encoded_motion),
+            "latent": latent_loss(z_text, z_motion),
+            # The means are contrasted, which are what retrieval uses.
+            "contrastive": info_nce(
+                text[0],
+                encoded_motion[0],
+                batch["similarity"],
+                temperature=config.temperature,
+                threshold=config.threshold,
+            ),
+        }
+        loss = (
+            config.reconstruction * (losses["rec_text"] + losses["rec_motion"])
+            + config.kl * losses["kl"]
+            + config.latent * losses["latent"]
+            + config.contrastive * losses["contrastive"]
+        )
+        return {"loss": loss, **losses}
+
+    def _sample(self, mu: Tensor, logvar: Tensor) -> Tensor:
         if not self.training:
             return mu
-        return mu + draws.normal_like(mu) * (0.5 * logvar).exp()
+        return mu + random.normal_like(mu) * (0.5 * logvar).exp()

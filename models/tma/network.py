@@ -1,6 +1,6 @@
 """TMA: text and motion in one latent space (HumanTOMATO section 3.5 and appendix D; TEMOS, TMR).
 
-Three transformers. The motion encoder and the text encoder each read their sequence behind two learned tokens
+Three transformers. The motion encoder and the text encoder each read their sequence after two learned tokens
 whose outputs are the mean and the log-variance of a Gaussian latent; the motion decoder writes a motion from
 one latent.
 
@@ -11,7 +11,7 @@ Notable choices:
 - Gains [ours] let it read and reconstruct motion in the coordinates of `Basis`, where a hand's shape is the
   same numbers wherever the hand is; in the paper's features small networks do not see it.
 - `text_noise` and `text_dropout` [ours] keep the text encoder from learning a few wordings by heart: small
-  sets say the same in the same words again and again, and users say it in others.
+  sets repeat the same wordings again and again, and users choose others.
 
 Legend: B batch, T frames, D motion features, S text tokens, E text width, Z latent width.
 """
@@ -21,24 +21,21 @@ from __future__ import annotations
 from typing import Self
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field
 from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import Config
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.layers.basis import Basis
-from motionloom.models.layers.transformer import Norm, Transformer, length_mask, sinusoid
+from motionloom.models.layers.transformer import Norm, StackConfig, Transformer, length_mask, sinusoid
 
 
-class TmaConfig(Config):
+class TmaConfig(StackConfig):
     """Sizes of TMA; the defaults are the paper config."""
 
     latent: int = Field(default=256, ge=2)
-    ff: int = Field(default=1024, ge=1)
     layers: int = Field(default=6, ge=1)
     heads: int = Field(default=4, ge=1)
-    dropout: float = Field(default=0.1, ge=0, lt=1)
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
     norm: Norm = "pre"
     """`post` is TEMOS' and TMR's; `pre` needs no warm-up [ours]."""
@@ -54,11 +51,10 @@ class TmaConfig(Config):
     """Width of Gaussian noise on the text features in training, in root mean squares of each caption's own
     features [ours]."""
 
-    @model_validator(mode="after")
-    def _heads_divide(self) -> Self:
-        if self.latent % self.heads:
-            raise ValueError(f"latent {self.latent} must be a multiple of heads {self.heads}")
-        return self
+    @property
+    def width(self) -> tuple[str, int]:
+        """The latent is the width of all three transformers."""
+        return "latent", self.latent
 
 
 class GaussianEncoder(nn.Module):
@@ -103,29 +99,20 @@ def noisy(tokens: Tensor, mask: Tensor, scale: float) -> Tensor:
     """tokens [B, S, E] with Gaussian noise, `scale` root mean squares of each caption's own features wide.
 
     The features of different encoders differ in size, so an absolute width would mean nothing. What is masked
-    (bool [B, S], True = real) plays no part in the size.
+    (bool [B, S], True = real) does not count.
     """
     squares = tokens.square().mean(-1).masked_fill(~mask, 0.0).sum(1) / mask.sum(1).clamp(min=1)
-    return tokens + scale * squares.sqrt()[:, None, None] * draws.normal_like(tokens)
+    return tokens + scale * squares.sqrt()[:, None, None] * random.normal_like(tokens)
 
 
 def _stack(config: TmaConfig) -> Transformer:
-    return Transformer(
-        config.layers,
-        config.latent,
-        config.heads,
-        config.ff,
-        dropout=config.dropout,
-        attention_dropout=config.attention_dropout,
-        norm=config.norm,
-    )
+    return Transformer.of(config, config.layers, attention_dropout=config.attention_dropout, norm=config.norm)
 
 
 class Tma(nn.Module):
     """Motion encoder, text encoder and motion decoder over one latent space.
 
     Args:
-        config: Sizes.
         motion_dim: D.
         text_dim: E.
         basis: Coordinates of the motion, as `of_layout` makes them; None = the features themselves.
@@ -153,14 +140,14 @@ class Tma(nn.Module):
             basis = Basis(layout, columns, root_gain=config.root_gain, finger_gain=config.finger_gain)
         return cls(config, len(columns), text_dim, basis)
 
-    def read(self, x: Tensor, present: Tensor | None = None) -> Tensor:
+    def coordinates(self, x: Tensor, present: Tensor | None = None) -> Tensor:
         """Motion [B, T, D] in the coordinates that are encoded and reconstructed; 0, the mean, in the columns
         that a clip does not hold (`present` bool [B, D]; None = all are present).
         """
-        seen = x if self.basis is None else self.basis.encode(x)
-        return seen if present is None else seen.masked_fill(~present[:, None], 0.0)
+        out = x if self.basis is None else self.basis.encode(x)
+        return out if present is None else out.masked_fill(~present[:, None], 0.0)
 
-    def strided(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    def subsample(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
         """Every `frame_stride`-th frame of x [B, T, D], and the lengths in such frames (rounded up)."""
         stride = self.config.frame_stride
         return x[:, ::stride], (length + stride - 1) // stride
@@ -168,13 +155,13 @@ class Tma(nn.Module):
     def encode_motion(
         self, x: Tensor, length: Tensor, present: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """x [B, T, D] normalised features, length int64 [B] frames, `present` as in `read` -> (mu, logvar),
-        float32 [B, Z].
+        """x [B, T, D] normalised features, length int64 [B] frames, `present` as in `coordinates` ->
+        (mu, logvar), float32 [B, Z].
         """
         if x.shape[-1] != self.motion_dim:
             raise ValueError(f"TMA was built for {self.motion_dim} motion features, got {x.shape[-1]}")
-        x, length = self.strided(x, length)
-        mu, logvar = self.motion_encoder(self.read(x, present), length_mask(length, x.shape[1]))
+        x, length = self.subsample(x, length)
+        mu, logvar = self.motion_encoder(self.coordinates(x, present), length_mask(length, x.shape[1]))
         return mu, logvar
 
     def encode_text(self, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -190,15 +177,15 @@ class Tma(nn.Module):
         """Z [B, Z] -> normalised features [B, ceil(frames / stride), D] at every `frame_stride`-th frame;
         zero past `length` frames.
         """
-        written = self.write(z, length, frames)
+        coordinates = self.decode_coordinates(z, length, frames)
         if self.basis is None:
-            return written
+            return coordinates
         stride = self.config.frame_stride
-        mask = length_mask((length + stride - 1) // stride, written.shape[1])
-        return self.basis.decode(written) * mask[..., None]
+        mask = length_mask((length + stride - 1) // stride, coordinates.shape[1])
+        return self.basis.decode(coordinates) * mask[..., None]
 
-    def write(self, z: Tensor, length: Tensor, frames: int) -> Tensor:
-        """`decode` in the coordinates of `read`: what the reconstruction is judged in."""
+    def decode_coordinates(self, z: Tensor, length: Tensor, frames: int) -> Tensor:
+        """`decode`, in the coordinates of `coordinates`: the reconstruction that the loss compares."""
         stride = self.config.frame_stride
         mask = length_mask((length + stride - 1) // stride, (frames + stride - 1) // stride)
         out: Tensor = self.motion_decoder(z, mask)

@@ -1,4 +1,4 @@
-"""`Tokenizer`: what every motion tokenizer offers to its trainer and to the stages behind it.
+"""`Tokenizer`: what every motion tokenizer offers to its trainer and to later stages.
 
 A tokenizer consumes exactly the layout columns it models, already normalised; `select` picks them out of full
 frames. Four frames are one group: `length` is rounded up to whole groups, so the last group of a clip may
@@ -38,11 +38,10 @@ class Stream(NamedTuple):
 class TokenizerOutput(NamedTuple):
     """What `Tokenizer.forward` returns."""
 
-    read: Tensor
-    """[B, T, dim] in the coordinates of `Basis`: what the encoders read, 0 in missing columns."""
-    written: Tensor
-    """[B, T, dim] in the same: what the decoder wrote, to be compared with `read`; `features` makes motion
-    of it."""
+    input: Tensor
+    """[B, T, dim], the encoders' input in the coordinates of `Basis`; 0 in missing columns."""
+    reconstruction: Tensor
+    """[B, T, dim], the decoder's output in the same coordinates; `features` turns it into motion."""
     penalty: Tensor
     """Commitment, summed over codebooks; scalar."""
     codes: dict[str, Tensor]
@@ -78,10 +77,6 @@ class Tokenizer(nn.Module, ABC):
     Subclasses set `decoder` and implement `codebooks`, `_quantize` and `_join`.
 
     Args:
-        config: Sizes and losses.
-        layout: Layout of the full frames.
-        part: Which columns of the layout are modelled.
-        streams: Kinds of tokens.
         pattern: Order of the streams' tokens within one group, e.g. ("body", "body", "hand").
     """
 
@@ -114,7 +109,6 @@ class Tokenizer(nn.Module, ABC):
 
     @property
     def dim(self) -> int:
-        """Number of columns modelled."""
         return len(self.columns)
 
     @property
@@ -125,10 +119,10 @@ class Tokenizer(nn.Module, ABC):
 
     @property
     def reach(self) -> int:
-        """Groups before and behind a group whose tokens its frames are decoded from, besides its own."""
+        """Groups before and after a group whose tokens its frames are decoded from, besides its own."""
         decoder = self.decoder
         if not isinstance(decoder, Windowed):
-            raise TypeError(f"{type(decoder).__name__} does not say which latents a frame is made of")
+            raise TypeError(f"{type(decoder).__name__} cannot tell which latents a frame is made of")
         first, last = decoder.needs(0, GROUP_FRAMES - 1)
         return max(-(first * decoder.stride // GROUP_FRAMES), last * decoder.stride // GROUP_FRAMES)
 
@@ -137,8 +131,7 @@ class Tokenizer(nn.Module, ABC):
         return x[..., self.columns]
 
     @abstractmethod
-    def codebooks(self) -> dict[str, Codebook]:
-        """The quantizer of each stream."""
+    def codebooks(self) -> dict[str, Codebook]: ...
 
     @abstractmethod
     def _quantize(
@@ -159,29 +152,29 @@ class Tokenizer(nn.Module, ABC):
 
     def missing(self, present: Tensor) -> dict[str, Tensor]:
         """Bool [B] for each stream of a part that clips may lack: true where `present` [B, dim] lacks it. The
-        stream's codes then say nothing.
+        stream's codes are then meaningless.
         """
         return self._missing(present)
 
     def forward(
         self, x: Tensor, length: Tensor | None = None, present: Tensor | None = None
     ) -> TokenizerOutput:
-        """Read, quantize and write x [B, T, dim]; `length` [B] = valid frames. Training updates codebooks.
+        """Encode, quantize and decode x [B, T, dim]; `length` [B] = valid frames. Training updates codebooks.
 
         `present` [B, dim]: false where a clip does not hold a column; None = all are present.
         """
         valid = self._valid(x, length)
-        read = self.coordinates(x, present)
-        latents = self._quantize(read, valid, self._missing(present), update=True)
-        written = self.decoder(latents.joined, valid)
-        return TokenizerOutput(read, written, latents.penalty, latents.codes, latents.metrics)
+        coordinates = self.coordinates(x, present)
+        latents = self._quantize(coordinates, valid, self._missing(present), update=True)
+        reconstruction = self.decoder(latents.joined, valid)
+        return TokenizerOutput(coordinates, reconstruction, latents.penalty, latents.codes, latents.metrics)
 
     def coordinates(self, x: Tensor, present: Tensor | None = None) -> Tensor:
-        """Motion [B, T, dim] as the encoders read it: in the coordinates of `Basis`, zero in the columns that
-        are not present. `features` is the way back.
+        """Motion [B, T, dim] in the coordinates of `Basis`, which the encoders read; zero in columns that are
+        not present. `features` is the inverse.
         """
-        read = self.basis.encode(x)
-        return read if present is None else read.masked_fill(~present[:, None], 0.0)
+        coordinates = self.basis.encode(x)
+        return coordinates if present is None else coordinates.masked_fill(~present[:, None], 0.0)
 
     @torch.no_grad()
     def encode(
@@ -219,9 +212,9 @@ class Tokenizer(nn.Module, ABC):
             vectors[name] = without(vectors[name], missing)
         return self._decode(vectors, length)
 
-    def features(self, written: Tensor, length: Tensor | None = None) -> Tensor:
-        """Motion [B, T, dim] of the decoder's coordinates, exactly zero after the last valid group."""
-        motion = self.basis.decode(written)
+    def features(self, coordinates: Tensor, length: Tensor | None = None) -> Tensor:
+        """Motion [B, T, dim] from the decoder's coordinates, exactly zero after the last valid group."""
+        motion = self.basis.decode(coordinates)
         mask = token_mask(_whole_groups(length), motion.shape[1], 1)
         return motion if mask is None else motion.masked_fill(~mask[..., None], 0.0)
 
@@ -235,7 +228,6 @@ class Tokenizer(nn.Module, ABC):
         return self
 
     def train(self, mode: bool = True) -> Self:
-        """Training mode, unless frozen."""
         return super().train(mode and not self.is_frozen)
 
     def _decode(self, vectors: dict[str, Tensor], length: Tensor | None) -> Tensor:

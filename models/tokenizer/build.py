@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.tokenizer.body_hand import H2VQ, SeparateVQ
 from motionloom.models.tokenizer.config import (
     AnyTokenizerConfig,
     FsqConfig,
@@ -11,11 +12,7 @@ from motionloom.models.tokenizer.config import (
     MqConfig,
     SeparateConfig,
 )
-from motionloom.models.tokenizer.fsq import FsqTokenizer
-from motionloom.models.tokenizer.h2vq import H2VQ
-from motionloom.models.tokenizer.mq import MotionQuantizer
-from motionloom.models.tokenizer.separate import SeparateVQ
-from motionloom.models.tokenizer.single import SingleTokenizer
+from motionloom.models.tokenizer.single import FsqTokenizer, MotionQuantizer, SingleTokenizer
 
 
 def build_tokenizer(config: AnyTokenizerConfig, layout: MotionLayout) -> Tokenizer:

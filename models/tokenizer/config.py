@@ -23,6 +23,14 @@ class LossTerms(TypedDict):
     velocity_weight: float
 
 
+class ConvSizes(TypedDict):
+    """Keyword arguments of the convolutional encoders and decoders."""
+
+    width: int
+    depth: int
+    dilation_growth: int
+
+
 class BaseTokenizerConfig(Config):
     """What every tokenizer has."""
 
@@ -40,17 +48,17 @@ class BaseTokenizerConfig(Config):
     finger_gain: float = Field(default=0.0, ge=0)
     """Above 0, fingers count by how they bend, in bone lengths times this [ours]; see `layers/basis.py`."""
 
+    def conv_sizes(self) -> ConvSizes:
+        """Keyword arguments of encoders and decoders."""
+        return {"width": self.width, "depth": self.depth, "dilation_growth": self.dilation_growth}
+
     def commitment(self) -> float:
         """Weight of the quantizers' penalty; 0 for quantizers without one."""
         return 0.0
 
     def loss_terms(self) -> LossTerms:
         """Keyword arguments of `TokenizerModule` and `tokenizer_loss`."""
-        return {
-            "alpha": self.commitment(),
-            "recon": self.recon,
-            "velocity_weight": self.velocity_weight,
-        }
+        return {"alpha": self.commitment(), "recon": self.recon, "velocity_weight": self.velocity_weight}
 
 
 class EmaTokenizerConfig(BaseTokenizerConfig):
@@ -63,11 +71,9 @@ class EmaTokenizerConfig(BaseTokenizerConfig):
     """Weight of the commitment penalty."""
 
     def commitment(self) -> float:
-        """`alpha`."""
         return self.alpha
 
     def quantizer(self) -> QuantizerConfig:
-        """Config of each codebook."""
         return QuantizerConfig(
             num_codes=self.num_codes, dim=self.code_dim, decay=self.decay, reset_below=self.reset_below
         )
@@ -125,7 +131,7 @@ class MqConfig(BaseTokenizerConfig):
     part: Part = "bodyhand"
     width: int = Field(default=1024, ge=1)
     depth: int = Field(default=1, ge=0)
-    """Residual blocks behind each layer that changes the rate: 1 in public UDE code, 0 is the bare text."""
+    """Residual blocks after each layer that changes the rate: 1 in public UDE code, 0 is the bare text."""
     dilation_growth: int = Field(default=1, ge=1)
     code_dim: int = Field(default=1024, ge=1)
     num_codes: int = Field(default=2048, ge=2)
@@ -147,7 +153,6 @@ class MqConfig(BaseTokenizerConfig):
         return 1.0 if self.quantizer == "gradient" else self.commitment_weight
 
     def gradient_quantizer(self) -> GradientQuantizerConfig:
-        """Config of the codebook learnt by gradient."""
         return GradientQuantizerConfig(
             num_codes=self.num_codes,
             dim=self.code_dim,
@@ -159,7 +164,6 @@ class MqConfig(BaseTokenizerConfig):
         )
 
     def ema_quantizer(self) -> QuantizerConfig:
-        """Config of the codebook learnt by moving averages."""
         return QuantizerConfig(
             num_codes=self.num_codes, dim=self.code_dim, decay=self.decay, reset_below=self.reset_below
         )

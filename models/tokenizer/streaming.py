@@ -22,7 +22,6 @@ class StreamDecoder:
     """Decodes tokens as they come.
 
     Args:
-        net: The tokenizer, in evaluation mode.
         least: Groups that are decoded together at least, except the last ones: more waste less on the
             window's margins, fewer come sooner.
     """

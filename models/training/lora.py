@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import nn
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 
 LAYERS = ("attention.qkv", "attention.out", "ff_in", "ff_out")
 """Every linear layer of a transformer block [ours]: attention alone has less room for new motion."""
@@ -76,7 +76,7 @@ def add_lora(net: nn.Module, config: LoraConfig) -> None:
     for layer in net.modules():
         # Ours draws by sample where the training does (`train.draws`).
         if isinstance(layer, LoraLayer) and config.dropout:
-            layer.lora_dropout[_NAME] = draws.Dropout(config.dropout)
+            layer.lora_dropout[_NAME] = random.Dropout(config.dropout)
 
 
 def merge_lora(net: nn.Module) -> None:

@@ -11,23 +11,19 @@ every backward pass, and a player's pass reaches its own alone.
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.amp import GradScaler
-from torch.nn.parallel import DistributedDataParallel
 from torch.optim import Optimizer
 
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.training.distributed import mean_gradients
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.training.stage_module import StageModule
+from motionloom.models.training.stage_module import Batch, Execution, StageModule
 
 
 @dataclass(frozen=True)
@@ -45,12 +41,10 @@ class Player:
     """First step without a turn any more; its schedule ends there (None = with the training)."""
 
     def plays(self, step: int) -> bool:
-        """Whether it has a turn in this step."""
         over = self.end_step is not None and step >= self.end_step
         return not over and step >= self.start_step and (step - self.start_step) % self.every == 0
 
     def params(self) -> list[nn.Parameter]:
-        """What it trains."""
         return [p for net in self.nets for p in net.parameters() if p.requires_grad]
 
 
@@ -63,10 +57,6 @@ class PlayersModule(StageModule):
 
     def __init__(self, net: nn.Module, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.automatic_optimization = False
-        self.accumulate = 1
-        """Parts that the batch of a step is cut into; they are gathered until the last is here."""
-        self._parts: list[dict[str, Any]] = []
         self._trained: list[list[nn.Parameter]] = []
 
     @abstractmethod
@@ -74,7 +64,7 @@ class PlayersModule(StageModule):
         """The players in the order of their turns; no parameter may belong to two."""
 
     @abstractmethod
-    def play(self, player: str, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+    def play(self, player: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """A player's losses and metrics on one batch: "loss" is minimised, the others are only logged.
 
         `shared` is empty in the first turn on a batch. What a player puts there the next ones get, without
@@ -82,7 +72,7 @@ class PlayersModule(StageModule):
         whose forerunner had no turn must do without it.
         """
 
-    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Figures of all players, each under its name, and the first one's loss as "loss" (validation)."""
         shared: dict[str, Tensor] = {}
         out: dict[str, Tensor] = {}
@@ -94,7 +84,6 @@ class PlayersModule(StageModule):
         return out
 
     def compile_losses(self) -> None:
-        """Compile each player's networks and losses as one graph."""
         torch.compiler.reset()
         self.play = torch.compile(self.play, fullgraph=True)  # type: ignore[method-assign]
 
@@ -110,73 +99,62 @@ class PlayersModule(StageModule):
             for player, params in zip(players, self._trained, strict=True)
         ]
 
-    def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:  # type: ignore[override]
-        """Gather the parts of a step; with the last one every player takes its turn."""
-        self._parts.append(batch)
-        if len(self._parts) < self.accumulate:
-            return
-        parts, self._parts = self._parts, []
-        shared: list[dict[str, Tensor]] = [{} for _ in parts]
-        optimizers = self.optimizers(use_pl_optimizer=False)
-        scaler: GradScaler | None = getattr(self.trainer.precision_plugin, "scaler", None)
+    def take_step(self, parts: Iterable[Batch], optimizers: list[Optimizer], how: Execution) -> Tensor:
+        """One step: every player that has a turn takes it. The first one's loss on the first part."""
+        batches = list(parts)
+        shared: list[dict[str, Tensor]] = [{} for _ in batches]
         self.gauges, first, stepped = {}, None, False
-        for turn, player in enumerate(self.players()):
-            if not player.plays(self.global_step):
+        for turn, (player, optimizer) in enumerate(zip(self.players(), optimizers, strict=True)):
+            if not player.plays(self.step):
                 continue
-            optimizer = optimizers[turn] if isinstance(optimizers, list) else optimizers
             with self._alone_trains(turn):
                 optimizer.zero_grad()
-                for number, part in enumerate(parts):
-                    loss = self._backward(player, turn, number, part, shared)
+                for number, part in enumerate(batches):
+                    loss = self._backward(player, turn, number, part, shared, how)
                     first = loss if first is None else first
-                stepped |= self._step(player, turn, optimizer, scaler)
-        if scaler is not None and stepped:
-            scaler.update()
-        self.log_row()
-        if first is not None:
-            self.log("loss", first, prog_bar=True, logger=False)
-        # Lightning would count the optimizers' steps.
-        progress = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
-        progress.increment_ready()
-        progress.increment_completed()
+                stepped |= self._step(player, turn, optimizer, how)
+        if how.scaler is not None and stepped:
+            how.scaler.update()
+        self.step += 1
+        return torch.zeros(()) if first is None else first
 
     def _backward(
-        self, player: Player, turn: int, number: int, part: dict[str, Any], shared: list[dict[str, Tensor]]
+        self,
+        player: Player,
+        turn: int,
+        number: int,
+        part: Batch,
+        shared: list[dict[str, Tensor]],
+        how: Execution,
     ) -> Tensor:
         self.seed_draws(number, turn)
         self.key_draws(part, number, turn)
-        values = self.play(player.name, part, shared[number])
+        with how.autocast():
+            values = self.play(player.name, part, shared[number])
         shared[number] = {name: value.detach() for name, value in shared[number].items()}
         named = _named(player, values)
         self.average({"loss": values["loss"], **named} if turn == 0 else named)
-        with self._outside_forward():
-            self.manual_backward(values["loss"] / self.accumulate)
-        draws.end()
+        how.fabric.backward(values["loss"] / self.accumulate)
+        random.end()
         return values["loss"].detach()
 
-    def _step(self, player: Player, turn: int, optimizer: Optimizer, scaler: GradScaler | None) -> bool:
+    def _step(self, player: Player, turn: int, optimizer: Optimizer, how: Execution) -> bool:
         """A player's step with the gradients that it has; False if it has none."""
         params = self._trained[turn]
-        begin = time.perf_counter()
         mean_gradients(params)
-        self.waited += time.perf_counter() - begin
         if all(param.grad is None for param in params):
             return False
-        step = self.global_step - player.start_step
+        step = self.step - player.start_step
         end = self.max_steps if player.end_step is None else player.end_step
         rate = player.optim.lr * player.optim.factor(step, end - player.start_step)
         for group in optimizer.param_groups:
             group["lr"] = rate
-        if scaler is not None:
-            scaler.unscale_(optimizer)
+        if how.scaler is not None:
+            how.scaler.unscale_(optimizer)
         norm = self.clip(params, player.optim.grad_clip)
         if norm is not None:
             self.gauges |= {f"lr/{player.name}": rate, f"grad_norm/{player.name}": norm}
-        with self._outside_forward():
-            if scaler is None:
-                optimizer.step()
-            else:
-                scaler.step(optimizer)
+        how.step(optimizer)
         return True
 
     @contextmanager
@@ -190,16 +168,6 @@ class PlayersModule(StageModule):
         finally:
             for param in others:
                 param.requires_grad_(True)
-
-    @contextmanager
-    def _outside_forward(self) -> Iterator[None]:
-        """What Lightning does around a loss that it minimises itself: no autocast, no reducer of DDP's."""
-        model = self.trainer.model
-        alone: AbstractContextManager[Any] = (
-            model.no_sync() if isinstance(model, DistributedDataParallel) else nullcontext()
-        )
-        with alone, torch.autocast(self.device.type, enabled=False):
-            yield
 
 
 def _named(player: Player, values: dict[str, Tensor]) -> dict[str, Tensor]:

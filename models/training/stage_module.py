@@ -1,29 +1,37 @@
-"""Base of the stages' LightningModules: one seeded step, one optimizer, plain scalar logs.
+"""Base of the stages' LightningModules: a network, its losses, and one training step.
 
 Every random draw of a training step (dropout, latents, Gumbel noise) comes from a generator state that is a
 pure function of (seed, step, rank), so a run that was killed and resumed repeats the undisturbed run bit for
-bit; or of the sample it is for, so that a run repeats it on any number of ranks too (`layers/draws.py`).
-Codebooks draw by themselves, the same on every rank (`quantize/draws.py`).
+bit; or of the sample it is for, so that a run repeats it on any number of ranks too (`layers/random.py`).
+Codebooks draw by themselves, the same on every rank (`quantize/base.py`).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, TypedDict
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypedDict
 
 import lightning as L
 import torch
+from lightning.fabric import Fabric
 from torch import Tensor, nn
+from torch.amp import GradScaler
 from torch.distributed.tensor import DTensor
+from torch.nn.parallel import DistributedDataParallel
+from torch.optim import Optimizer
 
-from motionloom.models.layers import draws
-from motionloom.models.training.distributed import alone
+from motionloom.models.layers import random
+from motionloom.models.training.distributed import alone, rank, world_size
 from motionloom.models.training.optim import OptimConfig as OptimConfig
-from motionloom.models.training.sharding import sharded
-from motionloom.models.training.watching import Watcher
 
 LOG_EVERY = 10
-"""Steps that a row of the log averages; averaging over ranks costs a collective each."""
+"""Steps that a row of the log averages."""
+
+Batch = dict[str, Any]
+"""Tensors, and conditions of tensors, by name (`datasets/loading`)."""
 
 
 class Means(TypedDict):
@@ -34,8 +42,49 @@ class Means(TypedDict):
     count: int
 
 
-RowMeans = list[Means]
-"""What a rank has added to the means of the log's next row."""
+class StepFigures(NamedTuple):
+    """Losses and metrics of one part of a step, still on the device."""
+
+    step: int
+    """Counted from 1, as in the log."""
+    names: tuple[str, ...]
+    values: Tensor
+    """float32 [len(names)]."""
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How this process computes a step: devices, precision and processes are Fabric's."""
+
+    fabric: Fabric
+    model: nn.Module
+    """The module, or DDP around it; its `forward` is `StageModule.forward`."""
+    half: torch.dtype | None = None
+    """Type of mixed precision; None computes in the type of the weights."""
+    scaler: GradScaler | None = None
+    """Of float16, which alone needs one."""
+
+    def autocast(self) -> AbstractContextManager[object]:
+        """Mixed precision of a forward pass; every use of a weight has a cast of its own, so that its
+        gradients add up in float32.
+        """
+        device = self.fabric.device.type
+        enabled = self.half is not None
+        return torch.autocast(device, dtype=self.half, enabled=enabled, cache_enabled=False)
+
+    def without_sync(self, skip: bool) -> AbstractContextManager[object]:
+        """Inside, DDP does not average gradients if `skip`: more parts of the step follow."""
+        if skip and isinstance(self.model, DistributedDataParallel):
+            no_sync: AbstractContextManager[object] = self.model.no_sync()
+            return no_sync
+        return nullcontext()
+
+    def step(self, optimizer: Optimizer) -> None:
+        """Let an optimizer step; float16 passes over steps whose gradients overflow."""
+        if self.scaler is None:
+            optimizer.step()
+        else:
+            self.scaler.step(optimizer)
 
 
 class StageModule(L.LightningModule, ABC):
@@ -47,29 +96,26 @@ class StageModule(L.LightningModule, ABC):
         self.optim_config = optim
         self.seed = seed
         self.max_steps = max_steps
-        self._since: dict[tuple[str, ...], tuple[Tensor, int]] = {}
+        self.step = 0
+        """Steps that are done."""
+        self.accumulate = 1
+        """Parts that the batch of a step is cut into."""
         self.draw_by_sample = False
         """Whether what a step draws depends on the samples and not on the ranks."""
-        self.row: tuple[str, ...] = ()
-        """Names of the figures in the newest row of the log."""
-        self.gauges: dict[str, float | Tensor] = {}
-        """Learning rate and gradient norm of the step that the newest row of the log ends with."""
-        self.watcher: Watcher | None = None
-        """What looks on, if anything does."""
-        self.waited = 0.0
-        """Seconds that this process has waited for other ranks where it averages gradients itself."""
         self.fused = True
         """Whether the optimizer is one kernel. False for "16-mixed": a fused step also removes the scale of
         the gradients, and they could not be clipped before it."""
+        self.gauges: dict[str, float | Tensor] = {}
+        """Learning rate and gradient norm of the step that the newest row of the log ends with."""
+        self.figures: list[StepFigures] = []
+        """Of all parts of steps since these lists were last cleared."""
+        self.norms: list[tuple[int, Tensor]] = []
+        """(step, norm of the gradients) likewise, where a norm was computed."""
+        self._sums: dict[tuple[str, ...], tuple[Tensor, int]] = {}
 
     @abstractmethod
-    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Losses and scalar metrics of one batch; "loss" is minimised, the others are only logged."""
-
-    def configure_model(self) -> None:
-        """Cut the network over the ranks where the strategy lays them out for that (FSDP)."""
-        if self.device_mesh is not None:
-            self.net = sharded(self.net, self.device_mesh["data_parallel"])
 
     def compile_losses(self) -> None:
         """Compile networks and losses as one graph; seeding and logging stay outside. A break is an error.
@@ -80,125 +126,105 @@ class StageModule(L.LightningModule, ABC):
         torch.compiler.reset()
         self.losses = torch.compile(self.losses, fullgraph=True)  # type: ignore[method-assign]
 
-    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
-        """One step; seeds torch from (seed, step, part of the step, rank) first."""
-        part = batch_idx % self.trainer.accumulate_grad_batches
+    def configure_optimizers(self) -> list[Optimizer]:
+        """The optimizer of the trainable parameters; `take_step` sets its learning rate."""
+        trained = [param for param in self.net.parameters() if param.requires_grad]
+        return [self.optim_config.build(trained, fused=self.fused)]
+
+    def take_step(self, parts: Iterable[Batch], optimizers: list[Optimizer], how: Execution) -> Tensor:
+        """One training step on the parts of its batch; the loss of the last part."""
+        (optimizer,) = optimizers
+        config, loss = self.optim_config, torch.zeros(())
+        for group in optimizer.param_groups:
+            group["lr"] = config.lr * config.factor(self.step, self.max_steps)
+        optimizer.zero_grad()
+        for number, batch in enumerate(parts):
+            with how.without_sync(number < self.accumulate - 1):
+                with how.autocast():
+                    loss = how.model(batch, number)
+                how.fabric.backward(loss / self.accumulate)
+            random.end()  # not before: the backward pass may repeat draws (activation checkpointing)
+        if how.scaler is not None:
+            how.scaler.unscale_(optimizer)
+        self.gauges = {}
+        norm = self.clip(list(self.net.parameters()), config.grad_clip)
+        if norm is not None:
+            self.gauges = {"lr": optimizer.param_groups[0]["lr"], "grad_norm": norm}
+        how.step(optimizer)
+        if how.scaler is not None:
+            how.scaler.update()
+        self.step += 1
+        return loss.detach()
+
+    def forward(self, batch: Batch, part: int) -> Tensor:
+        """Loss of one part of a step; seeds torch from (seed, step, part, rank) first."""
         self.seed_draws(part)
         self.key_draws(batch, part)
         values = self.losses(batch)
         self.average(values)
-        if part == self.trainer.accumulate_grad_batches - 1:
-            self.log_row()
-        self.log("loss", values["loss"].detach(), prog_bar=True, logger=False)
         return values["loss"]
 
     def seed_draws(self, part: int, turn: int = 0) -> None:
         """Seed torch for one part of a step, and one of several losses that are computed on it in turn."""
-        key = (self.seed * 1_000_003 + self.global_step) * 4099 + self.global_rank
+        key = (self.seed * 1_000_003 + self.step) * 4099 + rank()
         torch.manual_seed((key + (part << 48) + (turn << 56)) % 2**63)
 
-    def key_draws(self, batch: dict[str, Any], part: int, turn: int = 0) -> None:
+    def key_draws(self, batch: Batch, part: int, turn: int = 0) -> None:
         """Have the draws of a part of a step depend on its samples, where they do."""
         if self.draw_by_sample:
             rows, device = len(batch["length"]), batch["length"].device
-            first = (part * self.trainer.world_size + self.global_rank) * rows
+            first = (part * world_size() + rank()) * rows
             samples = torch.arange(first, first + rows, device=device)
-            draws.begin(self.seed, self.global_step, samples, turn)
-
-    def on_after_backward(self) -> None:
-        """Draws by sample are for a step; a backward pass may repeat them (activation checkpointing)."""
-        draws.end()
+            random.begin(self.seed, self.step, samples, turn)
 
     @property
     def ends_row(self) -> bool:
         """Whether a row of the log ends with the step that is being taken."""
-        return (self.global_step + 1) % LOG_EVERY == 0
-
-    def on_train_epoch_start(self) -> None:
-        """Averages begin anew with a chunk; in the middle of one a run that goes on has those so far."""
-        self._since = {}
+        return (self.step + 1) % LOG_EVERY == 0
 
     def average(self, values: dict[str, Tensor]) -> None:
         """Add figures of a step, or of a part of one, to the means of the next row."""
         names = tuple(values)
         figures = torch.stack([v.detach().float() for v in values.values()])
-        if self.watcher is not None:
-            self.watcher.figures(names, figures)
-        if names in self._since:
-            sums, count = self._since[names]
-            self._since[names] = (sums + figures, count + 1)
-        else:
-            self._since[names] = (figures, 1)
+        self.figures.append(StepFigures(self.step + 1, names, figures))
+        sums, count = self._sums.get(names, (None, 0))
+        self._sums[names] = (figures if sums is None else sums + figures, count + 1)
 
-    def row_means(self) -> RowMeans:
-        """What was added since the last row."""
+    def take_row(self) -> dict[str, Tensor]:
+        """Means since the last row, "train/NAME" -> scalar; the next row begins."""
+        means: dict[str, Tensor] = {}
+        for names, (sums, count) in self._sums.items():
+            means |= {f"train/{k}": v for k, v in zip(names, (sums / count).unbind(), strict=True)}
+        self._sums = {}
+        return means
+
+    def row_state(self) -> list[Means]:
+        """What was added since the last row, for a checkpoint."""
         return [
             {"names": list(names), "sums": sums.cpu(), "count": count}
-            for names, (sums, count) in self._since.items()
+            for names, (sums, count) in self._sums.items()
         ]
 
-    def go_on_with_row(self, means: RowMeans) -> None:
-        """Begin with what was added before."""
-        self._since = {tuple(m["names"]): (m["sums"].to(self.device), m["count"]) for m in means}
+    def load_row(self, means: Iterable[Means]) -> None:
+        self._sums = {tuple(m["names"]): (m["sums"].to(self.device), m["count"]) for m in means}
 
-    def log_row(self) -> None:
-        """Where a row ends with this step: log the means of what was added since the last one."""
-        if not self.ends_row:
-            return
-        means: dict[str, Any] = {}
-        for names, (sums, count) in self._since.items():
-            means |= {f"train/{k}": v for k, v in zip(names, (sums / count).unbind(), strict=True)}
-        self.log_dict(means, sync_dist=True)
-        self.row = tuple(means)
-        self._since = {}
-
-    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """The same losses on held-out data; every rank gets the same batches and the same figures.
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
+        """Losses on held-out data; every rank gets the same batches and the same figures.
 
         What a loss draws here depends on (seed, batch) alone, so two validations differ by the weights only.
         """
-        draws.end()
+        random.end()
         torch.manual_seed((self.seed * 1_000_003 + batch_idx) % 2**63)
         with alone():
-            values = self.losses(batch)
-        size = len(batch["length"])
-        self.log_dict({f"val/{k}": v for k, v in values.items()}, batch_size=size)
+            return self.losses(batch)
 
-    def configure_gradient_clipping(
-        self,
-        optimizer: torch.optim.Optimizer,
-        gradient_clip_val: float | None = None,
-        gradient_clip_algorithm: str | None = None,
-    ) -> None:
-        """Clip by the norm of all gradients, those cut over ranks too.
-
-        Lightning's own would refuse a fused optimizer in every mixed precision, bfloat16 included.
-        """
-        self.gauges = {}
-        norm = self.clip(list(self.net.parameters()), gradient_clip_val)
-        if norm is not None:
-            self.gauges = {"lr": optimizer.param_groups[0]["lr"], "grad_norm": norm}
-
-    def clip(self, params: list[nn.Parameter], largest: float | None) -> Tensor | None:
-        """Clip by the norm of all gradients, if there is a largest one; the norm before, where a row ends."""
-        norm = None
-        if largest or self.ends_row:
-            norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
-        if self.watcher is not None:
-            self.watcher.gradients(params, norm)
-        if norm is None:
+    def clip(self, params: list[nn.Parameter], largest: float) -> Tensor | None:
+        """Clip by the norm of all gradients (0 = not at all); the norm before, if a row of the log ends."""
+        if not largest and not self.ends_row:
             return None
+        norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
+        whole = norm.full_tensor() if isinstance(norm, DTensor) else norm
+        self.norms.append((self.step + 1, whole))
         if largest:
             torch.nn.utils.clip_grads_with_norm_(params, largest, norm)
-        if not self.ends_row:
-            return None
-        return norm.full_tensor() if isinstance(norm, DTensor) else norm
-
-    def configure_optimizers(self) -> Any:
-        """The optimizer of the trainable parameters, linear warm-up, then constant or cosine."""
-        config = self.optim_config
-        optimizer = config.build([p for p in self.net.parameters() if p.requires_grad], fused=self.fused)
-        schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: config.factor(step, self.max_steps)
-        )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        return whole if self.ends_row else None

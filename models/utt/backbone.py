@@ -20,14 +20,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from motionloom.models.layers import draws
-from motionloom.models.layers.draws import Dropout
+from motionloom.models.layers import random
 from motionloom.models.layers.transformer import KVCache, Transformer, length_mask
 
 
 @dataclass
 class State:
-    """Where step-by-step decoding stands."""
+    """State of step-by-step decoding."""
 
     mask: Tensor
     """bool [B, S], the prefix's real positions."""
@@ -37,26 +36,25 @@ class State:
 
 
 class PrefixTransformer(nn.Module):
-    """The GPT of UDE: full attention within the prefix, causal attention behind it."""
+    """The GPT of UDE: full attention within the prefix, causal attention after it."""
 
-    def __init__(
-        self, layers: int, dim: int, heads: int, ff: int, *, dropout: float, attention_dropout: float
-    ) -> None:
+    def __init__(self, stack: Transformer) -> None:
         super().__init__()
-        self.stack = Transformer(layers, dim, heads, ff, dropout=dropout, attention_dropout=attention_dropout)
+        self.stack = stack
 
-    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor, places: Tensor | None = None) -> Tensor:
+    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor, positions: Tensor | None = None) -> Tensor:
         """Prefix [B, S, D], mask bool [B, S], x [B, L, D] -> the states of x, [B, L, D].
 
-        places: int64 [S] of the prefix's columns, below 2^19, for draws by sample (`Encoded.places`).
+        positions: int64 [S] of the prefix's columns, below 2^19, for random numbers by sample
+        (`Encoded.positions`). Those of x follow in the upper half of the range.
         """
         size = prefix.shape[1]
         visible = prefix_mask(mask, x.shape[1])
-        if places is not None:
-            behind = torch.arange(x.shape[1], device=places.device) + (1 << (draws.PLACES - 1))
-            draws.columns(torch.cat([places, behind]))
-        out: Tensor = self.stack(torch.cat([prefix, x], dim=1), visible)
-        draws.columns(None)
+        if positions is not None:
+            after = torch.arange(x.shape[1], device=positions.device) + (1 << (random.POSITION_BITS - 1))
+            positions = torch.cat([positions, after])
+        with random.positions(positions):
+            out: Tensor = self.stack(torch.cat([prefix, x], dim=1), visible)
         return out[:, size:]
 
     def begin(self, prefix: Tensor, mask: Tensor, size: int) -> State:
@@ -66,7 +64,6 @@ class PrefixTransformer(nn.Module):
         return State(mask, cache=cache)
 
     def extend(self, x: Tensor, state: State) -> Tensor:
-        """States [B, L, D] of inputs x that continue those before."""
         cache = state.cache
         assert cache is not None  # `begin` made it
         before = cache.length - state.mask.shape[1]
@@ -82,16 +79,15 @@ class PrefixGru(nn.Module):
         super().__init__()
         self.norms = nn.ModuleList(nn.LayerNorm(dim) for _ in range(layers))
         self.layers = nn.ModuleList(nn.GRU(dim, dim, batch_first=True) for _ in range(layers))
-        self.dropout = Dropout(dropout)
+        self.dropout = random.Dropout(dropout)
         self.norm = nn.LayerNorm(dim)
 
-    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor, places: Tensor | None = None) -> Tensor:
-        """As `PrefixTransformer.forward`; real positions come first here, so padding moves none."""
+    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor, positions: Tensor | None = None) -> Tensor:
         return self.extend(x, self.begin(prefix, mask, x.shape[1]))
 
     def begin(self, prefix: Tensor, mask: Tensor, size: int) -> State:
-        """Read the prefix; a GRU needs no room, so `size` plays no part."""
-        # The first position last, before it the others' real ones, in order; padding goes behind them all,
+        """Read the prefix; a GRU needs no room, so `size` is ignored."""
+        # The first position last, before it the others' real ones, in order; padding goes after them all,
         # where it is not read any more.
         prefix, mask = prefix.roll(-1, dims=1), mask.roll(-1, dims=1)
         order = (~mask).long().argsort(dim=1, stable=True)
@@ -105,7 +101,6 @@ class PrefixGru(nn.Module):
         return State(mask.roll(1, dims=1), hidden=hidden)
 
     def extend(self, x: Tensor, state: State) -> Tensor:
-        """As `PrefixTransformer.extend`."""
         assert state.hidden is not None  # `begin` made it
         after = []
         for norm, layer, before in zip(self.norms, self.layers, state.hidden, strict=True):

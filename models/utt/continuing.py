@@ -24,7 +24,7 @@ def window_start(count: int, block: int, size: int) -> int:
 
 
 def join(first: Codes, second: Codes, pattern: Sequence[str]) -> Codes:
-    """The groups of `first`, then those of `second`, row by row; codes behind `groups` are 0."""
+    """The groups of `first`, then those of `second`, row by row; codes after `groups` are 0."""
     groups = first.groups + second.groups
     longest = int(groups.max()) if len(groups) else 0
     codes = {}
@@ -40,7 +40,7 @@ def join(first: Codes, second: Codes, pattern: Sequence[str]) -> Codes:
 
 
 def last_groups(codes: Codes, pattern: Sequence[str], count: int | None = None) -> tuple[Tensor, Tensor]:
-    """The last `count` groups of each row (None: all) as interleaved tokens int64 [B, G * P], 0 behind a
+    """The last `count` groups of each row (None: all) as interleaved tokens int64 [B, G * P], 0 after a
     row's own, and their numbers int64 [B].
     """
     groups = codes.groups

@@ -33,7 +33,6 @@ class UttLossConfig(Config):
     discriminator_optim: OptimConfig = OptimConfig(optimizer="adam", betas=(0.5, 0.99))
 
     def weight(self, step: int) -> float:
-        """Weight of the adversarial term in a step."""
         since = step - self.adversarial_start
         if since < 0:
             return 0.0
@@ -42,10 +41,10 @@ class UttLossConfig(Config):
 
 
 class SoftMotion(NamedTuple):
-    """A motion with a gradient to the logits behind it."""
+    """A motion with a gradient to the logits it comes from."""
 
     motion: Tensor
-    """[B, T, dim], zero behind `length`."""
+    """[B, T, dim], zero after `length`."""
     length: Tensor
     """int64 [B], frames."""
 
@@ -64,12 +63,9 @@ def soft_motion(
     """Decode what logits [B, L, V] predict for the clips of tokens [B, L], kinds [B, L].
 
     Args:
-        net: Whose logits they are.
         logits: Of `net`, with gradient.
-        tokens: The clips' own tokens, which say how many groups there are.
-        kinds: Stream of each token.
-        tokenizer: Frozen.
-        gumbel_temperature: Of the softmax behind the one-hots.
+        tokens: The clips' own tokens, which determine the number of groups.
+        gumbel_temperature: Temperature of the softmax that the one-hots are drawn from.
         sample: Draw from the distribution; false takes the likeliest codes.
         present: bool [B, dim], columns of the tokenizer that the clip has (None = all).
     """

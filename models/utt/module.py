@@ -2,7 +2,7 @@
 
 L = L_ce + beta_adv L_adv (equation 4): cross-entropy of the tokens of real motion, and what a discriminator
 says of the motion that the predicted tokens decode to. Tokens are made on the way, by the frozen tokenizer,
-so every window of a clip is tokenized as it stands.
+so every window of a clip is tokenized as it is.
 
 Notable choices [ours]:
 - The adversarial term begins at `adversarial_start` and rises over `adversarial_ramp` steps; the
@@ -13,27 +13,23 @@ Notable choices [ours]:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from motionloom.models.condition.mate import Encoded, drop_conditions
-from motionloom.models.discriminator.losses import (
-    discriminator_loss,
-    generator_loss,
-    gradient_penalty,
-)
+from motionloom.models.discriminator.losses import discriminator_loss, generator_loss, gradient_penalty
 from motionloom.models.discriminator.patch import PatchDiscriminator
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy
 from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave, stream_names
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
-from motionloom.models.utt.conditioned import ConditionedUtt
+from motionloom.models.training.stage_module import Batch
 from motionloom.models.utt.losses import SoftMotion, UttLossConfig, soft_motion
+from motionloom.models.utt.network import ConditionedUtt
 
 
 def closed_sequences(
@@ -48,7 +44,7 @@ def closed_sequences(
     tokens, kinds, length = interleave(codes, pattern, groups=groups)
     tokens = torch.cat([tokens, tokens.new_full((batch, len(names)), PAD)], dim=1)
     kinds = torch.cat([kinds, kinds.new_zeros(batch, len(names))], dim=1)
-    # The End tokens, behind each row's own.
+    # The End tokens, after each row's own.
     order = torch.arange(len(names), device=device)
     limits = torch.tensor([ends[name] for name in names], device=device)
     at = length[:, None] + order
@@ -82,7 +78,6 @@ class UttModule(PlayersModule):
             )
 
     def on_fit_start(self) -> None:
-        """The frozen tokenizer follows to this module's device."""
         self.tokenizer.to(self.device)
 
     def players(self) -> list[Player]:
@@ -100,7 +95,7 @@ class UttModule(PlayersModule):
             )
         return players
 
-    def play(self, player: str, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+    def play(self, player: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """A player's loss of one batch.
 
         "motion" [B, T, D] (the tokenizer's columns), "length" [B], "closed" bool [B] (whether the clip ends
@@ -110,7 +105,7 @@ class UttModule(PlayersModule):
             return self._critic(batch, shared)
         return self._tokens(batch, shared)
 
-    def sequences(self, batch: dict[str, Any]) -> TokenSequence:
+    def sequences(self, batch: Batch) -> TokenSequence:
         """Tokens of a batch's motion, as the frozen tokenizer makes them."""
         tokenizer, net = self.tokenizer.module, self.net.utt
         groups = (batch["length"] // GROUP_FRAMES).clamp(min=1)
@@ -118,25 +113,25 @@ class UttModule(PlayersModule):
             codes = tokenizer.encode(batch["motion"], groups * GROUP_FRAMES, batch.get("present"))
         return closed_sequences(codes, groups, batch["closed"], net.pattern, net.num_codes)
 
-    def _tokens(self, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+    def _tokens(self, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         net, config = self.net.utt, self.net.utt.config
         tokens, kinds, _ = self.sequences(batch)
         conditions, inputs, z = batch["conditions"], None, None
         size, device = len(tokens), tokens.device
         if self.training:
-            drop = draws.uniform(size, device=device) < config.condition_dropout
+            drop = random.uniform(size, device=device) < config.condition_dropout
             conditions = drop_conditions(conditions, drop)
             if config.pkeep < 1:
                 inputs = corrupt(tokens, kinds, net.ends, config.pkeep)
         encoded: Encoded = self.net.mate(conditions, size)
         if config.z_dim:
-            z = draws.normal(size, config.z_dim, device=device)
+            z = random.normal(size, config.z_dim, device=device)
         logits = net(tokens, kinds, encoded, z, inputs=inputs)
         ce = cross_entropy(logits, tokens)
         values = {"loss": ce, "ce": ce}
         for kind, name in enumerate(net.names):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind)
-        weight = self.loss_config.weight(self.global_step)
+        weight = self.loss_config.weight(self.step)
         if self.discriminator is None or (weight == 0 and self.training):
             return values
         fake = self._soft(batch, logits, tokens, kinds)
@@ -145,7 +140,7 @@ class UttModule(PlayersModule):
         values["loss"] = ce + weight * values["adversarial"]
         return values
 
-    def _soft(self, batch: dict[str, Any], logits: Tensor, tokens: Tensor, kinds: Tensor) -> SoftMotion:
+    def _soft(self, batch: Batch, logits: Tensor, tokens: Tensor, kinds: Tensor) -> SoftMotion:
         config = self.loss_config.adversarial
         return soft_motion(
             self.net.utt,
@@ -158,7 +153,7 @@ class UttModule(PlayersModule):
             present=batch.get("present"),
         )
 
-    def _critic(self, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
+    def _critic(self, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         critic = self.discriminator
         assert critic is not None
         glob, length = shared["glob"].detach(), shared["length"]

@@ -5,14 +5,14 @@ tokens shifted by one; the output at token i - 1 (at `start` for the first) is t
 
 Notable choices:
 - Any streams and pattern of `tokens.py`, with its grammar and End tokens; UDE's own is one stream. A learned
-  `start` vector stands where the public code has its SOS token.
+  `start` vector takes the place of the SOS token in the public code.
 - MATE's embeddings become the network's width by one linear layer for glob and seq alike [ours]: the paper's
   numbers, 256 for MATE and 512 here, leave a step open.
-- Motion positions are learned and counted from the first token, so padding of the prefix plays no part; the
+- Motion positions are learned and counted from the first token, independent of padding in the prefix; the
   prefix has MATE's positions.
-- `beside` gives every motion token what MATE made of the music of its own frames, added to the input that
-  predicts it [ours]. In the paper music is in the prefix alone, and which of its frames belong to a token has
-  to be learnt by attention.
+- `frame_condition` adds to the input that predicts a motion token MATE's embedding of the music of the
+  token's own frames [ours]. In the paper music is in the prefix alone, and attention has to learn which of
+  its frames belong to a token.
 - Without conditions (MATE's unconditional embedding) the same network is the unconditional model that
   guidance needs; `condition_dropout` is the share of rows that training makes so.
 
@@ -21,60 +21,52 @@ Legend: B batch, L tokens, G groups, S prefix, D width, E MATE's width, V larges
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, Self
+from collections.abc import Collection, Mapping, Sequence
+from typing import Literal
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field
 from torch import Tensor, nn
 
-from motionloom.datasets.schema import Config, UserError
-from motionloom.models.condition.mate import Encoded
+from motionloom.datasets.schema import UserError
+from motionloom.models.condition.mate import Encoded, Mate, MateConfig
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
-from motionloom.models.layers import draws
-from motionloom.models.layers.draws import Dropout
+from motionloom.models.layers import random
+from motionloom.models.layers.transformer import StackConfig, Transformer
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
 from motionloom.models.utt.backbone import PrefixGru, PrefixTransformer, State
 
 
-class UttConfig(Config):
+class UttConfig(StackConfig):
     """Sizes; the defaults are the paper's (section 4.2), at the public demo's width of 512."""
 
     kind: Literal["gpt", "gru"] = "gpt"
     """Transformer, or the GRU of Table 3."""
     layers: int = Field(default=8, ge=1)
     dim: int = Field(default=512, ge=2)
-    heads: int = Field(default=8, ge=1)
-    """Of the transformer."""
-    ff: int = Field(default=1024, ge=1)
-    """Of the transformer."""
-    dropout: float = Field(default=0.1, ge=0, lt=1)
     attention_dropout: float = Field(default=0.1, ge=0, lt=1)
     block_size: int = Field(default=160, ge=2)
     """Motion tokens that the network sees at once, End tokens included; longer motions slide."""
     z_dim: int = Field(default=256, ge=0)
     """Width of the noise z; 0 = a network without it."""
-    beside: bool = False
+    frame_condition: bool = False
     """Add the music of its own frames to each motion token [ours]; false is the paper: in the prefix only."""
     condition_dropout: float = Field(default=0.1, ge=0, lt=1)
     """Share of samples trained without conditions, for guidance [ours]; 0 turns guidance off."""
     pkeep: float = Field(default=1.0, gt=0, le=1)
     """Probability that an input token is kept; the others become random codes of their stream [ours]."""
 
-    @model_validator(mode="after")
-    def _heads_divide(self) -> Self:
-        if self.kind == "gpt" and self.dim % self.heads:
-            raise ValueError(f"dim {self.dim} must be a multiple of heads {self.heads}")
-        return self
+    @property
+    def width(self) -> tuple[str, int] | None:
+        """A GRU has no heads."""
+        return ("dim", self.dim) if self.kind == "gpt" else None
 
 
 class Utt(TokenNetwork):
     """Autoregressive model of motion tokens given MATE's embeddings and noise.
 
     Args:
-        config: Sizes.
-        streams: The tokenizer's streams.
         pattern: Stream of every slot of a group.
         glob_dim: E, width of MATE's embeddings.
         stride: Frames of music that one of them is about.
@@ -105,23 +97,17 @@ class Utt(TokenNetwork):
             )
         self.per_group = GROUP_FRAMES // stride
         """Embeddings of music for one group of tokens."""
-        self.beside_in: nn.Module | None = None
-        if config.beside:
-            self.beside_in = nn.Linear(self.per_group * glob_dim, config.dim, bias=False)
+        self.frame_condition_in: nn.Module | None = None
+        if config.frame_condition:
+            self.frame_condition_in = nn.Linear(self.per_group * glob_dim, config.dim, bias=False)
         self.start = nn.Parameter(torch.randn(config.dim) * 0.02)
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
         self.embeddings = self._tables(config.dim)
-        self.dropout = Dropout(config.dropout)
+        self.dropout = random.Dropout(config.dropout)
         self.backbone: PrefixTransformer | PrefixGru
         if config.kind == "gpt":
-            self.backbone = PrefixTransformer(
-                config.layers,
-                config.dim,
-                config.heads,
-                config.ff,
-                dropout=config.dropout,
-                attention_dropout=config.attention_dropout,
-            )
+            stack = Transformer.of(config, config.layers, attention_dropout=config.attention_dropout)
+            self.backbone = PrefixTransformer(stack)
         else:
             self.backbone = PrefixGru(config.layers, config.dim, dropout=config.dropout)
         self.heads = self._outputs(config.dim)
@@ -155,15 +141,14 @@ class Utt(TokenNetwork):
         Returns:
             float32 [B, L, V]; -inf where a token is illegal. At padded positions the values mean nothing.
         """
-        embedded = self.read(tokens, kinds, inputs, known, self.config.block_size)
-        places = None
-        if condition.places is not None:
-            places = torch.cat([condition.places.new_zeros(1), condition.places])
-        draws.columns(places)
-        prefix, mask = self.prefix(condition, z)
-        draws.columns(None)
-        motion = self.motion_inputs(embedded, 0, self.beside(condition))
-        hidden = self.backbone(prefix, mask, motion, places)
+        embedded = self.embed_inputs(tokens, kinds, inputs, known, self.config.block_size)
+        positions = condition.positions
+        if positions is not None:
+            positions = torch.cat([positions.new_zeros(1), positions])
+        with random.positions(positions):
+            prefix, mask = self.prefix(condition, z)
+        motion = self.motion_inputs(embedded, 0, self.frame_condition(condition))
+        hidden = self.backbone(prefix, mask, motion, positions)
         return self.logits(hidden, kinds, self.legal(tokens, kinds))
 
     def prefix(self, condition: Encoded, z: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -180,40 +165,40 @@ class Utt(TokenNetwork):
         mask = torch.cat([condition.mask.new_ones(len(x), 1), condition.mask], dim=1)
         return self.dropout(x), mask
 
-    def beside(self, condition: Encoded) -> Tensor | None:
-        """What every group of motion tokens is told of the music of its frames, [B, G, D]; None = nothing."""
-        if self.beside_in is None:
+    def frame_condition(self, condition: Encoded) -> Tensor | None:
+        """Music embedding for each group of motion tokens, [B, G, D]; None if the network has none."""
+        if self.frame_condition_in is None:
             return None
         timed = condition.timed
         if timed is None or not timed.shape[1]:
-            # Read nevertheless: distributed training wants the same parameters used on every rank.
+            # Zeros go through the layer nevertheless: DDP needs the same parameters used on every rank.
             timed = condition.glob.new_zeros(len(condition.glob), self.per_group, self.glob_dim)
         whole = nn.functional.pad(timed, (0, 0, 0, -timed.shape[1] % self.per_group))
         groups = whole.shape[1] // self.per_group
-        out: Tensor = self.beside_in(whole.to(self.start.dtype).reshape(len(whole), groups, -1))
+        out: Tensor = self.frame_condition_in(whole.to(self.start.dtype).reshape(len(whole), groups, -1))
         return out
 
     def motion_inputs(
-        self, embedded: Tensor, at: int, beside: Tensor | None = None, *, first: int = 0
+        self, embedded: Tensor, at: int, frame_condition: Tensor | None = None, *, first: int = 0
     ) -> Tensor:
         """Embedded tokens [B, L, D] with their positions from `at` on; at 0 the start vector comes first.
 
         Args:
-            embedded: Tokens that stand at the positions before those that they help to predict.
-            at: First position.
-            beside: Of `beside`.
-            first: Number of the token that position 0 predicts, where a long motion has slid.
+            embedded: Tokens at the positions before those that they help to predict.
+            frame_condition: [B, G, D] or None, from the method of that name.
+            first: Index of the token that position 0 predicts; above 0 after a long motion has slid.
         """
         if at == 0:
             start = self.start.to(embedded.dtype).expand(len(embedded), 1, -1)
             embedded = torch.cat([start, embedded], dim=1)
         x = embedded + self.positions[at : at + embedded.shape[1]].to(embedded.dtype)
-        if beside is not None:
+        if frame_condition is not None:
+            # Position p predicts token first + p, and a token's group tells which frames it is about.
             token = first + at + torch.arange(x.shape[1], device=x.device)
-            group = token // len(self.pattern)
+            group, last = token // len(self.pattern), frame_condition.shape[1] - 1
+            music = frame_condition[:, group.clamp(max=last)]
             # End tokens and motion that outlasts its music have none.
-            here = beside[:, group.clamp(max=beside.shape[1] - 1)]
-            x = x + here.masked_fill((group >= beside.shape[1])[:, None], 0.0).to(x.dtype)
+            x = x + music.masked_fill((group > last)[:, None], 0.0).to(x.dtype)
         out: Tensor = self.dropout(x)
         return out
 
@@ -221,3 +206,27 @@ class Utt(TokenNetwork):
         """Read the conditions for step-by-step decoding of up to `block_size` inputs."""
         prefix, mask = self.prefix(condition, z)
         return self.backbone.begin(prefix, mask, self.config.block_size)
+
+
+class ConditionedUtt(nn.Module):
+    """MATE and UTT as one network, trained end to end: from conditions to motion tokens.
+
+    Args:
+        widths: Modality -> width of its features.
+        pattern: Stream of every slot of a group.
+        timed: Modalities whose positions are the motion's frames.
+    """
+
+    def __init__(
+        self,
+        mate: MateConfig,
+        utt: UttConfig,
+        widths: Mapping[str, int],
+        streams: Sequence[Stream],
+        pattern: Sequence[str],
+        *,
+        timed: Collection[str],
+    ) -> None:
+        super().__init__()
+        self.mate = Mate(mate, widths, timed=timed)
+        self.utt = Utt(utt, streams, pattern, mate.dim, mate.stride)

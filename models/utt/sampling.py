@@ -3,7 +3,7 @@
 Notable choices:
 - Noise and draws come from counter-based streams keyed by each sample's own seed, as in `gpt/drawing.py`: a
   sample depends on its conditions, its seed and the settings, and on nothing else in the batch.
-- `start` gives tokens that stand before the first new one, e.g. those of a segment with other conditions, so
+- `start` gives tokens that come before the first new one, e.g. those of a segment with other conditions, so
   that a motion goes on across a change from text to music (UDE section 4.4) [ours].
 - When the block is full, the older half of the groups in it is dropped and the rest is read again from the
   first position on [ours]. Where that happens depends on the number of tokens alone.
@@ -22,7 +22,14 @@ from torch.nn.functional import pad
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.drawing import Drawing, as_codes, guide, seeds_of, uniform_numbers
+from motionloom.models.gpt.drawing import (
+    Drawing,
+    as_codes,
+    next_token,
+    requested_groups,
+    seeds_of,
+    uniform_numbers,
+)
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.utt.backbone import State
 from motionloom.models.utt.continuing import last_groups, window_start
@@ -70,7 +77,6 @@ def generate(
         groups: int64 [B], requested numbers of new groups: End is forbidden before and forced there. None:
             the model decides.
         temperature: 0 is greedy.
-        top_k: Keep the k most likely tokens.
         top_p: Keep the smallest set of tokens with this mass.
         cfg_scale: Guidance, one for all rows or one each; 1 is off. Needs a model trained with condition
             dropout.
@@ -79,7 +85,7 @@ def generate(
             used up, so that sampling in pieces gives what sampling at once gives.
 
     Returns:
-        The new codes per stream int64 [B, G * per_group], 0 behind each sample's `groups`.
+        The new codes per stream int64 [B, G * per_group], 0 after each sample's `groups`.
     """
     batch, device = len(condition.glob), condition.glob.device
     scales = [cfg_scale] * batch if isinstance(cfg_scale, (int, float)) else list(cfg_scale)
@@ -88,7 +94,8 @@ def generate(
     how = Drawing(temperature, top_k, top_p)
     guided = any(scale != 1 for scale in scales)
     _check(utt, guided, null, max_groups, context)
-    limit = _limits(utt, batch, max_groups, groups, device)
+    most_groups = max_groups or utt.max_groups
+    limit = requested_groups(groups, batch, most=most_groups, limit=max_groups, device=device)
     seeds = seeds_of(seed, batch, "conditions")
     if start is None:
         none = torch.zeros(batch, 0, dtype=torch.int64, device=device)
@@ -142,7 +149,7 @@ def _decode(
     counts = torch.zeros_like(limit)
     ended = torch.zeros(batch, dtype=torch.bool, device=device)
     no = torch.zeros_like(ended)
-    beside = utt.beside(condition)
+    frame_condition = utt.frame_condition(condition)
     state: State | None = None
     seen = opened = 0
     for step in range(int(before.min()) * size if batch else 0, total):
@@ -158,18 +165,14 @@ def _decode(
         kinds = utt.slots[torch.arange(seen, step, device=device) % size].expand(batch, -1)
         x = utt.embed(tokens[:, seen:step], kinds)
         at = 0 if fresh else seen - first + 1
-        x = utt.motion_inputs(x.repeat(2, 1, 1) if guided else x, at, beside, first=first)
+        x = utt.motion_inputs(x.repeat(2, 1, 1) if guided else x, at, frame_condition, first=first)
         hidden = utt.backbone.extend(x, state)[:, -1:]
         seen = step
         # A segment is never empty, so its first group cannot be End.
         may_end = alive & (group > before) if free and slot == 0 else no
-        legal = utt.legal_at(utt.ends[utt.slots[slot]].expand(batch), may_end, no)
-        rows = legal.repeat(2, 1) if guided else legal
-        logits = utt.logits(hidden, utt.slots[slot].expand(len(rows), 1), rows[:, None])[:, 0]
-        if scale is not None:
-            logits = guide(logits, legal, scale)
         index = (step - before * size).clamp(0, uniform.shape[1] - 1)
-        token = how(logits, uniform.gather(1, index[:, None])[:, 0])
+        own = uniform.gather(1, index[:, None])[:, 0]
+        token = next_token(utt, hidden, slot, may_end=may_end, how=how, uniform=own, scale=scale)
         if slot == 0:
             stops = alive & (token == utt.ends[utt.slots[0]])
             ended, alive = ended | stops, alive & ~stops
@@ -191,22 +194,6 @@ def _stacked(condition: Encoded, null: Encoded) -> Encoded:
         timed = torch.cat([timed, torch.zeros_like(timed)])
     glob, seq, mask = (torch.cat(both) for both in zip(first[:3], second[:3], strict=True))
     return Encoded(glob, seq, mask, timed)
-
-
-def _limits(
-    utt: Utt, batch: int, max_groups: int | None, groups: Tensor | None, device: torch.device
-) -> Tensor:
-    """Most new groups of each row, int64 [B]."""
-    if groups is None:
-        return torch.full((batch,), max_groups or utt.max_groups, dtype=torch.int64, device=device)
-    limit = groups.to(device=device, dtype=torch.int64)
-    if limit.shape != (batch,):
-        raise UserError(f"{tuple(limit.shape)} requested lengths were given for {batch} conditions")
-    if batch and int(limit.min()) < 1:
-        raise UserError(f"requested lengths must be 1 group or more; got {int(limit.min())}")
-    if batch and max_groups is not None and int(limit.max()) > max_groups:
-        raise UserError(f"a length of {int(limit.max())} groups was requested, max_groups is {max_groups}")
-    return limit
 
 
 def _check(utt: Utt, guided: bool, null: Encoded | None, max_groups: int | None, context: int | None) -> None:

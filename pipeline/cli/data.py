@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-from motionloom.pipeline.cli.convert import convert_app
-from motionloom.pipeline.cli.json_output import AsJson
+from motionloom.datasets.schema import Dropped, Manifest, UserError
+from motionloom.datasets.shards.left_out import grouped
+from motionloom.pipeline.cli.convert import convert_app, printable, say, say_manifest
+from motionloom.pipeline.cli.options import AsJson, plain, print_json
 from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.render.labels import label
+from motionloom.pipeline.store.files import require_file_place, require_folder
+
+if TYPE_CHECKING:
+    from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess
+
+_ALIKE = 5
+"""Findings that say the same and are still listed one by one."""
 
 data_app = typer.Typer(
     help="Shards: synthesise, convert, check, statistics.", no_args_is_help=True, rich_markup_mode="markdown"
@@ -35,10 +49,12 @@ def synth(
 
     Example: `motionloom data synth shards --clips 200`
     """
-    from motionloom.pipeline.cli.data_commands import synth_command
+    from motionloom.datasets.synth.generate import SynthConfig, synthesize
 
-    fields = {"clips": clips, "seed": seed, "layout": layout, "music": music}
-    synth_command(fields, out, workers=workers, console=make_console())
+    fields = {"clips": clips, "seed": seed, "layout": layout, "dances": {} if music else None}
+    config = SynthConfig.parse(fields, "data synth")
+    require_folder(out)
+    say_manifest(synthesize(config, out, workers=workers), out, make_console())
 
 
 @data_app.command()
@@ -73,12 +89,26 @@ def check(
 
     Example: `motionloom data check HumanML3D/new_joint_vecs --layout h3d263`
     """
-    from motionloom.pipeline.cli.data_commands import check_command
-
     rules = {"layout": layout, "fps": fps, "texts": texts, "seconds": seconds}
     console = make_console(aside=as_json)
-    problems = check_command(path, rules, strict=strict, every=every, console=console, as_json=as_json)
-    raise typer.Exit(1 if problems else 0)
+    if not path.exists():
+        raise UserError(f"{path}: no such folder or file")
+    files = path.is_file() or _holds_files(path)
+    of_files = [f"--{name}" for name, value in rules.items() if value not in (None, "auto")]
+    if of_files and not files:
+        raise UserError(
+            f"{path}: {', '.join(of_files)} is for single files; a data set says this in its manifest.json; "
+            f"leave it out"
+        )
+    count, warned, found = (
+        _check_files(path, rules, console) if files else _check_dataset(path, every, console)
+    )
+    if strict:
+        count += warned
+    console.print(f"{path}: {count} problems" if count else f"{path}: no problems", markup=False)
+    if as_json:
+        print_json({"path": path, "problems": count, **found})
+    raise typer.Exit(1 if count else 0)
 
 
 @data_app.command()
@@ -100,9 +130,31 @@ def joints(
 
     Example: `motionloom data joints walk.bvh -o joint_map.json`
     """
-    from motionloom.pipeline.cli.data_commands import joints_command
+    from motionloom.datasets.base.files import write_text
+    from motionloom.datasets.convert.bvh.plan import guess_source
+    from motionloom.datasets.motion.bvh.joint_map import map_text
+    from motionloom.datasets.motion.skeleton import Skeleton
 
-    joints_command(source, skeleton, out, console=make_console())
+    console = make_console()
+    if out is not None:
+        require_file_place(out)
+    if Path(source).exists():
+        guess = guess_source(Path(source), Skeleton.named(skeleton))
+        _show_guess(guess, console)
+        text = guess.text()
+    else:
+        try:
+            target = Skeleton.named(source)
+        except UserError as error:
+            raise UserError(f"{source}: no such file or folder, and {error}") from None
+        table = Table("", "joint", "parent", title=target.name)
+        for index, (joint, parent) in enumerate(zip(target.joints, target.parents, strict=True)):
+            table.add_row(str(index), joint, target.joints[parent] if parent >= 0 else "")
+        console.print(table)
+        text = map_text(target, [None] * len(target), note="a joint map to be filled in")
+    if out is not None:
+        write_text(out, text)
+        say(console, str(out))
 
 
 @data_app.command()
@@ -120,9 +172,12 @@ def report(
 
     Example: `motionloom data report shards -o shards.html`
     """
-    from motionloom.pipeline.cli.data_commands import report_command
+    from motionloom.pipeline.results.data_page.page import write_data_report
 
-    report_command(root, out, check=check, clips=clips, console=make_console())
+    console, path = make_console(), out or root / "report.html"
+    require_file_place(path)
+    write_data_report(root, path, check=check, clips=clips, progress=console.is_terminal)
+    console.print(str(path), markup=False, soft_wrap=True)
 
 
 @data_app.command()
@@ -137,6 +192,86 @@ def stats(
 
     Example: `motionloom data stats shards -o stats.safetensors`
     """
-    from motionloom.pipeline.cli.data_commands import stats_command
+    import numpy as np
 
-    stats_command(root, group=group, out=out, console=make_console())
+    from motionloom.datasets.loading.statistics import compute
+    from motionloom.datasets.shards.reader import ShardDataset
+
+    console = make_console()
+    manifest = Manifest.load_json(root / "manifest.json")
+    if out is not None:
+        require_file_place(out)
+    say_manifest(manifest, root, console)
+    dataset = ShardDataset.open(root, "train")
+    lengths = np.asarray(dataset.frames) / dataset.layout.fps
+    low, middle, high = np.percentile(lengths, [5, 50, 95])
+    console.print(f"clip length: median {middle:.1f} s, 5 % below {low:.1f} s, 5 % above {high:.1f} s")
+    stats = compute(dataset, group=group)
+    table = Table("feature", "dims", "mean |mean|", "mean deviation", "largest deviation")
+    for name, size in dataset.layout.fields:
+        columns = dataset.layout.slice(name)
+        mean, std = np.abs(stats.mean[columns]).mean(), stats.std[columns]
+        table.add_row(label(name), str(size), f"{mean:.4f}", f"{std.mean():.4f}", f"{std.max():.4f}")
+    console.print(table)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        stats.save(out)
+        console.print(str(out), markup=False)
+
+
+def _holds_files(folder: Path) -> bool:
+    """Whether a folder is no dataset, finished or not, but holds files that can be checked one by one."""
+    from motionloom.datasets.check.files import FILE_SUFFIXES
+
+    if (folder / "manifest.json").exists() or any(folder.glob("*.index.json")):
+        return False
+    return any(path.suffix.lower() in FILE_SUFFIXES for path in folder.rglob("*"))
+
+
+def _check_dataset(root: Path, every: bool, console: Console) -> tuple[int, int, dict[str, object]]:
+    from motionloom.datasets.check.dataset import examine
+
+    report = examine(root, progress=console.is_terminal)
+    for title, problems in (("warning: ", report.warnings), ("", report.errors)):
+        findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
+        for group in grouped(findings):
+            if group.count > _ALIKE and not every:
+                say(console, f"{title}{group}; each of them: --all")
+                continue
+            for finding in group.members:
+                say(console, f"{title}{finding.source}: {finding.reason}")
+    if report.warning_kinds:
+        counts = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
+        say(console, f"{root}: warnings: {counts}")
+    errors, warnings = sum(report.error_kinds.values()), sum(report.warning_kinds.values())
+    return errors, warnings, cast(dict[str, object], plain(report))
+
+
+def _check_files(
+    path: Path, given: Mapping[str, Any], console: Console
+) -> tuple[int, int, dict[str, object]]:
+    from motionloom.datasets.check.files import FileRules, check_file, check_folder
+
+    rules = FileRules(**given)
+    bad, warned, found = 0, 0, []
+    for verdict in [check_file(path, rules)] if path.is_file() else check_folder(path, rules):
+        say(console, str(verdict))
+        for note in verdict.notes:
+            say(console, f"{verdict.path}: note: {note}")
+        bad += not verdict.ok
+        warned += bool(verdict.ok and verdict.notes)
+        found.append({**cast(dict[str, object], plain(verdict)), "ok": verdict.ok})
+    return bad, warned, {"files": found}
+
+
+def _show_guess(guess: JointGuess, console: Console) -> None:
+    table = Table("", guess.target.name, "stands for it", "found")
+    for index, row in enumerate(guess.rows):
+        names = " + ".join(row.sources) or " or ".join(row.candidates)
+        cells = (str(index), row.joint, names if row.sources else f"{names}?", row.how)
+        table.add_row(*(Text(printable(cell)) for cell in cells))
+    console.print(table)
+    say(console, f"{guess.source}: {guess.summary()}")
+    if guess.unmapped:
+        say(console, f"stand for nothing: {', '.join(guess.unmapped)}")
+    say(console, "certain" if guess.certain else f"not certain: {guess.doubts()}")

@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.cli.json_output import AsJson, print_json
-from motionloom.pipeline.cli.options import Device
+from motionloom.pipeline.cli.options import AsJson, Device, print_json
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.process import process_rank
 
@@ -54,7 +53,7 @@ def evaluate(
             f"{len(runs)} run folders to evaluate; name one, like: motionloom evaluate runs/NAME "
             f"(several only with --table)"
         )
-    from motionloom.pipeline.evaluation.written import figures_in
+    from motionloom.pipeline.evaluation.figures import figures_in
     from motionloom.pipeline.runs.api import evaluate_run
 
     console = make_console(aside=as_json)
@@ -73,7 +72,7 @@ def _show_table(
     measuring: object,
 ) -> None:
     """A table of a paper, or the list of all; what is not of tables is refused."""
-    from motionloom.pipeline.published.compare import compare_with_paper, list_tables
+    from motionloom.pipeline.results.paper.compare import compare_with_paper, list_tables
 
     if measuring:
         raise UserError(

@@ -8,20 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.cli.options import (
-    Candidates,
-    CfgScale,
-    DenoisingSteps,
-    Device,
-    DiffusionSampler,
-    FaceCfgScale,
-    ModelFolder,
-    MusicCfgScale,
-    Temperature,
-    TopK,
-    TopP,
-    given,
-)
+from motionloom.pipeline.cli.options import Device, ModelFolder, Sampling, sampling_of
+from motionloom.pipeline.inference.writers import formats_help
 from motionloom.pipeline.launch.console import make_console
 
 
@@ -51,28 +39,10 @@ def generate(
             "--stream", help="One motion as JSON lines, written while it is made; - reads captions."
         ),
     ] = False,
-    formats: Annotated[
-        str | None,
-        typer.Option(
-            "--format",
-            "-f",
-            help="Comma-separated: npz, bvh, mp4, html (these by default), glb, smplx, arkit.",
-        ),
-    ] = None,
+    formats: Annotated[str | None, typer.Option("--format", "-f", help=formats_help())] = None,
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
-    temperature: Temperature = None,
-    top_k: TopK = None,
-    top_p: TopP = None,
-    candidates: Candidates = None,
-    cfg_scale: CfgScale = None,
-    face_cfg_scale: FaceCfgScale = None,
-    music_cfg_scale: MusicCfgScale = None,
-    face_model: Annotated[
-        str | None, typer.Option(help="gpt, vae or diffusion; default: the first the run has.")
-    ] = None,
-    sampler: DiffusionSampler = None,
-    denoising_steps: DenoisingSteps = None,
+    sampling: Sampling = None,
     rigid: Annotated[
         bool, typer.Option(help="Show bones of constant length; without, the generated joints as they are.")
     ] = True,
@@ -88,7 +58,7 @@ def generate(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Motions from captions, music or a script of both, as npz, BVH, MP4 and one page to watch; also GLB.
+    """Motions from captions, music or a script of both, as npz, BVH and a page to watch; films on request.
 
     Example: `motionloom generate synthetic "a person waves with the left hand"`
 
@@ -106,22 +76,11 @@ def generate(
         "script": script,
         "seconds": seconds,
         "seed": seed,
-        "sampling": given(
-            temperature=temperature,
-            top_k=top_k,
-            top_p=top_p,
-            candidates=candidates,
-            cfg_scale=cfg_scale,
-            face_cfg_scale=face_cfg_scale,
-            music_cfg_scale=music_cfg_scale,
-            face_model=face_model,
-            sampler=sampler,
-            denoising_steps=denoising_steps,
-        ),
+        "sampling": sampling_of(sampling),
         "device": device,
     }
     if stream:
-        from motionloom.pipeline.runs.streams import stream_motion
+        from motionloom.pipeline.runs.generation import stream_motion
 
         if samples != 1 or formats is not None:
             raise UserError("--stream writes one motion as JSON lines: leave --samples and --format out")

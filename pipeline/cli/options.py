@@ -1,11 +1,22 @@
-"""Arguments and options that several commands share."""
+"""Arguments and options that several commands share, and `--json`: JSON alone on standard output."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from pydantic import BaseModel, JsonValue
+
+from motionloom.datasets.schema import UserError
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.contract.sampling import SamplingConfig
+
 
 ModelFolder = Annotated[
     Path,
@@ -22,44 +33,68 @@ Device = Annotated[
     str, typer.Option(help="auto (a GPU if there is one; stages go by the recipe), cpu, cuda or cuda:N.")
 ]
 
-Temperature = Annotated[
-    float | None,
+Sampling = Annotated[
+    list[str] | None,
     typer.Option(
-        help="0: the likeliest tokens; below 1: safer, above 1: more varied. Default: the model's, or 1."
+        "--sampling",
+        help="How motions are drawn, KEY=VALUE; may be repeated. Keys: temperature (0: the likeliest), "
+        "top_k, top_p, candidates (keep the nearest of so many), cfg_scale, guidance.audio, face_cfg_scale, "
+        "face_model (gpt, vae, diffusion), sampler (ddpm, ddim, dpm++), denoising_steps. "
+        "Default: as the model recommends.",
     ),
-]
-TopK = Annotated[
-    int | None, typer.Option(help="Draw from the k likeliest tokens; 0 = all. Default: the model's, or 0.")
-]
-TopP = Annotated[
-    float | None,
-    typer.Option(
-        help="Draw from the likeliest tokens of this total probability. Default: the model's, or 0.95."
-    ),
-]
-Candidates = Annotated[
-    int | None,
-    typer.Option(
-        help="Draw so many motions of each caption and keep the one nearest to it, by TMA. Default: the "
-        "model's, or 1."
-    ),
-]
-CfgScale = Annotated[
-    float | None, typer.Option(help="Classifier-free guidance; 1 = off. Default: the model's, or 1.")
-]
-FaceCfgScale = Annotated[float | None, typer.Option(help="Guidance of the face; default: as --cfg-scale.")]
-MusicCfgScale = Annotated[
-    float | None, typer.Option(help="Guidance where there is music; default: as --cfg-scale.")
-]
-DiffusionSampler = Annotated[
-    str | None, typer.Option("--sampler", help="Of diffusion models: ddpm (default), ddim or dpm++.")
-]
-DenoisingSteps = Annotated[
-    int | None,
-    typer.Option(help="Denoising steps of diffusion models, default 50, at most those trained (1000)."),
 ]
 
 
-def given(**options: Any) -> dict[str, Any]:
-    """The options that were given."""
-    return {name: value for name, value in options.items() if value is not None}
+def fields_of(words: Sequence[str] | None, option: str) -> dict[str, Any]:
+    """Settings from `KEY=VALUE` words, as YAML has them; `a.b=1` is `{"a": {"b": 1}}`."""
+    from motionloom.pipeline.runs.resolve import merge
+    from motionloom.pipeline.store.yaml import load_yaml
+
+    fields: dict[str, Any] = {}
+    for word in words or ():
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise UserError(f"{option} {word}: write it as KEY=VALUE")
+        entry = load_yaml(value, f"{option} {word}")
+        for part in reversed(key.strip().split(".")):
+            entry = {part: entry}
+        fields = merge(fields, entry)
+    return fields
+
+
+def sampling_of(words: Sequence[str] | None) -> SamplingConfig:
+    """The sampling settings of `--sampling` options."""
+    from motionloom.pipeline.contract.sampling import SamplingConfig
+
+    return SamplingConfig.parse(fields_of(words, "--sampling"), "--sampling")
+
+
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print JSON for programs; all else goes to standard error.")
+]
+
+
+def print_json(result: object) -> None:
+    """Print a result: plain data, a config, a dataclass, or any of these within each other."""
+    typer.echo(json.dumps(plain(result), indent=1, ensure_ascii=False, allow_nan=False))
+
+
+def plain(value: object) -> JsonValue:
+    """`value` as JSON knows it. Paths become text, sets and tuples lists; JSON has no NaN: null."""
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, BaseModel):
+        return plain(value.model_dump(mode="json"))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, Set):
+        return sorted((plain(entry) for entry in value), key=str)
+    if isinstance(value, Sequence):
+        return [plain(entry) for entry in value]
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} has no form in JSON")

@@ -6,19 +6,21 @@ modalities it can be conditioned on and which sampling settings it takes notice 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from motionloom.datasets.conditions import Condition, Conditions
+from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.store.text import TextSource
+from motionloom.models.diffusion.schedule import Sampler
+from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -34,14 +36,27 @@ class Prompt:
     """What the face does; empty takes `text`."""
     sound: Sound | None = None
     """The music."""
-    music: NDArray[np.float32] | None = None
-    """Its features, a row for each frame, where they are known already; None = made of the sound."""
+    conditions: Mapping[str, object] = field(default_factory=dict)
+    """What else it is conditioned on, by modality; of "audio" the features [T, 438], where they are known."""
+
+    @property
+    def given(self) -> dict[str, object]:
+        own = {"text": self.text if self.text.strip() else None, "audio": self.sound}
+        pairs = [*own.items(), *self.conditions.items()]
+        return {name: value for name, value in pairs if value is not None}
 
     @property
     def modalities(self) -> frozenset[str]:
-        """The modalities given."""
-        given = {"text": bool(self.text.strip()), "audio": self.sound is not None}
-        return frozenset(name for name, there in given.items() if there)
+        return frozenset(self.given)
+
+    @property
+    def seconds(self) -> float | None:
+        """Length of what it brings, such as its music; None where that has none."""
+        found = [MODALITIES[name].seconds(value) for name, value in self.given.items() if name in MODALITIES]
+        return min((length for length in found if length is not None), default=None)
+
+    def with_words(self, text: str) -> Prompt:
+        return replace(self, text=text)
 
     @property
     def words(self) -> str:
@@ -58,8 +73,10 @@ class GenerationRequest:
     frames: Sequence[int] | None
     """Length of each motion, or None where the model decides."""
     seeds: Sequence[int]
-    """One for each motion, so that how they are batched plays no part."""
+    """One per motion, so that results do not depend on batching."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    noise_seeds: Sequence[int] | None = None
+    """Of the noise of a diffusion decoder; None takes `seeds`. Others take no notice of it."""
 
     def text(self, who: str) -> Condition:
         """The encoded texts; `who` is conditioned on them, for the message where there are none."""
@@ -92,46 +109,45 @@ class MotionGenerator(Protocol):
     @property
     def layout(self) -> MotionLayout:
         """The layout of whole frames."""
-        ...
 
     @property
     def part(self) -> Part:
         """The columns of the layout that it makes."""
-        ...
 
     @property
     def method(self) -> str:
         """A short name that tells generators of one part apart, such as "gpt" or "diffusion"."""
-        ...
 
     @property
     def modalities(self) -> frozenset[str]:
         """The modalities it can be conditioned on."""
-        ...
 
     @property
-    def text(self) -> TextSource | None:
-        """What encodes its words; None where it takes none."""
-        ...
+    def text(self) -> object | None:
+        """What the modality "text" encodes its words by; None where it takes none."""
 
     @property
     def settings(self) -> frozenset[str]:
         """The fields of `SamplingConfig` that it takes notice of."""
-        ...
 
     @property
     def unit_frames(self) -> int:
         """Lengths are multiples of this."""
-        ...
 
     @property
     def max_frames(self) -> int | None:
         """Longest motion; None without a limit."""
-        ...
 
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
         """Features of the part in their own units, [T, C] each, in the order of the rows."""
-        ...
+
+
+@runtime_checkable
+class DenoisingGenerator(MotionGenerator, Protocol):
+    """A generator in which a diffusion model makes motion."""
+
+    def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
+        """Sampler and number of steps: as asked for, or else the model's own."""
 
 
 @runtime_checkable
@@ -142,4 +158,43 @@ class DrivenGenerator(MotionGenerator, Protocol):
         self, stretches: Sequence[Stretch], seeds: Sequence[int], sampling: SamplingConfig
     ) -> list[NDArray[np.float32]]:
         """As `generate`, of several stretches one after another; [T, C] each."""
-        ...
+
+
+class TokenFlow(Protocol):
+    """Tokens of one motion without an end, under conditions that may change."""
+
+    def condition(self, conditions: Conditions) -> None:
+        """Conditions, one row, of all that is drawn from now on; timed ones begin with the next group."""
+
+    def draw(self, left: int | None) -> Mapping[str, Tensor]:
+        """Some groups, one or more and at most `left` (None = there will be another condition, some day).
+
+        Per stream int64 [1, G * per_group].
+        """
+
+
+class FrameFlow(Protocol):
+    """Frames of tokens as they come."""
+
+    def push(self, codes: Mapping[str, Tensor]) -> NDArray[np.float32] | None:
+        """More tokens -> the features [T, C] that are final now, in their own units; None = none yet."""
+
+    def finish(self) -> NDArray[np.float32] | None:
+        """No more tokens follow: the rest."""
+
+
+@runtime_checkable
+class StreamingGenerator(MotionGenerator, Protocol):
+    """A generator of tokens that can be decoded as they come."""
+
+    @property
+    def group_tokens(self) -> Mapping[str, int]:
+        """Tokens of a group, by stream."""
+
+    def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
+        """The tokens of a new motion. Of one caption they are those of `generate` by the same seed, as long
+        as the network's block holds them.
+        """
+
+    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> FrameFlow:
+        """What makes frames of them."""

@@ -2,44 +2,55 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.exported import exported_stage
-from motionloom.pipeline.contract.registry import stage_kind
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given, Stage, StageKind
-from motionloom.pipeline.store.artifact import Artifact
-from motionloom.pipeline.store.outside import in_export, is_place, label_of, owner_of
-from motionloom.pipeline.store.run_folder import stage_folder, stages_of
+from pydantic import Field
+
+from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, Role, Stage, StageKind, stage_kind
+from motionloom.pipeline.store.files import read_record
+from motionloom.pipeline.store.run_folder import (
+    BUNDLE_FILE,
+    in_export,
+    is_place,
+    label_of,
+    owner_of,
+    stage_folder,
+    stages_of,
+)
+from motionloom.pipeline.store.run_state import RunReader, StageRecord, finished_records
+from motionloom.pipeline.store.weights import LayoutFacts
 
 
-def preview_of(stage: Stage, others: Mapping[str, Stage | Finished]) -> Any:
+def preview_of(stage: Stage, others: Mapping[str, Stage | Finished]) -> object:
     """What a stage of a recipe will give, as far as it is known before it has run."""
     return stage.kind.preview(stage.config, previews(stage, others))
 
 
-def previews(stage: Stage, others: Mapping[str, Stage | Finished]) -> Given:
+def previews(stage: Stage, others: Mapping[str, Stage | Finished]) -> Inputs:
     """Previews of a stage's inputs, by role; `others` are those of its recipe, and finished ones outside."""
 
-    def maker(name: str) -> Callable[[], Any]:
+    def maker(name: str) -> Callable[[], object]:
         found = others[name]
         if isinstance(found, Finished):
             return partial(preview_of_finished, found)
         return partial(preview_of, found, others)
 
-    return Given({role: maker(name) for role, name in stage.inputs.items()})
+    return Inputs({role: maker(name) for role, name in stage.inputs.items()})
 
 
-def preview_of_finished(stage: Finished) -> Any:
+def preview_of_finished(stage: Finished) -> object:
     """What a finished stage gives, without what only running it needs."""
-    makers: dict[str, Callable[[], Any]] = {}
+    makers: dict[str, Callable[[], object]] = {}
     for role, source in stage.inputs.items():
         makers[role] = partial(preview_of_finished, source)
-    return stage.kind.preview_of_finished(stage, Given(makers))
+    return stage.kind.preview_of_finished(stage, Inputs(makers))
 
 
 def stages_giving(run: Path, what: str) -> list[str]:
@@ -56,17 +67,17 @@ def stages_giving(run: Path, what: str) -> list[str]:
 
 def finished_stages(run: Path) -> dict[str, Finished]:
     """The finished stages of a run by name, in the recipe's order."""
-    reader = _Reader(run)
-    found = {name: reader.find(stage_folder(run, name)) for name in stages_of(run)}
-    return {name: stage for name, stage in found.items() if stage is not None}
+    made: dict[Path, Finished] = {}
+    return {name: _finished(record, made) for name, record in finished_records(run).items()}
 
 
 def outside_stage(folder: Path) -> Finished | None:
     """A finished stage of a run or of an export, by its folder, for another run; None where there is none."""
     place = folder.resolve()
-    if not in_export(place):
-        return _Reader(None).find(place)
-    return _as_outside(exported_stage(place)) if place.is_dir() else None
+    if in_export(place):
+        return _as_outside(exported_stage(place)) if place.is_dir() else None
+    record = RunReader(None).find(place)
+    return None if record is None else _finished(record, {})
 
 
 def _as_outside(stage: Finished) -> Finished:
@@ -74,55 +85,33 @@ def _as_outside(stage: Finished) -> Finished:
     return replace(stage, name=label_of(stage.folder), inputs=inputs, outside=True)
 
 
-class _Reader:
-    """Reads finished stages and those that fed them, each once, into other runs too."""
+def _finished(record: StageRecord, made: dict[Path, Finished]) -> Finished:
+    """A stage that can be loaded, from its record; each once."""
+    if record.folder not in made:
+        made[record.folder] = _loadable(record, made)
+    return made[record.folder]
 
-    def __init__(self, home: Path | None) -> None:
-        self._home = None if home is None else home.resolve()
-        self._made: dict[Path, Finished | None] = {}
-        self._places: dict[Path, dict[Path, int]] = {}
 
-    def find(self, folder: Path) -> Finished | None:
-        """The stage in a folder; None where it has not finished."""
-        key = folder.resolve()
-        if key not in self._made:
-            self._made[key] = None  # a damaged folder may name itself
-            self._made[key] = self._read(folder)
-        return self._made[key]
-
-    def _read(self, folder: Path) -> Finished | None:
-        if in_export(folder):
-            return outside_stage(folder)
-        artifact = Artifact.find(folder)
-        if artifact is None:
-            return None
-        where = str(folder / "artifact.json")
-        kind = stage_kind(artifact.kind, where)
-        if artifact.version != kind.version and GENERATOR in _gives(kind, artifact):
-            raise UserError(
-                f"{where}: made by version {artifact.version} of stage kind {kind.name}, which is now "
-                f"version {kind.version}; run the recipe again"
-            )
-        run = owner_of(folder)
-        inputs, gone = dict[str, Finished](), dict[str, str]()
-        for role, source in artifact.inputs.items():
-            stage = self.find(source.place(run))
-            if stage is not None:
-                inputs[role] = stage
-            elif source.folder is not None:
-                gone[role] = say_gone(run, folder.name, source.place(run))
-        config = kind.config.parse(artifact.config, f"{where}: config")
-        outside = run.resolve() != self._home
-        name = label_of(folder) if outside else folder.name
-        return Finished(name, kind, config, folder, self._in_order(inputs, run), outside=outside, gone=gone)
-
-    def _in_order(self, inputs: Mapping[str, Finished], run: Path) -> dict[str, Finished]:
-        """Inputs as the run's recipe has their stages, then others; an artifact lists them by role."""
-        if run not in self._places:
-            names = enumerate(stages_of(run))
-            self._places[run] = {stage_folder(run, name).resolve(): number for number, name in names}
-        own = self._places[run]
-        return dict(sorted(inputs.items(), key=lambda item: own.get(item[1].folder.resolve(), len(own))))
+def _loadable(record: StageRecord, made: dict[Path, Finished]) -> Finished:
+    if in_export(record.folder):
+        return _as_outside(exported_stage(record.folder.resolve()))
+    where = str(record.folder / "artifact.json")
+    kind = stage_kind(record.kind, where)
+    if record.version != kind.version and GENERATOR in _gives(kind, record):
+        raise UserError(
+            f"{where}: made by version {record.version} of stage kind {kind.name}, which is now "
+            f"version {kind.version}; run the recipe again"
+        )
+    run = owner_of(record.folder)
+    return Finished(
+        record.name,
+        kind,
+        kind.config.parse(dict(record.config), f"{where}: config"),
+        record.folder,
+        {role: _finished(source, made) for role, source in record.inputs.items()},
+        outside=record.outside,
+        gone={role: say_gone(run, record.folder.name, place) for role, place in record.gone.items()},
+    )
 
 
 def say_gone(run: Path, stage: str, place: Path) -> str:
@@ -134,9 +123,9 @@ def say_gone(run: Path, stage: str, place: Path) -> str:
     )
 
 
-def _gives(kind: StageKind, artifact: Artifact) -> frozenset[str]:
+def _gives(kind: StageKind, record: StageRecord) -> frozenset[str]:
     try:
-        return kind.gives(kind.config.parse(artifact.config, "config"))
+        return kind.gives(kind.config.parse(dict(record.config), "config"))
     except UserError:
         return frozenset()
 
@@ -181,3 +170,119 @@ def _listed(run: Path) -> list[str]:
     roles = [entry.get("inputs") for entry in stages_of(run).values()]
     found = [given.get("generators") for given in roles if isinstance(given, dict)]
     return [str(name) for names in found if isinstance(names, list) for name in names]
+
+
+# Exports. One may come from anywhere, so nothing outside its folder is ever followed.
+
+FORMAT = 2
+
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+
+
+class ExportedStage(Config):
+    """One stage of an export."""
+
+    kind: str
+    version: int
+    config: dict[str, object]
+    inputs: dict[str, str]
+    """Role -> name of another stage of the export."""
+    sha256: dict[str, str] = Field(default_factory=dict)
+    """File of weights -> its sha256; what stands here is compared when the stage is opened."""
+
+
+class BundleFile(Config):
+    """`bundle.json`."""
+
+    format: int
+    layout: LayoutFacts
+    generators: tuple[str, ...]
+    """Stages that generate, the default first."""
+    stages: dict[str, ExportedStage] = Field(default_factory=dict)
+    sampling: dict[str, object] = Field(default_factory=dict)
+    """Fields of `SamplingConfig` that its motions are best drawn with, where nobody says otherwise."""
+
+
+def open_exported(folder: Path) -> list[Finished]:
+    """The stages of an export that generate, the default first."""
+    path, facts, made = folder / BUNDLE_FILE, _read(folder), dict[str, Finished]()
+    makers = [_build(folder, facts, name, (), made) for name in facts.generators]
+    for stage in makers:
+        if not stage.gives(GENERATOR):
+            raise UserError(
+                f"{path}: its stage '{stage.name}' of kind {stage.kind.name} generates nothing; export the "
+                f"run again"
+            )
+    return makers
+
+
+def exported_sampling(folder: Path) -> SamplingConfig:
+    """How an export's motions are best drawn; fields of which it says nothing are not set."""
+    return SamplingConfig.parse(_read(folder).sampling, f"{folder / BUNDLE_FILE}: sampling")
+
+
+def exported_stage(folder: Path) -> Finished:
+    """One stage of an export, by its folder, which must be there."""
+    return _build(folder.parent, _read(folder.parent), folder.name, (), {})
+
+
+def _read(folder: Path) -> BundleFile:
+    path = folder / BUNDLE_FILE
+    if read_record(path).get("format") != FORMAT:
+        raise UserError(
+            f"{path}: exported by another version of motionloom; export the run again: motionloom export RUN"
+        )
+    return BundleFile.load_json(path)
+
+
+def _build(
+    folder: Path, facts: BundleFile, name: str, above: tuple[str, ...], made: dict[str, Finished]
+) -> Finished:
+    """A stage and those it needs, each once."""
+    path = folder / BUNDLE_FILE
+    if name in above:
+        raise UserError(f"{path}: stage '{name}' needs itself; export the run again")
+    if name in made:
+        return made[name]
+    entry = facts.stages.get(name)
+    if entry is None or not _is_name(name) or not (folder / name).is_dir():
+        raise UserError(
+            f"{path}: its stage '{name}' is not here; copy the whole folder, or export the run again"
+        )
+    kind = stage_kind(entry.kind, f"{path}: stages.{name}")
+    if entry.version != kind.version:
+        raise UserError(
+            f"{path}: stages.{name} was made by version {entry.version} of kind {kind.name}, which "
+            f"is now version {kind.version}; run and export the recipe again"
+        )
+    _require_whole(folder / name, entry.sha256, path)
+    inputs = {
+        role: _build(folder, facts, source, (*above, name), made) for role, source in entry.inputs.items()
+    }
+    config = kind.config.parse(entry.config, f"{path}: stages.{name}.config")
+    roles = {role.name: role for role in kind.roles() if isinstance(role, Role)}
+    for role, source in inputs.items():
+        if role not in roles or not roles[role].fits(source.kind, source.config):
+            raise UserError(
+                f"{path}: stages.{name}.inputs: '{source.name}' of kind {source.kind.name} is no "
+                f"{role}; export the run again"
+            )
+    made[name] = Finished(name, kind, config, folder / name, inputs, exported=True)
+    return made[name]
+
+
+def _require_whole(stage: Path, digests: Mapping[str, str], path: Path) -> None:
+    """Refuse weights that are not those that were exported; files that are missing say so when they load."""
+    for name, digest in digests.items():
+        if Path(name).name != name:
+            raise UserError(
+                f"{path}: stages.{stage.name}.sha256 names {name!r}, which is no file of its folder"
+            )
+        if (stage / name).is_file() and sha256_of(stage / name) != digest:
+            raise UserError(
+                f"{stage / name}: is not the file that was exported (another sha256); copy the folder again"
+            )
+
+
+def _is_name(name: str) -> bool:
+    return re.fullmatch(_NAME, name) is not None

@@ -1,44 +1,77 @@
-"""How motions are drawn from trained models."""
+"""Settings of generation: how tokens, latents and noise are drawn, and how much a stream makes at a time."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.schedule import Sampler
-from motionloom.pipeline.contract.fingerprint import LATER
+
+Guidance = Annotated[float, Field(ge=1)]
 
 
 class SamplingConfig(Config):
-    """How tokens, latents and noise are drawn."""
+    """How tokens, latents and noise are drawn. Fields that are not set are as the model recommends."""
 
     temperature: float = Field(1.0, ge=0)
     """Below 1 safer, above 1 more varied; 0 is greedy: the likeliest token, a latent's mean."""
     top_k: int = Field(0, ge=0)
-    """0 keeps every token."""
+    """Draw from the k likeliest tokens; 0 keeps every token."""
     top_p: float = Field(0.95, gt=0, le=1)
-    candidates: int = Field(1, ge=1, le=64, json_schema_extra=LATER)
+    """Draw from the likeliest tokens of this total probability."""
+    candidates: int = Field(1, ge=1, le=64)
     """Motions drawn for each text, of which the one that TMA finds nearest to it is kept; 1 takes the first.
     Needs a GPT whose prior is TMA's."""
     cfg_scale: float = Field(1.0, ge=1)
     """Classifier-free guidance; 1 is off. Needs a model trained with `condition_dropout` > 0."""
-    music_cfg_scale: float | None = Field(None, ge=1)
-    """The same where there is music; None takes `cfg_scale`."""
+    guidance: dict[str, Guidance] = Field(default_factory=dict)
+    """Guidance in place of `cfg_scale` where a motion is conditioned on a modality, by the modality's name:
+    `{audio: 1.0}`. Of several the first that is present counts."""
     face_cfg_scale: float | None = Field(None, ge=1)
-    """The same of the face's GPT or diffusion model; None takes `cfg_scale`."""
+    """Guidance of the face's GPT or diffusion model; None takes `cfg_scale`."""
     face_model: str | None = None
     """Which face generator, by its method (gpt, vae, diffusion) or its stage; by default the first."""
-    sampler: Sampler = "ddpm"
-    """Sampler of diffusion models."""
-    denoising_steps: int = Field(50, ge=1)
-    """Steps of diffusion models, at most those of the training; the paper takes all 1000."""
+    sampler: Sampler | None = None
+    """Sampler of diffusion models: ddpm, ddim or dpm++; None takes the model's own (ddpm, of UDE its
+    stage's)."""
+    denoising_steps: int | None = Field(None, ge=1)
+    """Steps of diffusion models, at most those of the training; None takes the model's own (50, of UDE its
+    stage's)."""
 
-    @property
-    def music_guidance(self) -> float:
-        """Guidance where there is music."""
-        return self.cfg_scale if self.music_cfg_scale is None else self.music_cfg_scale
+    @staticmethod
+    def of(given: SamplingConfig | Mapping[str, object] | None) -> SamplingConfig:
+        """The config, also of a mapping with its keys, such as `{"top_p": 0.9}`."""
+        return SamplingConfig.parse({} if given is None else given, "sampling")
+
+    def over(self, recommended: SamplingConfig) -> SamplingConfig:
+        """These settings, those that are not set here as `recommended` has them."""
+        return recommended.model_copy(update={name: getattr(self, name) for name in self.model_fields_set})
+
+    def scale(self, present: Mapping[str, bool]) -> float:
+        """Guidance of a motion, by the modalities that it is conditioned on."""
+        return next((self.guidance[name] for name in self.guidance if present.get(name)), self.cfg_scale)
 
     @property
     def face_guidance(self) -> float:
-        """Guidance of the face generator."""
         return self.cfg_scale if self.face_cfg_scale is None else self.face_cfg_scale
+
+
+class StreamConfig(Config):
+    """How far a stream looks back and how much it makes at a time; all of it [ours]."""
+
+    chunk_frames: int = Field(8, ge=1)
+    """Frames that come together at least; more cost less in all, fewer come sooner."""
+    context_frames: int = Field(40, ge=0)
+    """Frames that a GPT goes on from where its block is full or another caption comes. UDE's own is its
+    stage's `context_frames`."""
+    hop_frames: int = Field(20, ge=1)
+    """Frames that UDE draws at a time: another caption takes effect after them."""
+    decoder: Literal["diffusion", "tokenizer"] | None = None
+    """What makes frames of a UDE's tokens: the diffusion decoder, which is better and needs the tokens of a
+    window before its first frame, or the tokenizer's own, which needs some groups. None takes the first
+    where the model has it."""
+    ahead_seconds: float = Field(0.5, ge=0)
+    """How far a stream whose captions come from a keyboard runs ahead of the clock."""

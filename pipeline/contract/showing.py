@@ -9,8 +9,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.pipeline.render.viewer import ViewerMotion
-
 
 @dataclass(frozen=True)
 class Curve:
@@ -73,15 +71,6 @@ class Matrix:
     counts: Sequence[Sequence[int]]
     more: bool = False
     """Less important than the others: the page folds it away."""
-
-
-@dataclass(frozen=True)
-class Clips:
-    """Motions to watch."""
-
-    title: str
-    note: str
-    motions: Sequence[ViewerMotion]
 
 
 @dataclass(frozen=True)

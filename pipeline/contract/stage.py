@@ -1,30 +1,43 @@
 """The contract of a stage: what every kind answers for itself, so that nothing else holds a list of kinds.
 
 A kind says which inputs it takes and what it gives, runs, and loads again what it left behind. Kinds that
-train say more (`stages/trained.py`). The graph, the dry run, exports, `generate`, `evaluate` and the report
-ask these questions of the stages of a run; a new stage answers them in its own file and is registered by one
-line (`registry.py`).
+train say more (`training/trained_stage.py`). The graph, the dry run, exports, `generate`, `evaluate` and the
+report ask these questions of the stages of a run; a new stage answers them in its own file and is registered
+by one line.
+
+A package adds kinds by an entry point of the group `motionloom.stages` that names a module; a lone file by
+the environment variable `MOTIONLOOM_STAGES`, a comma-separated list of importable modules. The module calls
+`register(MyStage())`; ours come in the same way. A recipe never names code: it is data, and reading one runs
+nothing.
 """
 
 from __future__ import annotations
 
+import importlib
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, Generic, NoReturn, TypeVar
 
 import torch
 from pydantic import BaseModel, model_validator
+from pydantic.config import JsonDict
 from rich.console import Console
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.inputs import Every as Every
+from motionloom.pipeline.contract.inputs import Inputs as Inputs
+from motionloom.pipeline.contract.inputs import MissingInputError as MissingInputError
+from motionloom.pipeline.contract.inputs import Role as Role
+from motionloom.pipeline.contract.inputs import filled_by as filled_by
 from motionloom.pipeline.contract.showing import Curve, ModelCard, Showing
 from motionloom.pipeline.contract.units import WORK, Units
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.store.run_state import RunState
 
 CPU = torch.device("cpu")
 
@@ -46,52 +59,21 @@ class StageConfig(Config):
 
     @model_validator(mode="before")
     @classmethod
-    def _keep_defaults(cls, data: Any) -> Any:
+    def _keep_defaults(cls, data: object) -> object:
         """A group of settings of which some are given keeps the stage's own defaults of the others."""
         if not isinstance(data, dict):
             return data
         out = dict(data)
         for name, info in cls.model_fields.items():
             if isinstance(info.default, BaseModel) and isinstance(out.get(name), dict):
-                out[name] = _over(info.default.model_dump(mode="json"), out[name])
+                out[name] = _filled(info.default, out[name])
         return out
 
     def require_fit(self, hardware: Hardware) -> None:
         """Refuse, before anything runs, settings that cannot run on this hardware."""
 
 
-@dataclass(frozen=True)
-class Role:
-    """An input of a stage, filled by the stage of the same name unless the recipe names another."""
-
-    name: str
-    optional: bool
-    gives: str
-    """What must fill it: a stage of the kind of this name, or one that gives this."""
-
-    @staticmethod
-    def parse(text: str) -> Role:
-        """As it stands in `takes`: "stats", "tma?", "face_tokenizer?: tokenizer"."""
-        left, _, gives = text.partition(":")
-        name = left.strip().removesuffix("?")
-        return Role(name, left.strip().endswith("?"), gives.strip() or name)
-
-    def fits(self, kind: StageKind, config: Any) -> bool:
-        """Whether a stage of this kind and config may fill it."""
-        return self.gives == kind.name or self.gives in kind.gives(config)
-
-
-@dataclass(frozen=True)
-class Every:
-    """An input filled by every other stage that gives something, or by those the recipe lists, in order."""
-
-    name: str
-    gives: str
-    optional: ClassVar[bool] = True
-
-    def key(self, stage: str) -> str:
-        """The name under which one of them stands among a stage's inputs."""
-        return f"{self.name}.{stage}"
+C = TypeVar("C", bound=StageConfig)
 
 
 @dataclass(frozen=True)
@@ -102,37 +84,6 @@ class Stage:
     kind: StageKind
     config: Any
     inputs: dict[str, str]
-
-
-class MissingInputError(UserError, KeyError):
-    """A role was asked for that no finished stage fills."""
-
-    def __str__(self) -> str:
-        return str(self.args[0])
-
-
-class Given(Mapping[str, Any]):
-    """What the inputs of a stage give, by role; each is made when it is first asked for."""
-
-    def __init__(self, makers: Mapping[str, Callable[[], Any]]) -> None:
-        self._makers = dict(makers)
-        self._made: dict[str, Any] = {}
-
-    def __getitem__(self, role: str) -> Any:
-        if role not in self._makers:
-            raise MissingInputError(f"no finished '{role}' stage here; run the recipe to the end first")
-        if role not in self._made:
-            self._made[role] = self._makers[role]()
-        return self._made[role]
-
-    def __contains__(self, role: object) -> bool:
-        return role in self._makers
-
-    def __iter__(self) -> Any:
-        return iter(self._makers)
-
-    def __len__(self) -> int:
-        return len(self._makers)
 
 
 @dataclass(frozen=True)
@@ -167,34 +118,31 @@ class Finished:
                 todo += stage.inputs.values()
 
 
-class Shelf:
+class StageCache:
     """What finished stages give, each loaded once, all on one device."""
 
     def __init__(self, device: torch.device = CPU) -> None:
         self.device = device
-        self._loaded: dict[Path, Any] = {}
+        self._loaded: dict[Path, object] = {}
 
     def get(self, stage: Finished) -> Any:
-        """What `stage` gives."""
         if stage.folder not in self._loaded:
             self._loaded[stage.folder] = stage.kind.load(stage, self.given_to(stage), self.device)
         return self._loaded[stage.folder]
 
-    def given(self, inputs: Mapping[str, Finished]) -> Given:
-        """What `inputs` give, by role."""
-        return Given({role: partial(self.get, stage) for role, stage in inputs.items()})
+    def given(self, inputs: Mapping[str, Finished]) -> Inputs:
+        return Inputs({role: partial(self.get, stage) for role, stage in inputs.items()})
 
-    def given_to(self, stage: Finished) -> Given:
+    def given_to(self, stage: Finished) -> Inputs:
         """What the inputs of a finished stage give; one that is gone says so where it is asked for."""
         makers = {role: partial(self.get, source) for role, source in stage.inputs.items()}
-        return Given({**{role: partial(_refuse, said) for role, said in stage.gone.items()}, **makers})
+        return Inputs({**{role: partial(_refuse, said) for role, said in stage.gone.items()}, **makers})
 
     def generator(self, stage: Finished) -> MotionGenerator:
-        """The generator that a stage is."""
         return stage.kind.generator(stage, self.given_to(stage), self.device)
 
 
-def _refuse(said: str) -> Any:
+def _refuse(said: str) -> NoReturn:
     raise UserError(said)
 
 
@@ -211,34 +159,29 @@ class StageContext:
     seed: int
     hardware: Hardware
     console: Console
-    shelf: Shelf
+    stage_cache: StageCache
     """Where inputs are loaded, each once."""
     rank: int = 0
     world: int = 1
     """This process among those that share the stage's work."""
-    watched_by: Sequence[Any] = ()
-    """Lightning callbacks that stand in for a training's flight recorder: those of a replay."""
-    again: RunState | None = None
-    """How far the whole run is, where a stage is run outside of it (`motionloom report`); then inputs may be
+    again: Path | None = None
+    """The run, where a stage is run outside of it, finished or not (`motionloom report`); then inputs may be
     missing, and times may be shown. Within a run equal stages give equal outputs."""
 
     @property
     def units(self) -> Units:
-        """The work that the processes divide."""
         return Units(self.folder / WORK, self.rank, self.world)
 
     @property
     def device(self) -> torch.device:
         """Where a stage computes that does not train, and where its inputs are loaded."""
-        return self.shelf.device
+        return self.stage_cache.device
 
     @property
-    def given(self) -> Given:
-        """What the inputs give, loaded on first use."""
-        return self.shelf.given(self.inputs)
+    def given(self) -> Inputs:
+        return self.stage_cache.given(self.inputs)
 
     def input(self, role: str) -> Path:
-        """Folder of an input."""
         return self.inputs[role].folder
 
     def every(self, role: str) -> list[Finished]:
@@ -246,14 +189,14 @@ class StageContext:
         return [stage for key, stage in self.inputs.items() if key.startswith(f"{role}.")]
 
 
-class StageKind(ABC):
+class StageKind(ABC, Generic[C]):
     """What one kind of stage answers. Subclasses set the attributes and override what applies to them."""
 
     name: str
     """In recipes: `kind: name`."""
     summary: str
     """A few words for people."""
-    config: type[StageConfig]
+    config: type[C]
     takes: tuple[str | Every, ...] = ()
     """Inputs: roles, with a trailing "?" for one that a recipe can do without, or `Every`. A role called
     otherwise than what fills it tells that behind a colon: "face_tokenizer?: tokenizer"."""
@@ -263,7 +206,7 @@ class StageKind(ABC):
     shares: bool = False
     """Whether all processes of a run take part by `share` before the first of them runs the stage."""
 
-    def gives(self, config: Any) -> frozenset[str]:
+    def gives(self, config: C) -> frozenset[str]:
         """Names of what other stages may ask of this one, such as "tokenizer" or `GENERATOR`."""
         return frozenset()
 
@@ -273,46 +216,46 @@ class StageKind(ABC):
 
     # Before and while it runs.
 
-    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:  # noqa: B027 (nothing to refuse)
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Refuse, with a `UserError`, a combination with the recipe's other stages that cannot work."""
 
-    def external(self, config: Any) -> Any:
+    def external(self, config: C) -> object:
         """Facts about files outside the run (names, sizes, checksums) that belong to the fingerprint."""
         return None
 
-    def share(self, context: StageContext) -> None:  # noqa: B027 (most kinds have none)
+    def share(self, context: StageContext) -> None:
         """Make this process's share of `context.units`, which `run` then reads and clears."""
 
     @abstractmethod
     def run(self, context: StageContext) -> None:
         """Make the stage's outputs in `context.folder`."""
 
-    def settle(self, config: Any, folder: Path) -> None:  # noqa: B027 (most kinds have none)
+    def settle(self, config: C, folder: Path) -> None:
         """Put RUNTIME settings into the folder of a finished stage, for the stages that read it."""
 
     # What it gives to other stages.
 
-    def preview(self, config: Any, given: Given) -> Any:
+    def preview(self, config: C, given: Inputs) -> object:
         """What `load` will give, as far as it is known before the stage has run (dry runs)."""
         return None
 
-    def load(self, stage: Finished, given: Given, device: torch.device) -> Any:
+    def load(self, stage: Finished, given: Inputs, device: torch.device) -> object:
         """What the finished stage gives to those that take it."""
         return stage.folder
 
-    def preview_of_finished(self, stage: Finished, given: Given) -> Any:
+    def preview_of_finished(self, stage: Finished, given: Inputs) -> object:
         """What `load` gives, for a dry run; a kind whose weights take long to read may leave them out."""
         return self.load(stage, given, CPU)
 
-    def generator(self, stage: Finished, given: Given, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
         """A generator of motion, of a kind that gives `GENERATOR`."""
         raise NotImplementedError(f"stages of kind {self.name} generate nothing")
 
-    def exported(self, config: Any) -> tuple[str, ...]:
+    def exported(self, config: C) -> tuple[str, ...]:
         """Roles whose stages an export must take along for this stage to load."""
         return ()
 
-    def exported_config(self, config: Any) -> Any:
+    def exported_config(self, config: C) -> C:
         """The config as an export shows it to everybody."""
         return config
 
@@ -322,15 +265,15 @@ class StageKind(ABC):
 
     # What a dry run and the report say of it.
 
-    def estimate(self, config: Any, given: Given, hardware: Hardware) -> ModelCard | None:
+    def estimate(self, config: C, given: Inputs, hardware: Hardware) -> ModelCard | None:
         """Sizes of a kind that trains; None for the others."""
         return None
 
-    def curves(self, config: Any) -> tuple[Curve, ...]:
+    def curves(self, config: C) -> tuple[Curve, ...]:
         """Curves of the training log that are worth drawing."""
         return ()
 
-    def show(self, stage: Finished, given: Given) -> list[Showing]:
+    def show(self, stage: Finished, given: Inputs) -> list[Showing]:
         """Figures of the finished stage for the report, beside its curves."""
         return []
 
@@ -350,18 +293,78 @@ class FunctionStage(StageKind):
     given_names: frozenset[str] = field(default_factory=frozenset)
 
     def gives(self, config: Any) -> frozenset[str]:
-        """As named at construction."""
         return self.given_names
 
     def run(self, context: StageContext) -> None:
-        """Call the function."""
         self.function(context)
 
 
-def _over(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """`given` with what it lacks of `defaults`, group by group."""
-    out = {**defaults, **given}
+def _filled(defaults: BaseModel, given: dict[str, object]) -> dict[str, object]:
+    """`given` with what it lacks of what the defaults set, group by group; what neither sets stays unset."""
+    set_by_stage = defaults.model_dump(mode="json", include=defaults.model_fields_set)
+    out = {**set_by_stage, **given}
     for name, value in given.items():
-        if isinstance(value, dict) and isinstance(defaults.get(name), dict):
-            out[name] = _over(defaults[name], value)
+        inner = getattr(defaults, name, None)
+        if isinstance(value, dict) and isinstance(inner, BaseModel):
+            out[name] = _filled(inner, value)
+    return out
+
+
+# The table of kinds.
+
+VARIABLE = "MOTIONLOOM_STAGES"
+_GROUP = "motionloom.stages"
+_KINDS: dict[str, StageKind] = {}
+_loaded = False
+
+K = TypeVar("K", bound=StageKind)
+
+
+def register(kind: K) -> K:
+    """Add a kind to the table; its name must be new."""
+    if _KINDS.setdefault(kind.name, kind) is not kind:
+        raise UserError(f"two stage kinds are called '{kind.name}'; rename one of them")
+    return kind
+
+
+def stage_kinds() -> Mapping[str, StageKind]:
+    """All kinds by name, those of other packages included."""
+    global _loaded
+    if not _loaded:
+        _loaded = True
+        for point in entry_points(group=_GROUP):
+            point.load()
+        for module in filter(None, map(str.strip, os.environ.get(VARIABLE, "").split(","))):
+            try:
+                importlib.import_module(module)
+            except ImportError as error:
+                raise UserError(
+                    f"{VARIABLE}={module}: cannot be imported ({error}); name a module on Python's path"
+                ) from None
+    return _KINDS
+
+
+def stage_kind(name: str, where: str) -> StageKind:
+    """A kind by name; `where` is what names it, for the message."""
+    kinds = stage_kinds()
+    if name not in kinds:
+        raise UserError(
+            f"{where}: stage kind '{name}' is not known here; name the module that registers it in {VARIABLE}"
+        )
+    return kinds[name]
+
+
+RUNTIME: JsonDict = {"runtime": True}
+"""Marks a config field that changes how a stage runs, not what it makes: it is not fingerprinted."""
+
+
+def fingerprint_fields(config: BaseModel) -> dict[str, object]:
+    """The config as plain data without the fields marked RUNTIME."""
+    out: dict[str, object] = {}
+    for name, info in type(config).model_fields.items():
+        extra = info.json_schema_extra
+        if isinstance(extra, dict) and extra.get("runtime"):
+            continue
+        value = getattr(config, name)
+        out[name] = fingerprint_fields(value) if isinstance(value, BaseModel) else value
     return out

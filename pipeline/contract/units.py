@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.launch import watch
 from motionloom.pipeline.store.files import remove_tree
 
 Arrays = dict[str, NDArray[Any]]
@@ -56,12 +55,10 @@ class Units:
         for index in range(self.rank, count, self.world):
             path = self._path(name, index)
             if not path.is_file():
-                with watch.unit(name, index, count), atomic_file(path) as file:
+                with atomic_file(path) as file:
                     np.savez(file, allow_pickle=False, **dict(result(index)))
             if done is not None:
                 done(index)
-        if (mine := watch.current()) is not None:
-            mine.rest("between two works, or waiting for the other processes")
 
     def read(self, name: str, count: int) -> Iterator[Arrays]:
         """The results, in order; a `UserError` names a file that is damaged."""
@@ -82,7 +79,6 @@ class Units:
         return sum(sizes[self.rank :: self.world])
 
     def clear(self) -> None:
-        """Remove all results."""
         remove_tree(self.folder)
 
     def _path(self, name: str, index: int) -> Path:

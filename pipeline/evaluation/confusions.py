@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from motionloom.datasets.synth.measure import measure
-from motionloom.pipeline.evaluation.text_motion import Latents
+from motionloom.pipeline.evaluation.latent_metrics import Latents
 from motionloom.pipeline.evaluation.truth import Truth
 
 ATTRIBUTES = ("action", "direction", "side", "count", "speed", "left_hand", "right_hand", "style", "genre")

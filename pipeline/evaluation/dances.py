@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,10 +12,10 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import beats as track_beats
 from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.synth.dance_plan import beats_of
+from motionloom.datasets.synth.dances import beats_of
 from motionloom.pipeline.render.score import Score, Segment
 
 SOUND = "audio.flac"
@@ -42,7 +43,6 @@ class DanceClip:
 
     @property
     def seconds(self) -> float:
-        """Its length."""
         return len(self.joints) / self.fps
 
     @property
@@ -87,11 +87,11 @@ def dance_at(
     if frames < 1:
         return None
     truth = dataset.meta(index).truth
-    song, rows = (truth or {}).get("song"), dataset.audio(index)
+    rows = dataset.array(index, "audio.npy")
     clip = DanceClip(
         index,
         dataset.ids[index],
-        dataset.ids[index] if song is None else str(song),
+        song_of(dataset, index),
         joints_of(motion[:frames], dataset.layout),
         fps,
         sound,
@@ -103,9 +103,9 @@ def dance_at(
 
 
 def dances_of(
-    dataset: ClipDataset, count: int, *, unit: int = 1, seconds: float | None = None
+    dataset: ClipDataset, count: int | None, *, unit: int = 1, seconds: float | None = None
 ) -> list[DanceClip]:
-    """At most `count` clips with music, different songs first, in the order of the data set.
+    """At most `count` clips with music (None: all), different songs first, in the order of the data set.
 
     The same data give the same clips.
     """
@@ -114,11 +114,18 @@ def dances_of(
     first: list[int] = []
     rest: list[int] = []
     for index in order.tolist():
-        song = str((dataset.meta(index).truth or {}).get("song", dataset.ids[index]))
+        song = song_of(dataset, index)
         (rest if song in seen else first).append(index)
         seen.add(song)
     found = (dance_at(dataset, i, unit=unit, seconds=seconds) for i in sorted((first + rest)[:count]))
     return [clip for clip in found if clip is not None]
+
+
+def song_of(dataset: ClipDataset, index: int) -> str:
+    """What a clip dances to: the piece that its source names, the synthetic song, else the clip's own id."""
+    meta = dataset.meta(index)
+    song = meta.song if meta.song is not None else (meta.truth or {}).get("song")
+    return dataset.ids[index] if song is None else str(song)
 
 
 def require_dances(dataset: ClipDataset) -> None:
@@ -128,6 +135,36 @@ def require_dances(dataset: ClipDataset) -> None:
             f"{dataset.where}: no clip of split '{dataset.split}' holds its sound; dances are evaluated on "
             f"clips with music (synthetic ones: data.dances with sound: true)"
         )
+
+
+def digest_of_dances(clips: Sequence[DanceClip]) -> str:
+    """Tells these dances from others, whatever their data set is called: sha256 of motions and beats."""
+    found = hashlib.sha256()
+    for clip in clips:
+        found.update(f"{clip.joints.shape} {clip.fps}".encode())
+        found.update(np.ascontiguousarray(clip.joints, "<f4").tobytes())
+        found.update(np.ascontiguousarray(clip.beats, "<f8").tobytes())
+    return found.hexdigest()
+
+
+def commonest(clips: Sequence[DanceClip]) -> dict[str, float]:
+    """Share of the commonest genre and style: what a guess gets that always says so."""
+    out: dict[str, float] = {}
+    for name in ("genre", "style"):
+        values = [clip.truth[name] for clip in clips if clip.truth and clip.truth.get(name)]
+        if values:
+            out[name] = max(map(values.count, values)) / len(values)
+    return out
+
+
+def other_songs(clips: Sequence[DanceClip], count: int, seed: int) -> list[list[int]]:
+    """For each clip at most `count` clips of other songs, drawn at random; none where there is one song."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for clip in clips:
+        apart = [k for k, other in enumerate(clips) if other.song != clip.song]
+        out.append(rng.permutation(apart)[:count].tolist())
+    return out
 
 
 def _beats(truth: Mapping[str, Any] | None, sound: Sound) -> NDArray[np.float64]:

@@ -1,74 +1,307 @@
-"""Figures of a run on held-out clips, each beside its trivial answer."""
+"""A figure: one number that was measured, with all that one must know to read it.
+
+An evaluation writes a list of them (`metrics.json`). The terminal, the report, `compare`, the papers' tables
+and JSON output filter that list; none of them knows a metric by name. Numpy is not imported here, so that
+reading takes no time.
+
+Two figures of one name were measured alike exactly when their protocols are equal, and only then are they
+ranked. The protocol holds the clips (by digest), what judged them, among how many candidates, how motions
+were drawn and how often; the seed of the draws is no part of it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.yaml import flatten, setting_text
 
-from motionloom.datasets.synth.measure import agrees
-from motionloom.models.metrics.physics import SHORTEST, physics
-from motionloom.models.metrics.retrieval import recall
-from motionloom.pipeline.contract.units import Row
-from motionloom.pipeline.evaluation.truth import Truth
+FILE_NAME = "metrics.json"
+VERSION = 1
+"""Raised when a figure keeps its name and changes its meaning; figures of other versions are refused."""
+DIGITS = 5
+
+Better = Literal["lower", "higher", ""]
+Fact = str | int | float | bool | None
+Protocol = Mapping[str, Fact]
+
+MODEL = ""
+"""The row of what is evaluated; all other rows are answers that need no model, and are never ranked."""
+RECORDED = "recorded motion"
+TRAINING = "training clips, as many"
+NEAREST = "nearest training clip"
+NEAREST_WORDS = "nearest training caption"
+NEAREST_LABELS = "nearest training labels"
+NEAREST_MUSIC = "training dance to the nearest music"
+RANDOM_DANCE = "random training dance"
+OTHER_MUSIC = "generated dances under other music"
+STILL = "mean pose, still"
+MEAN_FACE = "mean expression"
+CHANCE = "chance"
+TableRows = tuple[str, list[str], list[list[str]]]
+"""Title, columns and rows of a table."""
+ROWS = (
+    MODEL, RECORDED, NEAREST_WORDS, NEAREST_LABELS, TRAINING, NEAREST, NEAREST_MUSIC, RANDOM_DANCE,
+    OTHER_MUSIC, STILL, MEAN_FACE, CHANCE,
+)  # fmt: skip
+"""In the order in which they are shown."""
+
+
+_DIGESTS = {"clips_sha256": "clips", "judge": "judges"}
+"""Facts whose values say nothing to people."""
 
 
 @dataclass(frozen=True)
-class Interval:
-    """Mean and half-width of the 95 % interval over repetitions."""
+class Estimate:
+    """A value and half of its 95 % interval (`estimate.py`)."""
 
-    mean: float
-    half_width: float
-
-    @staticmethod
-    def of(values: Sequence[float]) -> Interval:
-        """Of repeated measurements."""
-        array = np.asarray(values, dtype=np.float64)
-        half = 1.96 * array.std(ddof=1) / np.sqrt(len(array)) if len(array) > 1 else 0.0
-        return Interval(float(array.mean()), float(half))
+    value: float
+    interval: float | None = None
+    over: str = ""
+    """What the interval is over: clips or repeats."""
 
 
-def retrieval_figures(
-    text: Tensor, motion: Tensor, *, size: int, repeats: int, seed: int
-) -> dict[str, Interval]:
-    """Recall@1/2/3 both ways among `size` (protocols C and D): mean over batches, interval over repeats."""
-    rows: dict[str, list[float]] = {}
-    for repeat in range(repeats):
-        for name, value in recall(
-            text, motion, batch=size, recalls=(1, 2, 3), seed=seed * 1000 + repeat
-        ).items():
-            if "/R@" in name:
-                rows.setdefault(name.replace("/R@", "_r"), []).append(value)
-    return {name: Interval.of(values) for name, values in rows.items()}
+@dataclass(frozen=True)
+class Metric:
+    """A column: the name of its figures, its title, which direction is better, and the unit."""
+
+    name: str
+    title: str
+    better: Better = ""
+    unit: str = ""
+    """"share" is shown in percent."""
 
 
-def chance(k: int, size: int) -> float:
-    """Recall@k of a guess."""
-    return k / size
+@dataclass(frozen=True)
+class Figure:
+    """One number."""
+
+    name: str
+    value: float
+    interval: float | None = None
+    """Half of the 95 % interval; None where nothing was repeated."""
+    unit: str = ""
+    better: Better = ""
+    row: str = MODEL
+    protocol: Protocol = field(default_factory=dict)
+    group: str = ""
+    """The table that it is shown in. All figures of a group have one protocol."""
+    title: str = ""
+    """Its column there."""
+    over: str = ""
+    """What the interval is over: clips or repeats."""
+    note: str = ""
+    """Why the figure is not to be trusted."""
+
+    def text(self) -> str:
+        """The value with its interval, for people."""
+        value = number(self.value, self.unit)
+        return value if self.interval is None else f"{value} ± {number(self.interval, self.unit)}"
+
+    @property
+    def protocol_key(self) -> str:
+        """Figures of one name whose keys are equal were measured alike."""
+        return json.dumps(dict(self.protocol), sort_keys=True)
 
 
-def obeyed(truth: Truth, joints: NDArray[np.float64], face: NDArray[np.float32] | None, fps: float) -> Row:
-    """1 or 0 for each attribute of a clip's caption that can be measured: whether a motion does it; and for
-    "everything" together. Only clips of the synthetic source know what they really do; others have nothing.
+def number(value: float, unit: str = "") -> str:
+    """One decimal of mm, whole percents of shares, else three decimals; four digits of large numbers."""
+    if unit == "share":
+        return f"{100 * value:.0f} %"
+    if unit == "mm":
+        return f"{value:.1f}"
+    return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3f}"
+
+
+def group_figures(
+    group: str,
+    metrics: Sequence[Metric],
+    rows: Mapping[str, Mapping[str, Estimate]],
+    protocol: Protocol,
+    notes: Mapping[str, str] | None = None,
+) -> list[Figure]:
+    """The figures of one table: row -> name of a metric -> its estimate; what a row lacks is left out.
+
+    `notes` says by the name of a metric why its figures are not to be trusted.
     """
-    if truth.truth is None:
-        return {}
-    found = agrees(truth.truth, joints, face, fps)
-    return {name: float(value) for name, value in (found | {"everything": all(found.values())}).items()}
+    return [
+        Figure(
+            metric.name,
+            found[metric.name].value,
+            found[metric.name].interval,
+            metric.unit,
+            metric.better,
+            row,
+            protocol,
+            group,
+            metric.title,
+            found[metric.name].over,
+            (notes or {}).get(metric.name, ""),
+        )
+        for row, found in rows.items()
+        for metric in metrics
+        if metric.name in found and math.isfinite(found[metric.name].value)
+    ]
 
 
-def bodily(joints: NDArray[np.float64], fps: float) -> Row:
-    """Skating, floating, penetration and jitter of a motion [T, N, 3]; of one too short for them nothing."""
-    return physics(joints, fps)._asdict() if len(joints) >= SHORTEST else {}
+def facts(values: Mapping[str, Any]) -> dict[str, Fact]:
+    """Settings as a protocol has them: dotted keys, plain values."""
+    flat = flatten(values)
+    return {k: v if isinstance(v, Fact) else setting_text(v) for k, v in flat.items()}
 
 
-def shares(rows: Iterable[Row]) -> Row:
-    """Mean of each figure over the rows that have it."""
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        for name, value in row.items():
-            values.setdefault(name, []).append(value)
-    return {name: float(np.mean(found)) for name, found in values.items()}
+def decodings_of(protocol: Protocol) -> int:
+    """How often each draw of tokens was decoded."""
+    return int(protocol.get("decodings") or 1)
+
+
+@dataclass(frozen=True)
+class FigureFile:
+    """What an evaluation has written: the figures, and what they are about."""
+
+    kind: str
+    """The kind of evaluation: evaluate, evaluate_dances, retrieval."""
+    figures: tuple[Figure, ...]
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """What was evaluated and what judged: stages by role, their checksums, the seed."""
+    details: Mapping[str, Any] = field(default_factory=dict)
+    """What is drawn beside the figures (`details.py`)."""
+
+    def of(self, name: str, row: str = MODEL) -> Figure | None:
+        """One figure; None where it was not measured."""
+        return next((one for one in self.figures if one.name == name and one.row == row), None)
+
+    def write(self, path: Path) -> None:
+        """Write it as JSON, numbers rounded."""
+        data: dict[str, object] = {"version": VERSION, "kind": self.kind, "about": self.about}
+        data["protocol"] = {one.group: dict(one.protocol) for one in self.figures}
+        data["figures"] = [_entry(one) for one in self.figures]
+        write_json(path, data | ({"details": self.details} if self.details else {}))
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read it again; a `UserError` names what is wrong with the file."""
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read ({error.strerror}); evaluate again") from None
+        except ValueError as error:
+            raise UserError(f"{path}: not valid JSON ({error}); evaluate again") from None
+        if not isinstance(data, dict):
+            raise UserError(f"{path}: holds no JSON object; evaluate again")
+        if data.get("version") != VERSION:
+            raise UserError(
+                f"{path}: version {data.get('version')}, whose figures meant something else than those of "
+                f"version {VERSION}; evaluate again"
+            )
+        try:
+            protocols = data["protocol"]
+            figures = tuple(Figure(**one, protocol=protocols[one["group"]]) for one in data["figures"])
+            found = cls(str(data["kind"]), figures, dict(data["about"]), dict(data.get("details", {})))
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"{path}: not as an evaluation writes it ({error}); evaluate again") from None
+        for one in figures:
+            if not _is_number(one.value) or not (one.interval is None or _is_number(one.interval)):
+                raise UserError(f"{path}: figure '{one.name}' is no number; evaluate again")
+        return found
+
+
+def _entry(figure: Figure) -> dict[str, object]:
+    """A figure as the file has it: its protocol stands under its group, what is empty is left out."""
+    rounded = replace(figure, value=round(float(figure.value), DIGITS))
+    if figure.interval is not None:
+        rounded = replace(rounded, interval=round(float(figure.interval), DIGITS))
+    out = {key: value for key, value in asdict(rounded).items() if value not in ("", None)}
+    del out["protocol"]
+    return out
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def figures_in(folder: Path) -> dict[str, Any]:
+    """The files of an evaluation by their folders, relative to `folder`: what `evaluate --json` prints."""
+    return {
+        path.relative_to(folder).with_suffix("").as_posix(): json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted(folder.rglob(FILE_NAME))
+    }
+
+
+def of_group(figures: Iterable[Figure]) -> dict[str, list[Figure]]:
+    """Figures by group, in order."""
+    out: dict[str, list[Figure]] = {}
+    for figure in figures:
+        out.setdefault(figure.group, []).append(figure)
+    return out
+
+
+def rows_of(figures: Iterable[Figure]) -> dict[str, dict[str, Figure]]:
+    """Row -> name -> figure, rows in the order of `ROWS`."""
+    out: dict[str, dict[str, Figure]] = {}
+    for figure in figures:
+        out.setdefault(figure.row, {})[figure.name] = figure
+    return dict(sorted(out.items(), key=lambda item: ROWS.index(item[0]) if item[0] in ROWS else len(ROWS)))
+
+
+def columns_of(figures: Iterable[Figure]) -> dict[str, Figure]:
+    """Name -> a figure of that column, in order."""
+    out: dict[str, Figure] = {}
+    for figure in figures:
+        out.setdefault(figure.name, figure)
+    return out
+
+
+def figure_tables(figures: Iterable[Figure]) -> list[TableRows]:
+    """A table for each group of figures; the terminal and the report show the same ones."""
+    return [_table(group, found) for group, found in of_group(figures).items()]
+
+
+def _table(group: str, figures: Sequence[Figure]) -> TableRows:
+    columns = columns_of(figures)
+    rows = [
+        [row if row != MODEL else "model", *(found[name].text() if name in found else "" for name in columns)]
+        for row, found in rows_of(figures).items()
+    ]
+    titles = [heading(one) for one in columns.values()]
+    return "; ".join([group, *remarks(figures)]), ["", *titles], rows
+
+
+def say_difference(protocols: Mapping[str, Protocol]) -> str:
+    """How the protocols of figures, by label, differ, in one sentence; nothing where they are equal."""
+    parts = []
+    for name in dict.fromkeys(name for protocol in protocols.values() for name in protocol):
+        values = {label: protocol.get(name) for label, protocol in protocols.items()}
+        if len({json.dumps(value) for value in values.values()}) > 1:
+            shown = "; ".join(f"{label}: {value}" for label, value in values.items())
+            parts.append(f"different {_DIGESTS[name]}" if name in _DIGESTS else f"{name} ({shown})")
+    return f"Not all measured alike, so not all ranked: {', '.join(parts)}." if parts else ""
+
+
+def heading(column: Figure) -> str:
+    """The title of a column with its unit."""
+    return f"{column.title}, {column.unit}" if column.unit not in ("", "share") else column.title
+
+
+def remarks(figures: Sequence[Figure]) -> list[str]:
+    """What a group of figures has to say of itself: clips, candidates, intervals, doubts."""
+    protocol = figures[0].protocol
+    out = (
+        [f"{protocol['clips']} {protocol.get('split', '')} clips".replace("  ", " ")]
+        if "clips" in protocol
+        else []
+    )
+    out += [f"among {protocol['candidates']}"] if "candidates" in protocol else []
+    overs = list(dict.fromkeys(one.over for one in figures if one.over))
+    out += [f"± 95 % over {' or '.join(overs)}"] if overs else []
+    doubts: dict[str, dict[str, None]] = {}
+    for one in figures:
+        if one.note:
+            doubts.setdefault(one.note, {})[one.title] = None
+    return out + [f"{' and '.join(titles)}: {note}" for note, titles in doubts.items()]

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from motionloom.pipeline.evaluation.text_motion import Latents
+from motionloom.pipeline.evaluation.latent_metrics import Latents
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
-from motionloom.pipeline.store.latents import MotionJudge, embed_motions
-from motionloom.pipeline.store.networks import LoadedTma
+from motionloom.pipeline.store.networks import LoadedTma, MotionJudge, embed_motions
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,6 @@ class Judge:
 
     @staticmethod
     def faces(tma: LoadedTma) -> Judge:
-        """TMA of faces."""
         return Judge(
             tma, lambda truths: tma.embed_captions([t.face_caption for t in truths], tma.given["text"].cache)
         )
@@ -58,13 +56,20 @@ class Judge:
         """Latents [n, Z] of what was recorded."""
         return embed_motions(self.motions, [self.read(t) for t in truths], [t.present for t in truths])
 
-    def latents(self, truths: Sequence[Truth], made: Sequence[Tensor], others: Sequence[Truth]) -> Latents:
+    def latents(
+        self,
+        truths: Sequence[Truth],
+        made: Sequence[Tensor],
+        others: Sequence[Truth],
+        nearest: Mapping[str, Sequence[Truth]],
+    ) -> Latents:
         """Latents of n clips, of what was made for their captions, of `others` and of the mean pose.
 
         Args:
             truths: The clips.
             made: Latents [n, Z] of motions for their captions, once a repeat.
             others: Training clips.
+            nearest: Row -> the training clip that it finds for each caption.
         """
         judge = self.motions
         mean = judge.stats.mean[judge.layout.part(judge.part)].astype("float32")
@@ -74,4 +79,5 @@ class Judge:
             made=made,
             others=self.recorded(others),
             still=embed_motions(judge, [np.tile(mean, (len(t.features), 1)) for t in truths]),
+            nearest={row: self.recorded(found) for row, found in nearest.items()},
         )

@@ -8,40 +8,74 @@ body's, and so must be measured from the wrist, as here.
 
 Our own **[ours]**, means over clips: `pose` with root and heading aligned, so that a figure that faces
 another way is no other pose, `pose_body`, `pose_hand`; and `world`, where the path counts.
+
+Of faces: errors of expressions, and of a head's vertices where the user has the basis of one.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
-from motionloom.datasets.schema import HANDS
+from motionloom.datasets.schema import HANDS, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.reconstruction import JointErrors, joint_errors, mpjpe
 from motionloom.pipeline.contract.units import Row
-from motionloom.pipeline.evaluation.nearest import NearestClip, local_joints
+from motionloom.pipeline.evaluation.answers import NearestClip, local_joints
+from motionloom.pipeline.evaluation.estimate import row_estimates, weighted
+from motionloom.pipeline.evaluation.figures import (
+    MEAN_FACE,
+    MODEL,
+    NEAREST,
+    STILL,
+    Estimate,
+    Figure,
+    Metric,
+    Protocol,
+    group_figures,
+)
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_all, reconstruct_truth
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 FINGERS = (range(22, 37), range(37, 52))
 """Joints of `smplx52`, left and right."""
 
-_SUM = "sum"
-"""Begins the names of a clip's sums over frames: "sum_hand_mean_pose/mpjpe"."""
+ANSWERS = {"": MODEL, "_nearest_train_clip": NEAREST, "_mean_pose": STILL}
+"""What ends the name of a clip's error -> the row of a table."""
+_PARTS = (("", ""), ("_body", ", body"), ("_hand", ", hands"))
+PUBLISHED = (
+    *(
+        Metric(f"reconstruction.{name}{part}", f"{title}{said}", "lower", "mm")
+        for name, title in (("mpjpe", "MPJPE"), ("pa_mpjpe", "PA-MPJPE"), ("accel", "ACCEL"))
+        for part, said in _PARTS
+    ),
+    Metric("reconstruction.bits_per_second", "bit/s"),
+)
+OURS = (
+    Metric("reconstruction.pose", "pose", "lower", "mm"),
+    Metric("reconstruction.pose_body", "body", "lower", "mm"),
+    Metric("reconstruction.pose_hand", "fingers from the wrist", "lower", "mm"),
+    Metric("reconstruction.world", "in the world", "lower", "mm"),
+)
+
+FACES = (
+    Metric("face.expression", "expression error", "lower"),
+    Metric("face.vertex", "vertices", "lower", "mm"),
+)
 
 
 def clip_errors(
     tokenizer: TrainedTokenizer, nearest: NearestClip, truth: Truth, found: NDArray[np.float32]
 ) -> Row:
     """Both families of errors of one clip, through the tokenizer, as the mean pose (`_mean_pose`) and as the
-    nearest training clip (`_nearest_train_clip`): sums over frames of the papers', means of ours.
+    nearest training clip (`_nearest_train_clip`); the papers' are weighted by frames.
 
     `found` [T, D] is what the tokenizer makes of the clip (`reconstruct_truth`). Of a clip without hands the
     body's joints alone count, and nothing in `_hand`.
@@ -61,43 +95,53 @@ def clip_errors(
     for suffix, motion in compared.items():
         pose, place = (torch.from_numpy(array)[:, joints] for array in motion)
         for part, errors in published_errors(place, target[:, joints]).items():
-            if layout.num_joints == BODY_JOINTS and part:
-                continue  # all of its joints are the body's
-            sums = {name: float(value) for name, value in errors._asdict().items()}
-            out |= {f"{_SUM}{part}{suffix}/{name}": value for name, value in sums.items()}
+            for name, frames in (
+                ("mpjpe", errors.frames),
+                ("pa_mpjpe", errors.frames),
+                ("accel", errors.accel_frames),
+            ):
+                out |= weighted(f"{name}{part}{suffix}", getattr(errors, name).item(), frames.item())
         ours = pose_errors(pose, real[:, joints])
-        if layout.num_joints > BODY_JOINTS:
-            ours.setdefault("pose_body", ours["pose"])
+        ours.setdefault("pose_body", ours["pose"])
         ours["world"] = mpjpe(place, target[:, joints], root=None)
         out |= {f"{name}{suffix}": float(value.mean()) for name, value in ours.items()}
     return out
 
 
-def mean_errors(clips: Iterable[Row]) -> dict[str, float]:
-    """Of `clip_errors`: the papers' figures over all frames, ours over all clips."""
-    sums: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-    ours: dict[str, list[float]] = defaultdict(list)
-    for clip in clips:
-        for name, value in clip.items():
-            key, _, kind = name.removeprefix(_SUM).partition("/")
-            if kind:
-                sums[key][kind] += value
-            else:
-                ours[name].append(value)
-    out = {name: float(np.mean(values)) for name, values in ours.items()}
-    for key, errors in sums.items():
-        means = JointErrors(**{name: torch.tensor(value) for name, value in errors.items()}).means()
-        out |= {f"{name}{key}": value for name, value in means.items()}
+def clip_error_figures(clips: Sequence[Row], bits_per_second: float, protocol: Protocol) -> list[Figure]:
+    """Figures of `clip_errors`: the papers' over all frames, ours over all clips."""
+    rows = _by_answer(row_estimates([clips]), "reconstruction", ANSWERS)
+    rows[MODEL]["reconstruction.bits_per_second"] = Estimate(bits_per_second)
+    return [
+        *group_figures("Reconstruction as the papers count it (lower is better)", PUBLISHED, rows, protocol),
+        *group_figures(
+            "Reconstruction with root and heading aligned, and in the world (lower is better)",
+            OURS,
+            rows,
+            protocol,
+        ),
+    ]
+
+
+def _by_answer(
+    found: Mapping[str, Estimate], prefix: str, answers: Mapping[str, str]
+) -> dict[str, dict[str, Estimate]]:
+    """Estimates by row, of names that end in what stands for the row."""
+    out: dict[str, dict[str, Estimate]] = {row: {} for row in answers.values()}
+    for name, value in found.items():
+        suffix = next(end for end in sorted(answers, key=len, reverse=True) if name.endswith(end))
+        out[answers[suffix]][f"{prefix}.{name.removesuffix(suffix)}"] = value
     return out
 
 
-def reconstruction_figures(
+def reconstruction_errors(
     tokenizer: TrainedTokenizer, train: ClipDataset, truths: Sequence[Truth]
 ) -> dict[str, float]:
-    """Errors over all of the clips `truths`, millimetres."""
+    """Mean errors over all of the clips `truths`, by the names of `clip_errors`, in mm."""
     nearest = NearestClip(train)
     rebuilt = ((truth, reconstruct_truth(tokenizer, truth)) for truth in truths)
-    return mean_errors(clip_errors(tokenizer, nearest, truth, found) for truth, found in rebuilt)
+    rows = [clip_errors(tokenizer, nearest, truth, found) for truth, found in rebuilt]
+    return {name: found.value for name, found in row_estimates([rows]).items()}
 
 
 def published_errors(made: Tensor, real: Tensor) -> dict[str, JointErrors]:
@@ -130,9 +174,28 @@ def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
     return out
 
 
+EXPRESSIONS = 50
+
+
+def read_basis(path: Path) -> NDArray[np.float64]:
+    """Floats [V, 3, 50] in metres: how far each vertex moves with each value of the expression."""
+    try:
+        found = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path}: cannot be read as an expression basis, .npy [V, 3, 50] ({error})") from None
+    shape = list(found.shape) if isinstance(found, np.ndarray) else "an archive of arrays"
+    if not isinstance(found, np.ndarray) or found.ndim != 3 or found.shape[1:] != (3, EXPRESSIONS):
+        raise UserError(
+            f"{path}: an expression basis has the shape [V, 3, {EXPRESSIONS}], and this is {shape}"
+        )
+    if not np.issubdtype(found.dtype, np.floating) or not np.isfinite(found).all():
+        raise UserError(f"{path}: an expression basis holds finite floats in metres")
+    return np.asarray(found, dtype=np.float64)
+
+
 def face_errors(tokenizer: TrainedTokenizer, truth: Truth, basis: NDArray[np.float64] | None = None) -> Row:
-    """Of one clip with a face, sums over its frames: length of the difference of the expressions (50 values)
-    by a tokenizer of faces or of everything (`expression`), and of the mean expression; nothing without.
+    """Of one clip with a face, means weighted by its frames: length of the difference of the expressions (50
+    values) by a tokenizer of faces or of everything (`expression`), and of the mean expression (`_mean`).
 
     With a `basis` [V, 3, 50], metres of a head's vertices for each value, also the mean distance of the
     vertices in mm (`vertex`; v.-err. of Tables 2 and 6).
@@ -143,24 +206,26 @@ def face_errors(tokenizer: TrainedTokenizer, truth: Truth, basis: NDArray[np.flo
     columns = tokenizer.layout.slice("face")
     made, mean = reconstruct_all(tokenizer, truth)[:, columns], tokenizer.stats.mean[columns]
 
-    out = {"frames": float(len(real))}
+    out, frames = Row(), float(len(real))
     for suffix, answer in (("", made), ("_mean", mean)):
         error = (answer - real).astype(np.float64)
-        out[f"expression{suffix}"] = float(np.linalg.norm(error, axis=-1).sum())
+        out |= weighted(f"expression{suffix}", float(np.linalg.norm(error, axis=-1).sum()), frames)
         if basis is not None:
             moved = np.einsum("vce,te->tvc", basis, error)
-            out[f"vertex{suffix}"] = float(1000 * np.linalg.norm(moved, axis=-1).mean(-1).sum())
+            mm = 1000 * np.linalg.norm(moved, axis=-1).mean(-1)
+            out |= weighted(f"vertex{suffix}", float(mm.sum()), frames)
     return out
 
 
-def mean_face_errors(clips: Iterable[Row]) -> dict[str, float]:
-    """Of `face_errors`: means over the frames of all clips with a face; without such clips nothing."""
-    found = [clip for clip in clips if clip]
-    frames = sum(clip["frames"] for clip in found)
-    names = [name for name in found[0] if name != "frames"] if found else []
-    return {name: sum(clip[name] for clip in found) / frames for name in names}
-
-
-def face_figures(tokenizer: TrainedTokenizer, truths: Sequence[Truth]) -> dict[str, float]:
-    """Errors of expressions over all of the clips `truths`."""
-    return mean_face_errors(face_errors(tokenizer, truth) for truth in truths)
+def face_figures(clips: Sequence[Row], protocol: Protocol) -> list[Figure]:
+    """Figures of `face_errors`, over the frames of all clips with a face; without such clips none."""
+    found = row_estimates([clips])
+    rows = {
+        row: {
+            f"face.{name.removesuffix('_mean')}": value
+            for name, value in found.items()
+            if name.endswith("_mean") == mean
+        }
+        for row, mean in ((MODEL, False), (MEAN_FACE, True))
+    }
+    return group_figures("Reconstruction of faces (lower is better)", FACES, rows, protocol)

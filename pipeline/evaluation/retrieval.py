@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,14 @@ from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.retrieval import RECALLS, Distance, recall
 from motionloom.pipeline.contract.lookup import finished_stages, stages_giving
-from motionloom.pipeline.contract.stage import ALIGNMENT, Finished, Role, Shelf
+from motionloom.pipeline.contract.stage import ALIGNMENT, Finished, Role, StageCache
+from motionloom.pipeline.evaluation.estimate import plain
+from motionloom.pipeline.evaluation.figures import CHANCE, MODEL, Figure, FigureFile, Metric, group_figures
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.truth import digest_of, truth_of
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.artifact import fingerprint_now, require_consistent
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
-from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.weights import MODEL_FILES
 
 THRESHOLD = 0.9
@@ -62,9 +63,9 @@ def retrieve(
     of TMA and TEMOS by cosine.
     """
     found = alignment_stage(run, stage)
-    shelf = Shelf(choose_device(device))
-    model, inputs = shelf.get(found), _sources(run, found)
-    data = shelf.get(inputs["data"])
+    stage_cache = StageCache(choose_device(device))
+    model, inputs = stage_cache.get(found), _sources(run, found)
+    data = stage_cache.get(inputs["data"])
     judge, distance = _judge(model, found, data)
     dataset = data.split(split) if split else data.held_out(prefer="test")
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
@@ -76,7 +77,9 @@ def retrieve(
     text, motion = judge.texts(truths), judge.recorded(truths)
     rows = [_result("A", "whole split", recall(text, motion, distance=distance))]
     if "text" in inputs:
-        sentence = torch.as_tensor(shelf.get(inputs["text"]).cache.similarity([t.caption for t in truths]))
+        sentence = torch.as_tensor(
+            stage_cache.get(inputs["text"]).cache.similarity([t.caption for t in truths])
+        )
         found_same = recall(text, motion, sentence=sentence, threshold=THRESHOLD, distance=distance)
         rows.append(_result("B", f"same meaning counts (cosine {THRESHOLD:g})", found_same))
     for name, size in BATCHES.items():
@@ -154,6 +157,17 @@ def _result(protocol: str, meaning: str, figures: dict[str, float]) -> ProtocolR
     return ProtocolResult(protocol, meaning, size, figures)
 
 
+def _figures(row: ProtocolResult, facts: dict[str, Any]) -> list[Figure]:
+    """Figures of one protocol, `A.t2m/R@1`, beside chance."""
+    names = {f"{row.protocol}.{name}": value for name, value in row.figures.items()}
+    guess = {name: min(1.0, int(name.partition("@")[2]) / row.size) for name in names if "/R@" in name}
+    metrics = [Metric(name, name.partition(".")[2], "higher" if "/R@" in name else "lower") for name in names]
+    protocol = {key: facts[key] for key in ("split", "clips", "clips_sha256", "distance", "threshold")}
+    protocol |= {"judge": facts["sha256"], "candidates": row.size}
+    rows = {MODEL: plain(names), CHANCE: plain(guess)}
+    return group_figures(f"Protocol {row.protocol}: {row.meaning}", metrics, rows, protocol)
+
+
 def retrieval_table(rows: list[ProtocolResult], title: str) -> Table:
     """For a terminal: both ways, with what a guess would get."""
     table = Table(title=title, title_justify="left")
@@ -186,6 +200,7 @@ def retrieval_command(
     title = "TMA retrieval" if stage == "tma" else f"Retrieval of stage {stage}"
     console.print(retrieval_table(found.protocols, title))
     path = run / ("retrieval.json" if stage == main else f"retrieval-{stage}.json")
-    write_json(path, {**found.facts, "protocols": [asdict(row) for row in found.protocols]})
+    figures = [figure for row in found.protocols for figure in _figures(row, found.facts)]
+    FigureFile("retrieval", tuple(figures), found.facts).write(path)
     console.print(str(path), markup=False, soft_wrap=True)
     return path

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.loading.spans import CaptionSpan, caption_spans
-from motionloom.datasets.motion.features import face_of
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.loading.crops import CaptionSpan, caption_spans
+from motionloom.datasets.motion.features.codec import face_of
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import FACE, PRESENT_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.store.networks import TrainedTokenizer
@@ -45,8 +45,13 @@ def truth_of(
     A caption about the whole clip comes first. Without one, the clip is cut to what its first caption of
     `min_frames` or more is about.
     """
+    span = _main_caption(dataset, index, int(dataset.frames[index]), min_frames)
+    return truth_in(dataset, index, span, max_frames)
+
+
+def truth_in(dataset: ClipDataset, index: int, span: CaptionSpan, max_frames: int | None = None) -> Truth:
+    """What one caption of a clip is about, cut to whole groups of four frames."""
     motion = np.asarray(dataset.motion(index))
-    span = _main_caption(dataset, index, len(motion), min_frames)
     whole, motion = span.frames == len(motion), motion[span.first : span.end]
     frames = min(len(motion), max_frames or len(motion)) // 4 * 4
     motion = motion[: max(frames, min(4, len(motion)))]
@@ -135,13 +140,13 @@ def captioned(dataset: ClipDataset) -> NDArray[np.bool_]:
     return found
 
 
-def spread_any(dataset: ClipDataset, count: int) -> list[int]:
+def spread_any(dataset: ClipDataset, count: int | None) -> list[int]:
     """Numbers of clips spread evenly over a split, at most `count`, captioned or not."""
     order: list[int] = np.random.default_rng(0).permutation(len(dataset)).tolist()
     return order[:count]
 
 
-def drawn(dataset: ClipDataset, count: int) -> list[int]:
+def drawn(dataset: ClipDataset, count: int | None) -> list[int]:
     """Numbers of captioned clips drawn at random from a split, at most `count`, as the papers' evaluations
     draw them: two may have the same caption.
     """

@@ -7,48 +7,52 @@ itself (`contract/stage.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from motionloom.datasets.conditions import Condition, Conditions
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.conditions import Conditions
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import sample_seeds
-from motionloom.pipeline.contract.exported import exported_sampling, open_exported
 from motionloom.pipeline.contract.generation import (
+    DenoisingGenerator,
     DrivenGenerator,
     GenerationRequest,
     MotionGenerator,
     Prompt,
     Stretch,
 )
-from motionloom.pipeline.contract.lookup import generators_of
+from motionloom.pipeline.contract.lookup import exported_sampling, generators_of, open_exported
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import CPU, Finished, Shelf
-from motionloom.pipeline.inference.conditions import PromptEncoder
+from motionloom.pipeline.contract.stage import CPU, Finished, StageCache
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
+    PromptEncoder,
     caption_list,
+    frames_of,
     prompts_of,
+    repeated_rows,
     require_driven,
     require_seed,
     require_used,
     require_words,
-    sampling_of,
+    ticks_of,
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model, say_model
 from motionloom.pipeline.render.score import Segment
 from motionloom.pipeline.store.artifact import require_consistent
-from motionloom.pipeline.store.outside import BUNDLE_FILE, owner_of
+from motionloom.pipeline.store.known_captions import Unknown
+from motionloom.pipeline.store.run_folder import BUNDLE_FILE, owner_of
+from motionloom.pipeline.store.text import TextSource
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -56,19 +60,16 @@ if TYPE_CHECKING:
 _AT_ONCE = 64
 """Motions sampled together."""
 
-_BEYOND = 0.5
-"""Seconds that a motion may be longer than its music."""
-
 
 class Bundle:
     """The generators of a model, loaded at once so that a broken one is found first, all on one device."""
 
     def __init__(
-        self, stages: Sequence[Finished], shelf: Shelf, recommended: SamplingConfig | None = None
+        self, stages: Sequence[Finished], stage_cache: StageCache, recommended: SamplingConfig | None = None
     ) -> None:
         self.stages = tuple(stages)
         """The stages that generate, the default of each kind first."""
-        self.shelf = shelf
+        self.stage_cache = stage_cache
         self.recommended = recommended or SamplingConfig()
         """How its motions are best drawn; fields that are not set here are nobody's recommendation."""
         self._generators: dict[Path, MotionGenerator] = {}
@@ -97,7 +98,6 @@ class Bundle:
 
     @staticmethod
     def from_run(run: Path, device: torch.device = CPU) -> Bundle:
-        """Open the finished stages of a run."""
         makers = generators_of(run)
         for stage in makers:
             require_consistent(owner_of(stage.folder), [stage.folder.name])
@@ -111,7 +111,7 @@ class Bundle:
         recommended: SamplingConfig | None = None,
     ) -> Bundle:
         try:
-            return Bundle(stages, Shelf(device), recommended)
+            return Bundle(stages, StageCache(device), recommended)
         except UserError as error:
             if str(error).startswith(str(folder)):
                 raise
@@ -119,7 +119,7 @@ class Bundle:
 
     def _open(self, stage: Finished) -> None:
         """Load a stage's inputs, and theirs, as far as generation needs them."""
-        needed, given = stage.kind.exported(stage.config), self.shelf.given_to(stage)
+        needed, given = stage.kind.exported(stage.config), self.stage_cache.given_to(stage)
         for role in stage.kind.roles():
             if role.name in needed and (role.name in given or not role.optional):
                 given[role.name]
@@ -128,13 +128,13 @@ class Bundle:
     def of(self, stage: Finished) -> MotionGenerator:
         """The generator that a stage is."""
         if stage.folder not in self._generators:
-            self._generators[stage.folder] = self.shelf.generator(stage)
+            self._generators[stage.folder] = self.stage_cache.generator(stage)
         return self._generators[stage.folder]
 
     def encoder(self, stage: Finished) -> PromptEncoder:
         """What encodes prompts for a stage."""
         if stage.folder not in self._encoders:
-            self._encoders[stage.folder] = PromptEncoder(self.of(stage).text, self.shelf.device)
+            self._encoders[stage.folder] = PromptEncoder(self.of(stage).text, self.stage_cache.device)
         return self._encoders[stage.folder]
 
     @cached_property
@@ -144,7 +144,6 @@ class Bundle:
 
     @property
     def generator(self) -> MotionGenerator:
-        """The generator of body and hands."""
         return self.of(self.main)
 
     @cached_property
@@ -171,13 +170,12 @@ class Bundle:
 
     @property
     def layout(self) -> MotionLayout:
-        """Layout of whole frames."""
         return self.generator.layout
 
     @property
     def device(self) -> torch.device:
         """Where all networks lie; what is made comes back as numpy arrays."""
-        return self.shelf.device
+        return self.stage_cache.device
 
     @property
     def max_seconds(self) -> float:
@@ -185,10 +183,22 @@ class Bundle:
         frames = self.generator.max_frames
         return math.inf if frames is None else frames / self.layout.fps
 
-    def drawing(self, given: SamplingConfig | Mapping[str, Any] | None = None) -> SamplingConfig:
+    def drawing(self, given: SamplingConfig | None = None) -> SamplingConfig:
         """How to draw: the fields that are given, else those that the model recommends."""
-        named = [config.model_dump(exclude_unset=True) for config in (self.recommended, sampling_of(given))]
-        return SamplingConfig.parse({**named[0], **named[1]}, "sampling")
+        return self.recommended if given is None else given.over(self.recommended)
+
+    def in_effect(self, given: SamplingConfig | None = None) -> dict[str, object]:
+        """The settings that motions are drawn with, of those that the generators in use take notice of."""
+        sampling = self.drawing(given)
+        face = self.choose_face(sampling.face_model)
+        used = [self.generator, *([] if face is None else [self.of(face)])]
+        noticed = frozenset[str]().union(*(generator.settings for generator in used))
+        out: dict[str, object] = {name: value for name, value in sampling.dump().items() if name in noticed}
+        for generator, prefix in zip(used, ("", "face_"), strict=False):
+            if isinstance(generator, DenoisingGenerator) and "sampler" in generator.settings:
+                sampler, steps = generator.denoising(sampling)
+                out |= {f"{prefix}sampler": sampler, f"{prefix}denoising_steps": steps}
+        return {name: value for name, value in out.items() if value is not None}
 
     def generate(
         self,
@@ -196,37 +206,38 @@ class Bundle:
         *,
         face: Sequence[str] | None = None,
         sounds: Sequence[Sound | None] | None = None,
-        music: Sequence[NDArray[np.float32] | None] | None = None,
+        conditions: Mapping[str, Sequence[object]] | None = None,
         seconds: float | Sequence[float] | None = None,
         seed: int = 0,
-        sampling: SamplingConfig | Mapping[str, Any] | None = None,
+        noise_seed: int | None = None,
+        sampling: SamplingConfig | None = None,
         batch: int = _AT_ONCE,
         strict: bool = False,
     ) -> list[GeneratedMotion]:
         """Motions for captions, sounds or both, in order; equal arguments give equal motions.
 
-        A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
-        a motion is as long as its sound, or else the model decides. `music` are the sounds' features [T, 438]
-        where they are known, such as those that a data set stores. With `strict`, empty captions and options
-        without effect are refused.
+        As `MotionModel.generate`. `conditions` are more of what motions are conditioned on, by modality: of
+        "audio" the sounds' features [T, 438], where they are known, such as those that a data set stores.
+        `noise_seed` decodes the same tokens with other noise, where a diffusion model decodes. With `strict`,
+        empty captions and options without effect are refused.
         """
-        sampling = sampling_of(sampling)
         require_seed(seed)
         texts = None if captions is None else caption_list(captions)
         faces = None if face is None else caption_list(face, "face")
         if strict:
             require_words(faces or [], "face")
-            require_used(self, faces, sampling)
+            require_used(self, faces, sampling or SamplingConfig())
         sampling = self.drawing(sampling)
-        prompts = prompts_of(texts, faces, sounds, music)
+        prompts = prompts_of(texts, faces, sounds, conditions)
         require_driven(self.generator, prompts)
-        frames = self._frames(seconds, prompts)
-        # One seed a motion, so that how they are batched plays no part.
+        frames = frames_of(self.generator, seconds, prompts)
+        # One seed per motion, so that results do not depend on batching.
         seeds = sample_seeds(seed, 2 * len(prompts))
+        noise = seeds if noise_seed is None else sample_seeds(noise_seed, len(prompts))
         out: dict[int, GeneratedMotion] = {}
         for rows in _alike(frames, batch):
-            both = [seeds[row] for row in rows], [seeds[len(prompts) + row] for row in rows]
-            made = self._batch([prompts[row] for row in rows], [frames[row] for row in rows], both, sampling)
+            own = tuple([draws[row] for row in rows] for draws in (seeds, seeds[len(prompts) :], noise))
+            made = self._batch([prompts[row] for row in rows], [frames[row] for row in rows], own, sampling)
             out.update((row, replace(one, seed=seed)) for row, one in zip(rows, made, strict=True))
         return [out[row] for row in range(len(prompts))]
 
@@ -236,7 +247,7 @@ class Bundle:
         *,
         samples: int = 1,
         seed: int = 0,
-        sampling: SamplingConfig | Mapping[str, Any] | None = None,
+        sampling: SamplingConfig | None = None,
     ) -> list[GeneratedMotion]:
         """One motion driven by segments of text and music in turn, and other samples of it (`script.py`)."""
         sampling, generator, fps = self.drawing(sampling), self.generator, self.layout.fps
@@ -261,24 +272,23 @@ class Bundle:
             Segment(float(a), float(b), s.label, "text" if s.prompt.sound is None else "music")
             for s, a, b in zip(segments, starts, starts[1:], strict=False)
         )
+        beats = tuple(
+            float(start + tick)
+            for segment, stretch, start, count in zip(segments, stretches, starts, frames, strict=False)
+            for tick in ticks_of(segment.prompt, stretch.conditions, 0, fps)
+            if tick < count / fps
+        )
         sound = sound_of(list(zip(segments, frames, strict=True)), fps)
-        words = "; ".join(segment.label for segment in segments)
+        whole = Prompt(text="; ".join(segment.label for segment in segments), sound=sound)
         return [
-            replace(self._motion(Prompt(text=words, sound=sound), motion, face, bands), seed=seed)
+            replace(self._motion(whole, motion, face, bands), seed=seed, beats=beats)
             for motion, face in zip(body, faces, strict=True)
         ]
 
     def _repeated(self, stage: Finished, prompt: Prompt, words: str, count: int) -> Conditions:
         """The conditions of one prompt, encoded once, for `count` rows."""
-        once = self.encoder(stage).encode([prompt], [words], self.of(stage).modalities, self.layout.fps)
-        return {
-            name: Condition(
-                features.expand(count, -1, -1),
-                mask.expand(count, -1),
-                None if pooled is None else pooled.expand(count, -1),
-            )
-            for name, (features, mask, pooled) in once.items()
-        }
+        encoder, modalities = self.encoder(stage), self.of(stage).modalities
+        return repeated_rows(encoder.encode([prompt], [words], modalities, self.layout.fps), count)
 
     def _faces(
         self,
@@ -314,7 +324,7 @@ class Bundle:
         self,
         prompts: list[Prompt],
         frames: list[int | None],
-        seeds: tuple[list[int], list[int]],
+        seeds: Sequence[list[int]],
         sampling: SamplingConfig,
     ) -> list[GeneratedMotion]:
         generator, layout = self.generator, self.layout
@@ -322,7 +332,7 @@ class Bundle:
             prompts, [p.text for p in prompts], generator.modalities, layout.fps
         )
         lengths = None if None in frames else [n for n in frames if n is not None]
-        body = generator.generate(GenerationRequest(conditions, lengths, seeds[0], sampling))
+        body = generator.generate(GenerationRequest(conditions, lengths, seeds[0], sampling, seeds[2]))
         face: list[NDArray[np.float32]] | list[None] = [None] * len(prompts)
         stage = self.choose_face(sampling.face_model)
         if stage is not None:
@@ -332,34 +342,14 @@ class Bundle:
             )
             # The face takes the body's length, so that both share one time line.
             face = maker.generate(GenerationRequest(words, [len(m) for m in body], seeds[1], sampling))
-        return [self._motion(*row) for row in zip(prompts, body, face, strict=True)]
-
-    def _frames(self, seconds: float | Sequence[float] | None, prompts: Sequence[Prompt]) -> list[int | None]:
-        """Length of each motion in frames; None where the model decides."""
-        fps, unit, most = self.layout.fps, self.generator.unit_frames, self.generator.max_frames
-        if seconds is None:
-            wanted: list[float | None] = [None if p.sound is None else p.sound.seconds for p in prompts]
-        else:
-            wanted = list(seconds) if isinstance(seconds, Iterable) else [seconds] * len(prompts)
-        if len(wanted) != len(prompts):
-            raise UserError(f"{len(prompts)} captions but {len(wanted)} lengths in seconds")
-        out: list[int | None] = []
-        for length, prompt in zip(wanted, prompts, strict=True):
-            if length is None:
-                out.append(None)
-                continue
-            if prompt.sound is not None and prompt.sound.seconds + _BEYOND < length < math.inf:
-                raise UserError(
-                    f"{length:g} s were asked for and the music lasts {prompt.sound.seconds:.1f} s; take at "
-                    f"most as many seconds"
-                )
-            units = round(length * fps / unit) if math.isfinite(length) else 0
-            if units < 1 or (most is not None and units * unit > most):
-                longest = "any length from" if most is None else f"{unit / fps:.2g} to"
-                end = unit / fps if most is None else self.max_seconds
-                raise UserError(f"{length:g} s is out of reach: this model makes {longest} {end:.1f} s")
-            out.append(units * unit)
-        return out
+        made = [self._motion(*row) for row in zip(prompts, body, face, strict=True)]
+        return [
+            replace(
+                one,
+                beats=tuple(t for t in ticks_of(one.prompt, conditions, row, layout.fps) if t < one.seconds),
+            )
+            for row, one in enumerate(made)
+        ]
 
 
 def split_columns(
@@ -376,3 +366,34 @@ def _alike(frames: Sequence[int | None], batch: int) -> list[list[int]]:
     free = [row for row, count in enumerate(frames) if count is None]
     given = [row for row, count in enumerate(frames) if count is not None]
     return [rows[i : i + batch] for rows in (free, given) for i in range(0, len(rows), batch)]
+
+
+def bundle_driven_by(modality: str, stages: Sequence[Finished], stage_cache: StageCache) -> Bundle | None:
+    """The first generator of body motion that is conditioned on `modality`, with the face generators.
+
+    None where there is none.
+    """
+    bundle = Bundle(stages, stage_cache)
+    faces = [stage for stage in stages if bundle.of(stage).part == "face"]
+    for stage in stages:
+        maker = bundle.of(stage)
+        if maker.part != "face" and modality in maker.modalities:
+            # A face generator that is not conditioned on it would have nothing to go by.
+            fitting = [face for face in faces if modality in bundle.of(face).modalities]
+            return Bundle([stage, *fitting], stage_cache)
+    return None
+
+
+def unknown_captions(
+    bundle: Bundle, captions: Sequence[str], face: Sequence[str] = (), face_model: str | None = None
+) -> list[Unknown]:
+    """Captions that are far from all that the model was trained on, and what it knows nearest to each.
+
+    Empty for models without text, and for those whose run or export does not say what it knows.
+    """
+    out: list[Unknown] = []
+    for stage, given in ((bundle.main, captions), (bundle.choose_face(face_model), face)):
+        text = None if stage is None else bundle.of(stage).text
+        if isinstance(text, TextSource):
+            out += text.unknown([caption for caption in given if caption.strip()], face=given is face)
+    return out

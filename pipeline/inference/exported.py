@@ -4,35 +4,45 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import chain, count
 from pathlib import Path
-from typing import Any
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.pipeline.contract.exported import FORMAT, BundleFile, ExportedStage
+from motionloom.pipeline.contract.lookup import FORMAT, BundleFile, ExportedStage
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.requests import require_used
 from motionloom.pipeline.store.files import write_json
-from motionloom.pipeline.store.outside import BUNDLE_FILE
+from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 from motionloom.pipeline.store.weights import LayoutFacts, halve_weights
 
+HUB_CONFIG = {"format": "motionloom bundle"}
+"""`config.json`, which the hub looks for; nothing here reads it."""
 
-def write_exported(
-    stages: Iterable[Finished],
-    layout: LayoutFacts,
-    skeleton: Skeleton,
-    out: Path,
-    *,
-    half: bool = False,
-    sampling: Mapping[str, Any] | None = None,
-) -> None:
-    """Copy what the generators `stages` need to load into `out`; `bundle.json` is written last.
 
-    Stages of other runs come along like the run's own, so an export is whole in itself. With `half`, weights
-    as 16 bits; `sampling` are fields of `SamplingConfig` to draw with where nobody says otherwise.
+def write_bundle(run: Path, out: Path, *, half: bool = False, sampling: SamplingConfig | None = None) -> None:
+    """Copy what generation needs of a run's finished stages into `out`; with `half`, weights as 16 bits.
+
+    What is set of `sampling` goes with the model: motions are drawn so where nobody says otherwise.
     """
-    makers = list(stages)
+    bundle, sampling = Bundle.from_run(run), sampling or SamplingConfig()
+    require_used(bundle, None, sampling)
+    for stage in bundle.stages:
+        bundle.of(stage)  # opens every stage, so a broken one is found before anything is copied
+    out.mkdir(parents=True, exist_ok=True)
+    _write_stages(bundle, out, half, sampling.model_dump(mode="json", exclude_unset=True))
+    write_json(out / "config.json", HUB_CONFIG)
+
+
+def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, object]) -> None:
+    """The folders of all stages that the bundle's need to load; `bundle.json` is written last.
+
+    Stages of other runs come along like the run's own, so an export is whole in itself.
+    """
+    makers, skeleton = bundle.stages, bundle.layout.skeleton
     needed: dict[Path, Finished] = {}
     for stage in makers:
         _collect(stage, needed)
@@ -60,16 +70,16 @@ def write_exported(
     write_json(out / "skeleton.json", _plain(skeleton))
     facts = BundleFile(
         format=FORMAT,
-        layout=layout,
+        layout=LayoutFacts.of(bundle.layout),
         generators=tuple(names[stage.folder] for stage in makers),
         stages=entries,
-        sampling=dict(sampling or {}),
+        sampling=sampling,
     )
     write_json(out / BUNDLE_FILE, facts.dump())
 
 
 def _collect(stage: Finished, needed: dict[Path, Finished]) -> None:
-    """Add a stage behind those that it needs."""
+    """Add a stage after those that it needs."""
     if stage.folder in needed:
         return
     for role in stage.kind.exported(stage.config):
@@ -89,7 +99,7 @@ def _names(stages: Iterable[Finished]) -> dict[Path, str]:
     return out
 
 
-def _plain(skeleton: Skeleton) -> dict[str, Any]:
+def _plain(skeleton: Skeleton) -> dict[str, object]:
     made = {
         "name": skeleton.name,
         "joints": skeleton.joints,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -11,18 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.render.score import Segment
 
-WRITERS = {
-    ".npz": "motionloom.pipeline.inference.saving:save_npz",
-    ".bvh": "motionloom.pipeline.inference.saving:save_bvh",
-    ".glb": "motionloom.pipeline.inference.saving:save_glb",
-    ".mp4": "motionloom.pipeline.inference.saving:save_mp4",
-    ".html": "motionloom.pipeline.inference.saving:save_html",
-}
-"""What writes a motion to a file that ends so: `module:function`, a function of (path, motion)."""
+# The writers read this class, so it names their module instead of importing it.
+_OUTPUTS = "motionloom.pipeline.inference.outputs"
 
 
 @dataclass(frozen=True)
@@ -39,6 +31,8 @@ class GeneratedMotion:
     layout: MotionLayout
     segments: tuple[Segment, ...] = ()
     """What drove which seconds, of a motion made from a script."""
+    beats: tuple[float, ...] | None = None
+    """Seconds of the beats of its music, as the model heard them; None: not looked for."""
     seed: int | None = None
     """The seed that it was asked for with."""
 
@@ -54,43 +48,22 @@ class GeneratedMotion:
 
     @property
     def fps(self) -> float:
-        """Frames a second."""
         return self.layout.fps
 
     @property
     def seconds(self) -> float:
-        """Its length."""
         return len(self.joints) / self.layout.fps
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the N joints."""
         return tuple(self.layout.skeleton.joints)
 
     def save(self, path: Path | str) -> Path:
-        """Write one file; its ending says which kind: .npz, .bvh, .glb, .mp4, .html. Returns its path."""
+        """Write one file, of the format that its ending names (`writers.WRITERS`); returns its path."""
         path = Path(path)
-        write = _from_table(WRITERS.get(path.suffix.lower()))
-        if write is None:
-            known = ", ".join(WRITERS)
-            ending = f"'{path.suffix}'" if path.suffix else "no ending"
-            raise UserError(
-                f"{path}: a motion cannot be saved with {ending}; name a file that ends in {known}"
-            )
-        write(path, self)
+        import_module(_OUTPUTS).save(path, self)
         return path
 
     def _repr_html_(self) -> str:
         """The viewer, in a frame of its own that can reach neither the notebook nor the network."""
-        show = _from_table("motionloom.pipeline.inference.saving:frame_of")
-        assert show is not None
-        return str(show(self))
-
-
-def _from_table(entry: str | None) -> Callable[..., object] | None:
-    """The function `module:function`, imported when it is asked for."""
-    if entry is None:
-        return None
-    module, name = entry.split(":")
-    function: Callable[..., object] = getattr(import_module(module), name)
-    return function
+        return str(import_module(_OUTPUTS).frame_of(self))

@@ -1,23 +1,31 @@
-"""What a user asks of a model, checked before it is made: captions, seed, options without effect."""
+"""What a user asks of a model, checked before it is made, and encoded as networks take it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
+from motionloom.datasets.conditions import Condition, Conditions
+from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import Finished
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
 
-_OPTIONS = ("candidates", "face_cfg_scale", "music_cfg_scale", "sampler", "denoising_steps")
-"""Settings that some generators take; the command line calls them by the same words."""
+
+_BEYOND = 0.5
+"""Seconds that a motion may be longer than its music."""
+
+_OPTIONS = ("candidates", "face_cfg_scale", "guidance", "sampler", "denoising_steps")
+"""Settings that only some generators take."""
 
 
 def caption_list(given: Iterable[str], name: str = "captions") -> list[str]:
@@ -44,27 +52,21 @@ def require_seed(seed: int) -> None:
         raise UserError(f"seed {seed}: a seed is a whole number, 0 or more")
 
 
-def sampling_of(given: SamplingConfig | Mapping[str, Any] | None) -> SamplingConfig:
-    """The config, also of a mapping with its keys."""
-    return SamplingConfig.parse({} if given is None else given, "sampling")
-
-
 def prompts_of(
     captions: Sequence[str] | None,
     faces: Sequence[str] | None,
     sounds: Sequence[Sound | None] | None,
-    music: Sequence[NDArray[np.float32] | None] | None = None,
+    conditions: Mapping[str, Sequence[object]] | None = None,
 ) -> list[Prompt]:
-    """One prompt a motion from lists of equal length; None is left out. `music` goes with `sounds`."""
-    given = {"captions": captions, "sounds": sounds}
+    """One prompt a motion from lists of equal length; `conditions` adds modalities by name."""
+    more = conditions or {}
+    given: dict[str, Sequence[object] | None] = {"captions": captions, "sounds": sounds, **more}
     counts = {name: len(values) for name, values in given.items() if values is not None}
     if not counts:
         raise UserError("nothing to generate from: give captions, sounds or both")
     if len(set(counts.values())) > 1:
         raise UserError(" but ".join(f"{count} {name}" for name, count in counts.items()))
     count = next(iter(counts.values()))
-    if music is not None and (sounds is None or len(music) != count):
-        raise UserError(f"{len(music)} rows of music features but {len(sounds or [])} sounds")
     if faces is not None and len(faces) != count:
         raise UserError(f"{count} captions but {len(faces)} face captions")
     return [
@@ -72,7 +74,7 @@ def prompts_of(
             text=captions[row] if captions else "",
             face_text=faces[row] if faces else "",
             sound=sounds[row] if sounds else None,
-            music=music[row] if music else None,
+            conditions={name: values[row] for name, values in more.items()},
         )
         for row in range(count)
     ]
@@ -90,31 +92,107 @@ def require_driven(generator: MotionGenerator, prompts: Iterable[Prompt]) -> Non
 
 class _Chooses(Protocol):
     @property
-    def stages(self) -> Sequence[Any]: ...
-    @property
-    def faces(self) -> Mapping[str, Any]: ...
+    def faces(self) -> Mapping[str, Finished]: ...
     @property
     def generator(self) -> MotionGenerator: ...
-    def choose_face(self, wanted: str | None) -> Any: ...
-    def of(self, stage: Any) -> MotionGenerator: ...
+    def choose_face(self, wanted: str | None) -> Finished | None: ...
+    def of(self, stage: Finished) -> MotionGenerator: ...
 
 
 def require_used(model: _Chooses, face_captions: Iterable[str] | None, sampling: SamplingConfig) -> None:
-    """Refuse options that were given, and that no generator in use takes notice of."""
+    """Refuse settings that were given, and that no generator in use takes notice of."""
     face = model.choose_face(sampling.face_model)
-    if face is None:
-        if face_captions is not None:
-            raise UserError("this model makes no face: leave the face captions (--face) out")
-        if sampling.face_cfg_scale is not None:
-            raise UserError("this model makes no face: leave face_cfg_scale (--face-cfg-scale) out")
-    used = model.generator.settings | (model.of(face).settings if face is not None else frozenset())
-    unused = [
-        name
-        for name in _OPTIONS
-        if name in sampling.model_fields_set and getattr(sampling, name) is not None and name not in used
-    ]
+    if face is None and face_captions is not None:
+        raise UserError("this model makes no face: leave the face captions (--face) out")
+    body, expression = model.generator, None if face is None else model.of(face)
+    used = body.settings | (frozenset() if expression is None else expression.settings)
+    given = {name for name in sampling.model_fields_set if getattr(sampling, name) not in (None, {})}
+    unused = [name for name in _OPTIONS if name in given - used]
     if unused:
-        named = " and ".join(f"{name} (--{name.replace('_', '-')})" for name in unused)
         takers = [m for m, s in model.faces.items() if set(unused) <= model.of(s).settings]
-        fix = f"choose --face-model {takers[0]}, or leave it out" if takers else "leave it out"
-        raise UserError(f"{named}: no generator that is used here takes it; {fix}")
+        fix = f"set face_model to {takers[0]}, or leave it out" if takers else "leave it out"
+        raise UserError(f"{' and '.join(unused)}: no generator that is used here takes it; {fix}")
+    for name in sampling.guidance:
+        if name not in body.modalities:
+            known = " and ".join(sorted(body.modalities))
+            raise UserError(f"guidance.{name}: this model is conditioned on {known} only; leave it out")
+
+
+def frames_of(
+    generator: MotionGenerator, seconds: float | Sequence[float] | None, prompts: Sequence[Prompt]
+) -> list[int | None]:
+    """Length of each motion in frames, in whole units of the generator; None where the model decides.
+
+    Args:
+        seconds: One length for all, one for each, or None: as long as what the prompt brings, such as music.
+    """
+    fps, unit, most = generator.layout.fps, generator.unit_frames, generator.max_frames
+    if seconds is None:
+        wanted: list[float | None] = [prompt.seconds for prompt in prompts]
+    else:
+        wanted = list(seconds) if isinstance(seconds, Iterable) else [seconds] * len(prompts)
+    if len(wanted) != len(prompts):
+        raise UserError(f"{len(prompts)} captions but {len(wanted)} lengths in seconds")
+    out: list[int | None] = []
+    for length, prompt in zip(wanted, prompts, strict=True):
+        if length is None:
+            out.append(None)
+            continue
+        if prompt.seconds is not None and prompt.seconds + _BEYOND < length < math.inf:
+            raise UserError(
+                f"{length:g} s were asked for and the music lasts {prompt.seconds:.1f} s; take at most as "
+                f"many seconds"
+            )
+        units = round(length * fps / unit) if math.isfinite(length) else 0
+        if units < 1 or (most is not None and units * unit > most):
+            least = unit / fps
+            span = f"any length from {least:.1f} s" if most is None else f"{least:.2g} to {most / fps:.1f} s"
+            raise UserError(f"{length:g} s is out of reach: this model makes {span}")
+        out.append(units * unit)
+    return out
+
+
+class PromptEncoder:
+    """Encodes prompts for one generator, with the text encoder that it was trained with."""
+
+    def __init__(self, text: object | None, device: torch.device) -> None:
+        self._prepared: dict[str, object] = {"text": text}
+        self._device = device
+
+    def encode(
+        self, prompts: Sequence[Prompt], words: Sequence[str], modalities: frozenset[str], fps: float
+    ) -> Conditions:
+        """The conditions of `modalities`, those that no prompt has left out.
+
+        `words` are the prompts' texts, about the body or the face; an empty one is no text.
+        """
+        rows = [prompt.with_words(text).given for prompt, text in zip(prompts, words, strict=True)]
+        out: dict[str, Condition] = {}
+        for name, record in MODALITIES.items():
+            given = [row.get(name) for row in rows]
+            if name in modalities and any(value is not None for value in given):
+                features, mask, pooled = record.encode(self._prepared.get(name), given, fps)
+                pooled = None if pooled is None else pooled.to(self._device)
+                out[name] = Condition(features.to(self._device), mask.to(self._device), pooled)
+        return out
+
+
+def ticks_of(prompt: Prompt, conditions: Conditions, row: int, fps: float) -> tuple[float, ...]:
+    """Seconds worth marking on the time line of a row of encoded conditions: the beats of its music."""
+    found: list[float] = []
+    for name, (features, mask, _) in conditions.items():
+        values = np.asarray(features[row][mask[row]].cpu(), np.float32)
+        found += MODALITIES[name].ticks(prompt.given.get(name), values, fps)
+    return tuple(found)
+
+
+def repeated_rows(conditions: Conditions, count: int) -> Conditions:
+    """Conditions of one row, for `count` rows."""
+    return {
+        name: Condition(
+            features.expand(count, -1, -1),
+            mask.expand(count, -1),
+            None if pooled is None else pooled.expand(count, -1),
+        )
+        for name, (features, mask, pooled) in conditions.items()
+    }

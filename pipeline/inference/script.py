@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +52,7 @@ class ScriptSegment(Config):
         elif self.end is not None and self.seconds is not None:
             raise ValueError("give seconds or end, not both")
         elif self.end is not None and self.end <= self.start:
-            raise ValueError(f"end {self.end:g} is not behind start {self.start:g}")
+            raise ValueError(f"end {self.end:g} is not after start {self.start:g}")
         return self
 
     @property
@@ -77,7 +76,7 @@ class Script(Config):
         return Script.parse(data, str(path))
 
     def open(self, folder: Path, name: str = "script") -> list[DrivenSegment]:
-        """The segments with their sounds; `folder` is where files are looked for, `name` stands in errors."""
+        """The segments with their sounds; `folder` is where files are looked for, `name` is for errors."""
         sounds: dict[str, Sound] = {}
         out = []
         for number, segment in enumerate(self.segments):
@@ -104,7 +103,7 @@ class DrivenSegment:
 
 
 def segment_frames(generator: MotionGenerator, segment: DrivenSegment, number: int) -> int:
-    """Its length in frames, in whole units of the generator; `number` stands in errors."""
+    """Length of a segment in frames, in whole units of the generator; `number` is for errors."""
     unit, fps = generator.unit_frames, generator.layout.fps
     units = round(segment.seconds * fps / unit)
     if units < 1:
@@ -142,7 +141,7 @@ def sound_of(segments: list[tuple[DrivenSegment, int]], fps: float) -> Sound | N
     if not rates:
         return None
     rate = max(rates)
-    pieces: list[NDArray[Any]] = []
+    pieces: list[NDArray[np.float32]] = []
     for segment, frames in segments:
         count = round(frames / fps * rate)
         piece = np.zeros(count, dtype=np.float32)

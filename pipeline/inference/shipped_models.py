@@ -6,19 +6,14 @@ Each is an exported folder in `models/pretrained/` with its card (`README.md`), 
 
 from __future__ import annotations
 
-import atexit
 import difflib
 import json
-import tempfile
-from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
 from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from motionloom.datasets.base.places import no_such_folder
-from motionloom.pipeline.store.outside import BUNDLE_FILE
+from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 
 CARD_FIGURES = "card.json"
 """Beside a model's card: its figures, and what it is in one line."""
@@ -29,32 +24,28 @@ class ShippedModel:
     """A model that comes with the package."""
 
     name: str
-    place: Traversable
+    folder: Path
 
     @property
     def bytes(self) -> int:
-        """Size of all its files."""
-        return _size(self.place)
+        return sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
 
     @property
     def description(self) -> str:
         """What it is, in one line; empty where its card does not say."""
         try:
-            facts = json.loads((self.place / CARD_FIGURES).read_text(encoding="utf-8"))
+            facts = json.loads((self.folder / CARD_FIGURES).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return ""
         return str(facts.get("description", "")) if isinstance(facts, dict) else ""
 
-    @property
-    def folder(self) -> Path:
-        """Its folder on disk; out of a packed installation it is unpacked once a process."""
-        return self.place if isinstance(self.place, Path) else _unpacked(self.name)
-
 
 def shipped_models() -> dict[str, ShippedModel]:
     """The models that come with this installation, by name; none where it was made without their weights."""
-    found = (ShippedModel(one.name, one) for one in _place().iterdir() if (one / BUNDLE_FILE).is_file())
-    return {model.name: model for model in sorted(found, key=lambda model: model.name)}
+    return {
+        file.parent.name: ShippedModel(file.parent.name, file.parent)
+        for file in sorted(_place().glob(f"*/{BUNDLE_FILE}"))
+    }
 
 
 def model_folder(name: Path | str) -> Path:
@@ -85,30 +76,5 @@ def no_such_model(name: Path | str) -> str:
     return f"{said}; models that come with motionloom: {', '.join(shipped)}"
 
 
-def _place() -> Traversable:
-    return resources.files("motionloom.models.pretrained")
-
-
-def _size(place: Traversable) -> int:
-    if isinstance(place, Path):
-        return place.stat().st_size if place.is_file() else sum(_size(one) for one in place.iterdir())
-    return len(place.read_bytes()) if place.is_file() else sum(_size(one) for one in place.iterdir())
-
-
-@cache
-def _unpacked(name: str) -> Path:
-    """A copy of a model on disk, until the process ends."""
-    keep = ExitStack()
-    atexit.register(keep.close)
-    out = Path(keep.enter_context(tempfile.TemporaryDirectory(prefix="motionloom-"))) / name
-    _copy(_place() / name, out)
-    return out
-
-
-def _copy(place: Traversable, out: Path) -> None:
-    if place.is_file():
-        out.write_bytes(place.read_bytes())
-        return
-    out.mkdir()
-    for one in place.iterdir():
-        _copy(one, out / one.name)
+def _place() -> Path:
+    return Path(str(resources.files("motionloom.models.pretrained")))

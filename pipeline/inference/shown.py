@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from motionloom.datasets.motion.feet import FeetOptions, FeetReport, foot_contacts, plant_feet
-from motionloom.datasets.motion.joints import rotations_of
-from motionloom.datasets.motion.rigid import RigidMotion, fit_rigid
+from motionloom.datasets.motion.body.feet import FeetOptions, FeetReport, foot_contacts, plant_feet
+from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
+from motionloom.datasets.motion.features.joints import rotations_of
 from motionloom.datasets.schema import Config
 from motionloom.pipeline.inference.motion import GeneratedMotion
 
@@ -30,7 +29,7 @@ class FigureOptions(Config):
     symmetric: bool = False
     """Left and right bones of one length."""
     plant_feet: bool = False
-    """Hold feet still where they stand (`datasets/motion/feet.py`)."""
+    """Hold feet still where they stand (`datasets/motion/body/feet.py`)."""
     feet: FeetOptions = FeetOptions()
     body_model: Path | None = None
     """Your SMPL-X model (.npz), which the files of format smplx are made for."""
@@ -56,8 +55,12 @@ class ShownMotion:
     feet: FeetReport | None = None
 
     @property
+    def rigid(self) -> RigidMotion | None:
+        """The figure, where it is what page, film and npz show."""
+        return self.figure if self.joints is self.figure.joints else None
+
+    @property
     def fps(self) -> float:
-        """Frames a second."""
         return self.motion.layout.fps
 
     @property
@@ -66,11 +69,11 @@ class ShownMotion:
         feet = "" if self.feet is None else f"; {self.feet}"
         return f"bones of constant length, {self.figure.error} from the generated joints{feet}"
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         """The same as numbers, for metadata."""
         error = self.figure.error
-        out: dict[str, Any] = {
-            "rigid": self.joints is self.figure.joints,
+        out: dict[str, object] = {
+            "rigid": self.rigid is not None,
             "fit_mean_mm": round(error.mean_mm, 3),
             "fit_max_mm": round(error.max_mm, 3),
         }

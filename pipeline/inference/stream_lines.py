@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.pipeline.inference.streaming import MotionChunk
+from motionloom.pipeline.inference.stream import MotionChunk
 
 DIGITS = 5
 
@@ -41,7 +40,7 @@ def heading(layout: MotionLayout, seed: int, model: str) -> str:
 def frame_lines(chunk: MotionChunk) -> Iterator[str]:
     """A line for each frame."""
     for number, joints in enumerate(chunk.joints):
-        frame: dict[str, Any] = {
+        frame: dict[str, object] = {
             "frame": chunk.start + number,
             "caption": chunk.caption,
             "joints": rounded(joints),
@@ -51,6 +50,6 @@ def frame_lines(chunk: MotionChunk) -> Iterator[str]:
         yield json.dumps(frame, separators=(",", ":"), ensure_ascii=False) + "\n"
 
 
-def rounded(values: NDArray[Any]) -> Any:
+def rounded(values: NDArray[np.floating]) -> object:
     """Numbers as lists, short in writing."""
     return np.round(np.asarray(values, np.float64), DIGITS).tolist()

@@ -20,8 +20,8 @@ from motionloom.pipeline.launch.process import local_rank
 LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow", "trackio"]
 
 
-EXTRA_LOGGERS: dict[str, str] = {"wandb": "wandb", "mlflow": "mlflow", "trackio": "trackio"}
-"""Loggers that need a package of their own, and that package."""
+SERVERS: tuple[LoggerName, ...] = ("wandb", "mlflow", "trackio")
+"""Loggers that send what they get to a server."""
 
 
 class Hardware(Config):
@@ -42,23 +42,19 @@ class Hardware(Config):
     threads: int = Field(0, ge=0)
     """CPU threads per process; 0 leaves torch's choice."""
     stall_seconds: int = Field(600, ge=0)
-    """Seconds without a step, a validation batch or a word of one of the processes after which a training
-    counts as stalled and the run ends; 0 = never. Compiling counts, so it must be longer than that takes. In
-    work that processes divide (tokens, evaluation) a unit may take ten times as long as any before it."""
+    """Seconds without a step, a validation batch or a checkpoint after which a training ends itself and
+    leaves the stacks of its threads; 0 = never. Compiling counts, so it must be longer than that takes."""
     verify_shards: Literal["once", "always", "never"] = "once"
     """Whether shards in folders are compared with their sha256 before a stage reads them: files that have not
     been compared in this run as they are now, all each time a stage starts, or none."""
-    loggers: tuple[LoggerName, ...] = ("tensorboard", "csv")
-    """Where the figures of trainings go, besides `metrics.jsonl`; wandb, mlflow and trackio are extras."""
+    loggers: tuple[LoggerName, ...] = ("csv",)
+    """Where the figures of trainings go, besides `metrics.jsonl`; all but csv are extras of these names."""
     flight_rows: int = Field(1000, ge=0)
     """Rows of each process's flight log, one every 10 steps; older ones are thinned out. 0: no log."""
-    crash_steps: int = Field(20, ge=1)
-    """Last steps whose samples and figures a crash bundle lists."""
     profile: int = Field(0, ge=0)
     """Steps of each training that torch's profiler looks at; 0 = none."""
 
     def resolved_accelerator(self) -> Literal["cpu", "gpu"]:
-        """`auto` made concrete."""
         if self.accelerator == "auto":
             return "gpu" if torch.cuda.is_available() else "cpu"
         return self.accelerator
@@ -75,7 +71,6 @@ class Hardware(Config):
         return torch.device("cuda", local_rank() % count)
 
     def resolved_devices(self) -> int:
-        """Processes on this node."""
         if self.devices:
             return self.devices
         if "RANK" in os.environ and "LOCAL_WORLD_SIZE" in os.environ:  # torchrun has decided
@@ -89,20 +84,30 @@ class Hardware(Config):
             )
         return torch.cuda.device_count()
 
+    def require_devices(self) -> None:
+        """Refuse GPUs that are asked for and not here, before anything waits for them."""
+        gpus = torch.cuda.device_count()
+        if self.resolved_accelerator() == "gpu" and self.resolved_devices() > gpus:
+            raise UserError(
+                f"hardware.devices is {self.resolved_devices()} and {gpus or 'no'} GPU{'s are' * (gpus > 1)}"
+                f"{' is' * (gpus < 2)} here; set it to what this machine has"
+            )
+        if self.accelerator == "auto" and self.devices > 1 and not gpus:
+            raise UserError(
+                f"hardware.devices is {self.devices} and no GPU is here; to train in so many processes on "
+                f"the CPU set hardware.accelerator to cpu"
+            )
+
     def world(self) -> int:
-        """Processes on all nodes."""
         return self.resolved_devices() * self.nodes
 
     def lightning_accelerator(self) -> str:
-        """Lightning's name of the accelerator."""
         return "cuda" if self.resolved_accelerator() == "gpu" else "cpu"
 
     def backend(self) -> str:
-        """What the processes talk through."""
         return "nccl" if self.resolved_accelerator() == "gpu" else "gloo"
 
     def describe(self) -> str:
-        """One readable line about what runs where."""
         count, nodes = self.resolved_devices(), self.nodes
         if self.resolved_accelerator() == "gpu":
             here = torch.cuda.is_available()
@@ -120,8 +125,7 @@ class Hardware(Config):
 def require_loggers(names: Sequence[LoggerName]) -> None:
     """Refuse, before anything runs, loggers whose package is not installed."""
     for name in names:
-        package = EXTRA_LOGGERS.get(name)
-        if package is not None and importlib.util.find_spec(package) is None:
+        if name != "csv" and importlib.util.find_spec(name) is None:
             raise UserError(
                 f"hardware.loggers names {name}, which is not installed: pip install 'motionloom[{name}]'"
             )

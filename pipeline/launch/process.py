@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+import time
 from typing import NoReturn
 
 from motionloom.datasets.schema import UserError
@@ -13,6 +15,13 @@ SAVED = 75
 
 The system's number for "try again later" (`EX_TEMPFAIL`): the same command goes on.
 """
+
+
+_PARENT_POLL = 2.0
+"""Seconds between two looks of a loader worker at whether its parent is still there."""
+
+LOST = 76
+"""Exit code of a process that ends because another one of its run has."""
 
 
 class TeamError(Exception):
@@ -84,15 +93,25 @@ def leave(code: int) -> NoReturn:
 
     torch's gloo group may be destroyed while the interpreter lock is held and then waits for a thread that
     wants that lock: the process would hang after its work is done. Every file is written by then.
-
-    Processes that still wait for this one get the code first.
     """
-    watch = sys.modules.get("motionloom.pipeline.launch.watch")
-    if watch is not None:
-        watch.end(code)
     torch = sys.modules.get("torch")
     if torch is not None and torch.distributed.is_available() and torch.distributed.is_initialized():
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def end_with_parent(parent: int, _worker: int = 0) -> None:
+    """Have a loader worker end when its process, `parent`, has gone: also where it hangs in a read, or was
+    still starting.
+
+    torch's own look at the parent is between two batches only, and takes whoever is the parent by then.
+    """
+    threading.Thread(target=_watch_parent, args=(parent,), daemon=True).start()
+
+
+def _watch_parent(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_PARENT_POLL)
+    os._exit(1)

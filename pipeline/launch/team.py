@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import torch.distributed as dist
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.launch import watch
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError, srun_tasks
 
@@ -29,8 +28,8 @@ _PATIENCE = timedelta(days=30)
 """How long the others wait for a stage that only the lead runs; a dead lead ends the wait at once."""
 
 _COLLECTIVE = 1800
-"""Seconds after which a collective of a training fails, at least; twice `hardware.stall_seconds` where that
-is more, so that the message names who stalls and not who waits."""
+"""Seconds for which a process waits for the others, at least. A training that stalls ends itself earlier,
+after `hardware.stall_seconds` without a step; this ends what waits for a process that cannot do so."""
 
 
 @dataclass(frozen=True)
@@ -64,16 +63,13 @@ class Team:
         )
         fabric.launch()
         waiting = dist.new_group(backend="gloo", timeout=_PATIENCE)
-        _watch(fabric.global_rank, hardware.stall_seconds, waiting)
         return Team(fabric.global_rank, fabric.world_size, waiting)
 
     @property
     def leads(self) -> bool:
-        """True in the one process that writes."""
         return self.rank == 0
 
     def meet(self) -> None:
-        """Wait until every process is here."""
         if self.waiting is None:
             return
         try:
@@ -91,22 +87,6 @@ class Team:
         except RuntimeError as error:
             raise TeamError(str(error)) from None
         return found
-
-    def part(self) -> None:
-        """This process has done all that the others need it for."""
-        watch.end()
-
-
-def _watch(rank: int, stall_seconds: float, group: dist.ProcessGroup | None) -> None:
-    """Have every process notice when another one dies or stalls."""
-    mine = watch.Watch(rank, stall_seconds)
-    address: list[tuple[str, int, str] | None] = [None]
-    if rank == 0:
-        address = [mine.listen(os.environ.get("MASTER_ADDR", "127.0.0.1"))]
-    dist.broadcast_object_list(address, src=0, group=group)
-    if rank and address[0] is not None:
-        mine.connect(*address[0])
-    watch.begin(mine)
 
 
 def lead_finds(find: Callable[[], Found]) -> Found:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.joint_names import joint_label
+from motionloom.pipeline.render.labels import joint_label
 
 STOPS = ((254, 240, 190), (253, 190, 90), (238, 110, 60), (190, 45, 60), (95, 15, 70))
 """From no error to the largest; dark enough at the end and light enough at the start on either theme."""

@@ -1,10 +1,9 @@
-"""The camera of the picture and video renderers; the same lens and default view as the viewer's script."""
+"""The camera of films and pictures; the same lens and default view as the viewer's script."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ class Camera:
         right = np.array([np.cos(self.yaw), 0.0, -np.sin(self.yaw)])
         return np.stack([right, np.cross(back, right), back])
 
-    def project(self, points: NDArray[Any], target: NDArray[Any]) -> NDArray[np.float64]:
+    def project(self, points: NDArray[np.floating], target: NDArray[np.floating]) -> NDArray[np.float64]:
         """Points [..., 3] (metres) to [..., 4]: x and y in pixels, depth in metres, pixels per metre."""
         seen = (np.asarray(points, np.float64) - target) @ self.axes.T
         depth = self.distance - seen[..., 2]
@@ -42,17 +41,14 @@ class Camera:
         return np.stack([x, y, depth, scale], axis=-1)
 
 
-def fit_distance(height: float, radius: float, width: int, tall: int, travel: float = 0.0) -> float:
-    """Distance from which a figure of this height and radius (metres) fills a `width` x `tall` picture.
-
-    It may move `travel` metres either way.
-    """
+def fit_distance(height: float, radius: float, width: int, tall: int) -> float:
+    """Distance from which a figure of this height and radius (metres) fills a `width` x `tall` picture."""
     tan = np.tan(FIELD_OF_VIEW / 2)
-    up, across = max(height * 0.58, radius * 1.05) + 0.25 * travel, (radius + travel) * 1.08
-    return float(max(up / tan, across * tall / (tan * width)) + radius * 0.3 + travel * 0.7)
+    up, across = max(height * 0.58, radius * 1.05), radius * 1.08
+    return float(max(up / tan, across * tall / (tan * width)) + radius * 0.3)
 
 
-def smooth_path(root: NDArray[Any], fps: float, seconds: float = 0.8) -> NDArray[np.float64]:
+def smooth_path(root: NDArray[np.floating], fps: float, seconds: float = 0.8) -> NDArray[np.float64]:
     """Root positions [T, 3] averaged over about `seconds`, ends repeated: what a camera follows."""
     reach = max(1, round(fps * seconds / 2))
     padded = np.pad(np.asarray(root, np.float64), ((reach, reach), (0, 0)), mode="edge")
@@ -61,7 +57,7 @@ def smooth_path(root: NDArray[Any], fps: float, seconds: float = 0.8) -> NDArray
     return (total[window:] - total[:-window]) / window
 
 
-def floor_of(joints: NDArray[Any]) -> float:
+def floor_of(joints: NDArray[np.floating]) -> float:
     """Ground height, metres: 0 for clips that stand near 0, else the lowest joint."""
     lowest = float(np.min(joints[..., 1]))
     return 0.0 if abs(lowest) < 0.5 else lowest

@@ -6,7 +6,6 @@ inlined once, and only into pages that hold a viewer.
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,8 +16,15 @@ from numpy.typing import ArrayLike
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.charts import COLOURS, Line, bar_chart, histogram, line_chart, ranking
-from motionloom.pipeline.render.matrix import matrix_table
+from motionloom.pipeline.render.charts import (
+    COLOURS,
+    Line,
+    bar_chart,
+    histogram,
+    line_chart,
+    matrix_table,
+    ranking,
+)
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
     fill,
@@ -51,7 +57,6 @@ class Cell:
 Value = str | float | int | Cell | None
 SHORT = 24
 """Columns whose cells have no more letters than this are not broken into lines."""
-PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 
 
 class Page:
@@ -198,35 +203,22 @@ class Page:
         )
         return self
 
-    def add_image(self, image: Path | bytes, alt: str, caption: str = "") -> Page:
-        """A PNG or JPEG, embedded."""
-        data = image if isinstance(image, bytes) else image.read_bytes()
-        kind = next((mime for magic, mime in PICTURES.items() if data.startswith(magic)), None)
-        if kind is None:
-            raise UserError(f"'{alt}': only PNG and JPEG pictures can be put into a page")
-        text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-        source = f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
-        self._blocks.append(f'<figure><img src="{source}" alt="{escape(alt, quote=True)}">{text}</figure>')
-        return self
-
     def html(self) -> str:
-        """The whole page."""
         links = "".join(f'<a href="#{anchor}">{escape(text)}</a>' for anchor, text in self._contents)
         contents = f'<nav aria-label="Sections">{links}</nav>' if len(self._contents) > 1 else ""
         return fill(
-            resource("page.html"),
+            resource("report/page.html"),
             MEDIA=media_policy(self._sounding),
             TITLE=escape(self.title),
             SUBTITLE=f"<p>{escape(self.subtitle)}</p>" if self.subtitle else "",
-            STYLE=resource("page.css") + (resource("viewer.css") if self._viewers else ""),
+            STYLE=resource("report/page.css") + (resource("viewer/viewer.css") if self._viewers else ""),
             SCRIPT=viewer_script(self._bodies) if self._viewers else "",
             CONTENTS=contents,
             BODY="\n".join(self._blocks),
-            HOVER=resource("page.js"),
+            HOVER=resource("report/page.js"),
         )
 
     def write(self, path: Path) -> None:
-        """Write the page atomically."""
         write_text(path, self.html())
 
     def _add_chart(self, chart: str, title: str) -> Page:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
 
@@ -36,12 +36,19 @@ class Score:
     segments: Segments = ()
 
 
-def score_data(beats: Sequence[float], segments: Segments, seconds: float, where: str) -> dict[str, Any]:
+class ScoreData(TypedDict):
+    """Beats in seconds; segments [start, end, label, kind]."""
+
+    beats: list[float]
+    segments: list[tuple[float, float, str, str]]
+
+
+def score_data(beats: Sequence[float], segments: Segments, seconds: float, where: str) -> ScoreData:
     """Beats and segments as plain JSON types, those past `seconds` left out; `UserError` names `where`."""
     times = np.asarray(beats, np.float64)
     if times.ndim != 1 or not np.isfinite(times).all():
         raise UserError(f"{where}: beats must be a list of finite seconds, got shape {list(times.shape)}")
-    bands = []
+    bands: list[tuple[float, float, str, str]] = []
     for segment in (Segment(*s) for s in segments):
         named = f"{where}: segment '{segment.label}'"
         if not (np.isfinite([segment.start, segment.end]).all() and 0 <= segment.start < segment.end):
@@ -50,6 +57,6 @@ def score_data(beats: Sequence[float], segments: Segments, seconds: float, where
             raise UserError(f"{named} is of kind '{segment.kind}'; known: {', '.join(get_args(Driver))}")
         if segment.start < seconds:
             end = min(float(segment.end), seconds)
-            bands.append([float(segment.start), end, segment.label, segment.kind])
+            bands.append((float(segment.start), end, segment.label, segment.kind))
     inside = np.unique(times[(times >= 0) & (times <= seconds)])
     return {"beats": [round(float(t), 4) for t in inside], "segments": bands}

@@ -16,9 +16,9 @@ from __future__ import annotations
 import hashlib
 import io
 import wave
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,30 +56,26 @@ class EncodedSound:
     seconds: float
 
 
-@dataclass(frozen=True)
-class Playing:
-    """One motion's use of a sound: how long the motion lasts, and its name in errors."""
+def embed_sounds(
+    uses: Iterable[tuple[str, Soundtrack | None, float]],
+) -> tuple[list[EncodedSound], list[int | None]]:
+    """Each distinct sound once, as long as the longest motion that plays it; and which one each use plays.
 
-    where: str
-    sound: Soundtrack | None
-    seconds: float
-
-
-def embed_sounds(uses: Sequence[Playing]) -> tuple[list[EncodedSound], list[int | None]]:
-    """Each distinct sound once, as long as the longest motion that plays it; and which one each use plays."""
+    `uses` are motions: the name in errors, what it plays, and its seconds.
+    """
     order: dict[tuple[float, bytes], int] = {}
     found: list[tuple[NDArray[np.float32], float]] = []
     chosen: list[int | None] = []
-    for use in uses:
-        if use.sound is None:
+    for where, sound, seconds in uses:
+        if sound is None:
             chosen.append(None)
             continue
-        content = hashlib.sha256(np.ascontiguousarray(use.sound.samples).tobytes()).digest()
-        number = order.setdefault((use.sound.rate, content), len(found))
+        content = hashlib.sha256(np.ascontiguousarray(sound.samples).tobytes()).digest()
+        number = order.setdefault((sound.rate, content), len(found))
         if number == len(found):
-            found.append((playable(use.sound, f"{use.where}: sound"), use.seconds))
+            found.append((playable(sound, f"{where}: sound"), seconds))
         samples, longest = found[number]
-        found[number] = (samples, max(longest, use.seconds))
+        found[number] = (samples, max(longest, seconds))
         chosen.append(number)
     return [_encode(samples[: round(seconds * RATE)]) for samples, seconds in found], chosen
 
@@ -114,7 +110,7 @@ def playable(sound: Soundtrack, where: str) -> NDArray[np.float32]:
     return np.clip(resample_sound(samples.astype(np.float32), int(rate), RATE), -1.0, 1.0)
 
 
-def wav_bytes(samples: NDArray[Any]) -> bytes:
+def wav_bytes(samples: NDArray[np.floating]) -> bytes:
     """A 16-bit mono WAV of samples [S] in -1..1 at `RATE` Hz."""
     file = io.BytesIO()
     with wave.open(file, "wb") as out:

@@ -17,40 +17,87 @@ from functools import cache
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.motion.rigid import RigidMotion
+from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body.embed import mesh_data, pose_data
+from motionloom.pipeline.render.body.embed import PoseData, mesh_data, packed, pose_data
+from motionloom.pipeline.render.body.face import FACE_CONTROLS, FACE_NEUTRAL
 from motionloom.pipeline.render.body.posing import human_skeleton, posing_of
-from motionloom.pipeline.render.figure import Figure, figure_for
-from motionloom.pipeline.render.score import Segments, score_data
-from motionloom.pipeline.render.sound import Playing, Soundtrack, embed_sounds
+from motionloom.pipeline.render.score import ScoreData, Segments, score_data
+from motionloom.pipeline.render.sound import Soundtrack, embed_sounds
 
-SCRIPTS = (
-    "viewer_space.js",
-    "viewer_scene.js",
-    "viewer_head.js",
-    "viewer_body.js",
-    "viewer_clip.js",
-    "viewer_mesh.js",
-    "viewer_bones.js",
-    "viewer_shaders.js",
-    "viewer_skin.js",
-    "viewer_gl.js",
-    "viewer_stage.js",
-    "viewer_page.js",
-    "viewer_score.js",
-    "viewer_sound.js",
-    "viewer_app.js",
-)
-FACE_CONTROLS = ("smile", "brow", "eye_open", "mouth_open", "frown")
-FACE_NEUTRAL = (0.0, 0.0, 1.0, 0.0, 0.0)
+SCRIPTS = [
+    "space",
+    "ground",
+    "sticks",
+    "clip",
+    "mesh",
+    "bones",
+    "shaders",
+    "gl",
+    "stage",
+    "board",
+    "score",
+    "sound",
+    "app",
+]
+"""The files of `web/viewer`, in the order that they need each other."""
 FACE_STEP = 1e-3
+
+
+class SkeletonData(TypedDict):
+    """A tree of joints that sticks can be drawn of."""
+
+    parents: list[int]
+    sides: list[int]
+    """0 the middle, 1 left, 2 right."""
+    head: int
+    """Joint of the head; -1 where it is not known."""
+
+
+class ClipData(TypedDict):
+    """One motion; arrays are base64."""
+
+    label: str
+    caption: str
+    group: str
+    fps: float
+    frames: int
+    joints: int
+    skeleton: int
+    low: list[float]
+    step: list[float]
+    positions: str
+    face: str | None
+    pose: PoseData | None
+    sound: NotRequired[int]
+    score: NotRequired[int]
+
+
+class SoundData(TypedDict):
+    """A sound's file in base64."""
+
+    mime: str
+    seconds: float
+    data: str
+
+
+class ViewerData(TypedDict):
+    """Everything that the viewer's script needs."""
+
+    title: str
+    note: str
+    faceNeutral: list[float]
+    faceStep: float
+    skeletons: list[SkeletonData]
+    motions: list[ClipData]
+    sounds: NotRequired[list[SoundData]]
+    scores: NotRequired[list[ScoreData]]
 
 
 @dataclass(frozen=True)
@@ -58,20 +105,19 @@ class ViewerMotion:
     """One cell of the viewer.
 
     `joints` [T, N, 3] metres, Y up; `parents` [N] with -1 for the root; `label` is the chip ('truth',
-    'generated'); motions with one `group` share a row. `face_controls` [T, 5] are smile, brow (-1 lowered,
-    1 raised), eye-open (0 closed, 1 neutral), mouth-open and frown (mouth corners down, inner brows up);
-    neutral is (0, 0, 1, 0, 0). `sound` starts with frame 0; `beats` are seconds, ticks on the time line;
+    'generated'); motions with one `group` share a row. `face_controls` [T, 5] are those of `body/face.py`.
+    `sound` starts with frame 0; `beats` are seconds, ticks on the time line;
     `segments` are what drives the motion when: (start, end, label) in seconds, or `Segment`s. `figure` is the
     rigid figure whose joints these are, where there is one: its rotations pose the body.
     """
 
-    joints: NDArray[Any]
+    joints: NDArray[np.floating]
     fps: float
     parents: Sequence[int]
     label: str = ""
     caption: str = ""
     group: str = ""
-    face_controls: NDArray[Any] | None = None
+    face_controls: NDArray[np.floating] | None = None
     sound: Soundtrack | None = None
     beats: Sequence[float] = ()
     segments: Segments = ()
@@ -87,31 +133,31 @@ def viewer_page(motions: Sequence[ViewerMotion], title: str, note: str = "") -> 
     """The viewer page as text."""
     data = viewer_data(motions, title, note)
     return fill(
-        resource("viewer.html"),
+        resource("viewer/viewer.html"),
         MEDIA=media_policy("sounds" in data),
         TITLE=escape(title),
-        STYLE=resource("viewer.css"),
+        STYLE=resource("viewer/viewer.css"),
         DATA=safe_json(data),
         SCRIPT=viewer_script(has_bodies(data)),
     )
 
 
-def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = "") -> dict[str, Any]:
+def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = "") -> ViewerData:
     """Everything the viewer's script needs, as plain JSON types."""
     if not motions:
         raise UserError("a viewer needs at least one motion")
-    figures: list[Figure] = []
-    clips = []
+    skeletons: list[SkeletonData] = []
+    clips: list[ClipData] = []
     for number, motion in enumerate(motions):
         joints = _checked(motion, number)
-        figure = figure_for(motion.parents, joints)
-        if figure not in figures:
-            figures.append(figure)
+        skeleton = _skeleton(motion.parents, joints)
+        if skeleton not in skeletons:
+            skeletons.append(skeleton)
         positions, low, step = quantise(joints)
         face = None
         if motion.face_controls is not None:
             controls = np.clip(np.asarray(motion.face_controls, np.float64), -2, 2) / FACE_STEP
-            face = _base64(np.round(controls).astype("<i2"))
+            face = packed(np.round(controls), "<i2")
         clips.append(
             {
                 "label": motion.label,
@@ -120,28 +166,38 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
                 "fps": float(motion.fps),
                 "frames": len(joints),
                 "joints": joints.shape[1],
-                "figure": figures.index(figure),
-                "scale": round(figure.scale(joints), 4),
+                "skeleton": skeletons.index(skeleton),
                 "low": [float(v) for v in low],
                 "step": [float(v) for v in step],
-                "positions": _base64(positions),
+                "positions": packed(positions),
                 "face": face,
                 "pose": _pose(motion, joints),
             }
         )
-    tracks = _tracks(motions, clips)
-    return {
+    out: ViewerData = {
         "title": title,
         "note": note,
         "faceNeutral": list(FACE_NEUTRAL),
         "faceStep": FACE_STEP,
-        "figures": [figure.to_json() for figure in figures],
+        "skeletons": skeletons,
         "motions": clips,
-        **tracks,
     }
+    _add_tracks(out, motions)
+    return out
 
 
-def has_bodies(data: dict[str, Any]) -> bool:
+def _skeleton(parents: Sequence[int], joints: NDArray[np.float64]) -> SkeletonData:
+    """Sides by the names of a person's joints; by where they are in the first pose for other skeletons."""
+    own, human = [int(parent) for parent in parents], human_skeleton(parents)
+    if human is not None:
+        sides = [{"left": 1, "right": 2}.get(name.split("_")[0], 0) for name in human.joints]
+        return {"parents": own, "sides": sides, "head": human.index("head")}
+    across = joints[0, :, 0] - joints[0, 0, 0]
+    sides = np.where(across > 0.03, 1, np.where(across < -0.03, 2, 0)).tolist()
+    return {"parents": own, "sides": sides, "head": -1}
+
+
+def has_bodies(data: ViewerData) -> bool:
     """Whether any of `viewer_data`'s motions is one that the body can be posed by."""
     return any(clip["pose"] is not None for clip in data["motions"])
 
@@ -151,15 +207,15 @@ def media_policy(sounding: bool) -> str:
     return "; media-src blob:" if sounding else ""
 
 
-def _tracks(motions: Sequence[ViewerMotion], clips: list[dict[str, Any]]) -> dict[str, Any]:
-    """Distinct `sounds` and `scores`, where there are any; each clip gets the numbers of its own."""
+def _add_tracks(data: ViewerData, motions: Sequence[ViewerMotion]) -> None:
+    """Put in distinct `sounds` and `scores`, where there are any; clips get the numbers of their own."""
     names = [_name(motion, number) for number, motion in enumerate(motions)]
     lengths = [len(motion.joints) / motion.fps for motion in motions]
-    sounds, playing = embed_sounds(
-        [Playing(name, m.sound, length) for name, m, length in zip(names, motions, lengths, strict=True)]
-    )
-    scores: list[dict[str, Any]] = []
-    for motion, clip, name, length, sound in zip(motions, clips, names, lengths, playing, strict=True):
+    sounds, playing = embed_sounds(zip(names, [motion.sound for motion in motions], lengths, strict=True))
+    scores: list[ScoreData] = []
+    for motion, clip, name, length, sound in zip(
+        motions, data["motions"], names, lengths, playing, strict=True
+    ):
         if sound is not None:
             clip["sound"] = sound
         score = score_data(motion.beats, motion.segments, length, name)
@@ -167,15 +223,17 @@ def _tracks(motions: Sequence[ViewerMotion], clips: list[dict[str, Any]]) -> dic
             if score not in scores:
                 scores.append(score)
             clip["score"] = scores.index(score)
-    encoded = [
-        {"mime": s.mime, "seconds": s.seconds, "data": base64.b64encode(s.data).decode("ascii")}
-        for s in sounds
-    ]
-    return ({"sounds": encoded} if encoded else {}) | ({"scores": scores} if scores else {})
+    if sounds:
+        data["sounds"] = [
+            {"mime": s.mime, "seconds": s.seconds, "data": base64.b64encode(s.data).decode("ascii")}
+            for s in sounds
+        ]
+    if scores:
+        data["scores"] = scores
 
 
 def quantise(
-    joints: NDArray[Any],
+    joints: NDArray[np.floating],
 ) -> tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.float64]]:
     """Joints [T, N, 3] to 16-bit integers with joints = low + step * integers, per axis."""
     exact = np.asarray(joints, np.float64)
@@ -187,15 +245,15 @@ def quantise(
 def viewer_script(bodies: bool = True) -> str:
     """The viewer's own scripts as one, defining `motionloomViewer(element, data, options)`.
 
-    Without `bodies` it lacks the skinned body's mesh (about 0.5 MB) and draws flat figures only.
+    Without `bodies` it lacks the skinned body's mesh (about 0.5 MB) and draws sticks only.
     """
-    body = "\n".join(resource(name) for name in SCRIPTS)
+    body = "\n".join(resource(f"viewer/{name}.js") for name in SCRIPTS)
     mesh = safe_json(mesh_data()) if bodies else "null"
     head, foot = f"'use strict';\nconst BODY = {mesh};", "window.motionloomViewer = mountViewer;"
     return f"(function () {{\n{head}\n{body}\n{foot}\n}})();"
 
 
-def safe_json(data: Any) -> str:
+def safe_json(data: object) -> str:
     """JSON that cannot end or open a script element, whatever the strings in it say."""
     text = json.dumps(data, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
@@ -213,8 +271,8 @@ def fill(template: str, **parts: str) -> str:
 
 @cache
 def resource(name: str) -> str:
-    """Text of a file that ships beside this module."""
-    return (resources.files("motionloom.pipeline.render") / name).read_text(encoding="utf-8")
+    """Text of a file of the folder `web`."""
+    return (resources.files("motionloom.pipeline.render") / "web" / name).read_text(encoding="utf-8")
 
 
 def _checked(motion: ViewerMotion, number: int) -> NDArray[np.float64]:
@@ -237,14 +295,10 @@ def _checked(motion: ViewerMotion, number: int) -> NDArray[np.float64]:
     return joints
 
 
-def _pose(motion: ViewerMotion, joints: NDArray[np.float64]) -> dict[str, Any] | None:
+def _pose(motion: ViewerMotion, joints: NDArray[np.float64]) -> PoseData | None:
     skeleton = human_skeleton(motion.parents)
     return None if skeleton is None else pose_data(posing_of(joints, skeleton, motion.figure))
 
 
 def _name(motion: ViewerMotion, number: int) -> str:
     return f"motion {number} ('{motion.label or motion.caption}')"
-
-
-def _base64(values: NDArray[Any]) -> str:
-    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")

@@ -1,22 +1,33 @@
-"""`motionloom generate`: motions from captions, music or a script, written to files."""
+"""`motionloom generate`: motions from captions, music or a script, written to files, or streamed as lines."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, TextIO
 
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.formats import Format
+from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
+from motionloom.pipeline.inference.writers import WRITERS, default_formats
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
-from motionloom.pipeline.runs.shipped import nearest
-from motionloom.pipeline.store.files import require_folder
+from motionloom.pipeline.runs.resolve import nearest
+from motionloom.pipeline.store.files import require_file_place, require_folder
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.inference.bundle import Bundle
+    from motionloom.pipeline.inference.stream import MotionStream
+
+STDIN = "-"
+"""The caption that means the lines of standard input."""
 
 FEW = 8
 """Motions that are made at once by one thread: a step of a small batch is over before a second one is awake,
@@ -36,6 +47,45 @@ def threads_for(motions: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@contextmanager
+def film_progress(console: Console) -> Iterator[Callable[[int, int], None]]:
+    """A bar of frames done, which appears with a film's first one; give what it yields to `write_motions`."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("film, frame"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("film", visible=False)
+        yield lambda done, total: bar.update(task, completed=done, total=total, visible=done < total)
+
+
+def _require_driver(
+    captions: Sequence[str],
+    face: Sequence[str] | None,
+    audio: Sequence[Path],
+    script: Path | None,
+    seconds: float | None,
+) -> None:
+    """Refuse a request without anything that drives motion, and one with a script and more."""
+    if not captions and not audio and script is None:
+        raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
+    if script is not None and (captions or audio or seconds is not None or face):
+        raise UserError("--script says everything: leave captions, --face, --audio and --seconds out")
+
+
+def _open(folder: Path, device: str, console: Console) -> Bundle:
+    from motionloom.pipeline.inference.bundle import Bundle
+    from motionloom.pipeline.inference.shipped_models import say_model
+
+    bundle = Bundle.open(folder, choose_device(device))
+    if (taken := say_model(folder)) is not None:
+        console.print(taken, markup=False, highlight=False, soft_wrap=True)
+    return bundle
+
+
+def _print_note(console: Console, note: object) -> None:
+    console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+
+
 def generate_motions(
     folder: Path,
     captions: Sequence[str] = (),
@@ -45,11 +95,11 @@ def generate_motions(
     script: Path | None = None,
     samples: int = 1,
     out: Path,
-    formats: str = "npz,bvh,mp4,html",
+    formats: str | None = None,
     seconds: float | None = None,
     seed: int = 0,
-    sampling: dict[str, Any] | None = None,
-    figure: dict[str, Any] | None = None,
+    sampling: SamplingConfig | None = None,
+    figure: Mapping[str, object] | None = None,
     device: str = "auto",
     console: Console,
 ) -> list[Path]:
@@ -58,31 +108,27 @@ def generate_motions(
     From captions, sound files, or both side by side (the first caption with the first file, and so on), or
     from one script. `samples` motions of each. `figure` are the keys of `FigureOptions`.
     """
-    from motionloom.pipeline.inference.bundle import Bundle
-    from motionloom.pipeline.inference.outputs import write_motions
-    from motionloom.pipeline.inference.page_words import page_note, page_title
+    from motionloom.pipeline.inference.bundle import unknown_captions
+    from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
     from motionloom.pipeline.inference.script import Script, read_music
-    from motionloom.pipeline.inference.shipped_models import say_model
     from motionloom.pipeline.inference.shown import FigureOptions
-    from motionloom.pipeline.inference.unknown import unknown_captions
 
-    if not captions and not audio and script is None:
-        raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
-    if script is not None and (captions or audio or seconds is not None or face):
-        raise UserError("--script says everything: leave captions, --face, --audio and --seconds out")
+    _require_driver(captions, face, audio, script, seconds)
     if samples < 1:
         raise UserError(f"--samples {samples}: take 1 or more")
-    wanted = [f.strip() for f in formats.split(",") if f.strip()]
+    wanted = default_formats()
+    if formats is not None:
+        wanted = [name.strip() for name in formats.split(",") if name.strip()]
     for name in wanted:
-        if name not in get_args(Format):
-            raise UserError(f"--format {name}: no such format{nearest(name, get_args(Format))}")
+        if name not in WRITERS:
+            raise UserError(f"--format {name}: no such format{nearest(name, list(WRITERS))}")
     if not wanted:
-        raise UserError(f"--format {formats!r} names no format: npz, bvh, mp4, html, glb, smplx or arkit")
+        raise UserError(f"--format {formats!r} names no format; known: {', '.join(WRITERS)}")
     # All that needs no model is checked before one is opened.
     require_words(caption_list(captions))
     require_seed(seed)
     require_folder(out)
-    drawing = SamplingConfig.parse(sampling or {}, "sampling")
+    sampling = sampling or SamplingConfig()
     posing = FigureOptions.parse(figure or {}, "figure")
     if posing.body_model is not None and "smplx" not in wanted:
         raise UserError("--body-model is what --format smplx is made for: name that format too")
@@ -91,12 +137,10 @@ def generate_motions(
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     with threads_for(samples * max(len(captions), len(audio), 1)):
-        bundle = Bundle.open(folder, choose_device(device))
         aside = make_console(aside=True)  # standard output is the list of files
-        if (taken := say_model(folder)) is not None:
-            aside.print(taken, markup=False, highlight=False, soft_wrap=True)
+        bundle = _open(folder, device, aside)
         if segments is not None:
-            motions = bundle.perform(segments, samples=samples, seed=seed, sampling=drawing)
+            motions = bundle.perform(segments, samples=samples, seed=seed, sampling=sampling)
         else:
             motions = bundle.generate(
                 [text for text in captions for _ in range(samples)] or None,
@@ -104,27 +148,131 @@ def generate_motions(
                 sounds=[sound for sound in sounds for _ in range(samples)] or None,
                 seconds=seconds,
                 seed=seed,
-                sampling=drawing,
+                sampling=sampling,
                 strict=True,
             )
         said = captions if segments is None else [segment.prompt.text for segment in segments]
-        for unknown in unknown_captions(bundle, said, face or (), drawing.face_model):
-            aside.print(f"note: {unknown}", style="yellow", markup=False, soft_wrap=True)
+        for unknown in unknown_captions(bundle, said, face or (), sampling.face_model):
+            _print_note(aside, unknown)
         title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
         note = page_note(len(motions), folder.resolve().name, seed)
-        paths = write_motions(
-            out,
-            motions,
-            wanted,  # type: ignore[arg-type]
-            title=title,
-            note=note,
-            seed=seed,
-            figure=posing,
-            say=lambda line: aside.print(line, soft_wrap=True, markup=False),
-        )
+        with film_progress(aside) as progress:
+            paths = write_motions(
+                out,
+                motions,
+                wanted,
+                title=title,
+                note=note,
+                seed=seed,
+                figure=posing,
+                say=lambda line: aside.print(line, soft_wrap=True, markup=False),
+                progress=progress,
+            )
         for path in paths:
             console.print(str(path), markup=False, soft_wrap=True)
         if "html" in wanted:
             place = (out / "index.html").resolve()
             aside.print(f"watch it in a browser: {place}", markup=False, highlight=False, soft_wrap=True)
         return paths
+
+
+def stream_motion(
+    folder: Path,
+    captions: Sequence[str] = (),
+    *,
+    face: Sequence[str] | None = None,
+    audio: Sequence[Path] = (),
+    script: Path | None = None,
+    out: Path | None = None,
+    seconds: float | None = None,
+    seed: int = 0,
+    sampling: SamplingConfig | None = None,
+    device: str = "auto",
+    console: Console,
+    given: TextIO | None = None,
+) -> None:
+    """Write JSON lines (`inference/stream_lines.py`) as frames come; ends with the last segment or Ctrl-C.
+
+    Several captions follow each other, each `seconds` long. The caption "-" is the lines of `given`, by
+    default standard input: with `seconds` each lasts so long, without each takes over from the one before,
+    and frames come no faster than they are watched.
+    `out` is a file, None is standard output. What is said to people goes to `console`.
+    """
+    from motionloom.pipeline.inference.script import Script, read_music
+    from motionloom.pipeline.inference.stream import MotionStream, stream_of
+    from motionloom.pipeline.inference.stream_lines import frame_lines, heading
+
+    _require_driver(captions, face, audio, script, seconds)
+    if len(captions) > 1 and (seconds is None or STDIN in captions or audio or face):
+        raise UserError(
+            "a stream of several captions makes one motion: give --seconds, the length of each, and neither "
+            "--audio nor --face; with --script each has its own"
+        )
+    if len(audio) > 1 or (face and len(face) > 1):
+        raise UserError("a stream makes one motion: give one --audio and one --face")
+    require_seed(seed)
+    if out is not None:
+        require_file_place(out)
+    sampling = sampling or SamplingConfig()
+    sound = read_music(audio[0]) if audio else None
+    opened = None if script is None else Script.read(script).open(script.parent, str(script))
+    bundle, config, live = _open(folder, device, console), StreamConfig(), False
+
+    def notice(unknown: object) -> None:
+        _print_note(console, unknown)
+
+    if opened is not None:
+        stream = MotionStream(
+            bundle, iter(opened), seed=seed, sampling=sampling, config=config, notice=notice
+        )  # fmt: skip
+    else:
+        asked: str | list[str] | Iterator[str] | None = list(captions) if len(captions) > 1 else None
+        lines: Iterator[str] = iter(())
+        if list(captions) == [STDIN]:
+            lines = (line.strip() for line in given or sys.stdin if line.strip())
+            live = seconds is None
+            asked = next(lines, None) if live else lines
+            if asked is None:
+                raise UserError("standard input has no caption; write one a line")
+        elif len(captions) == 1:
+            asked = captions[0]
+        stream = stream_of(
+            bundle, asked, face=face[0] if face else "", sound=sound, seconds=seconds, seed=seed,
+            sampling=sampling, notice=notice,
+        )  # fmt: skip
+        if live:
+            listener = threading.Thread(target=_listen, args=(stream, lines, console), daemon=True)
+            listener.start()
+    with ExitStack() as stack:
+        file: TextIO = sys.stdout if out is None else stack.enter_context(out.open("w", encoding="utf-8"))
+        file.write(heading(bundle.layout, seed, folder.resolve().name))
+        file.flush()
+        started, first, frames = time.perf_counter(), math.nan, 0
+        try:
+            for chunk in stream:
+                for line in frame_lines(chunk):
+                    file.write(line)
+                file.flush()
+                first = time.perf_counter() - started if not frames else first
+                frames += len(chunk.joints)
+                if live:
+                    early = (
+                        frames / chunk.fps - config.ahead_seconds - (time.perf_counter() - started - first)
+                    )
+                    time.sleep(max(0.0, early))
+        except KeyboardInterrupt:  # how a stream without an end is ended
+            console.print("ended")
+    took, length = time.perf_counter() - started, frames / bundle.layout.fps
+    console.print(
+        f"{frames} frames, {length:.1f} s of motion in {took:.1f} s; the first after {first:.2f} s",
+        highlight=False,
+    )
+
+
+def _listen(stream: MotionStream, lines: Iterator[str], console: Console) -> None:
+    """Each line takes over from the one before as it comes."""
+    for line in lines:
+        try:
+            stream.say(line)
+        except UserError as error:
+            console.print(f"{error}", style="red", markup=False)

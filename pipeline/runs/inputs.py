@@ -1,16 +1,24 @@
-"""Which stage feeds which role of a recipe's stages: by the role's name, or as `inputs` says."""
+"""Which stage feeds which role of a recipe's stages: by the role's name, or as `inputs` says.
+
+Stages of other runs, and of exports, are named by their folder: `inputs: {start: runs/other/stages/gpt}`,
+seen from the folder of the recipe file, else from the current one. Such a stage must be finished, of the
+version that is installed, and made from what its own run holds now.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.lookup import outside_stage
 from motionloom.pipeline.contract.stage import Every, Finished, Role, Stage
-from motionloom.pipeline.runs.outside import find_outside
-from motionloom.pipeline.runs.shipped import nearest
-from motionloom.pipeline.store.outside import is_place, label_of
+from motionloom.pipeline.runs.resolve import nearest, place_name
+from motionloom.pipeline.store.artifact import Artifact, require_consistent
+from motionloom.pipeline.store.run_folder import in_export, is_place, label_of, owner_of, stage_folder
+
+_LIKE = "name the folder of a stage, like runs/other/stages/gpt"
 
 
 @dataclass
@@ -28,7 +36,7 @@ class Sources:
     gone: dict[tuple[str, str], str] = field(default_factory=dict)
     """Stage and role -> what to say where an input from outside is not there any more."""
 
-    def resolve(self, stage: Stage, given: Any) -> dict[str, str]:
+    def resolve(self, stage: Stage, given: object) -> dict[str, str]:
         """Role -> stage; a role that is filled by several stages has one entry for each (`Every.key`)."""
         roles, at = stage.kind.roles(), f"{self.where}: stages.{stage.name}.inputs"
         if not isinstance(given, dict):
@@ -51,7 +59,7 @@ class Sources:
                 inputs[role.name] = one
         return inputs
 
-    def _one(self, stage: Stage, role: Role, given: Mapping[str, Any]) -> str | None:
+    def _one(self, stage: Stage, role: Role, given: Mapping[str, object]) -> str | None:
         """The stage in a role; None for an optional one that nothing fills."""
         source = given.get(role.name, role.name)
         if source is None and role.optional:
@@ -73,7 +81,7 @@ class Sources:
             f"{self._why_not(source) or nearest(str(source), known)}"
         )
 
-    def _why_not(self, name: Any) -> str:
+    def _why_not(self, name: object) -> str:
         """Where a stage has been left out, by what."""
         by = self.removed.get(str(name))
         return "" if by is None else f", which {by} leaves out; name another one in inputs, or null"
@@ -101,7 +109,7 @@ class Sources:
             + f" in stages.{stage.name}.inputs.{role.name}"
         )
 
-    def _every(self, stage: Stage, role: Every, listed: Any) -> Iterator[tuple[str, str]]:
+    def _every(self, stage: Stage, role: Every, listed: object) -> Iterator[tuple[str, str]]:
         """Key and stage of an `Every` role: as listed, else all of the recipe that give what it wants."""
         giving = [other.name for other in self.own if role.gives in other.kind.gives(other.config)]
         at = f"{self.where}: stages.{stage.name}.inputs.{role.name}"
@@ -127,4 +135,98 @@ class Sources:
             raise UserError(
                 f"{at}: '{name}' is no stage that gives a {role.gives}"
                 f"{', as ' + self.removed[name] + ' leaves it out' if name in self.removed else ''}{hint}"
+            )
+
+
+def find_outside(name: str, where: str) -> Finished:
+    """A stage outside the run; a `UserError` says what is wrong with it and begins with `where`."""
+    folder = Path(name).resolve()
+    if not folder.is_dir():
+        raise UserError(f"{where}: {name}: no such folder{_hint(folder)}")
+    if (folder / "recipe.yaml").is_file() or (folder / "bundle.json").is_file():
+        what = "a whole run" if (folder / "recipe.yaml").is_file() else "a whole export"
+        raise UserError(f"{where}: {name}: {what}; name one of its stages{_hint(_first(folder))}")
+    found = outside_stage(folder)
+    if found is None:
+        known = (folder / "started.json").is_file()
+        fix = "; finish its run first" if known else f"; {_LIKE}"
+        raise UserError(f"{where}: {name}: no finished stage (no artifact.json){fix}")
+    if not in_export(folder):
+        _require_usable(found, name, where)
+    return found
+
+
+def _require_usable(found: Finished, name: str, where: str) -> None:
+    run = owner_of(found.folder)
+    again = f"make it again: motionloom run {run / 'recipe.yaml'} -o {run}"
+    for stage in _needed(found):
+        artifact = Artifact.find(stage.folder)
+        if artifact is None:  # in an export, which is checked as it is opened
+            continue
+        if artifact.version != stage.kind.version:
+            raise UserError(
+                f"{where}: {name}: '{stage.folder.name}' was made by version {artifact.version} of stage "
+                f"kind {artifact.kind}, which is now version {stage.kind.version}; {again}"
+            )
+        if gone := artifact.missing(stage.folder):
+            raise UserError(f"{where}: {name}: {stage.folder / gone} is gone or has another size; {again}")
+    try:
+        require_consistent(run, [found.folder.name])
+    except UserError as error:
+        raise UserError(f"{where}: {name}: {error}") from None
+
+
+def _needed(stage: Finished) -> Iterable[Finished]:
+    """A stage and those that it needs to load."""
+    yield stage
+    for role in stage.kind.exported(stage.config):
+        if role in stage.inputs:
+            yield from _needed(stage.inputs[role])
+
+
+def _first(folder: Path) -> Path:
+    """Where the stages of a run or an export lie."""
+    return folder / "stages" / "" if (folder / "recipe.yaml").is_file() else folder / ""
+
+
+def _hint(folder: Path) -> str:
+    """The stages next to a folder that is not one."""
+    parent = folder.parent if not folder.is_dir() else folder
+    there = [one.name for one in sorted(parent.iterdir()) if one.is_dir()] if parent.is_dir() else []
+    names = [name for name in there if not name.startswith(".")]
+    return nearest(folder.name, names) if names else f"; {_LIKE}"
+
+
+def as_stages(found: Mapping[str, Finished]) -> dict[str, Stage]:
+    """Outside stages and all above them, as the checks of a recipe see stages."""
+    out: dict[str, Stage] = {}
+    for name, stage in found.items():
+        _add(name, stage, out)
+    return out
+
+
+def _add(name: str, stage: Finished, out: dict[str, Stage]) -> None:
+    if name in out:
+        return
+    above = {role: (place_name(source.folder), source) for role, source in stage.inputs.items()}
+    out[name] = Stage(name, stage.kind, stage.config, {role: place for role, (place, _) in above.items()})
+    for place, source in above.values():
+        _add(place, source, out)
+
+
+def require_elsewhere(run: Path, stage: Stage, found: Mapping[str, Finished]) -> None:
+    """Refuse, as an input from outside, a stage of the run itself, or one made from what it shall feed."""
+    target = stage_folder(run, stage.name).resolve()
+    for name in stage.inputs.values():
+        if name not in found:
+            continue
+        source = found[name]
+        if owner_of(source.folder).resolve() == run.resolve():
+            raise UserError(
+                f"stage '{stage.name}': {name} is a stage of this very run; name it '{source.folder.name}'"
+            )
+        if any(above.folder.resolve() == target for above in source.upstream()):
+            raise UserError(
+                f"stage '{stage.name}': {label_of(source.folder)} was itself made from this stage of {run}; "
+                f"choose another folder with -o"
             )

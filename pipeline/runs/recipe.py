@@ -10,10 +10,8 @@
 A stage's inputs are found by role: a stage that needs `data` takes the stage called `data` unless its
 `inputs:` names another (or `null`, for an input it can do without), or the path of a stage of another run or
 of an export (`start: runs/other/stages/gpt`). `seed` is everybody's; `data_seed`, where it is given, is that
-of all that comes before the first training. `extends:` starts from another recipe file, one beside this one
-or a shipped one by name; a stage that is `null` is left out. `defaults:` holds what stages share
-(`defaults.py`), and `start:` names a trained model to go on from (`starting.py`).
-`--set stage.field=value` overrides one value.
+of all that comes before the first training. What else a recipe may say, `extends`, `start`, `defaults`, and
+`--set` over it are resolved first (`resolve.py`).
 """
 
 from __future__ import annotations
@@ -27,17 +25,21 @@ from typing import Any
 from pydantic import Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.contract.registry import VARIABLE, stage_kinds
-from motionloom.pipeline.contract.stage import Every, Finished, Stage
+from motionloom.pipeline.contract.stage import (
+    VARIABLE,
+    Every,
+    Finished,
+    Stage,
+    StageConfig,
+    StageKind,
+    stage_kinds,
+)
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.runs.defaults import fill, require_used
-from motionloom.pipeline.runs.inputs import Sources
-from motionloom.pipeline.runs.layers import override, read_layers, read_recipe_file
-from motionloom.pipeline.runs.outside import as_stages
-from motionloom.pipeline.runs.shipped import find_recipe, nearest
-from motionloom.pipeline.runs.starting import with_start
-from motionloom.pipeline.store.outside import place_from
+from motionloom.pipeline.runs.inputs import Sources, as_stages
+from motionloom.pipeline.runs.resolve import TRAINED, Tree, find_recipe, nearest, resolve
+from motionloom.pipeline.store.run_folder import place_from
 from motionloom.pipeline.store.yaml import dump_yaml
+from motionloom.pipeline.training.config import TrainedStageConfig
 
 
 class RecipeFile(Config):
@@ -47,18 +49,17 @@ class RecipeFile(Config):
     description: str = ""
     seed: int = Field(0, ge=0)
     data_seed: int | None = Field(None, ge=0)
-    """Of all that comes before the first training; null = `seed`."""
+    """Seed of everything before the first training; null = `seed`."""
     hardware: Hardware = Hardware()
     start: str | None = None
-    """A trained model that stages go on from: one of the package, or the folder of an export or a run; see
-    `starting.py`."""
-    defaults: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """What stages of a kind, or all that train (`trained`), share; see `defaults.py`."""
-    stages: dict[str, dict[str, Any]]
+    """A trained model that stages go on from: one of the package, or the folder of an export or a run."""
+    defaults: dict[str, Tree] = Field(default_factory=dict)
+    """What stages of a kind, or all that train (`trained`), share."""
+    stages: dict[str, Tree]
 
     @field_validator("stages")
     @classmethod
-    def _plain_names(cls, stages: dict[str, Any]) -> dict[str, Any]:
+    def _plain_names(cls, stages: dict[str, Tree]) -> dict[str, Tree]:
         """A stage's name is its folder in the run."""
         for name in stages:
             if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
@@ -111,9 +112,9 @@ class Recipe:
 
         Stages outside are written as they are seen from the folder `run` where it is to lie, or absolutely.
         """
-        stages: dict[str, Any] = {}
+        stages: dict[str, Tree] = {}
         for stage in self.stages:
-            entry: dict[str, Any] = {"kind": stage.kind.name, **stage.config.dump()}
+            entry: Tree = {"kind": stage.kind.name, **stage.config.dump()}
             renamed = self._written_inputs(stage, run)
             stages[stage.name] = {**entry, "inputs": renamed} if renamed else entry
         data = {
@@ -126,7 +127,7 @@ class Recipe:
         }
         return dump_yaml(data)
 
-    def _written_inputs(self, stage: Stage, run: Path | None) -> dict[str, Any]:
+    def _written_inputs(self, stage: Stage, run: Path | None) -> Tree:
         """The `inputs` of a stage that are not as the roles' names would have them."""
 
         def written(name: str) -> str:
@@ -135,7 +136,7 @@ class Recipe:
             place = self.outside[name].folder.resolve()
             return str(place) if run is None else place_from(run, place)
 
-        out: dict[str, Any] = {}
+        out: Tree = {}
         for role in stage.kind.roles():
             if isinstance(role, Every):
                 keys = [key for key in stage.inputs if key.startswith(f"{role.name}.")]
@@ -151,19 +152,11 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = (), *, stri
 
     Unless `strict`, inputs from outside may be gone: what a run has made of them may still be used.
     """
-    path = find_recipe(str(name_or_path))
-    layers = read_layers(path)
-    # Defaults of a base recipe may concern stages that this one has replaced; its own may not.
-    require_used(read_recipe_file(path).get("defaults"), layers.data.get("stages"), str(path))
-    known = set(layers.data.get("defaults") or {})
-    for text in overrides:
-        layers = override(layers, text)
-    where = f"{path} with --set" if overrides else str(path)
-    data = with_start(layers.data, where)
-    file = RecipeFile.parse(data, where)
-    require_used(file.defaults.keys() - known, file.stages, where)
-    parsed = _parse(fill(file.stages, file.defaults, where), where)
-    sources = Sources([stage for stage, _ in parsed], where, layers.removed, strict)
+    resolved = resolve(find_recipe(str(name_or_path)), overrides)
+    where = resolved.where
+    file = RecipeFile.parse(resolved.data, where)
+    parsed = _parse(file.stages, where)
+    sources = Sources([stage for stage, _ in parsed], where, resolved.removed, strict)
     stages = [replace(stage, inputs=sources.resolve(stage, given)) for stage, given in parsed]
     if not sources.gone:
         _check(stages, sources, where)
@@ -173,7 +166,7 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = (), *, stri
     )  # fmt: skip
 
 
-def _parse(entries: Mapping[str, dict[str, Any]], where: str) -> list[tuple[Stage, Any]]:
+def _parse(entries: Mapping[str, dict[str, Any]], where: str) -> list[tuple[Stage, object]]:
     """The stages without their inputs, and what was written of those."""
     kinds, parsed = stage_kinds(), []
     for name, entry in entries.items():
@@ -202,8 +195,8 @@ def _check(stages: Sequence[Stage], sources: Sources, where: str) -> None:
 
 
 def _in_order(stages: Sequence[Stage], sources: Sources, where: str) -> tuple[Stage, ...]:
-    """The stages so that each stands behind its inputs, else as written: a recipe that `extends` another may
-    add a stage that an earlier one reads.
+    """The stages sorted so that each comes after its inputs, otherwise as written: a recipe that `extends`
+    another may add a stage that an earlier one reads.
     """
     out: list[Stage] = []
     waiting = list(stages)
@@ -216,3 +209,63 @@ def _in_order(stages: Sequence[Stage], sources: Sources, where: str) -> tuple[St
         waiting.remove(ready)
         out.append(ready)
     return tuple(out)
+
+
+def recipe_schema() -> Tree:
+    """JSON schema (draft 2020-12) of a recipe file, from the config classes that check it.
+
+    On a recipe's first line, `# yaml-language-server: $schema=recipe.schema.json` has editors complete and
+    check it.
+    """
+    schema = RecipeFile.model_json_schema()
+    definitions: Tree = schema.setdefault("$defs", {})
+    branches, kinds = [], stage_kinds()
+    defaults: Tree = {TRAINED: _fields(TrainedStageConfig, definitions)}
+    for name, kind in kinds.items():
+        stage = _fields(kind.config, definitions)
+        defaults[name] = dict(stage)
+        stage["title"] = f"{name}: {kind.summary}"
+        stage["properties"] = {
+            "kind": {"const": name},
+            "inputs": _inputs(kind),
+            **stage.get("properties", {}),
+        }
+        branches.append(
+            {"if": {"properties": {"kind": {"const": name}}, "required": ["kind"]}, "then": stage}
+        )
+    entry = {"type": "object", "properties": {"kind": {"enum": list(kinds)}}, "allOf": branches}
+    removed = {"type": "null", "description": "Leaves out a stage of the recipe that this one extends."}
+    schema["properties"]["stages"]["additionalProperties"] = {"anyOf": [entry, removed]}
+    schema["properties"]["defaults"] = {
+        "type": "object",
+        "description": f"What stages of a kind share, or all that train ({TRAINED}).",
+        "properties": defaults,
+        "additionalProperties": False,
+    }
+    schema["properties"]["extends"] = {"type": "string", "description": "A recipe to start from, by name."}
+    schema["required"] = ["name"]
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["title"] = "motionloom recipe"
+    return schema
+
+
+def _fields(config: type[StageConfig], definitions: Tree) -> Tree:
+    """The schema of a stage's fields, none of them required: a base recipe or defaults may give them."""
+    schema = config.model_json_schema(ref_template="#/$defs/{model}")
+    definitions.update(schema.pop("$defs", {}))
+    schema.pop("required", None)
+    return schema
+
+
+def _inputs(kind: StageKind) -> Tree:
+    one: Tree = {"type": ["string", "null"]}
+    several: Tree = {"type": "array", "items": {"type": "string"}}
+    return {
+        "type": "object",
+        "description": (
+            "Which stage feeds a role; without it the stage of the role's own name. A path is a stage of "
+            "another run or of an export: runs/other/stages/gpt."
+        ),
+        "properties": {role.name: several if isinstance(role, Every) else one for role in kind.roles()},
+        "additionalProperties": False,
+    }

@@ -1,32 +1,40 @@
-"""The pages and the API of a server (docs/serving.md)."""
+"""The pages and the API of a server (docs/generating.md)."""
 
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import json
 import sys
 import traceback
 import uuid
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Collection
 from concurrent.futures import Future
 from importlib import resources
-from typing import Any, TypeVar
+from typing import TypeVar
+from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
-from starlette.types import ASGIApp
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
-from motionloom.pipeline.serve.config import ServeConfig
-from motionloom.pipeline.serve.guard import Guard
-from motionloom.pipeline.serve.requests import Answer, MotionRequest, lines, make, notes_of, stream
-from motionloom.pipeline.serve.sounds import Sounds
+from motionloom.pipeline.serve.requests import (
+    Answer,
+    MotionRequest,
+    ServeConfig,
+    Sounds,
+    lines,
+    make,
+    notes_of,
+    stream,
+)
 from motionloom.pipeline.serve.work import Busy, Stopped, Worker
 
 T = TypeVar("T")
@@ -48,14 +56,14 @@ class Site:
         self.sounds = Sounds(config)
         self._uploads = asyncio.Semaphore(_UPLOADS)
         self.assets = {
-            "serve.css": (resource("viewer.css") + own("serve.css"), "text/css; charset=utf-8"),
+            "serve.css": (resource("viewer/viewer.css") + own("serve.css"), "text/css; charset=utf-8"),
             "viewer.js": (viewer_script(), "text/javascript; charset=utf-8"),
             "serve.js": (own("serve.js"), "text/javascript; charset=utf-8"),
         }
 
     @property
     def app(self) -> ASGIApp:
-        """The ASGI application. The guard stands outermost, so that every answer bears its headers."""
+        """The ASGI application. The guard is outermost, so that every answer has its headers."""
         return Guard(self._routes(), self.config.host, self.config.allow_hosts)
 
     def _routes(self) -> Starlette:
@@ -72,7 +80,6 @@ class Site:
         )
 
     async def page(self, request: Request) -> Response:
-        """The page to type and watch."""
         return Response(own("page.html"), media_type="text/html; charset=utf-8")
 
     async def asset(self, request: Request) -> Response:
@@ -83,7 +90,6 @@ class Site:
         return Response(found[0], media_type=found[1])
 
     async def info(self, request: Request) -> Response:
-        """What the model is and what is taken."""
         bundle, limits = self.model.bundle, self.config
         longest = min(limits.max_seconds, self.model.max_seconds)
         skeleton = bundle.layout.skeleton
@@ -109,7 +115,6 @@ class Site:
         )
 
     async def generate(self, request: Request) -> Response:
-        """One motion."""
         asked, sound = await self._asked(request)
         future = self._submit(asked, lambda: make(self.model, asked, sound, self.config))
         answer: Answer = await self._outcome(request, future, asked)
@@ -223,7 +228,7 @@ def own(name: str) -> str:
     return (resources.files("motionloom.pipeline.serve") / name).read_text(encoding="utf-8")
 
 
-def _plain(name: Any) -> str:
+def _plain(name: object) -> str:
     """A request's name as a header can carry it."""
     return "".join(letter for letter in str(name)[:64] if letter.isascii() and letter.isprintable())
 
@@ -267,3 +272,91 @@ async def _said(request: Request, error: Exception) -> Response:
 async def _broken(request: Request, error: Exception) -> Response:
     """A bug: the log has it, by Starlette's own way, and the client a sentence."""
     return JSONResponse({"error": _BROKEN}, 500)
+
+
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
+    "media-src blob:; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
+
+HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-resource-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cache-control": "no-store",
+}
+
+
+class Guard:
+    """Checks every request, and adds the headers of every answer (ASGI middleware).
+
+    A page from elsewhere in the same browser must not reach the model. By its own name it is stopped by
+    `Origin`; by a name of its own that it has made to point at this machine (DNS rebinding) it is stopped by
+    `Host`, which then is that name: only localhost, the names in `allowed`, and where others may come in
+    plain addresses pass. `host` is the address that is listened at.
+    """
+
+    def __init__(self, app: ASGIApp, host: str, allowed: Collection[str] = ()) -> None:
+        self.app = app
+        self.names = {*LOOPBACK, host.lower(), *(name.lower() for name in allowed)}
+        self.addresses = not is_loopback(host)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                own = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
+                message["headers"] = [*message.get("headers", []), *own]
+            await send(message)
+
+        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        refused = self.refusal(headers, scope["method"])
+        if refused:
+            await JSONResponse({"error": refused}, 403)(scope, receive, send_with_headers)
+            return
+        await self.app(scope, receive, send_with_headers)
+
+    def refusal(self, headers: dict[str, str], method: str) -> str:
+        """Why a request with these headers is refused; empty where it is not."""
+        host = headers.get("host", "")
+        if not self.knows(host):
+            return f"this server is not called {host[:80]!r}; use localhost, or start it with --allow-host"
+        origin = headers.get("origin")
+        if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
+            return f"a page of {origin[:80]!r} asks; only this server's own page may"
+        followed = method == "GET" and headers.get("sec-fetch-mode") == "navigate"  # a link to here
+        if headers.get("sec-fetch-site", "none") not in ("none", "same-origin") and not followed:
+            return "a page of another site asks; only this server's own page may"
+        return ""
+
+    def knows(self, host: str) -> bool:
+        """Whether a `Host` header names this server."""
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        if name in self.names:
+            return True
+        return self.addresses and _is_address(name)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches an address."""
+    if host == "localhost":
+        return True
+    return _is_address(host) and ipaddress.ip_address(host).is_loopback
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True

@@ -7,7 +7,6 @@ import socket
 from contextlib import closing
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import numpy as np
 import uvicorn
@@ -15,12 +14,11 @@ from rich.console import Console
 
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.streaming import StreamingGenerator
-from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.contract.generation import StreamingGenerator
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import model_folder, say_model
-from motionloom.pipeline.serve.app import Site
-from motionloom.pipeline.serve.config import ServeConfig
-from motionloom.pipeline.serve.guard import is_loopback
+from motionloom.pipeline.serve.app import Site, is_loopback
+from motionloom.pipeline.serve.requests import ServeConfig
 from motionloom.pipeline.serve.work import Worker
 
 _LAST = 5
@@ -108,7 +106,7 @@ class _Server(uvicorn.Server):
         super().__init__(config)
         self._worker = worker
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> Any:
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """At the first signal: nothing new is begun."""
         self._worker.stop()
         return super().handle_exit(sig, frame)

@@ -2,33 +2,69 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tempfile
+import threading
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated
 
-from pydantic import Field
+import numpy as np
+from pydantic import AfterValidator, Field
 
-from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.audio.sound import Sound, read_sound, require_audible, sound_seconds
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import file_stem
-from motionloom.pipeline.inference.pretrained import MotionModel
-from motionloom.pipeline.inference.saving import cell_of
+from motionloom.pipeline.inference.outputs import clip_of, file_stem
+from motionloom.pipeline.inference.stream import MotionStream
 from motionloom.pipeline.inference.stream_lines import frame_lines, heading, rounded
-from motionloom.pipeline.inference.streaming import MotionStream
+from motionloom.pipeline.inference.writers import WRITERS, cell_of
 from motionloom.pipeline.render.viewer import viewer_data
-from motionloom.pipeline.serve.config import ServeConfig
 
-FILES = {
-    "npz": "application/octet-stream",
-    "bvh": "text/plain; charset=utf-8",
-    "glb": "model/gltf-binary",
-    "html": "text/html; charset=utf-8",
-}
+
+class ServeConfig(Config):
+    """Where a server listens, and how much it takes on."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at; anything but loopback lets others in."""
+    port: int = Field(8000, ge=0, le=65535)
+    """0 takes a free one."""
+    allow_hosts: tuple[str, ...] = ()
+    """Names that the server is reached by, besides localhost and addresses."""
+    waiting: int = Field(32, ge=1)
+    """Requests that wait for the model; more are refused."""
+    max_seconds: float = Field(30.0, gt=0)
+    """Longest motion."""
+    max_caption: int = Field(300, ge=1)
+    """Longest caption, in letters."""
+    max_sound_mb: float = Field(20.0, gt=0)
+    """Largest sound file."""
+    max_sound_seconds: float = Field(300.0, gt=0)
+    """Longest sound."""
+    sounds: int = Field(4, ge=1)
+    """Sounds that are kept; the one used longest ago makes room."""
+    max_request_kb: float = Field(16.0, gt=0)
+    """Largest request besides a sound."""
+    patience: float = Field(20.0, gt=0)
+    """Seconds in which a request must have arrived."""
+
+
+def known_answer(name: str) -> str:
+    """The name of a format that a server gives; ValueError for others."""
+    known = ["joints", "viewer", *(name for name, writer in WRITERS.items() if not writer.slow)]
+    if name not in known:
+        raise ValueError(f"no format '{name}'; known: {', '.join(known)}")
+    return name
+
+
+_SOUND = "the sound"
+_KINDS = {b"RIFF": ".wav", b"RF64": ".wav", b"fLaC": ".flac", b"OggS": ".ogg"}
+"""First bytes and the file's ending; what begins otherwise is tried as MP3."""
 
 
 class MotionRequest(Config):
@@ -46,8 +82,8 @@ class MotionRequest(Config):
     cfg_scale: float = Field(1.0, ge=1, le=20, allow_inf_nan=False)
     temperature: float = Field(1.0, ge=0, le=10, allow_inf_nan=False)
     top_p: float = Field(0.95, gt=0, le=1)
-    format: Literal["joints", "viewer", "npz", "bvh", "glb", "html"] = "joints"
-    """Numbers, the viewer's data, or a file."""
+    format: Annotated[str, AfterValidator(known_answer)] = "joints"
+    """Numbers (`joints`), the viewer's data (`viewer`), or a file of a quick format of `WRITERS`."""
     request: str = Field("", max_length=64)
     """A name for the answer to bear; made up where it is empty."""
 
@@ -70,12 +106,10 @@ class MotionRequest(Config):
 
     @property
     def captions(self) -> list[str]:
-        """The caption, where there is one."""
         return [self.caption] if self.caption.strip() else []
 
     @property
     def faces(self) -> list[str]:
-        """The face's caption, where there is one."""
         return [self.face] if self.face else []
 
     @property
@@ -116,11 +150,11 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
         seed=asked.seed,
         sampling=asked.sampling,
     )[0]
-    if asked.format in FILES:
+    if asked.format in WRITERS:
         return _file(motion, asked)
     facts = {**_facts(motion, asked), "notes": notes_of(model, asked)}
     if asked.format == "viewer":
-        facts["viewer"] = viewer_data([cell_of(motion)])
+        facts["viewer"] = viewer_data([cell_of(clip_of(motion))])
     else:
         facts |= {
             "joint_names": list(motion.joint_names),
@@ -152,7 +186,7 @@ def lines(stream: MotionStream, asked: MotionRequest, model: str, notes: Sequenc
         yield "".join(frame_lines(chunk))
 
 
-def _facts(motion: GeneratedMotion, asked: MotionRequest) -> dict[str, Any]:
+def _facts(motion: GeneratedMotion, asked: MotionRequest) -> dict[str, object]:
     return {
         "request": asked.request,
         "caption": motion.caption,
@@ -165,7 +199,51 @@ def _facts(motion: GeneratedMotion, asked: MotionRequest) -> dict[str, Any]:
 
 
 def _file(motion: GeneratedMotion, asked: MotionRequest) -> Answer:
+    writer, name = WRITERS[asked.format], file_stem(asked.seed, motion.caption)
     with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
-        path = motion.save(Path(folder) / f"motion.{asked.format}")
-        body = path.read_bytes()
-    return Answer(body, FILES[asked.format], f"{file_stem(asked.seed, motion.caption)}.{asked.format}")
+        body = motion.save(Path(folder) / f"motion{writer.suffix}").read_bytes()
+    return Answer(body, writer.mime, f"{name}{writer.suffix}")
+
+
+class Sounds:
+    """The sounds used last."""
+
+    def __init__(self, config: ServeConfig) -> None:
+        self._config = config
+        self._kept: OrderedDict[str, Sound] = OrderedDict()
+        self._lock, self._decoding = threading.Lock(), threading.Lock()
+
+    def add(self, data: bytes) -> tuple[str, Sound]:
+        """Decode a file's bytes and keep them; `UserError` for what is no sound, silent or too long."""
+        if not data:
+            raise UserError(f"{_SOUND}: empty (0 bytes)")
+        name = hashlib.sha256(data).hexdigest()[:24]
+        with self._decoding:  # one at a time: a sound takes several times its file's memory
+            with self._lock:
+                sound = self._kept.pop(name, None)
+            sound = self._decode(data) if sound is None else sound
+            with self._lock:
+                self._kept[name] = sound
+                while len(self._kept) > self._config.sounds:
+                    self._kept.popitem(last=False)
+        return name, sound
+
+    def get(self, name: str) -> Sound:
+        with self._lock:
+            sound = self._kept.get(name)
+            if sound is None:
+                raise UserError("the sound is not here any more; send it again")
+            self._kept.move_to_end(name)
+            return sound
+
+    def _decode(self, data: bytes) -> Sound:
+        longest = self._config.max_sound_seconds
+        with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
+            path = Path(folder) / f"sound{_KINDS.get(data[:4], '.mp3')}"
+            path.write_bytes(data)
+            seconds = sound_seconds(path, _SOUND)
+            if seconds > longest:
+                raise UserError(f"{_SOUND} lasts {seconds:.0f} s; this server takes at most {longest:g} s")
+            samples, rate = read_sound(path, _SOUND)
+        require_audible(samples, _SOUND)
+        return Sound(np.clip(samples, -1.0, 1.0), rate)

@@ -63,7 +63,6 @@ class Worker:
 
     @property
     def length(self) -> int:
-        """Calls that wait."""
         return self._calls.qsize()
 
     @property

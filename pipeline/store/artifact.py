@@ -16,8 +16,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.store.files import write_json
-from motionloom.pipeline.store.outside import identity_of, in_export, owner_of
-from motionloom.pipeline.store.run_folder import stage_folder
+from motionloom.pipeline.store.run_folder import identity_of, in_export, owner_of, stage_folder
 
 FILE_NAME = "artifact.json"
 
@@ -49,7 +48,6 @@ class InputStage(Config):
         return {name: value for name, value in handler(self).items() if value is not None}
 
     def place(self, run: Path) -> Path:
-        """The stage's folder."""
         return stage_folder(run, self.stage) if self.folder is None else (run / self.folder).resolve()
 
     def now(self, run: Path) -> str | None:
@@ -71,13 +69,12 @@ class Artifact(Config):
     version: int
     fingerprint: str
     seed: int
-    config: dict[str, Any]
+    config: dict[str, object]
     inputs: dict[str, InputStage]
     outputs: dict[str, OutputFile] = Field(default_factory=dict)
 
     @staticmethod
     def find(folder: Path) -> Artifact | None:
-        """The artifact in a stage folder, or None when the stage has not finished."""
         path = folder / FILE_NAME
         return Artifact.load_json(path) if path.is_file() else None
 
@@ -90,7 +87,6 @@ class Artifact(Config):
         return None
 
     def finish(self, folder: Path) -> Artifact:
-        """Hash every output and write `artifact.json`."""
         outputs = {}
         for path in sorted(p for p in folder.rglob("*") if p.is_file()):
             name = path.relative_to(folder).as_posix()
@@ -101,29 +97,37 @@ class Artifact(Config):
         return done
 
 
-def require_consistent(run: Path, stages: Iterable[str]) -> None:
-    """Refuse stages of a run that were made from something else than what their inputs hold now.
+Changed = tuple[Path, InputStage]
+"""The folder of a stage, and one of its inputs that is another now than the stage was made from."""
+
+
+def changed_above(folder: Path, found: dict[Path, Changed | None]) -> Changed | None:
+    """The first change above a stage, or of its own inputs; `found` keeps what was looked at.
 
     Goes up to the first stage of all, into other runs too; an export is whole in itself. What is gone without
     a trace cannot be compared and is let through.
     """
-    todo, seen = [stage_folder(run, name) for name in stages], set[Path]()
-    while todo:
-        folder = todo.pop()
-        if folder.resolve() in seen:
-            continue
-        seen.add(folder.resolve())
+    key, own = folder.resolve(), folder.parent.parent
+    if key not in found:
+        found[key] = None  # a damaged folder may name itself
         artifact = None if in_export(folder) else Artifact.find(folder)
-        if artifact is None:
-            continue
-        own = folder.parent.parent
-        for source in artifact.inputs.values():
-            if source.now(own) not in (None, source.fingerprint):
-                raise UserError(
-                    f"{own}: stage '{folder.name}' was made from another {source.say(own)}, which has been "
-                    f"made anew since; finish the run: motionloom run {own / 'recipe.yaml'} -o {own}"
-                )
-            todo.append(source.place(own))
+        sources = [] if artifact is None else list(artifact.inputs.values())
+        own_ones = ((folder, one) for one in sources if one.now(own) not in (None, one.fingerprint))
+        above = (changed_above(source.place(own), found) for source in sources)
+        found[key] = next(own_ones, None) or next(filter(None, above), None)
+    return found[key]
+
+
+def require_consistent(run: Path, stages: Iterable[str]) -> None:
+    """Refuse stages of a run that were made from something else than what their inputs hold now."""
+    for name in stages:
+        if changed := changed_above(stage_folder(run, name), {}):
+            folder, source = changed
+            own = folder.parent.parent
+            raise UserError(
+                f"{own}: stage '{folder.name}' was made from another {source.say(own)}, which has been made "
+                f"anew since; finish the run: motionloom run {own / 'recipe.yaml'} -o {own}"
+            )
 
 
 def fingerprint_now(folder: Path) -> str | None:

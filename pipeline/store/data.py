@@ -12,10 +12,11 @@ from pydantic import Field
 from motionloom.datasets.loading.mix import MixedDataset
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Config, Manifest
+from motionloom.datasets.shards.cache import CacheConfig
 from motionloom.datasets.shards.checksums import LocalShard
 from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset, read_manifest
-from motionloom.datasets.shards.reading import CacheConfig, Reading
 from motionloom.datasets.shards.store import LocalStore, Store, open_store
 
 SHARDS = "shards"
@@ -177,11 +178,9 @@ class Data:
 
     @cached_property
     def layout(self) -> MotionLayout:
-        """Layout of the clips."""
         return self.split(splits_of(self.folder)[0]).layout
 
     def split(self, name: str, *, training: bool = False) -> ClipDataset:
-        """See `open_split`."""
         return open_split(self.folder, name, training=training)
 
     def held_out(self, *, prefer: str = "val") -> ClipDataset:

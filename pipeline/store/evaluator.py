@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.cache import key_of
@@ -50,7 +50,6 @@ class StageWords:
     """The evaluator's file, for messages."""
 
     def read(self, captions: Sequence[str], tokens: Sequence[Sequence[str]]) -> Words:
-        """See `CaptionReader`; tags play no part."""
         cache = self.text.cache
         if cache.encoder != self.encoder:
             raise UserError(
@@ -76,13 +75,12 @@ class LoadedEvaluator:
     stats: FeatureStats
     """Mean and deviation of its motion."""
     words: CaptionReader
-    facts: dict[str, Any] = field(default_factory=dict)
+    facts: dict[str, object] = field(default_factory=dict)
     """What else has to be known of its figures, for the protocol of an evaluation."""
     part: Part = PART
 
     @property
     def max_frames(self) -> int:
-        """Longer motions are cut to this."""
         return self.net.max_frames
 
     def require_layout(self, layout: MotionLayout, stage: str) -> None:

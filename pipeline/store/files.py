@@ -4,38 +4,49 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from motionloom.datasets.base import files
 from motionloom.datasets.schema import UserError
 
 
 def require_folder(folder: Path) -> None:
-    """Refuse a place for files that is a file, or lies below one; nothing is made yet."""
+    """Refuse an output folder that is a file, or is below one; creates nothing."""
     there = next((place for place in (folder, *folder.parents) if place.exists()), folder)
     if there.exists() and not there.is_dir():
         raise UserError(f"{there}: is a file, and a folder is needed here; choose another name")
 
 
 def require_file_place(path: Path) -> None:
-    """Refuse a name for a file that is a folder, or lies below a file; nothing is made yet."""
+    """Refuse an output file that is a folder, or is below a file; creates nothing."""
     if path.is_dir():
         raise UserError(f"{path}: is a folder; name a file, like {path / 'NAME'}")
     require_folder(path.parent)
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_json(path: Path, data: object) -> None:
     """Write a record of a run atomically, keys sorted; a figure that is not finite is written as `NaN`."""
     files.write_json(path, data, sort_keys=True, allow_nan=True)
 
 
-def fingerprint_of(data: Any) -> str:
+def read_record(path: Path) -> dict[str, object]:
+    """A JSON object that a run keeps; a `UserError` names the file."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); run its stage again") from None
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not valid JSON ({error}); run its stage again") from None
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: holds no JSON object; run its stage again")
+    return data
+
+
+def fingerprint_of(data: object) -> str:
     """What tells one set of settings and inputs from another: sha256 of plain JSON data, hex.
 
     Kept apart from `sha256_of_json`: it goes by the characters, not their escapes, and finished runs hold it.
@@ -77,12 +88,3 @@ def copy_files(source: Path, target: Path, names: Iterable[str]) -> None:
     target.mkdir(parents=True, exist_ok=True)
     for name in names:
         shutil.copyfile(source / name, target / name)
-
-
-def link_or_copy(path: Path, target: Path) -> None:
-    """The same file under a second name, or a copy where the file system has no links."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(path, target)
-    except OSError:
-        shutil.copy2(path, target)

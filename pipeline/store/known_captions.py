@@ -23,7 +23,7 @@ from motionloom.datasets.schema import Config, UserError
 KNOWN_FILES = ("known.json", "known.safetensors")
 
 COUNT = 384
-"""Captions that stand for all of a kind; of bodies and of faces."""
+"""Number of representative captions of each kind, of bodies and of faces."""
 
 FAR = 0.45
 """Cosine below which a caption is far from another.

@@ -12,13 +12,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import PRESENT_ALL
+from motionloom.datasets.schema import PRESENT_ALL, UserError
+from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
+from motionloom.models.utt.network import ConditionedUtt
+from motionloom.pipeline.store.weights import ModelFacts
 
 CPU = torch.device("cpu")
 
@@ -38,7 +41,6 @@ class TrainedTokenizer:
 
     @property
     def layout(self) -> MotionLayout:
-        """Layout of the full frames."""
         return self.net.layout
 
     @cached_property
@@ -48,7 +50,6 @@ class TrainedTokenizer:
 
     @property
     def stats(self) -> FeatureStats:
-        """Mean and deviation of its input."""
         stats: FeatureStats = self.given["stats"]
         return stats
 
@@ -103,9 +104,7 @@ class TrainedTokenizer:
 class TokensOfCaptions(Protocol):
     """A cache of encoded captions, or a text stage."""
 
-    def tokens(self, captions: Sequence[str]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Token features [n, S, E] and the mask [n, S]."""
-        ...
+    def tokens(self, captions: Sequence[str]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]: ...
 
 
 @dataclass(frozen=True)
@@ -125,13 +124,11 @@ class LoadedTma:
 
     @property
     def stats(self) -> FeatureStats:
-        """Mean and deviation of its motion."""
         stats: FeatureStats = self.given["stats"]
         return stats
 
     @property
     def device(self) -> torch.device:
-        """Where the network lies."""
         return device_of(self.net)
 
     @torch.no_grad()
@@ -165,3 +162,97 @@ class LoadedGpt:
 
     net: InterleavedGPT
     prior: str
+
+
+@dataclass(frozen=True)
+class LoadedDmd:
+    """A trained decoder."""
+
+    net: Dmd
+    window: int
+    given: Mapping[str, Any]
+    """What its stage was given; "tokenizer" of it."""
+
+
+@dataclass(frozen=True)
+class LoadedUtt:
+    """A trained token model."""
+
+    net: ConditionedUtt
+    max_frames: int
+    """Frames of a training window."""
+    given: Mapping[str, Any]
+    """What its stage was given: "tokenizer", and "text" and "audio" as its modalities are."""
+
+    @property
+    def modalities(self) -> frozenset[str]:
+        return frozenset(self.net.mate.widths)
+
+
+def stream_facts(tokenizer: Tokenizer) -> dict[str, object]:
+    """What a network over a tokenizer's codes writes down: `streams` (codes by name) and `pattern`."""
+    return {
+        "streams": {stream.name: stream.num_codes for stream in tokenizer.streams},
+        "pattern": list(tokenizer.pattern),
+    }
+
+
+def require_streams(facts: ModelFacts, tokenizer: Tokenizer, what: str) -> None:
+    """`UserError` unless the tokenizer has the streams and the pattern that the network was trained on."""
+    here = stream_facts(tokenizer)
+    streams, pattern = facts.fact("streams", dict), facts.fact("pattern", list)
+    if (streams, pattern) != (here["streams"], here["pattern"]):
+        raise UserError(
+            f"{facts.where}: this {what} was trained on streams {streams} in the order {pattern}, the "
+            f"tokenizer has {here['streams']} in the order {here['pattern']}; train it again on this one"
+        )
+
+
+class MotionJudge(Protocol):
+    """What embeds motions: an alignment model (TMA, TEMOS) or an evaluator."""
+
+    @property
+    def layout(self) -> MotionLayout: ...
+
+    @property
+    def part(self) -> Part: ...
+
+    @property
+    def stats(self) -> FeatureStats: ...
+
+    @property
+    def max_frames(self) -> int: ...
+
+    def embed_motion(self, motion: Tensor, length: Tensor, present: Tensor | None = None) -> Tensor:
+        """Latents [B, Z] of normalised features [B, T, D]."""
+        ...
+
+
+def embed_motions(
+    judge: MotionJudge,
+    motions: Sequence[NDArray[np.float32]],
+    present: Sequence[int] | None = None,
+    batch: int = 64,
+) -> Tensor:
+    """Latents [n, Z] of body-hand features, by TMA or an evaluator; longer motions are cut at its length.
+
+    `present` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
+    """
+    columns = judge.layout.part(judge.part)
+    mean, std = judge.stats.mean[columns], judge.stats.std[columns]
+    order = np.argsort([len(m) for m in motions], kind="stable")
+    masks = judge.layout.present_columns[:, columns][
+        [PRESENT_ALL] * len(motions) if present is None else present
+    ]
+    out: dict[int, Tensor] = {}
+    for start in range(0, len(order), batch):
+        rows = order[start : start + batch].tolist()
+        cut = [(motions[i][: judge.max_frames] - mean) / std for i in rows]
+        length = torch.tensor([len(m) for m in cut])
+        motion = torch.zeros(len(cut), int(length.max()), len(columns))
+        for row, values in enumerate(cut):
+            motion[row, : len(values)] = torch.from_numpy(values.astype(np.float32))
+        near = torch.from_numpy(masks[rows])
+        for i, latent in zip(rows, judge.embed_motion(motion, length, near).cpu(), strict=True):
+            out[i] = latent
+    return torch.stack([out[i] for i in range(len(motions))])

@@ -26,7 +26,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
@@ -90,12 +90,10 @@ class PublishedWords:
 
     @cached_property
     def rows(self) -> Mapping[str, int]:
-        """Row of each word."""
         return {word: row for row, word in enumerate(self.vocabulary.words)}
 
     @cached_property
     def own_class(self) -> Mapping[str, str]:
-        """Class of the words that stand in a list."""
         out: dict[str, str] = {}
         for name, words in self.vocabulary.lists.items():
             for word in words:

@@ -1,21 +1,134 @@
-"""How far a run has come, from its files alone: no stage is loaded, and torch is not imported."""
+"""A run read from its files alone: its finished stages and how far the others are.
+
+No stage is loaded and torch is not imported. Everything that reads a run begins here: `contract/lookup.py`
+makes stages of these records that can be loaded, the report, `compare` and the papers' tables take them as
+they are.
+"""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from motionloom.datasets.schema import UserError
-from motionloom.pipeline.store.artifact import Artifact
-from motionloom.pipeline.store.outside import in_export
-from motionloom.pipeline.store.run_folder import require_run, stage_folder, stages_of
+from motionloom.pipeline.store.artifact import Artifact, Changed, changed_above
+from motionloom.pipeline.store.files import read_record
+from motionloom.pipeline.store.run_folder import (
+    BUNDLE_FILE,
+    identity_of,
+    in_export,
+    label_of,
+    owner_of,
+    require_run,
+    stage_folder,
+    stages_of,
+)
 from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.store.yaml import read_yaml
 
 Progress = Literal["finished", "outdated", "started", "missing"]
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """A finished stage: its kind, its config with every default, and the stages that fed it, by role."""
+
+    name: str
+    """Of a stage outside the run that was opened: the run's name and its own, `other:gpt`."""
+    kind: str
+    version: int
+    fingerprint: str
+    folder: Path
+    config: Mapping[str, object]
+    inputs: Mapping[str, StageRecord]
+    """In the order of the recipe, then those of other runs."""
+    outside: bool = False
+    """In another run than the one that was opened, or in an export."""
+    gone: Mapping[str, Path] = field(default_factory=dict)
+    """Roles filled by stages of other runs that are not there any more, and where they were."""
+
+    def upstream(self) -> Iterator[StageRecord]:
+        """All stages above this one, some of them more than once."""
+        for stage in self.inputs.values():
+            yield stage
+            yield from stage.upstream()
+
+
+class RunReader:
+    """Reads finished stages and those that fed them, each once, into other runs too."""
+
+    def __init__(self, home: Path | None) -> None:
+        """`home` is the run whose stages have no run in their names; None where all of them do."""
+        self._home = None if home is None else home.resolve()
+        self._found: dict[Path, StageRecord | None] = {}
+        self._places: dict[Path, dict[Path, int]] = {}
+
+    def find(self, folder: Path) -> StageRecord | None:
+        """The stage in a folder; None where it has not finished."""
+        key = folder.resolve()
+        if key not in self._found:
+            self._found[key] = None  # a damaged folder may name itself
+            self._found[key] = self._read(folder)
+        return self._found[key]
+
+    def _read(self, folder: Path) -> StageRecord | None:
+        exported = in_export(folder)
+        artifact = _exported_artifact(folder) if exported else Artifact.find(folder)
+        if artifact is None:
+            return None
+        run = owner_of(folder)
+        inputs, gone = dict[str, StageRecord](), dict[str, Path]()
+        for role, source in artifact.inputs.items():
+            stage = self.find(source.place(run))
+            if stage is not None:
+                inputs[role] = stage
+            elif source.folder is not None:
+                gone[role] = source.place(run)
+        outside = run.resolve() != self._home
+        return StageRecord(
+            name=label_of(folder) if outside else folder.name,
+            kind=artifact.kind,
+            version=artifact.version,
+            fingerprint=artifact.fingerprint,
+            folder=folder,
+            config=artifact.config,
+            inputs=inputs if exported else self._in_order(inputs, run),
+            outside=outside,
+            gone=gone,
+        )
+
+    def _in_order(self, inputs: Mapping[str, StageRecord], run: Path) -> dict[str, StageRecord]:
+        """As the run's recipe has their stages, then others; an artifact lists them by role."""
+        if run not in self._places:
+            names = enumerate(stages_of(run))
+            self._places[run] = {stage_folder(run, name).resolve(): number for number, name in names}
+        own = self._places[run]
+        return dict(sorted(inputs.items(), key=lambda item: own.get(item[1].folder.resolve(), len(own))))
+
+
+def finished_records(run: Path) -> dict[str, StageRecord]:
+    """The finished stages of a run by name, in the recipe's order."""
+    reader = RunReader(run)
+    found = {name: reader.find(stage_folder(run, name)) for name in stages_of(run)}
+    return {name: stage for name, stage in found.items() if stage is not None}
+
+
+def _exported_artifact(folder: Path) -> Artifact | None:
+    """What made a stage of an export, as far as the export says it."""
+    where = folder.parent / BUNDLE_FILE
+    entries = read_record(where).get("stages")
+    entry = entries.get(folder.name) if isinstance(entries, dict) else None
+    if not isinstance(entry, dict):
+        return None
+    inputs = {
+        role: {"stage": name, "fingerprint": "", "folder": str(folder.parent.resolve() / str(name))}
+        for role, name in dict(entry.get("inputs", {})).items()
+    }
+    identity = str(identity_of(folder))
+    data = {"stage": folder.name, "fingerprint": identity, "seed": 0, "inputs": inputs}
+    data |= {key: entry[key] for key in ("kind", "version", "config") if key in entry}
+    return Artifact.parse(data, f"{where}: stages.{folder.name}")
 
 
 @dataclass(frozen=True)
@@ -25,10 +138,10 @@ class StageState:
     name: str
     kind: str
     folder: Path
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
     """What made it, of a finished stage; else what its recipe says."""
     progress: Progress
-    inputs: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Mapping[str, object] = field(default_factory=dict)
     """Roles that its recipe fills otherwise than by their names."""
     why: str = ""
     """What makes a finished stage outdated."""
@@ -48,7 +161,6 @@ class StageState:
         return self.progress == "finished"
 
     def say(self) -> str:
-        """Its progress, for people."""
         if self.progress == "outdated":
             return f"outdated: {self.why}"
         if self.progress == "started":
@@ -66,21 +178,15 @@ class RunState:
     recipe: str
     seed: int | None
     data_seed: int | None
-    hardware: Mapping[str, Any]
+    hardware: Mapping[str, object]
     stages: tuple[StageState, ...]
 
     def stage(self, name: str) -> StageState | None:
-        """A stage by name, None where the recipe has none."""
         return next((stage for stage in self.stages if stage.name == name), None)
 
     @property
     def unfinished(self) -> list[StageState]:
-        """Stages that there is something missing of."""
         return [stage for stage in self.stages if not stage.usable]
-
-    def say_unfinished(self) -> str:
-        """What is missing, in words; nothing where all is there."""
-        return "; ".join(f"{stage.name} ({stage.say()})" for stage in self.unfinished)
 
 
 def run_state(run: Path) -> RunState:
@@ -89,36 +195,25 @@ def run_state(run: Path) -> RunState:
     entries = stages_of(run)
     recipe = read_yaml(run / "recipe.yaml")
     seed, data_seed = recipe.get("seed"), recipe.get("data_seed")
-    causes: dict[str, str] = {}
+    changes: dict[Path, Changed | None] = {}
     return RunState(
         folder=run,
         recipe=str(recipe.get("name", run.name)),
         seed=seed if isinstance(seed, int) else None,
         data_seed=data_seed if isinstance(data_seed, int) else None,
         hardware=_mapping(recipe.get("hardware")),
-        stages=tuple(_stage(run, name, entry, causes) for name, entry in entries.items()),
+        stages=tuple(_stage(run, name, entry, changes) for name, entry in entries.items()),
     )
 
 
-def read_record(path: Path) -> dict[str, Any]:
-    """A JSON object that a run keeps; a `UserError` names the file."""
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); run its stage again") from None
-    except ValueError as error:
-        raise UserError(f"{path}: not valid JSON ({error}); run its stage again") from None
-    if not isinstance(data, dict):
-        raise UserError(f"{path}: holds no JSON object; run its stage again")
-    return data
-
-
-def _stage(run: Path, name: str, entry: Mapping[str, Any], causes: dict[str, str]) -> StageState:
+def _stage(
+    run: Path, name: str, entry: Mapping[str, object], changes: dict[Path, Changed | None]
+) -> StageState:
     folder = stage_folder(run, name)
     written = {key: value for key, value in entry.items() if key not in ("kind", "inputs")}
     artifact = Artifact.find(folder)
     settings = written if artifact is None else artifact.config
-    why = "" if artifact is None else _why_outdated(run, name, causes)
+    why = "" if artifact is None else _why_outdated(run, name, changes)
     progress: Progress = "finished" if not why else "outdated"
     if artifact is None:
         progress = "started" if (folder / "started.json").is_file() else "missing"
@@ -142,29 +237,16 @@ def _stage(run: Path, name: str, entry: Mapping[str, Any], causes: dict[str, str
     )
 
 
-def _why_outdated(run: Path, name: str, causes: dict[str, str]) -> str:
+def _why_outdated(run: Path, name: str, found: dict[Path, Changed | None]) -> str:
     """The first stage above a finished one that is another now than it was made from."""
-    return _cause(stage_folder(run, name), run.resolve(), causes)
+    changed = changed_above(stage_folder(run, name), found)
+    if changed is None:
+        return ""
+    folder, source = changed
+    own = folder.parent.parent
+    there = f" of {own}" if source.folder is None and own.resolve() != run.resolve() else ""
+    return f"{source.say(own)}{there} has been made anew since"
 
 
-def _cause(folder: Path, home: Path, causes: dict[str, str]) -> str:
-    key = str(folder.resolve())
-    if key not in causes:
-        causes[key] = ""  # a damaged folder may name itself
-        artifact = None if in_export(folder) else Artifact.find(folder)
-        own = folder.parent.parent
-        for source in () if artifact is None else artifact.inputs.values():
-            if source.now(own) not in (None, source.fingerprint):
-                there = "" if own.resolve() == home else f" of {own}"
-                causes[key] = (
-                    f"{source.say(own)}{there if source.folder is None else ''} has been made anew since"
-                )
-            elif cause := _cause(source.place(own), home, causes):
-                causes[key] = cause
-            if causes[key]:
-                break
-    return causes[key]
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
+def _mapping(value: object) -> Mapping[str, object]:
     return value if isinstance(value, dict) else {}

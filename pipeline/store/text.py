@@ -1,28 +1,38 @@
-"""What a text stage gives: its cache of encoded captions, and the encoder that made it, for new words."""
+"""What a text stage gives: its cache of encoded captions, and the encoder that made it, for new words.
+
+An export brings a copy of the encoder along.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.places import hub_is_away
 from motionloom.datasets.schema import Config, UserError
-from motionloom.datasets.text.cache import TextCache, key_of
+from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
-from motionloom.pipeline.store.encoder_files import BUILT_IN, copy_encoder, copy_encoder_files, place_of
-from motionloom.pipeline.store.files import copy_files, write_json
+from motionloom.pipeline.store.files import copy_files, remove_tree, write_json
 from motionloom.pipeline.store.known_captions import KNOWN_FILES, KnownCaptions, Unknown, load_known
 
+BUILT_IN = "minilm"
+"""Comes with the installation, so it is never copied."""
+
+_PLACE = "encoder.json"
+_SUFFIXES = (".safetensors", ".json", ".txt", ".model", ".md")
+"""What a text encoder's folder may bring along; pickled weights and code stay behind."""
 _EXPORTED = "text.json"
 _COPY = "encoder"
 _KNOWN_WIDTHS = {BUILT_IN: 384, "openai/clip-vit-base-patch32": 512}
 _USUAL_WIDTH = 768
-"""Of DistilBERT and CLIP ViT-L/14, assumed for encoders that are not loaded to look."""
+"""Width of DistilBERT and CLIP ViT-L/14, assumed for encoders that are not loaded to look."""
 
 
 class ExportedText(Config):
@@ -54,7 +64,7 @@ class TextSource:
     """The encoder as its config names it."""
     device: torch.device
     exported: bool = False
-    """In an export, where `text.json` says which encoder, and `named` plays no part."""
+    """In an export, where `text.json` says which encoder, and `named` is ignored."""
 
     @cached_property
     def cache(self) -> TextCache:
@@ -63,7 +73,6 @@ class TextSource:
 
     @cached_property
     def dim(self) -> int:
-        """Width of its features."""
         if self.exported:
             return ExportedText.load_json(self.folder / _EXPORTED).dim
         return self.cache.dim
@@ -99,7 +108,7 @@ class TextSource:
 
     @cached_property
     def known(self) -> Mapping[str, KnownCaptions]:
-        """Captions that stand for those of the training, "body" and "face"; none where they were not kept."""
+        """Captions that represent those of the training, "body" and "face"; none where they were not kept."""
         return load_known(self.folder)
 
     def unknown(self, captions: Sequence[str], *, face: bool = False) -> list[Unknown]:
@@ -111,7 +120,6 @@ class TextSource:
 
     @cached_property
     def _sentences(self) -> TextEncoder:
-        """The encoder of `known`."""
         if self.encoder_name == BUILT_IN:
             return self.encoder
         return load_text_encoder(BUILT_IN, device=str(self.device))
@@ -128,3 +136,73 @@ class TextSource:
                 copy_encoder(name, self.folder, target / _COPY)
             name = _COPY
         write_json(target / _EXPORTED, ExportedText(encoder=name, dim=self.dim).dump())
+
+
+class EncoderPlace(Config):
+    """`encoder.json` of a text stage whose encoder is a folder."""
+
+    folder: str
+    """Absolute: the recipe may name it from the folder the run was started in."""
+
+
+def keep_place(spec: str, stage: Path) -> None:
+    """Write down where an encoder that is a folder lies; a hub name says so itself."""
+    folder = Path(spec).expanduser()
+    if spec != BUILT_IN and folder.is_dir():
+        write_json(stage / _PLACE, EncoderPlace(folder=str(folder.absolute())).dump())
+
+
+def place_of(stage: Path) -> str | None:
+    """The folder that `keep_place` wrote down, if the encoder is one."""
+    path = stage / _PLACE
+    return EncoderPlace.load_json(path).folder if path.is_file() else None
+
+
+def copy_encoder(spec: str, stage: Path, target: Path) -> None:
+    """Copy the encoder of a text stage into `target`: from its folder, or from the hub (its cache first).
+
+    The copy is loaded once: it must have the weights that encoded the run's captions.
+    """
+    from motionloom.datasets.text.encoder import load_text_encoder
+
+    digest = CacheInfo.load_json(stage / "cache" / "cache.json").encoder.rpartition(":")[2]
+    problem = ""
+    for find in _sources(spec):
+        try:
+            copy_encoder_files(find(), target)
+            if load_text_encoder(str(target)).name.endswith(f":{digest}"):
+                return
+            problem = "its weights are not those that encoded this run's captions"
+        except Exception as error:  # the hub's library raises many kinds
+            problem = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        remove_tree(target)
+    raise UserError(
+        f"text encoder '{spec}' cannot be copied ({problem}); put the model back where the text stage found "
+        f"it: in its folder, seen from where the run was started, or on the hub or in the hub's cache"
+    )
+
+
+def _sources(spec: str) -> list[Callable[[], Path]]:
+    """Ways to a folder that holds the encoder, in the order to be tried."""
+    from huggingface_hub import snapshot_download
+
+    folder = Path(spec).expanduser()
+    if folder.is_dir() or folder.is_absolute():
+        return [lambda: folder]
+    patterns = [f"*{suffix}" for suffix in _SUFFIXES]
+
+    def fetched(only_cached: bool) -> Path:
+        return Path(snapshot_download(spec, allow_patterns=patterns, local_files_only=only_cached))
+
+    return [partial(fetched, only_cached) for only_cached in ((True,) if hub_is_away() else (True, False))]
+
+
+def copy_encoder_files(source: Path, target: Path) -> None:
+    """Copy the files of an encoder that may be exported: no pickled weights, no code."""
+    if not source.is_dir():
+        raise UserError(f"{source}: no such folder")
+    for path in sorted(source.rglob("*")):
+        if path.is_file() and path.suffix in _SUFFIXES:
+            copy = target / path.relative_to(source)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)

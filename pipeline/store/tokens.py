@@ -4,14 +4,15 @@ One `tokens-SPLIT.safetensors` per split: for each stream the codes of all clips
 clip begins, counted in groups of four frames. Written once by the `tokens` stage, never re-encoded by a GPT.
 
 A clip that lacks a part which the tokenizer models (hands, face) has codes, but some of them say what was
-never recorded: clips that lack nothing are marked (`whole`). Which codes of the others a GPT may learn,
-`pipeline/stages/gpt_data.py` says.
+never recorded: clips that lack nothing are marked (`whole`). A GPT leaves out clips without a caption (of the
+face, for the face GPT) and those that lack a part whose tokens say more than that part. A clip that lacks a
+part with a stream of its own (hands, in H2VQ) stays; that stream's tokens are neither predicted nor read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,11 +26,15 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from motionloom.datasets.base.files import atomic_path
+from motionloom.datasets.loading.crops import CaptionSpan, caption_spans
 from motionloom.datasets.loading.plan import BatchPlan
-from motionloom.datasets.loading.samples import BatchRow
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import ClipDataset, in_order
 from motionloom.datasets.shards.order import Source
 from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences, stream_names
+from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.pipeline.store.data import captions_of
 
 Codes = dict[str, Tensor]
 
@@ -46,7 +51,6 @@ class TokenStore:
 
     @property
     def groups(self) -> NDArray[np.int64]:
-        """Length of each clip in groups."""
         return np.diff(self.starts)
 
     def clip(self, index: int, first: int = 0, count: int | None = None) -> Codes:
@@ -56,7 +60,6 @@ class TokenStore:
         return {name: flat[begin * n : end * n] for (name, flat), n in self._streams()}
 
     def whole_clips(self) -> TokenStore:
-        """The store of the clips in `whole` alone, in order."""
         return self.of(self.whole)
 
     def of(self, chosen: NDArray[np.bool_]) -> TokenStore:
@@ -73,7 +76,6 @@ class TokenStore:
         return [((name, flat), self.per_group[name]) for name, flat in self.codes.items()]
 
     def save(self, path: Path) -> None:
-        """Write the store."""
         tensors = {f"codes.{name}": flat.to(torch.int32) for name, flat in self.codes.items()}
         tensors["starts"] = torch.from_numpy(self.starts)
         tensors["whole"] = torch.from_numpy(self.whole)
@@ -92,8 +94,6 @@ class TokenStore:
         codes = {k.removeprefix("codes."): v.long() for k, v in tensors.items() if k.startswith("codes.")}
         if set(codes) != set(per_group):
             raise UserError(f"{path}: holds streams {sorted(codes)}, the tokenizer has {sorted(per_group)}")
-        if "whole" not in tensors:
-            raise UserError(f"{path}: written by an older version; run the tokens stage again")
         return TokenStore(codes, tensors["starts"].numpy(), per_group, tensors["whole"].numpy())
 
 
@@ -150,8 +150,6 @@ class TokenBatches(Dataset[dict[str, Any]]):
     training: bool = True
     sources: tuple[Source, ...] = ()
     """Data sets and their weights, when several are mixed."""
-    ids: Sequence[str] = ()
-    """Names of the clips, for people."""
     latents: Tensor | None = None
     """TMA's embeddings of the same captions [n, Z], for an alignment loss where `prior` is something else."""
     present: PresentTokens | None = None
@@ -194,15 +192,6 @@ class TokenBatches(Dataset[dict[str, Any]]):
             **more,
         }
 
-    def samples(self, k: int) -> list[BatchRow]:
-        """Which stretches batch `k` of a training holds."""
-        turns, items = self._plan.local(k, self.rank, self.world)
-        out = []
-        for turn, item in zip(turns.tolist(), items.tolist(), strict=True):
-            _, first, groups = self._drawn(item, turn)
-            out.append(BatchRow(self.ids[item] if self.ids else str(item), first, groups))
-        return out
-
     def _drawn(self, item: int, turn: int) -> tuple[TokenCaption, int, int]:
         """A caption of a clip, and first group and length of the stretch it is about, or of a random part of
         one that is longer than the block.
@@ -220,3 +209,98 @@ class TokenBatches(Dataset[dict[str, Any]]):
     def _row(self, codes: Codes, *, closed: bool) -> TokenSequence:
         batched = {name: row[None] for name, row in codes.items()}
         return interleave(batched, self.pattern, ends=self.ends if closed else None)
+
+
+@dataclass(frozen=True)
+class GptClips:
+    """Clips of one split, n of them, and m different captions."""
+
+    store: TokenStore
+    """Their tokens alone."""
+    captions: list[list[TokenCaption]]
+    """Those of each clip, n lists."""
+    texts: list[str]
+    """All captions, [m]."""
+    present: PresentTokens | None
+    """Which of their tokens were recorded; None when all were."""
+    sources: tuple[Source, ...]
+    ids: tuple[str, ...]
+    """Their names."""
+    uncaptioned: int
+    """Clips that were left out because they have no caption."""
+
+
+def gpt_clips(
+    dataset: ClipDataset, store: TokenStore, tokenizer: Tokenizer, *, face: bool, min_frames: int
+) -> GptClips:
+    """The clips of `dataset` that a GPT over the tokens of `tokenizer` can train on.
+
+    `store` holds the tokens of all clips. Captions about fewer than `min_frames` frames give way to longer
+    ones of the same clip.
+    """
+    table = present_table(tokenizer, dataset.layout)
+    usable = table.usable[dataset.present]
+    if not usable.any():
+        raise UserError(
+            f"{dataset.where}: no clip of split '{dataset.split}' holds all that the tokenizer models "
+            f"(hands, face): train a tokenizer of another `part`, or take other data"
+        )
+    member = "face_texts.json" if face else "texts.json"
+    chosen = usable & dataset.has(member)
+    clips = np.flatnonzero(chosen)
+    if len(clips) == 0:
+        kind = "face caption" if face else "caption"
+        raise UserError(
+            f"{dataset.where}: no clip of split '{dataset.split}' has a {kind} to train a GPT on; "
+            f"convert data with {kind}s"
+        )
+    own = store.of(chosen)
+    rows: dict[str, int] = {}
+    captions = []
+    for number, index in enumerate(in_order(dataset, member, clips=clips.tolist())):
+        found, frames = captions_of(dataset, index, face=face), int(dataset.frames[index])
+        spans = caption_spans(found, dataset.layout.fps, frames, min_frames)
+        groups = int(own.groups[number])
+        captions.append([_caption(span, groups, tokenizer.group_frames, rows) for span in spans])
+    bits = torch.from_numpy(dataset.present[clips].astype(np.int64))
+    return GptClips(
+        own,
+        captions,
+        list(rows),
+        None if table.streams[bits].all() else PresentTokens(bits, table.streams, table.columns),
+        # Weights count; the order of shards does not, as the tokens are all in memory.
+        tuple(replace(source, shards=None) for source in dataset.sources(clips)),
+        tuple(dataset.ids[clip] for clip in clips.tolist()),
+        int((usable & ~chosen).sum()),
+    )
+
+
+def _caption(span: CaptionSpan, groups: int, unit: int, rows: dict[str, int]) -> TokenCaption:
+    """The groups whose borders are nearest to the caption's, at least one."""
+    first = min((span.first + unit // 2) // unit, groups - 1)
+    end = min(max((span.end + unit // 2) // unit, first + 1), groups)
+    return TokenCaption(rows.setdefault(span.text, len(rows)), first, end)
+
+
+@dataclass(frozen=True)
+class PresentTable:
+    """What clips with the bits b (row b, see `ClipMeta.present`) have of a tokenizer's input and output."""
+
+    columns: Tensor
+    """bool [4, C]: columns of the tokenizer."""
+    streams: Tensor
+    """bool [4, K]: streams whose tokens say what was recorded, in the order of `stream_names`."""
+    usable: NDArray[np.bool_]
+    """[4]: whether any stream is left that a GPT can learn."""
+
+
+def present_table(tokenizer: Tokenizer, layout: MotionLayout) -> PresentTable:
+    """The table of a tokenizer and the layout of the full frames."""
+    columns = torch.from_numpy(layout.present_columns[:, tokenizer.columns.cpu().numpy()])
+    found = tokenizer.missing(columns.to(tokenizer.columns.device))
+    missing = {name: value.cpu() for name, value in found.items()}
+    # A tokenizer that gives a part a stream of its own keeps that part out of the other streams.
+    others = torch.ones(len(columns), dtype=torch.bool) if missing else columns.all(1)
+    known = [~missing[name] if name in missing else others for name in stream_names(tokenizer.pattern)]
+    streams = torch.stack(known, dim=1)
+    return PresentTable(columns, streams, streams.any(1).numpy())

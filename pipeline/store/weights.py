@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from pydantic import Field, PrivateAttr
@@ -30,11 +30,9 @@ class LayoutFacts(Config):
 
     @staticmethod
     def of(layout: MotionLayout) -> LayoutFacts:
-        """The facts of a layout."""
         return LayoutFacts(name=layout.name, fps=layout.fps, family=layout.family)
 
     def layout(self) -> MotionLayout:
-        """The layout again."""
         return MotionLayout.named(self.name, fps=self.fps, family=self.family)  # type: ignore[arg-type]
 
 
@@ -42,9 +40,9 @@ class ModelFacts(Config):
     """`model.json`."""
 
     kind: str
-    config: dict[str, Any]
+    config: dict[str, object]
     layout: LayoutFacts
-    extra: dict[str, Any] = Field(default_factory=dict)
+    extra: dict[str, object] = Field(default_factory=dict)
     _where: str = PrivateAttr("model.json")
 
     def fact(self, key: str, kind: type[Fact]) -> Fact:
@@ -57,7 +55,6 @@ class ModelFacts(Config):
 
     @property
     def where(self) -> str:
-        """The file these were read from, for messages."""
         return self._where
 
 

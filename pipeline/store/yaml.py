@@ -7,7 +7,9 @@ ones are refused, as in `yaml.safe_load`.
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,20 @@ _CORE = (
 
 class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        """Refuse a key that is written twice, of which PyYAML would keep the last; `<<` may repeat keys."""
+        seen: dict[tuple[str, str], int] = {}
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.tag == "tag:yaml.org,2002:merge":
+                continue
+            line, name = key.start_mark.line + 1, (key.tag, key.value)
+            if name in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key '{key.value}' is in line {seen[name]} already; keep one", key.start_mark
+                )
+            seen[name] = line
+        return super().construct_mapping(node, deep)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -78,6 +94,31 @@ def read_yaml(path: Path) -> Any:
     return load_yaml(text, str(path))
 
 
-def dump_yaml(data: Any) -> str:
+def dump_yaml(data: object) -> str:
     """YAML of plain data, in its order; reading it again gives equal data."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+
+
+def flatten(settings: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    """`{"train": {"steps": 5}}` as `{"train.steps": 5}`; lists stay whole."""
+    out: dict[str, object] = {}
+    for key, value in settings.items():
+        name = f"{prefix}.{key}" if prefix else str(key)
+        if isinstance(value, Mapping) and value:
+            out |= flatten(value, name)
+        else:
+            out[name] = value
+    return out
+
+
+def setting_text(value: object) -> str:
+    """As it would stand in a recipe, on one line."""
+    if isinstance(value, str):
+        return value or "(empty)"
+    if value is None:
+        return "null"
+    if isinstance(value, list) and all(isinstance(one, str | int | float) for one in value):
+        return "[" + ", ".join(str(one) for one in value) + "]"
+    if isinstance(value, float):
+        return f"{value:g}"
+    return json.dumps(value, ensure_ascii=False)

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.convert.amass.convert import AmassConfig, prepare_amass
+from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
 from motionloom.datasets.schema import Manifest, Split
 from motionloom.datasets.shards.reader import ShardDataset
 
@@ -73,7 +74,7 @@ def in_parts(clip: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def make(source: Path, out: Path, *, workers: int = 1, **options: Any) -> Manifest:
-    conversion = prepare_amass(AmassConfig(source=source, **options), workers=workers)
+    conversion = prepare(AmassConfig(source=source, **options), workers=workers)
     return run_conversion(conversion, out, workers=workers, progress=False)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.motion.bvh import write_bvh
+from motionloom.datasets.motion.bvh.motion import write_bvh
 from motionloom.datasets.motion.skeleton import Skeleton
 
 SKELETON = Skeleton.named("smpl22")

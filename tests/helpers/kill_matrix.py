@@ -24,6 +24,7 @@ import socket
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ from step_records import RECORDS, rows_of, watch_steps
 PRELOADED = (
     "motionloom.pipeline.cli.main",
     "motionloom.pipeline.runs.api",
-    "motionloom.pipeline.stages.training",
+    "motionloom.pipeline.training.trainer",
     "s3fs",  # fsspec imports it to learn that a folder is none of S3's
 )
 
@@ -153,15 +154,6 @@ class Try:
         """The ranks' exit codes, once all have ended."""
         return [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in self.pids]
 
-    def stop(self) -> None:
-        """Stop all ranks, and return when rank 0 stands still."""
-        os.killpg(self.pids[0], signal.SIGSTOP)
-        os.waitpid(self.pids[0], os.WUNTRACED)
-
-    def go_on(self) -> None:
-        """After `stop`."""
-        os.killpg(self.pids[0], signal.SIGCONT)
-
     def kill(self) -> bool:
         """SIGKILL to all; whether it found them running."""
         with suppress(ProcessLookupError):
@@ -194,8 +186,6 @@ def _become(words: list[str], group: int, place: dict[str, str], log: Path) -> N
     except SystemExit as end:
         code = int(end.code or 0)
     except BaseException:
-        import traceback
-
         traceback.print_exc()
     finally:
         sys.stdout.flush()
@@ -233,20 +223,15 @@ def undisturbed(cell: Cell, work: Path) -> tuple[dict[tuple[int, int], dict[str,
     return {(rank, row["step"]): row for rank, row in rows_of(records)}, finished_files(stage)
 
 
-def wait_for(attempt: Try, step: int) -> None:
-    """Until rank 0 has trained `step`, or ended."""
-    while attempt.last_step() < step and attempt.running():
-        time.sleep(0.002)
-
-
 def into_a_write(attempt: Try, folder: Path) -> bool:
     """Stop all ranks while a checkpoint is half written, however slow or busy the machine is."""
     while attempt.running():
         if any(folder.glob(".*.tmp")):
-            attempt.stop()
+            os.killpg(attempt.pids[0], signal.SIGSTOP)
+            os.waitpid(attempt.pids[0], os.WUNTRACED)  # rank 0 stands still
             if any(folder.glob(".*.tmp")):
                 return True
-            attempt.go_on()
+            os.killpg(attempt.pids[0], signal.SIGCONT)
         time.sleep(0.0003)
     return False
 
@@ -273,7 +258,8 @@ def kill_and_compare(cell: Cell, work: Path) -> Seen:
         if moment < 0:
             time.sleep(chance.uniform(0, 0.3))
         else:
-            wait_for(attempt, moment)
+            while attempt.last_step() < moment and attempt.running():
+                time.sleep(0.002)
             if number % 4 == 2:
                 into_a_write(attempt, stage / "checkpoints")
             else:
@@ -288,20 +274,21 @@ def kill_and_compare(cell: Cell, work: Path) -> Seen:
     codes = last.wait()
     if any(codes):
         raise RuntimeError(f"{log}: the last try ended with {codes}")
-    _compare(seen, attempts, calm, files, finished_files(stage))
+    compare(seen, attempts, calm, files, finished_files(stage))
     seen.seconds = round(time.monotonic() - started, 1)
     if seen.exact:
         shutil.rmtree(run)
     return seen
 
 
-def _compare(
+def compare(
     seen: Seen,
     attempts: Sequence[Path],
     calm: dict[tuple[int, int], dict[str, Any]],
     files: dict[str, str],
     found: dict[str, str],
 ) -> None:
+    """Note in `seen` what differs of the steps in the records of `attempts`, and of the files."""
     trained: list[tuple[int, int]] = []
     for records in attempts:
         for rank, row in rows_of(records):
@@ -322,7 +309,7 @@ def main() -> None:
     for name in PRELOADED:
         with suppress(ImportError):
             importlib.import_module(name)
-    from motionloom.pipeline.contract.registry import stage_kinds
+    from motionloom.pipeline.contract.stage import stage_kinds
 
     stage_kinds()
     watch_steps()

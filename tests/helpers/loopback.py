@@ -127,18 +127,11 @@ class Network:
                 content = answer.read()
                 self.send_response(answer.status)
                 for name, value in answer.getheaders():
-                    if name.lower() not in (
-                        "transfer-encoding",
-                        "content-length",
-                        "connection",
-                        "server",
-                        "date",
-                    ):
+                    if name.lower() not in OWN_HEADERS:
                         self.send_header(name, value)
                 head = self.command == "HEAD"
-                self.send_header(
-                    "Content-Length", answer.headers["Content-Length"] if head else str(len(content))
-                )
+                length = answer.headers["Content-Length"] if head else str(len(content))
+                self.send_header("Content-Length", length)
                 self.end_headers()
                 self.wfile.write(content)
                 inner.close()

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from motionloom.datasets.convert.motionx.plan import MotionXClip, MotionXConfig, plan_motionx
+from motionloom.datasets.convert.motionx.plan import MotionXClip, MotionXConfig
+from motionloom.datasets.convert.registry import prepare
 
 WAVE = "idea400/subset_0001/bandai_wave_right_hand_clip_1"
 TURN = "idea400/subset_0001/bandai_Walking_And_Turn_Left_clip_2"
@@ -25,4 +26,4 @@ def config(folder: Path, **changes: Any) -> MotionXConfig:
 
 
 def planned(folder: Path, **changes: Any) -> dict[str, MotionXClip]:
-    return {clip.id: clip for _, clip in plan_motionx(config(folder, **changes)).items}
+    return {clip.id: clip for _, clip in prepare(config(folder, **changes)).plan.items}

@@ -1,7 +1,7 @@
-"""A stage kind in one file: motion paced by music, trained by a generator and a critic of its own.
+"""A complete stage in one file: motion paced by music, trained by a generator and a discriminator of its own.
 
-`docs/architecture.md` walks through this file; `tests/pipeline/contract/test_new_stage.py` runs it. Nothing
-else knows of it: `MOTIONLOOM_STAGES=pacer_stage` names the module, and a recipe says `kind: pacer`.
+`tests/pipeline/contract/test_new_stage.py` runs it. `MOTIONLOOM_STAGES=pacer_stage` names the module, and a
+recipe says `kind: pacer`; nothing else knows of it.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from motionloom.datasets.base.randomness import uniform
-from motionloom.datasets.loading.audio_statistics import AudioStats
+from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.loading.plan import BatchPlan
-from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
-from motionloom.pipeline.contract.registry import register
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Given
-from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
-from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 PART: Part = "bodyhand"
 
@@ -88,14 +88,23 @@ class PacerBatch(TypedDict):
     """[B]; all the window. A module counts the rows of a validation batch by it."""
 
 
+class PacerInputs(Inputs):
+    """What it takes: a role for each attribute."""
+
+    data: Data
+    stats: FeatureStats
+    audio: FrameStats
+
+
 class PacerBatches(Dataset[PacerBatch]):
     """Item k is one rank's rows of global batch k: a pure function of (data, seed, k), so runs resume."""
 
-    def __init__(self, data: ClipDataset, given: Given, window: int, batch: int, seed: int, *at: int) -> None:
+    def __init__(
+        self, data: ClipDataset, inputs: PacerInputs, window: int, batch: int, seed: int, *at: int
+    ) -> None:
         self.data, self.window, self.seed = data, window, seed
         self.at = at or (0, 1)  # rank, and number of ranks
-        self.stats: FeatureStats = given["stats"]
-        self.audio: AudioStats = given["audio"]
+        self.stats, self.audio = inputs.stats, inputs.audio
         self.columns = data.layout.part(PART)
         self.clips = np.flatnonzero(data.has("audio.npy") & (data.frames >= window))
         if not len(self.clips):
@@ -111,7 +120,7 @@ class PacerBatches(Dataset[PacerBatch]):
         begins = (draws * (self.data.frames[clips] - self.window + 1)).astype(np.int64)
         motion, audio = [], []
         for clip, begin in zip(clips.tolist(), begins.tolist(), strict=True):
-            rows, heard = slice(begin, begin + self.window), self.data.audio(clip)
+            rows, heard = slice(begin, begin + self.window), self.data.array(clip, "audio.npy")
             assert heard is not None
             motion.append(self.stats.normalize(self.data.motion(clip)[rows][:, self.columns], self.columns))
             audio.append(self.audio.normalize(heard[rows]))
@@ -159,7 +168,7 @@ class PacerGenerator:
     net: Pacer
     layout: MotionLayout
     stats: FeatureStats
-    audio: AudioStats
+    audio: FrameStats
     part: Part = PART
     method = "pacer"
     modalities = frozenset({"audio"})
@@ -186,48 +195,48 @@ class PacerGenerator:
         return out
 
 
-class PacerStage(TrainedStage):
+class PacerStage(TrainedStage[PacerConfig, PacerInputs, Pacer]):
     """Music to motion."""
 
     name = "pacer"
     summary = "motion paced by music"
     config = PacerConfig
-    takes = ("data", "stats", "audio")
+    inputs = PacerInputs
 
     def gives(self, config: PacerConfig) -> frozenset[str]:
         """Motion, beside the curves of every trained stage."""
         return super().gives(config) | {GENERATOR}
 
-    def facts(self, config: PacerConfig, given: Given) -> ModelFacts:
+    def facts(self, config: PacerConfig, inputs: PacerInputs) -> ModelFacts:
         """Written beside the weights: with the stages of `exported`, all that `network` needs."""
-        layout, extra = LayoutFacts.of(given["data"].layout), {"audio": given["audio"].dim}
+        layout, extra = LayoutFacts.of(inputs.data.layout), {"audio": inputs.audio.dim}
         return ModelFacts(kind=self.name, config=config.net.dump(), layout=layout, extra=extra)
 
-    def network(self, facts: ModelFacts, given: Given) -> Pacer:
+    def network(self, facts: ModelFacts, inputs: PacerInputs) -> Pacer:
         """For training, for the dry run and for loading."""
         config = PacerNetConfig.parse(facts.config, facts.where)
         return Pacer(config, facts.fact("audio", int), len(facts.layout.layout().part(PART)))
 
-    def module(self, config: PacerConfig, net: Any, given: Given, seed: int) -> PacerModule:
+    def module(self, config: PacerConfig, net: Pacer, inputs: PacerInputs, seed: int) -> PacerModule:
         """The generator and its critic."""
         return PacerModule(net, config, seed)
 
-    def batches(self, config: PacerConfig, net: nn.Module, given: Given, seed: int, say: Say) -> Batches:
+    def batches(self, config: PacerConfig, net: Pacer, inputs: PacerInputs, seed: int, log: Log) -> Batches:
         """Windows of clips with music."""
-        data, window = given["data"], config.window
+        data, window = inputs.data, config.window
 
         def train(batch: int, rank: int, world: int) -> PacerBatches:
-            return PacerBatches(data.split("train"), given, window, batch, seed, rank, world)
+            return PacerBatches(data.split("train"), inputs, window, batch, seed, rank, world)
 
-        return Batches(train, lambda: PacerBatches(data.held_out(), given, window, 8, seed))
+        return Batches(train, lambda: PacerBatches(data.held_out(), inputs, window, 8, seed))
 
-    def example(self, config: PacerConfig, net: Any, given: Given, batch: int) -> Example:
+    def example(self, config: PacerConfig, net: Pacer, inputs: PacerInputs, batch: int) -> Example:
         """Shapes alone: the dry run has no data."""
         both = {name: torch.empty(batch, config.window, getattr(net, name)) for name in ("motion", "audio")}
         length = torch.full((batch,), config.window)
         return Example({**both, "length": length}, f"{config.window} frames")
 
-    def generator(self, stage: Finished, given: Given, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
         """From a run and from an export alike."""
         stats: FeatureStats = given["stats"]
         return PacerGenerator(self.load(stage, given, device), stats.layout, stats, given["audio"])

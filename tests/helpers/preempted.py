@@ -7,15 +7,15 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from bvh_clips import write_clip, write_map
-from kill_matrix import finished_files
+from kill_matrix import Seen, compare, finished_files
 from slurm_cluster import Cluster
 from step_records import PAUSE, RECORDS, rows_of
 
@@ -83,6 +83,14 @@ class Launched:
         """(rank, line) of every step so far, of all starts."""
         return list(rows_of(self.records))
 
+    def files(self) -> dict[str, str]:
+        """sha256 of what the stages behind the data keep."""
+        return {
+            f"{name}/{file}": digest
+            for name in TRAINED
+            for file, digest in finished_files(self.run / "stages" / name).items()
+        }
+
     def states(self) -> list[str]:
         """Of the jobs; those of an array are one word where they agree."""
         shown = self.cluster.ask(
@@ -130,18 +138,14 @@ def launch(cluster: Cluster, recipe: Path, run: Path, *, parts: int = 2, pause: 
     """`motionloom launch` on both nodes; every step leaves a line beside the run folder."""
     records = run.with_name(f"{run.name}-records")
     records.mkdir(parents=True)
-    words = ["motionloom", "launch", str(recipe), "--engine", "slurm", "--nodes", "2", "--gpus-per-node", "0"]
-    words += [
-        "--out",
-        str(run),
-        *(word for asked in (*ASKED, f"parts={parts}") for word in ("--cluster", asked)),
-    ]
+    words = ["motionloom", "launch", str(recipe), "--nodes", "2", "--gpus-per-node", "0", "--out", str(run)]
+    words += [word for asked in (*ASKED, f"parts={parts}") for word in ("--cluster", asked)]
     path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(Path(__file__).parent)]))
     watched = {"MOTIONLOOM_STAGES": "watched_steps", RECORDS: str(records), PAUSE: str(pause)}
     before = _jobs(cluster)
     # The nodes' names are SLURM's own here and no host's.
     meet = {"MASTER_ADDR": "127.0.0.1", "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    with _changed(watched | meet), _argv(words):
+    with mock.patch.dict(os.environ, watched | meet), mock.patch.object(sys, "argv", words):
         from motionloom.pipeline.cli.main import main as program
 
         try:
@@ -154,26 +158,6 @@ def launch(cluster: Cluster, recipe: Path, run: Path, *, parts: int = 2, pause: 
 
 def _jobs(cluster: Cluster) -> set[str]:
     return set(cluster.ask("squeue", "--noheader", "--states=all", "--format=%F").split())
-
-
-@contextmanager
-def _changed(variables: dict[str, str]) -> Iterator[None]:
-    old = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in old.items():
-            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
-
-
-@contextmanager
-def _argv(words: Sequence[str]) -> Iterator[None]:
-    old, sys.argv = sys.argv, list(words)
-    try:
-        yield
-    finally:
-        sys.argv = old
 
 
 @dataclass
@@ -191,22 +175,10 @@ class Restart:
 
 
 @dataclass
-class Preempted:
-    """A training that urgent jobs have preempted, beside the undisturbed one."""
+class Preempted(Seen):
+    """A training that urgent jobs have preempted, compared with the undisturbed one."""
 
-    restarts: list[Restart]
-    steps: int
-    repeated: int
-    """Steps that rank 0 has trained more than once."""
-    wrong: int
-    """Steps of all ranks with another batch or another bit in a figure."""
-    unequal: list[str]
-    """Files of the stages behind the data with other bytes."""
-
-    @property
-    def exact(self) -> bool:
-        """Nothing differs."""
-        return not (self.wrong or self.unequal)
+    restarts: list[Restart] = field(default_factory=list)
 
 
 def preempt(
@@ -242,28 +214,14 @@ def preempt(
 
 
 def _compared(calm: Launched, launched: Launched, starts: Sequence[datetime]) -> Preempted:
-    expected = {(rank, row["step"]): (row["batch"], row["figures"]) for rank, row in calm.rows()}
-    rows = launched.rows()
-    wrong = sum((row["batch"], row["figures"]) != expected[rank, row["step"]] for rank, row in rows)
-    mine = [row for rank, row in rows if rank == 0]
-    restarts = []
+    undisturbed = {(rank, row["step"]): row for rank, row in calm.rows()}
+    seen = Preempted("preempted", TRAINED[0], 2, 0, steps=1 + max(step for _, step in undisturbed))
+    compare(seen, [launched.records], undisturbed, calm.files(), launched.files())
+    mine = [row for rank, row in launched.rows() if rank == 0]
     for number in range(1, len(starts)):
         last = [row for row in mine if row["start"] == number - 1][-1]
         first = next(row for row in mine if row["start"] == number)
         begun = starts[number].timestamp()
-        restarts.append(
-            Restart(
-                last_step=last["step"],
-                first_step=first["step"],
-                queued_seconds=round(begun - last["time"], 1),
-                start_seconds=round(first["time"] - begun, 1),
-            )
-        )
-    steps = {row["step"] for row in mine}
-    unequal = []
-    for name in TRAINED:
-        ours, theirs = (finished_files(one.run / "stages" / name) for one in (launched, calm))
-        names = sorted(set(ours) | set(theirs))
-        unequal += [f"{name}/{file}" for file in names if ours.get(file) != theirs.get(file)]
-    missing = len({step for rank, step in expected if rank == 0} - steps)
-    return Preempted(restarts, len(steps), len(mine) - len(steps), wrong + missing, unequal)
+        queued, start = round(begun - last["time"], 1), round(first["time"] - begun, 1)
+        seen.restarts.append(Restart(last["step"], first["step"], queued, start))
+    return seen

@@ -9,25 +9,44 @@ from typing import Any
 
 import yaml
 
-from motionloom.pipeline.evaluation.versions import EVALUATE, EVALUATE_DANCES
+from motionloom.pipeline.evaluation.figures import (
+    CHANCE,
+    FILE_NAME,
+    NEAREST,
+    RECORDED,
+    STILL,
+    TRAINING,
+    Fact,
+    Figure,
+    FigureFile,
+)
 
-FILES = {"evaluate": ("metrics.json", EVALUATE), "evaluate_dances": ("dances.json", EVALUATE_DANCES)}
 
+def write_run(
+    run: Path,
+    stages: Mapping[str, Mapping[str, Any]],
+    *,
+    seed: int = 0,
+    facts: Mapping[str, Any] | None = None,
+) -> Path:
+    """A run of `stages`: name -> kind, config, inputs (role -> stage), figures, log; in this order.
 
-def write_run(run: Path, stages: Mapping[str, Mapping[str, Any]]) -> Path:
-    """A run of `stages`: name -> kind, config, inputs (role -> stage), figures, version; in this order.
-
-    A stage with `finished: False` stands in the recipe alone.
+    A stage with `finished: False` stands in the recipe alone, with its log where it has begun. `facts` go
+    into the recipe.
     """
     run.mkdir(parents=True, exist_ok=True)
-    recipe = {name: {"kind": stage["kind"]} for name, stage in stages.items()}
-    (run / "recipe.yaml").write_text(yaml.safe_dump({"name": run.name, "stages": recipe}, sort_keys=False))
+    entries = {name: {"kind": stage["kind"], **stage.get("config", {})} for name, stage in stages.items()}
+    recipe = {"name": run.name, **(facts or {}), "stages": entries}
+    (run / "recipe.yaml").write_text(yaml.safe_dump(recipe, sort_keys=False))
     for name, stage in stages.items():
-        if not stage.get("finished", True):
+        folder, finished = run / "stages" / name, stage.get("finished", True)
+        if finished or "log" in stage:
+            folder.mkdir(parents=True)
+        if "log" in stage:
+            (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in stage["log"]))
+            (folder / "started.json").write_text(json.dumps({"fingerprint": f"of-{name}"}))
+        if not finished:
             continue
-        folder = run / "stages" / name
-        folder.mkdir(parents=True)
-        file, version = FILES.get(stage["kind"], ("", 1))
         inputs = {
             role: {"stage": source, "fingerprint": f"of-{source}"}
             for role, source in stage.get("inputs", {}).items()
@@ -35,79 +54,134 @@ def write_run(run: Path, stages: Mapping[str, Mapping[str, Any]]) -> Path:
         record = {
             "stage": name,
             "kind": stage["kind"],
-            "version": stage.get("version", version),
+            "version": 1,
             "fingerprint": f"of-{name}",
-            "seed": 0,
+            "seed": seed,
             "config": stage.get("config", {}),
             "inputs": inputs,
         }
         (folder / "artifact.json").write_text(json.dumps(record))
-        if file:
-            (folder / file).write_text(json.dumps(stage.get("figures", {})))
+        (folder / "timing.json").write_text(json.dumps({"seconds": 61.0, "hardware": "an abacus"}))
+        if "figures" in stage:
+            stage["figures"].write(folder / FILE_NAME)
     return run
 
 
-def errors(mpjpe: float, *, hands: bool = True) -> dict[str, float]:
-    """Errors of a reconstruction as `evaluate` writes them."""
-    parts = ("", "_body", "_hand") if hands else ("",)
-    out = {}
-    for at, part in enumerate(parts):
+def figure(
+    name: str,
+    value: float,
+    interval: float | None = None,
+    *,
+    row: str = "",
+    protocol: Mapping[str, Fact] | None = None,
+    group: str = "",
+    better: Any = "",
+    unit: str = "",
+) -> Figure:
+    """A figure in a group of its own family: what stands before the first dot of its name."""
+    group, title = group or name.split(".")[0], name.rpartition(".")[2]
+    return Figure(name, value, interval, unit, better, row, protocol or {}, group, title)
+
+
+def reconstruction(mpjpe: float, *, clips: int = 40, hands: bool = True) -> FigureFile:
+    """Figures of a tokenizer alone."""
+    protocol: dict[str, Fact] = {"split": "test", "clips": clips, "clips_sha256": f"{clips} clips"}
+    out = [figure("reconstruction.bits_per_second", 100.0, protocol=protocol)]
+    for at, part in enumerate(("", "_body", "_hand") if hands else ("", "_body")):
         for number, metric in enumerate(("mpjpe", "pa_mpjpe", "accel")):
-            value = mpjpe / (1 + at) / (1 + number)
-            out |= {
-                f"{metric}{part}": value,
-                f"{metric}{part}_mean_pose": 200.0,
-                f"{metric}{part}_nearest_train_clip": 50.0,
-            }
-    return out
-
-
-def reconstruction(mpjpe: float, *, clips: int = 40, hands: bool = True) -> dict[str, Any]:
-    """`metrics.json` of a tokenizer alone."""
-    return {
-        "split": "test",
-        "clips": clips,
-        "reconstructed_clips": clips,
-        "bits_per_second": 100.0,
-        "reconstruction_mm": errors(mpjpe, hands=hands),
-    }
-
-
-def of(mean: float, half: float = 0.0) -> dict[str, float]:
-    """An interval as JSON has it."""
-    return {"mean": mean, "half_width": half}
+            value = mpjpe / ((1 + at) if hands else 1) / (1 + number)
+            for row, error in (("", value), (NEAREST, 50.0), (STILL, 200.0)):
+                name = f"reconstruction.{metric}{part}"
+                out.append(figure(name, error, row=row, protocol=protocol, better="lower", unit="mm"))
+    return FigureFile("evaluate", tuple(out), {"stage": "evaluate", "split": "test"})
 
 
 def by_text(
-    fid: float, m2t: float, *, generators: list[str], judge: str = "a", size: int = 32
-) -> dict[str, Any]:
-    """`metrics.json` of motions made for captions."""
-    return {
+    fid: float, m2t: float, *, generator: str, judge: str = "a", size: int = 32, **protocol: Fact
+) -> FigureFile:
+    """Figures of motions made for captions, judged by TMA."""
+    facts: dict[str, Fact] = {
+        "split": "test", "clips": 40, "clips_sha256": "40 clips", "lengths": "free", "repeats": 2,
+        "sampling.temperature": 1.0, "judge": judge, **protocol,
+    }  # fmt: skip
+    ranked = facts | {"candidates": size}
+    out = [
+        figure(f"tma.m2t_r{k}", value, half, row=row, protocol=ranked, group="precision", better="higher")
+        for k in (1, 2, 3)
+        for row, value, half in (("", m2t, 0.01), (RECORDED, 0.9, None), (CHANCE, k / size, None))
+    ]
+    for name, value in (("top-1", 0.25), ("top-5", 0.5)):
+        out.append(figure(f"tma.{name}", value, protocol=facts | {"candidates": 40}, group="choice"))
+    for name, row, value, half in (
+        ("fid", "", fid, 0.2), ("fid", TRAINING, 0.1, None), ("fid", STILL, 9.0, None),
+        ("diversity", "", 1.0, None), ("diversity", RECORDED, 1.2, None), ("multimodality", "", 0.3, None),
+    ):  # fmt: skip
+        better = "lower" if name == "fid" else ""
+        out.append(figure(f"tma.{name}", value, half, row=row, protocol=facts, group="spread", better=better))
+    about = {
+        "stage": "evaluate",
         "split": "test",
-        "clips": 40,
-        "retrieval": {
-            "among": 40,
-            "clips": 40,
-            "size": size,
-            "chance": {f"r{k}": k / size for k in (1, 2, 3)},
-            "real": {f"m2t_r{k}": of(0.9) for k in (1, 2, 3)} | {"matching_score": of(0.5), "top-1": of(0.4)},
-            "generated": {f"m2t_r{k}": of(m2t, 0.01) for k in (1, 2, 3)}
-            | {"matching_score": of(0.8), "top-1": of(0.25), "top-5": of(0.5)},
-        },
-        "distribution": {
-            "clips": 40,
-            "training_clips": 40,
-            "rows": {
-                "generated": {"fid": of(fid, 0.2), "diversity": of(1.0), "multimodality": of(0.3)},
-                "recorded": {"diversity": of(1.2)},
-                "training": {"fid": of(0.1), "diversity": of(1.1)},
-                "mean_pose": {"fid": of(9.0), "diversity": of(0.0)},
-            },
-        },
-        "protocol": {
-            "repeats": 2,
-            "lengths": "free",
-            "generators": generators,
-            "evaluator": {"stage": "tma", "sha256": judge},
-        },
+        "made_by": {"generator": generator},
+        "judges": {"tma": {"stage": "tma", "sha256": judge}},
     }
+    return FigureFile("evaluate", tuple(out), about)
+
+
+def metrics(mpjpe: float = 50.0, r1: float = 0.5, half: float | None = 0.01, **protocol: Fact) -> FigureFile:
+    """A few figures; keywords change the protocol of those of generated motion."""
+    rebuilt: dict[str, Fact] = {"split": "test", "clips": 40, "clips_sha256": "r" * 64}
+    made: dict[str, Fact] = {
+        "split": "test", "clips": 40, "clips_sha256": "c" * 64, "lengths": "free", "repeats": 2,
+        "sampling.temperature": 1.0, "judge": "e" * 64, **protocol,
+    }  # fmt: skip
+    ranked = made | {"candidates": 8}
+    figures = [
+        figure("reconstruction.mpjpe", mpjpe, protocol=rebuilt, better="lower", unit="mm"),
+        figure("reconstruction.mpjpe", 200.0, row=STILL, protocol=rebuilt, better="lower", unit="mm"),
+        figure("reconstruction.mpjpe", 80.0, row=NEAREST, protocol=rebuilt, better="lower", unit="mm"),
+        figure("reconstruction.bits_per_second", 100.0, protocol=rebuilt),
+        figure("tma.t2m_r1", r1, half, protocol=ranked, group="precision", better="higher"),
+        figure("tma.t2m_r1", 0.9, row=RECORDED, protocol=ranked, group="precision", better="higher"),
+        figure("tma.t2m_r1", 0.125, row=CHANCE, protocol=ranked, group="precision", better="higher"),
+        figure("tma.matching_score", 0.8, protocol=ranked, group="precision", better="lower"),
+        figure("tma.fid", 3.0, protocol=made, group="spread", better="lower"),
+        figure("tma.diversity", r1, protocol=made, group="spread"),
+    ]
+    return FigureFile("evaluate", tuple(figures), {"stage": "evaluate", "split": "test"})
+
+
+def log(steps: int, start: float = 1.0) -> list[dict[str, float]]:
+    """Rows of a training that learns."""
+    rows: list[dict[str, float]] = [
+        {"step": step, "train/loss": start / step, "train/extra": 1.0} for step in range(10, steps + 1, 10)
+    ]
+    return [*rows, {"step": steps, "val/loss": start / steps}]
+
+
+def write_compared(
+    folder: Path,
+    *,
+    seed: int = 7,
+    stages: Mapping[str, Mapping[str, Any]] | None = None,
+    finished: tuple[str, ...] = ("data", "tokenizer", "evaluate"),
+    logs: Mapping[str, list[dict[str, float]]] | None = None,
+    figures: FigureFile | None = None,
+) -> Path:
+    """A run whose stages data, tokenizer and evaluate (or `stages`), each from the one before, have settings,
+    logs and figures.
+    """
+    entries = {
+        "data": {"kind": "synth", "clips": 40},
+        "tokenizer": {"kind": "h2vq", "train": {"steps": 100}, "net": {"width": 8}},
+        "evaluate": {"kind": "evaluate", "repeats": 2},
+    } | dict(stages or {})
+    written: dict[str, dict[str, Any]] = {}
+    for above, name in zip((None, *entries), entries, strict=False):
+        config = {key: value for key, value in entries[name].items() if key not in ("kind", "inputs")}
+        stage = {"kind": entries[name]["kind"], "config": config, "finished": name in finished}
+        stage |= {"inputs": {above: above}} if above else {}
+        stage |= {"log": logs[name]} if logs and name in logs else {}
+        stage |= {"figures": figures} if figures and entries[name]["kind"] == "evaluate" else {}
+        written[name] = stage
+    facts = {"name": "by-hand", "seed": seed, "hardware": {"devices": 0}}
+    return write_run(folder, written, seed=seed, facts=facts)

@@ -9,16 +9,15 @@ import torch
 from torch import Tensor
 
 from motionloom.models.training.stage_module import StageModule
-from motionloom.pipeline.stages.training import read_metrics
+from motionloom.pipeline.store.training_log import read_training_log
 
 
 def newest(folder: Path) -> dict[str, Any]:
     """What training goes on from, without the clock and the paths in it."""
     path = max((folder / "checkpoints").iterdir())
     checkpoint: dict[str, Any] = torch.load(path, weights_only=True)
-    kept = {name: checkpoint[name] for name in ("global_step", "epoch", "state_dict", "optimizer_states")}
-    average = checkpoint["callbacks"].get("AveragedWeights")
-    return {**kept, "average": average, "rows": checkpoint["callbacks"]["MetricLog"]["rows"]}
+    kept = ("global_step", "state_dict", "optimizer_states", "average", "row", "validate")
+    return {**{name: checkpoint[name] for name in kept}, "rows": checkpoint["log"]["rows"]}
 
 
 def assert_equal(one: Any, two: Any, where: str = "") -> None:
@@ -41,4 +40,4 @@ def assert_same_stage(one: Path, two: Path, first: StageModule, second: StageMod
     """The same saved weights, checkpoint and log."""
     assert_equal(first.state_dict(), second.state_dict())
     assert_equal(newest(one), newest(two))
-    assert read_metrics(one) == read_metrics(two)
+    assert read_training_log(one) == read_training_log(two)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from motionloom.datasets.motion.features import encode
+from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Manifest, Split
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions

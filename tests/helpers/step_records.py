@@ -23,6 +23,7 @@ PAUSE = "KILL_MATRIX_PAUSE"
 
 def watch_steps() -> None:
     """Have every training step of this process and its forks leave a line in the folder of RECORDS."""
+    from motionloom.models.training.distributed import rank
     from motionloom.models.training.players import PlayersModule
     from motionloom.models.training.stage_module import StageModule
 
@@ -34,21 +35,22 @@ def watch_steps() -> None:
         average(self, values)
 
     def wrapped(step: Any) -> Any:
-        def training_step(self: Any, batch: Any, batch_idx: int) -> Any:
+        def take_step(self: Any, parts: Any, *rest: Any) -> Any:
             figures.clear()
-            taken, digest = int(self.global_step), _digest(batch)
-            out = step(self, batch, batch_idx)
+            batches = list(parts)
+            taken, digest = self.step, _digest(batches[0] if len(batches) == 1 else batches)
+            out = step(self, batches, *rest)
             time.sleep(float(os.environ.get(PAUSE, 0)))
             start = int(os.environ.get("SLURM_RESTART_COUNT", 0))
             row = {"step": taken, "start": start, "time": time.time(), "batch": digest}
-            _leave(self.global_rank, row | {"figures": dict(figures)})
+            _leave(rank(), row | {"figures": dict(figures)})
             return out
 
-        return training_step
+        return take_step
 
     StageModule.average = averaged  # type: ignore[method-assign]
     for module in (StageModule, PlayersModule):
-        module.training_step = wrapped(module.training_step)  # type: ignore[method-assign]
+        module.take_step = wrapped(module.take_step)  # type: ignore[method-assign]
 
 
 def _digest(batch: Any) -> str:

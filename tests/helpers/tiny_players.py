@@ -14,13 +14,13 @@ from rich.console import Console
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from motionloom.models.layers.draws import Dropout
+from motionloom.models.layers.random import Dropout
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
-from motionloom.pipeline.contract.stage import Shelf, StageContext
+from motionloom.pipeline.contract.stage import StageCache, StageContext
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.train_config import TrainConfig
-from motionloom.pipeline.stages.training import fit
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.trainer import fit
 
 DIM = 6
 GENERATOR = OptimConfig(optimizer="adam", lr=1e-2, grad_clip=0.3, warmup_steps=3)
@@ -83,9 +83,10 @@ class Duel(PlayersModule):
         self.critic_optim, self.start = critic, start
         self.readers: set[int] = set()
 
-    def on_train_batch_start(self, batch: dict[str, Any], batch_idx: int) -> None:
+    def key_draws(self, batch: dict[str, Any], part: int, turn: int = 0) -> None:
         """Note which process has read the batch."""
         self.readers.add(int(batch["reader"]))
+        super().key_draws(batch, part, turn)
 
     def players(self) -> Sequence[Player]:
         """Generator, then critic."""
@@ -111,7 +112,7 @@ def context(folder: Path, console: Console, **hardware: Any) -> StageContext:
     given: dict[str, Any] = {"accelerator": "cpu", "devices": 1, "threads": 1, "loggers": (), **hardware}
     return StageContext(
         name="duel", recipe="test", config=None, folder=folder, inputs={}, seed=0,
-        hardware=Hardware(**given), console=console, shelf=Shelf(),
+        hardware=Hardware(**given), console=console, stage_cache=StageCache(),
     )  # fmt: skip
 
 
@@ -145,6 +146,5 @@ def train(
             batch, rank, world, parts=config.accumulate, dtype=dtype, dies_at=dies_at, signalled=signalled
         ),
         lambda: Vectors(8, size=3, dtype=dtype, signalled=validation_signalled),
-        0.0,
     )
     return duel

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from motionloom.pipeline.contract import registry
+from motionloom.pipeline.contract import stage as registry
 from motionloom.pipeline.contract.stage import StageKind
 
 

@@ -10,12 +10,11 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 from toy_stages import register_toys
 
-from motionloom.datasets.loading.samples import BatchRow
 from motionloom.models.training.stage_module import StageModule
-from motionloom.pipeline.contract.stage import Given
-from motionloom.pipeline.stages.train_config import TrainConfig, TrainedStageConfig
-from motionloom.pipeline.stages.trained import Batches, Example, Say, TrainedStage
+from motionloom.pipeline.contract.stage import Inputs
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 DIM = 6
 
@@ -76,10 +75,6 @@ class ToyBatches(Dataset[dict[str, Tensor]]):
         broken = torch.full((len(rows),), fails and self.config.failure == "error")
         return {"motion": rows, "length": torch.full((len(rows),), 3), "broken": broken}
 
-    def samples(self, k: int) -> list[BatchRow]:
-        """Rows by their numbers."""
-        return [BatchRow(f"clip{k}", row, 3) for row in self.rows]
-
 
 class ToyTraining(TrainedStage):
     """`kind: toy`; it needs no data."""
@@ -87,24 +82,24 @@ class ToyTraining(TrainedStage):
     name, summary, config = "toy", "a toy", ToyConfig
     takes = ()
 
-    def facts(self, config: Any, given: Given) -> ModelFacts:
+    def facts(self, config: Any, given: Inputs) -> ModelFacts:
         """Its width."""
         layout = LayoutFacts(name="body133", fps=20.0, family="exact")
         return ModelFacts(kind="toy", config={"width": config.width}, layout=layout)
 
-    def network(self, facts: ModelFacts, given: Given) -> nn.Module:
+    def network(self, facts: ModelFacts, given: Inputs) -> nn.Module:
         """Untrained."""
         return ToyNet(facts.config["width"])
 
-    def module(self, config: Any, net: nn.Module, given: Given, seed: int) -> StageModule:
+    def module(self, config: Any, net: nn.Module, given: Inputs, seed: int) -> StageModule:
         """With its loss."""
         return ToyModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
-    def batches(self, config: Any, net: nn.Module, given: Given, seed: int, say: Say) -> Batches:
+    def batches(self, config: Any, net: nn.Module, given: Inputs, seed: int, log: Log) -> Batches:
         """Random vectors."""
         return Batches(lambda *at: ToyBatches(config, seed, *at), None)
 
-    def example(self, config: Any, net: nn.Module, given: Given, batch: int) -> Example:
+    def example(self, config: Any, net: nn.Module, given: Inputs, batch: int) -> Example:
         """Never asked for."""
         raise AssertionError("a toy is not estimated")
 

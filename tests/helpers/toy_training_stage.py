@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from toy_training import ToyTraining
 
-from motionloom.pipeline.contract.registry import register
+from motionloom.pipeline.contract.stage import register
 
 register(ToyTraining())

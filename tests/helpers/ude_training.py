@@ -14,6 +14,7 @@ from unittest import mock
 
 import torch
 from rich.console import Console
+from tiny_players import context
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
@@ -28,14 +29,11 @@ from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule
-from motionloom.models.utt.conditioned import ConditionedUtt
 from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.module import UttModule
-from motionloom.models.utt.network import UttConfig
-from motionloom.pipeline.contract.stage import CPU, Shelf, StageContext
-from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.train_config import TrainConfig
-from motionloom.pipeline.stages.training import fit
+from motionloom.models.utt.network import ConditionedUtt, UttConfig
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.trainer import fit
 
 LAYOUT = MotionLayout.named("smpl75")
 MQ = MqConfig(width=8, depth=1, code_dim=8, num_codes=9, quantizer="gradient", start="data")
@@ -90,7 +88,7 @@ class SharedNoise(DmdModule):
 
     def seed_draws(self, part: int, turn: int = 0) -> None:
         """The same on every rank."""
-        torch.manual_seed(self.seed * 1000 + self.global_step)
+        torch.manual_seed(self.seed * 1000 + self.step)
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """As the base class."""
@@ -143,10 +141,9 @@ def module_of(name: str, steps: int, *, dropout: float = 0.0) -> StageModule:
         MateConfig(dim=8, layers=1, heads=2, ff=8, dropout=dropout, attention_dropout=0.0, stride=2),
         UttConfig(
             layers=1, dim=8, heads=2, ff=8, block_size=8, dropout=dropout, attention_dropout=0.0,
-            z_dim=2 if dropout else 0, condition_dropout=dropout, pkeep=1 - dropout, beside=True,
+            z_dim=2 if dropout else 0, condition_dropout=dropout, pkeep=1 - dropout, frame_condition=True,
         ),
-        {"text": 4, "audio": 3}, frozen.streams, frozen.pattern,
-    )  # fmt: skip
+        {"text": 4, "audio": 3}, frozen.streams, frozen.pattern, timed=["audio"])  # fmt: skip
     loss = {
         "adversarial": {"weight": 0.1, "sample": bool(dropout), "gradient_penalty": 0.01},
         "adversarial_start": 4,
@@ -155,14 +152,6 @@ def module_of(name: str, steps: int, *, dropout: float = 0.0) -> StageModule:
         "discriminator_optim": {"optimizer": "adam", "lr": 1e-3},
     }
     return UttModule(net, OPTIM, tokenizer=frozen, loss=UttLossConfig.parse(loss, "loss"), **given)
-
-
-def _context(name: str, folder: Path, devices: int) -> StageContext:
-    return StageContext(
-        name=name, recipe="test", config=None, folder=folder, inputs={}, seed=0,
-        hardware=Hardware(accelerator="cpu", devices=devices, threads=1, loggers=()),
-        console=Console(quiet=True), shelf=Shelf(CPU),
-    )  # fmt: skip
 
 
 def train(
@@ -182,11 +171,10 @@ def train(
     if name != "mq":
         module.tokenizer.module.to(dtype)  # type: ignore[operator, union-attr]
     fit(
-        _context(name, folder, devices),
+        context(folder, Console(quiet=True), devices=devices),
         module,
         config,
         lambda batch, number, world: Clips(batch, number, world, dtype=dtype, dies_at=dies_at),
         lambda: Clips(8, size=2, dtype=dtype, dies_at=None),
-        OPTIM.grad_clip,
     )
     return module

@@ -6,5 +6,5 @@ import sys
 
 from step_records import watch_steps
 
-if "motionloom.pipeline.cluster.convert_part" not in sys.orig_argv:  # it trains nothing, and spares torch
+if "motionloom.pipeline.runs.convert_part" not in sys.orig_argv:  # it trains nothing, and spares torch
     watch_steps()

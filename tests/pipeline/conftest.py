@@ -201,7 +201,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 BROWSER_ARGUMENTS = [
     "--no-sandbox",
     "--disable-gpu",
-    "--disable-3d-apis",  # the viewer's flat view, which is quick; its WebGL2 view has tests of its own
+    "--disable-3d-apis",  # sticks, which are quick; the page's WebGL2 view has tests of its own
     "--no-first-run",
     "--disable-background-networking",
     "--disable-component-update",
@@ -210,14 +210,20 @@ BROWSER_ARGUMENTS = [
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def browser_arguments() -> list[str]:
+    """How Chromium is started; a module may have its own."""
+    return BROWSER_ARGUMENTS
+
+
+@pytest.fixture(scope="module")
+def browser(browser_arguments: list[str]) -> Iterator[Any]:
     """A headless Chromium; skips where there is none."""
     if CHROMIUM is None:
         pytest.skip("no Chromium on this machine to drive")
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER_ARGUMENTS)
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=browser_arguments)
         yield chromium
         chromium.close()
 

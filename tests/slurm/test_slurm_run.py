@@ -7,18 +7,17 @@ import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 from slurm_cluster import Cluster, why_not
 
-from motionloom.pipeline.cluster import slurm_run
-from motionloom.pipeline.cluster.plan import LaunchPlan, make_launch_plan
-from motionloom.pipeline.cluster.slurm_run import submit_run
-from motionloom.pipeline.launch.options import SlurmOptions
+from motionloom.pipeline.runs import slurm
+from motionloom.pipeline.runs.launch_plan import LaunchPlan, SlurmOptions, make_launch_plan
 from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.slurm import submit_run
 
 pytestmark = [
     pytest.mark.slurm,
@@ -44,7 +43,7 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], 
     monkeypatch.chdir(folder)
 
     def put(line: str) -> None:
-        monkeypatch.setattr(slurm_run, "PROGRAM", ("sh", "-c", line, "motionloom"))
+        monkeypatch.setattr(slurm, "PROGRAM", ("sh", "-c", line, "motionloom"))
 
     return put
 
@@ -55,7 +54,7 @@ def plan(nodes: int = 2) -> LaunchPlan:
         OPTIONS,
         given="humantomato-tiny",
         overrides=(),
-        out=PurePosixPath(Path("run").absolute()),
+        out=Path("run").absolute(),
         nodes=nodes,
         gpus_per_node=0,
     )
@@ -76,16 +75,6 @@ def states(cluster: Any, ids: list[str]) -> list[str]:
     shown = cluster.ask("squeue", "--noheader", "--states=all", "--format=%A %T", f"--jobs={','.join(ids)}")
     found = dict(line.split() for line in shown.splitlines())
     return [found.get(job, "") for job in ids]
-
-
-def test_groups_run_in_order_and_train_on_both_nodes(cluster: Any, program: Callable[[str], None]) -> None:
-    program('echo "$SLURM_JOB_NAME $SLURM_STEP_NUM_TASKS $SLURM_NTASKS_PER_NODE $SLURM_PROCID" >> order')
-    ids = submitted(plan())
-    until(lambda: states(cluster, ids) == ["COMPLETED"] * 3)
-    lines = [line.split() for line in Path("order").read_text().splitlines()]
-    name = "humantomato-tiny"
-    assert [line[0] for line in lines] == [f"{name}-1-data", *[f"{name}-2-train"] * 2, f"{name}-3-generate"]
-    assert sorted(line[1:] for line in lines[1:3]) == [["2", "1", "0"], ["2", "1", "1"]]
 
 
 def test_a_warned_job_starts_again_and_the_next_waits_for_it(

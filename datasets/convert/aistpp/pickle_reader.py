@@ -18,7 +18,7 @@ import pickletools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +91,7 @@ def read_aist_motion(path: Path, name: str | None = None) -> AistMotion:
     return AistMotion(poses.astype(np.float32), trans.astype(np.float32), factor)
 
 
-def _array(name: str, data: dict[str, Any], key: str, width: int) -> NDArray[Any]:
+def _array(name: str, data: dict[str, object], key: str, width: int) -> NDArray[np.floating]:
     values = _values(name, data, key)
     if values.ndim != 2 or values.shape[1] != width or not len(values):
         raise UserError(f"{name}: {key} is {list(values.shape)}, not [T, {width}]")
@@ -102,7 +102,7 @@ def _array(name: str, data: dict[str, Any], key: str, width: int) -> NDArray[Any
     return values
 
 
-def _values(name: str, data: dict[str, Any], key: str) -> NDArray[Any]:
+def _values(name: str, data: dict[str, object], key: str) -> NDArray[np.floating]:
     if key not in data:
         raise UserError(f"{name}: no key '{key}'")
     value = data[key]
@@ -113,14 +113,14 @@ def _values(name: str, data: dict[str, Any], key: str) -> NDArray[Any]:
     return value
 
 
-def _check_range(name: str, key: str, values: NDArray[Any], limit: float, unit: str) -> None:
+def _check_range(name: str, key: str, values: NDArray[np.floating], limit: float, unit: str) -> None:
     far = np.abs(values) > limit
     if far.any():
         frame, column = np.argwhere(far)[0]
         raise UserError(f"{name}: {key} at frame {frame}, column {column} is beyond {limit:g} {unit}")
 
 
-def load_aist_pickle(path: Path, name: str | None = None) -> dict[str, Any]:
+def load_aist_pickle(path: Path, name: str | None = None) -> dict[str, object]:
     """The dict of a pickle of plain values and numpy arrays; `UserError` naming the file otherwise."""
     name = str(path) if name is None else name
     if not path.is_file():
@@ -142,8 +142,7 @@ def load_aist_pickle(path: Path, name: str | None = None) -> dict[str, Any]:
         ) from None
 
 
-def _plain(data: Any) -> dict[str, Any]:
-    """The loaded dict with arrays in place of their stand-ins."""
+def _plain(data: object) -> dict[str, object]:
     if not isinstance(data, dict) or not all(isinstance(key, str) for key in data):
         raise _Refused(f"it holds a {type(data).__name__}, not a dict of named values")
     return {key: value.values() if isinstance(value, _Array) else value for key, value in data.items()}
@@ -154,7 +153,6 @@ class _Refused(Exception):  # noqa: N818 (a decision, not an error)
 
 
 def _check_opcodes(raw: bytes) -> None:
-    """Refuse a stream with other opcodes than arrays need, before any of them is run."""
     calls = 0
     for number, (opcode, argument, _) in enumerate(pickletools.genops(raw)):
         if number >= MAX_OPCODES:
@@ -174,12 +172,14 @@ class _DType:
 
     __slots__ = ("found",)
 
-    def __init__(self, code: Any, *_: Any) -> None:
+    def __init__(self, code: object, *_: object) -> None:
         if not isinstance(code, str) or code not in _KINDS:
             raise _Refused(f"array type {code!r:.40}; plain numbers only")
         self.found = _KINDS[code]
 
-    def __setstate__(self, state: Any) -> None:
+    def __setstate__(self, state: object) -> None:
+        if not isinstance(state, tuple):
+            raise _Refused("an array without a state")
         order = state[1]
         if order not in ("<", ">", "|", "=") or any(part is not None for part in state[2:5]):
             raise _Refused("an array type with fields")
@@ -192,9 +192,11 @@ class _Array:
     __slots__ = ("found",)
 
     def __init__(self) -> None:
-        self.found: NDArray[Any] | None = None
+        self.found: NDArray[np.floating] | None = None
 
-    def __setstate__(self, state: Any) -> None:
+    def __setstate__(self, state: object) -> None:
+        if not isinstance(state, tuple):
+            raise _Refused("an array without a state")
         _, shape, kind, fortran, raw = state
         if not isinstance(kind, _DType) or not isinstance(shape, tuple) or len(shape) > 3:
             raise _Refused("an array without a plain type and shape")
@@ -202,13 +204,15 @@ class _Array:
             raise _Refused(f"array shape {shape!r:.60}")
         self.found = _from_bytes(raw, kind, shape, "F" if fortran else "C")
 
-    def values(self) -> NDArray[Any]:
+    def values(self) -> NDArray[np.floating]:
         if self.found is None:
             raise _Refused("an array that is named but not filled")
         return self.found
 
 
-def _from_bytes(raw: Any, kind: _DType, shape: tuple[int, ...], order: Any) -> NDArray[Any]:
+def _from_bytes(
+    raw: object, kind: _DType, shape: tuple[int, ...], order: Literal["C", "F"]
+) -> NDArray[np.floating]:
     if isinstance(raw, str):
         raw = raw.encode("latin1")  # pickles of Python 2 keep bytes as text
     if not isinstance(raw, bytes):
@@ -219,7 +223,8 @@ def _from_bytes(raw: Any, kind: _DType, shape: tuple[int, ...], order: Any) -> N
     if len(raw) != expected:
         raise _Refused(f"an array of shape {list(shape)} with {len(raw)} bytes instead of {expected}")
     native = kind.found.newbyteorder("=")
-    return np.frombuffer(raw, kind.found).reshape(shape, order=order).astype(native)
+    made: NDArray[np.floating] = np.frombuffer(raw, kind.found).reshape(shape, order=order).astype(native)
+    return made
 
 
 class _Callable:
@@ -227,42 +232,42 @@ class _Callable:
 
     __slots__ = ("_make",)
 
-    def __init__(self, make: Callable[..., Any]) -> None:
+    def __init__(self, make: Callable[..., object]) -> None:
         self._make = make
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: object) -> object:
         return self._make(*arguments)
 
-    def __setstate__(self, state: Any) -> None:
+    def __setstate__(self, state: object) -> None:
         raise _Refused("an attempt to change a function")
 
 
-def _reconstruct(kind: Any, *_: Any) -> _Array:
+def _reconstruct(kind: object, *_: object) -> _Array:
     if kind is not _NDARRAY:
         raise _Refused("an array of another class than numpy.ndarray")
     return _Array()
 
 
-def _encode(text: Any, encoding: Any = None) -> bytes:
+def _encode(text: object, encoding: object = None) -> bytes:
     """`_codecs.encode` as Python 2's protocols use it for bytes; other codecs could unpack or loop."""
     if not isinstance(text, str) or encoding != "latin1":
         raise _Refused(f"_codecs.encode with {encoding!r:.40}")
     return text.encode("latin1")
 
 
-def _scalar(kind: Any, raw: Any) -> float:
+def _scalar(kind: object, raw: object) -> float:
     if not isinstance(kind, _DType):
         raise _Refused("a number without a plain type")
     return float(_from_bytes(raw, kind, (), "C"))
 
 
-def _no_call(*_: Any) -> Any:
+def _no_call(*_: object) -> object:
     raise _Refused("a call of numpy.ndarray")
 
 
 _NDARRAY = _Callable(_no_call)
 _NUMPY = {"_reconstruct": _Callable(_reconstruct), "scalar": _Callable(_scalar)}
-ALLOWED: dict[str, Any] = {
+ALLOWED: dict[str, object] = {
     "numpy.ndarray": _NDARRAY,
     "numpy.dtype": _Callable(_DType),
     "_codecs.encode": _Callable(_encode),
@@ -273,7 +278,7 @@ ALLOWED: dict[str, Any] = {
 
 
 class _Restricted(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
+    def find_class(self, module: str, name: str) -> object:
         found = ALLOWED.get(f"{module}.{name}")
         if found is None:
             raise _Refused(f"the file asks for '{module}.{name}', which an annotation never needs")

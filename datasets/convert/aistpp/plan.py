@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -17,16 +16,69 @@ from pydantic import Field
 from rich.progress import track
 
 from motionloom.datasets.audio.sound import sound_seconds
-from motionloom.datasets.convert.aistpp.lists import SequenceLists, read_lists
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import inside
-from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset, drop
-from motionloom.datasets.convert.common.splits import hash_split
+from motionloom.datasets.convert.common.plan import ConversionPlan, Subset, count_subsets, drop
+from motionloom.datasets.convert.common.splits import hash_split, join_splits, read_ids
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Dropped, Split, UserError
-from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
+
+_SUFFIXES = (".json", ".pkl")
+
+
+@dataclass(frozen=True)
+class SequenceLists:
+    """What the lists say."""
+
+    splits: dict[str, Split] = field(default_factory=dict)
+    ignored: frozenset[str] = frozenset()
+    files: tuple[Path, ...] = ()
+    """The files read."""
+    notes: tuple[str, ...] = ()
+
+
+def read_lists(config: AistppConfig) -> SequenceLists:
+    """Read `crossmodal_{train,val,test}.txt` (else `{train,val,test}.txt`) of a folder, and an ignore list.
+
+    A sequence in two splits is a `UserError` that names both files. Absent lists are noted, or an error where
+    the options name them.
+    """
+    splits = config.splits or config.source / "splits"
+    ignore_list = config.ignore_list or config.source / "ignore_list.txt"
+    lists: list[tuple[Split, Path]] = []
+    absent: list[str] = []
+    for split in SPLITS:
+        paths = [splits / f"crossmodal_{split}.txt", splits / f"{split}.txt"]
+        here = [(split, path) for path in paths if path.is_file()][:1]
+        lists += here
+        absent += [] if here else [paths[0].name]
+    found, notes = join_splits(lists, _SUFFIXES)
+    files = [path for _, path in lists]
+    if config.splits and not files:
+        raise UserError(f"{splits}: no crossmodal_train.txt, crossmodal_val.txt or crossmodal_test.txt")
+    if not files:
+        notes.append("no split files: split 80/5/15 by a hash of the music")
+    elif absent:
+        notes.append(f"no {', '.join(absent)} beside the other split files")
+    ignored: dict[str, int] = {}
+    if ignore_list.is_file():
+        files.append(ignore_list)
+        ignored, found_notes = read_ids(ignore_list, _SUFFIXES)
+        notes += found_notes
+    elif config.ignore_list:
+        raise UserError(f"{ignore_list}: no such file")
+    else:
+        notes.append("no ignore_list.txt: bad sequences of the release are not left out")
+    both = sorted(found.keys() & ignored.keys())
+    if both:
+        notes.append(
+            f"{len(both)} sequences of the split files are on the ignore list: {', '.join(both[:3])}"
+        )
+    return SequenceLists(found, frozenset(ignored), tuple(files), tuple(notes))
+
 
 FPS = 60.0
 LAYOUTS = ("body133", "h3d263", "smpl75")
@@ -35,7 +87,7 @@ MUSIC_LICENCE = "CC-BY-4.0 AND LicenseRef-AIST-Dance-DB"
 """Annotations: CC BY 4.0. Music: the terms of use of the AIST Dance Video Database, which no converter can
 grant; shards that hold sound, or features made from it, stand under both.
 """
-RELEASED: dict[Split, int] = {"train": 980, "val": 20, "test": 20}
+RELEASED = {"crossmodal train": 980, "crossmodal val": 20, "crossmodal test": 20}
 """Ids in the official cross-modal split files."""
 
 MOTIONS = "motions"
@@ -80,19 +132,16 @@ class AistppConfig(ConvertConfig):
     """SMPL model (.npz) for the bone lengths; default: the package's neutral skeleton."""
 
     def motion_layout(self) -> MotionLayout:
-        """The layout of the written shards; AIST++ has neither fingers nor a face."""
         if self.layout not in LAYOUTS:
             raise UserError(f"layout {self.layout} cannot be made from AIST++; use {', '.join(LAYOUTS)}")
         return super().motion_layout()
 
     @property
     def sound_folder(self) -> Path:
-        """Where the music lies."""
         return self.music_folder or self.source / "wavs"
 
     @property
     def stores_music(self) -> bool:
-        """Whether anything of the music goes into the shards."""
         return self.music != "none" and (self.audio_features or self.sound_rate > 0)
 
 
@@ -111,7 +160,6 @@ class AistClip:
     licence: str
 
     def label(self) -> str:
-        """Name of the clip in reports."""
         return f"{MOTIONS}/{self.id}.pkl"
 
 
@@ -145,23 +193,18 @@ class _Music:
         return self.files.get(sequence) or self.files.get(music_of(sequence))
 
 
-def plan_aistpp(config: AistppConfig, *, progress: bool = False) -> ConversionPlan[AistClip]:
+def plan_aistpp(config: AistppConfig, settings: PlanSettings) -> ConversionPlan[AistClip]:
     """Find every sequence and decide what becomes of it, without converting anything."""
     layout = config.motion_layout()
     folder = config.source / MOTIONS
     if not folder.is_dir():
         raise UserError(f"{config.source}: no {MOTIONS}/ in it; give the folder of the AIST++ annotations")
-    lists = read_lists(
-        config.splits or config.source / "splits",
-        config.ignore_list or config.source / "ignore_list.txt",
-        splits_required=config.splits is not None,
-        ignore_required=config.ignore_list is not None,
-    )
+    lists = read_lists(config)
     music = _find_music(config)
     names = sorted(path.name for path in folder.iterdir() if path.suffix == ".pkl" and path.name[0] != ".")
-    draft: PlanDraft[AistClip] = PlanDraft(config, broken=list(music.broken))
+    draft = ConversionPlan[AistClip](config, broken=list(music.broken))
     cut = 0
-    for name in track(names, "reading the source", disable=not progress):
+    for name in track(names, "reading the source", disable=not settings.progress):
         label = f"{MOTIONS}/{name}"
         try:
             found = _decide(config, lists, music, name.removesuffix(".pkl"), label)
@@ -226,7 +269,6 @@ def _decide(
 
 
 def _find_music(config: AistppConfig) -> _Music:
-    """The music files of the source and their lengths."""
     music = _Music({}, {}, [])
     folder = config.sound_folder
     if config.music == "none":
@@ -250,7 +292,6 @@ def _find_music(config: AistppConfig) -> _Music:
 
 
 def _notes(config: AistppConfig, music: _Music, items: list[tuple[Split, AistClip]], cut: int) -> list[str]:
-    """What a user should know about the music as a whole."""
     notes = []
     if cut:
         notes.append(f"{cut} sequences end with their music, at most {config.max_music_gap:g} s early")
@@ -291,20 +332,17 @@ def _count_ignored(config: AistppConfig, lists: SequenceLists, music: _Music) ->
 
 
 def _subsets(
-    present: set[str],
-    lists: SequenceLists,
-    missing: dict[str, Split],
-    items: list[tuple[Split, AistClip]],
+    present: set[str], lists: SequenceLists, missing: dict[str, Split], items: list[tuple[Split, AistClip]]
 ) -> dict[str, Subset]:
     """By split file, with the official numbers; the ignored and the unlisted beside them."""
-    table: dict[str, Subset] = {}
-    found = Counter(lists.splits.get(sequence) for sequence in present)
-    absent = Counter(missing.values())
-    used = Counter(lists.splits.get(clip.id) for _, clip in items)
-    for split in SPLITS if lists.splits else ():
-        table[f"crossmodal {split}"] = Subset(found[split], used[split], absent[split], RELEASED[split])
-    if found[None]:
-        table["in no split"] = Subset(found[None], used[None])
+    named = {None: "in no split"} | {split: f"crossmodal {split}" for split in SPLITS}
+
+    def subset(sequence: str) -> str:
+        return named[lists.splits.get(sequence)]
+
+    used = [subset(clip.id) for _, clip in items]
+    absent = [subset(sequence) for sequence in missing]
+    table = count_subsets(map(subset, present), used, absent, RELEASED if lists.splits else None)
     if lists.ignored:
         table["on the ignore list"] = Subset(len(present & lists.ignored))
     return table

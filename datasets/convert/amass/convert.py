@@ -8,121 +8,117 @@
 | `mocap_framerate` or `mocap_frame_rate` | resampled by time to `fps` |
 | captions of your own, or HumanML3D's texts | `texts.json` |
 
-Z up becomes Y up. Jaw, eyes, soft tissue (`dmpls`) and markers are not used.
+Z up becomes Y up. Jaw, eyes, soft tissue (`dmpls`) and markers are not used. `smpl75` keeps the parameters,
+without a shape; its two hand joints are SMPL's, at rest for SMPL-H and SMPL-X, which have none.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.files import sha256_of_json
-from motionloom.datasets.convert.amass.plan import AmassClip, plan_amass
-from motionloom.datasets.convert.amass.source import LICENCE, AmassConfig
-from motionloom.datasets.convert.common.conversion import Conversion
-from motionloom.datasets.convert.common.features import features_of
+from motionloom.datasets.convert.amass.plan import LICENCE, AmassClip, AmassConfig, plan_amass
+from motionloom.datasets.convert.amass.smpl_npz import SmplMotion, read_motion
+from motionloom.datasets.convert.common.converter import Converter, PlanSettings
+from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.convert.common.look import SourceJoints
-from motionloom.datasets.convert.common.smpl_npz import SmplMotion, read_motion
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.smpl75 import canonical_smpl75, mirrored, upright
+from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import mirror
-from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.motion.smpl import BodyModel, SkeletonName, smpl_joints
+from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.shards.sample import Sample
-
-__all__ = ["AmassConfig", "prepare_amass"]
-
-CONVERTER = "amass"
-CONVERTER_VERSION = 1
 
 FINGERS_MOVE = 1e-3
 """Radians. Fingers that turn less than this over a clip were not captured, but set to one pose."""
 
-_PATHS = ("captions", "splits", "humanml_index", "humanml_texts")
-_MODEL_PATHS = {
-    "neutral": "body_model",
-    "female": "body_model_female",
-    "male": "body_model_male",
-}
-"""Options that hold local paths, beside the source."""
+_MODEL_OPTIONS = {"neutral": "body_model", "female": "body_model_female", "male": "body_model_male"}
 
 
-def prepare_amass(config: AmassConfig, *, workers: int = 1, progress: bool = False) -> Conversion[AmassClip]:
-    """Plan the conversion of a folder of AMASS clips."""
-    skeleton = cast("SkeletonName", config.motion_layout().skeleton_name)
-    paths = {gender: getattr(config, option) for gender, option in _MODEL_PATHS.items()}
-    bodies = {gender: BodyModel.load(path, skeleton) for gender, path in paths.items() if path is not None}
-    kinds = {gender: str(body.statement["kind"]) for gender, body in bodies.items()}
-    plan = plan_amass(config, kinds, workers=workers, progress=progress)
-    bodies = bodies or {"neutral": BodyModel.neutral(skeleton)}
-    statements = {gender: body.statement for gender, body in bodies.items()}
-    plan.notes.extend(sorted({str(statement["sentence"]) for statement in statements.values()}))
-    content = [
-        [clip.label(), clip.file.size, clip.first, clip.last, [caption.dump() for caption in clip.texts]]
-        for _, clip in plan.items
-    ]
-    options = config.options(*_PATHS, *_MODEL_PATHS.values())
-    options |= {"humanml_index": config.humanml_index is not None, "bodies": statements}
-    maker = ClipMaker(config, bodies)
-    return Conversion(
-        config=config,
-        plan=plan,
-        convert=maker,
-        licence=config.licence or LICENCE,
-        converter=CONVERTER,
-        version=CONVERTER_VERSION,
-        options=options | {"source_sha256": sha256_of_json(content)},
-        see=maker.see,
-        subset_of=lambda clip: clip.file.subset,
-    )
+class Amass(Converter[AmassConfig, AmassClip]):
+    """The AMASS converter."""
 
+    name = "amass"
+    title = "AMASS"
+    summary = "AMASS: SMPL-H and SMPL-X .npz files to shards."
+    example = "AMASS shards"
+    config_class = AmassConfig
 
-@dataclass(frozen=True, eq=False)
-class ClipMaker:
-    """Everything a worker needs to make samples."""
+    def __init__(self, config: AmassConfig) -> None:
+        super().__init__(config)
+        skeleton = cast("SkeletonName", self.layout.skeleton_name)
+        paths = {gender: getattr(config, option) for gender, option in _MODEL_OPTIONS.items()}
+        bodies = {
+            gender: BodyModel.load(path, skeleton) for gender, path in paths.items() if path is not None
+        }
+        self.kinds = {gender: str(body.statement["kind"]) for gender, body in bodies.items()}
+        """Kind of the user's body models by gender; empty without any."""
+        self.bodies = bodies or {"neutral": BodyModel.neutral(skeleton)}
+        """By gender; `neutral` serves the genders that are not there."""
 
-    config: AmassConfig
-    bodies: dict[str, BodyModel]
-    """By gender; `neutral` serves the genders that are not there."""
+    def plan(self, settings: PlanSettings) -> ConversionPlan[AmassClip]:
+        plan = plan_amass(self.config, self.kinds, settings)
+        plan.notes.extend(sorted({str(body.statement["sentence"]) for body in self.bodies.values()}))
+        return plan
 
-    @cached_property
-    def layout(self) -> MotionLayout:
-        """The layout of the samples."""
-        return self.config.motion_layout()
+    def depends_on(self, clip: AmassClip) -> list[object]:
+        texts = [caption.dump() for caption in clip.texts]
+        return [clip.label(), clip.file.size, clip.first, clip.last, texts]
 
-    def __call__(self, clip: AmassClip) -> Sample:
-        """One sample; `UserError` when the motion cannot be used."""
-        motion = self._read(clip)
+    def options(self) -> dict[str, object]:
+        return super().options() | {
+            "bodies": {gender: body.statement for gender, body in self.bodies.items()}
+        }
+
+    def licence(self, plan: ConversionPlan[AmassClip]) -> str:
+        return self.config.licence or LICENCE
+
+    def subset(self, clip: AmassClip) -> str:
+        return clip.file.subset
+
+    def joints(self, clip: AmassClip) -> SourceJoints:
+        return SourceJoints(self._joints(clip, self._read(clip), 1), clip.fps)
+
+    def convert(self, clip: AmassClip) -> Sample:
+        motion = self._read(clip, palms=self.layout.name == "smpl75")
         # Resampling would take every 6th frame as it is (120 to 20 a second): pose no others.
         ratio = clip.fps / self.layout.fps
         step = max(round(ratio), 1) if abs(ratio - round(ratio)) < 1e-6 else 1
-        joints = self._joints(clip, motion, step)
-        if clip.mirror_of is not None:
-            joints = mirror(joints, self.layout.skeleton)
-        features = features_of(joints, clip.fps / step, self.layout, same_bones=self.config.retarget)
-        turned = np.ptp(motion.rotations[:, BODY_JOINTS:], axis=0)
-        meta = self.layout.clip_meta(
-            clip.id,
+        if self.layout.name == "smpl75":
+            features, turned = self._parameters(clip, motion, step), np.zeros(0)
+        else:
+            joints = self._joints(clip, motion, step)
+            if clip.mirror_of is not None:
+                joints = mirror(joints, self.layout.skeleton)
+            features = features_of(joints, clip.fps / step, self.layout, same_bones=self.config.retarget)
+            turned = np.ptp(motion.rotations[:, BODY_JOINTS:], axis=0)
+        meta = self.meta(
+            clip,
+            features,
             source=clip.file.label,
-            split=clip.split,
-            frames=len(features),
             licence=self.config.licence or LICENCE,
-            has_hands=bool(turned.size) and float(turned.max()) > FINGERS_MOVE,
-            has_face=False,
+            hands=bool(turned.size) and float(turned.max()) > FINGERS_MOVE,
             mirror_of=clip.mirror_of,
         )
         return Sample(meta, features, texts=list(clip.texts))
 
-    def see(self, clip: AmassClip) -> SourceJoints:
-        """The joints of one clip, Y up."""
-        return SourceJoints(self._joints(clip, self._read(clip), 1), clip.fps)
+    def _parameters(self, clip: AmassClip, motion: SmplMotion, step: int) -> NDArray[np.float32]:
+        """Columns of `smpl75` [T', 75]."""
+        body = self.bodies.get(clip.header.gender) or self.bodies["neutral"]
+        poses, trans = motion.rotations[::step], motion.trans[::step]
+        if self.config.up == "z":
+            poses, trans = upright(poses, trans, body)
+        if clip.mirror_of is not None:
+            poses, trans = mirrored(poses, trans, body)
+        require_human(smpl_joints(poses[:, :BODY_JOINTS], trans, body), clip.fps / step)
+        return canonical_smpl75(poses, trans, body, clip.fps / step, self.layout.fps)
 
-    def _read(self, clip: AmassClip) -> SmplMotion:
+    def _read(self, clip: AmassClip, palms: bool = False) -> SmplMotion:
         fingers = self.layout.num_joints > BODY_JOINTS
         frames = slice(clip.first, clip.last)
-        return read_motion(clip.file.path, clip.file.label, hands=fingers, frames=frames)
+        return read_motion(clip.file.path, clip.file.label, hands=fingers, palms=palms, frames=frames)
 
     def _joints(self, clip: AmassClip, motion: SmplMotion, step: int) -> NDArray[np.float64]:
         """World joints [T, N, 3], Y up, of every `step`-th frame."""

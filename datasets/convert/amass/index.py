@@ -12,13 +12,10 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from motionloom.datasets.convert.common.files import read_text_file
-from motionloom.datasets.convert.common.splits import check_id
+from motionloom.datasets.convert.common.files import check_id, read_text_file
 from motionloom.datasets.schema import UserError
 
 INDEX_FPS = 20
@@ -60,7 +57,6 @@ class IndexRow:
 
     @property
     def subset(self) -> str:
-        """First folder: the AMASS subset."""
         return self.source.split("/", 1)[0]
 
     def cut(self, frames: int, fps: float) -> tuple[int, int]:
@@ -92,14 +88,6 @@ def clip_key(path: str) -> str:
     parts[0] = OLD_NAMES.get(parts[0], parts[0])
     parts[-1] = parts[-1].removesuffix("_poses").removesuffix("_stageii")
     return "/".join(parts).replace(" ", "_")
-
-
-def group_by_key(paths: Sequence[str]) -> dict[str, list[str]]:
-    """Paths that are the same clip of AMASS, in the given order."""
-    groups: defaultdict[str, list[str]] = defaultdict(list)
-    for path in paths:
-        groups[clip_key(path)].append(path)
-    return dict(groups)
 
 
 def read_index(path: Path) -> list[IndexRow]:

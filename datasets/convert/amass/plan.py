@@ -1,37 +1,162 @@
-"""AMASS conversion, planning: a plan of what becomes of every file of the source.
+"""AMASS conversion, planning: options, the motion files of a source, and what becomes of each.
 
 Files that may be used are opened, but only for their headers and a few scalars.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from pydantic import Field, model_validator
 
 from motionloom.datasets.convert.amass.index import INDEX_FPS, IndexRow, clip_key, read_index, thinning
-from motionloom.datasets.convert.amass.source import (
-    LICENCE,
-    SUFFIX,
-    AmassConfig,
-    AmassFile,
-    list_files,
-    read_headers,
+from motionloom.datasets.convert.amass.smpl_npz import MotionHeader, read_motion_header
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
+from motionloom.datasets.convert.captions.options import (
+    CaptionConfig,
+    CaptionedPlan,
+    CaptionMatch,
+    settle_captions,
 )
-from motionloom.datasets.convert.common.caption_match import CaptionMatch
-from motionloom.datasets.convert.common.caption_options import settle_captions
+from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
-from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
-from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset
-from motionloom.datasets.convert.common.smpl_npz import MotionHeader
-from motionloom.datasets.convert.common.splits import (
-    hash_split,
-    keep_mirrors_together,
-    original_of,
-)
-from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.convert.common.files import check_id, inside, read_in_threads
+from motionloom.datasets.convert.common.plan import ConversionPlan, count_subsets, drop
+from motionloom.datasets.convert.common.splits import hash_split, keep_mirrors_together, original_of
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.schema import Caption, Dropped, Split, UserError
+
+SUFFIX = ".npz"
+LICENCE = "AMASS-noncommercial"
+"""Stated for every subset. The motions come from many laboratories with terms of their own, some of them
+freer, but the fits are AMASS's: non-commercial research only, and not to be passed on.
+"""
+
+
+class AmassConfig(CaptionConfig):
+    """AMASS, or any folder tree of SMPL, SMPL-H or SMPL-X clips in .npz files (`SUBSET/subject/clip.npz`)."""
+
+    name: str = "amass"
+    """Name of the data set; part of the shards' file names."""
+    layout: str = "body133"
+    """`body133` or `h3d263`; `wholebody313` has the fingers too; `smpl75` keeps the parameters, for UDE."""
+    fps: float = Field(default=20.0, gt=0, le=240)
+    """Frame rate of the shards; clips are resampled by time."""
+    body_model: Path | None = None
+    """Your SMPL-H, SMPL-X or SMPL model (.npz) for clips of any gender. Without one, poses keep their
+    rotations and take the bone lengths of one neutral adult.
+    """
+    body_model_female: Path | None = None
+    """The same, for female clips."""
+    body_model_male: Path | None = None
+    """The same, for male clips."""
+    humanml_index: Path | None = None
+    """HumanML3D's `index.csv`: convert its clips (cut, and named by its numbers) instead of whole files."""
+    humanml_texts: Path | None = None
+    """HumanML3D's folder of texts, for the clips of `humanml_index`."""
+    mirror: bool = False
+    """With `humanml_index`: also the mirrored clips (`M...`), which have texts of their own there."""
+    up: Literal["z", "y"] = "z"
+    """The axis that points up in the files; AMASS's is z."""
+    source_fps: float | None = Field(default=None, gt=0)
+    """Overrides the files' frame rate, for collections that state a wrong one or none."""
+    retarget: bool = False
+    """Give every clip the bone lengths of the layout's skeleton (h3d features always do)."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> AmassConfig:
+        if self.humanml_index is None and (self.mirror or self.humanml_texts is not None):
+            raise ValueError("mirror and humanml_texts need humanml_index")
+        if self.humanml_index is not None and self.captions is not None:
+            raise ValueError("captions and humanml_index exclude each other; the index has humanml_texts")
+        return self
+
+    def motion_layout(self) -> MotionLayout:
+        layout = super().motion_layout()
+        if layout.has("face") or (layout.family == "raw" and layout.name != "smpl75"):
+            raise UserError(
+                f"layout {self.layout} cannot be made from AMASS; use body133, wholebody313, h3d263 or smpl75"
+            )
+        return layout
+
+
+@dataclass(frozen=True)
+class AmassFile:
+    """A motion file as the scan finds it."""
+
+    path: Path
+    label: str
+    """Path in the source."""
+    size: int
+
+    @property
+    def id(self) -> str:
+        return self.label.removesuffix(SUFFIX)
+
+    @property
+    def subset(self) -> str:
+        """Folder of the release: the third name from the end."""
+        parts = PurePosixPath(self.label).parts
+        return parts[-3] if len(parts) > 2 else "."
+
+
+def list_files(source: Path) -> tuple[list[AmassFile], int, list[Dropped]]:
+    """Motion files in name order, the number of other files, and what cannot be opened.
+
+    Files that hold the shape of a subject without motion (`shape.npz`, `..._stagei.npz`) count as others.
+    """
+    if not source.is_dir():
+        raise UserError(f"{source}: no such folder")
+    files: list[AmassFile] = []
+    broken: list[Dropped] = []
+    others = 0
+    for folder, folders, names in os.walk(source):
+        links = [name for name in folders if (Path(folder) / name).is_symlink()]
+        for name in (*names, *links):
+            path = Path(folder) / name
+            relative = path.relative_to(source).as_posix()
+            label = relative.encode("utf-8", "backslashreplace").decode()  # names may be any bytes
+            if name in links:
+                reason = "a link to a folder, which is not followed; put the folder in its place"
+                broken.append(Dropped(source=label, reason=reason))
+            elif not name.endswith(SUFFIX) or name == "shape.npz" or name.endswith("_stagei.npz"):
+                others += 1
+            else:
+                try:
+                    check_id(relative, label)
+                    files.append(AmassFile(path, label, inside(source, relative).stat().st_size))
+                except (UserError, OSError) as error:
+                    broken.append(drop(label, error))
+    if not files:
+        raise UserError(f"{source}: no {SUFFIX} file with motion in it")
+    return sorted(files, key=lambda file: file.label), others, sorted(broken, key=lambda drop: drop.source)
+
+
+def read_headers(
+    files: Sequence[AmassFile], settings: PlanSettings
+) -> tuple[list[tuple[AmassFile, MotionHeader]], list[Dropped]]:
+    """The files that can be read, with what they state, and the others."""
+    out: list[tuple[AmassFile, MotionHeader]] = []
+    broken: list[Dropped] = []
+    headers = read_in_threads(_read, files, workers=settings.workers, progress=settings.progress)
+    for file, header in zip(files, headers, strict=True):
+        if isinstance(header, UserError):
+            broken.append(drop(file.label, header))
+        else:
+            out.append((file, header))
+    return out, broken
+
+
+def _read(file: AmassFile) -> MotionHeader | UserError:
+    try:
+        return read_motion_header(file.path, file.label)
+    except UserError as error:
+        return error
+
 
 _NOTED_LINES = 50
 """Wrong caption lines that are noted one by one."""
@@ -54,24 +179,22 @@ class AmassClip:
 
     @property
     def seconds(self) -> float:
-        """Length."""
         return (self.last - self.first) / self.fps
 
     def label(self) -> str:
-        """Name of the clip in reports."""
         return self.file.label if self.id == self.file.id else f"{self.file.label} ({self.id})"
 
 
 @dataclass
-class _Draft(PlanDraft[AmassClip]):
-    missing_in: Counter[str] = field(default_factory=Counter)
-    """Missing clips a subset."""
+class _Draft(CaptionedPlan[AmassClip]):
+    missing_in: list[str] = field(default_factory=list)
+    """Subset of every missing clip."""
     match: CaptionMatch = field(default_factory=CaptionMatch)
     """Captions of whole files."""
 
 
 def plan_amass(
-    config: AmassConfig, models: Mapping[str, str], *, workers: int = 1, progress: bool = False
+    config: AmassConfig, models: Mapping[str, str], settings: PlanSettings
 ) -> ConversionPlan[AmassClip]:
     """Find every clip and decide what becomes of it. `models` is the kind of the body model by gender."""
     layout = config.motion_layout()
@@ -79,15 +202,11 @@ def plan_amass(
     listed, notes = config.listed_splits()
     draft = _Draft(config, broken=broken, notes=notes)
     if config.humanml_index is not None:
-        clips = _index_clips(config, config.humanml_index, files, listed, draft, workers, progress)
+        clips = _index_clips(config, config.humanml_index, files, listed, draft, settings)
     else:
-        clips = _whole_clips(config, files, listed, draft, workers, progress)
+        clips = _whole_clips(config, files, listed, draft, settings)
     with_texts = config.captions is not None or config.humanml_texts is not None
-    bare_clips: list[str] = []
-    captioned = 0
     for clip, reason in clips:
-        if with_texts and not clip.texts:
-            draft.uncaptioned.append(clip.label())
         if config.splits is not None and clip.id not in listed:
             reason = reason or "in no split file"
         reason = (
@@ -96,22 +215,19 @@ def plan_amass(
             or config.licence_problem(config.licence or LICENCE)
             or config.length_problem(clip.seconds)
         )
-        captioned += bool(clip.texts) and not reason
-        if with_texts and not clip.texts and not reason:
-            bare_clips.append(clip.label())
-            reason = "" if config.uncaptioned == "keep" else "no captions"
-        if reason:
-            draft.leave_out(clip.label(), reason)
-        else:
-            draft.take(clip)
-    settle_captions(config, draft, draft.match, bare_clips, captioned)
+        draft.decide(clip, clip.texts, reason, needed=with_texts, keep=config.uncaptioned == "keep")
+    settle_captions(config, draft, draft.match)
     draft.limit(AmassClip.label)
     return draft.finish(
         found=len(files),
         frames=lambda clip: frames_after(clip.last - clip.first, clip.fps, layout),
         licence=lambda clip: config.licence or LICENCE,
         ignored=others,
-        subsets=_subsets(files, draft.items, draft.missing_in),
+        subsets=count_subsets(
+            (file.subset for file in files),
+            (file.subset for file in {clip.file for _, clip in draft.items}),
+            draft.missing_in,
+        ),
     )
 
 
@@ -120,11 +236,9 @@ def _whole_clips(
     files: list[AmassFile],
     listed: Mapping[str, Split],
     draft: _Draft,
-    workers: int,
-    progress: bool,
+    settings: PlanSettings,
 ) -> list[tuple[AmassClip, str]]:
-    """Every file as one clip, with the reason against it if there is one already."""
-    headers, broken = read_headers(files, workers, progress)
+    headers, broken = read_headers(files, settings)
     draft.broken += broken
     draft.match = config.matched([file.label for file in files] + [drop.source for drop in draft.broken])
     clips: list[tuple[AmassClip, str]] = []
@@ -157,15 +271,14 @@ def _index_clips(
     files: list[AmassFile],
     listed: Mapping[str, Split],
     draft: _Draft,
-    workers: int,
-    progress: bool,
+    settings: PlanSettings,
 ) -> list[tuple[AmassClip, str]]:
     """Every row of the index as one clip, or two with `mirror`."""
     rows = read_index(index)
     if config.splits is not None:
         keep_mirrors_together(listed, original_of, config.splits)
     by_file = _rows_by_file(rows, files, draft)
-    headers, broken = read_headers([file for file in files if file.label in by_file], workers, progress)
+    headers, broken = read_headers([file for file in files if file.label in by_file], settings)
     draft.broken += broken
     clips: list[tuple[AmassClip, str]] = []
     problems: list[str] = []
@@ -206,7 +319,7 @@ def _rows_by_file(rows: list[IndexRow], files: list[AmassFile], draft: _Draft) -
             continue
         why = "HumanAct12 is not part of AMASS" if row.subset == "humanact12" else "its file is not here"
         draft.miss(row.source, f"clip '{row.id}' of the index: {why}")
-        draft.missing_in[here.get(row.subset, row.subset)] += 1
+        draft.missing_in.append(here.get(row.subset, row.subset))
     for file in by_key.values():
         if file.label not in found:
             draft.leave_out(file.label, "in no row of the index")
@@ -256,11 +369,3 @@ def _body_problem(config: AmassConfig, models: Mapping[str, str], header: Motion
     if (kind == "SMPL-X") != (header.kind == "SMPL-X"):
         return f"{header.kind} parameters, but the body model is {kind}: their shapes and rest poses differ"
     return ""
-
-
-def _subsets(
-    files: list[AmassFile], items: list[tuple[Split, AmassClip]], missing: Counter[str]
-) -> dict[str, Subset]:
-    found = Counter(file.subset for file in files)
-    used = Counter(file.subset for file in {clip.file for _, clip in items})
-    return {name: Subset(found[name], used[name], missing[name]) for name in sorted(found | missing)}

@@ -1,132 +1,106 @@
-"""BVH folders and archives -> shards: any skeleton, through a joint map (`datasets/motion/joint_map.py`).
+"""BVH folders and archives -> shards: any skeleton, through a joint map (`datasets/motion/bvh/joint_map.py`).
 
-Three steps, each independent of the number of workers:
-1. plan (`plan.py`): read every file once; list it with its captions, split, frame count and checksum;
-2. features: one task a batch (an archive, or 64 loose files) parses, maps, resamples and encodes its clips
-   into a file of the work folder, so an archive is unpacked once although its clips go to many shards;
-3. shards: the clips are copied from those files.
-A killed run resumes at the first unfinished batch or shard; a finished one finds its shards and makes
-nothing.
+An archive is unpacked once although its clips go to many shards: one task a batch (an archive, or 64 loose
+files) encodes its clips into a file of the work folder, and the shards are copied from those files.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import time
+import operator
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
-from motionloom.datasets.convert.bvh.maps import SUFFIX, JointMaps, guess_maps, map_name
-from motionloom.datasets.convert.bvh.plan import BvhClip, BvhConfig, plan_bvh
-from motionloom.datasets.convert.common.archives import Batch
-from motionloom.datasets.convert.common.conversion import Conversion
-from motionloom.datasets.convert.common.feature_step import FeatureStep
-from motionloom.datasets.convert.common.feature_store import store_batch, stored_batch, stored_features
+from motionloom.datasets.convert.bvh.plan import (
+    SUFFIX,
+    BvhClip,
+    BvhConfig,
+    JointMaps,
+    guess_maps,
+    map_name,
+    plan_bvh,
+)
+from motionloom.datasets.convert.captions.options import digest_of
+from motionloom.datasets.convert.common.converter import Converter, PlanSettings
+from motionloom.datasets.convert.common.feature_step import FeatureBatch, FeatureStep
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
-from motionloom.datasets.motion.bvh import read_bvh
-from motionloom.datasets.motion.joint_map import JointMap
-from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.motion.resting_hands import with_resting_hands
+from motionloom.datasets.convert.common.scan import Batch
+from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.bvh.joint_map import JointMap
+from motionloom.datasets.motion.bvh.motion import read_bvh
+from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.sample import Sample
-
-__all__ = ["BvhConfig", "plan_bvh", "prepare_bvh"]
-
-CONVERTER = "bvh"
-CONVERTER_VERSION = 2
 
 _NAMED_JOINTS = 12
 """Joints without a row that are named; a hand alone has twenty."""
 
 
-def prepare_bvh(
-    config: BvhConfig,
-    *,
-    workers: int = 1,
-    progress: bool = False,
-    scan: Path | None = None,
-    maps: Path | None = None,
-) -> Conversion[BvhClip]:
-    """Plan the conversion. `scan` is a file that remembers what unchanged files hold, `maps` a folder for the
-    joint maps that are guessed.
-    """
-    target = config.mapped_skeleton()
-    given = None
-    if config.joint_map != "auto":  # a wrong map should fail before the long part
-        given = JointMap.load(config.joint_map, target=target.name)
-    plan = plan_bvh(config, workers=workers, progress=progress, scan=scan)
-    contents = [clip.found.sha256 for _, clip in plan.items]
-    options = config.options() | {"source_sha256": sha256_of_json(contents)}
-    guessed: dict[str, JointMap] = {}
-    if given is None:
-        plan, guessed = _guessed(config, plan, maps)
-        sources = {key: joint_map.sources for key, joint_map in guessed.items()}
-        options["joint_map"] = {"file": "auto", "sha256": sha256_of_json(sources)}
-    clips = BvhClips(config, JointMaps(given, guessed))
-    made_from = sha256_of_json(options)
-    groups: dict[int, list[BvhClip]] = {}
-    for _, clip in plan.items:
-        groups.setdefault(clip.number, []).append(clip)
-    batches = [
-        BvhBatch(clips, group[0].batch, number, tuple(clip.label() for clip in group), made_from)
-        for number, group in sorted(groups.items())
-    ]
-    positions = {batch.number: position for position, batch in enumerate(batches)}
-    return Conversion(
-        config=config,
-        plan=plan,
-        convert=clips,
-        licence=config.licence,
-        converter=CONVERTER,
-        version=CONVERTER_VERSION,
-        options=options,
-        features=FeatureStep(batches, lambda clip: positions[clip.number], clips.take),
-        see=clips.see,
-        subset_of=lambda clip: clip.subset,
-        in_order=lambda clip: clip.batch.archive is not None,
-    )
+class Bvh(Converter[BvhConfig, BvhClip]):
+    """The BVH converter."""
 
+    name = "bvh"
+    title = "BVH"
+    summary = "BVH files of any skeleton, loose or in tar archives, to shards."
+    example = "mocap shards --captions captions.jsonl --licence CC-BY-4.0"
+    config_class = BvhConfig
+    features_first = True
 
-def _guessed(
-    config: BvhConfig, plan: ConversionPlan[BvhClip], folder: Path | None
-) -> tuple[ConversionPlan[BvhClip], dict[str, JointMap]]:
-    """The plan, with a note on each guessed joint map, and the maps."""
-    clips = ((clip.batch, clip.label(), clip.found.skeleton) for _, clip in plan.items)
-    guesses = guess_maps(clips, config.mapped_skeleton(), config.source, folder)
-    notes = [
-        f"{map_name(number)}: guessed from {guess.source}; {guess.summary()}"
-        for number, guess in enumerate(guesses.values(), start=1)
-    ]
-    maps = {key: guess.joint_map(f"the guess from {guess.source}") for key, guess in guesses.items()}
-    return dataclasses.replace(plan, notes=[*plan.notes, *notes]), maps
+    def __init__(self, config: BvhConfig) -> None:
+        super().__init__(config)
+        given = None
+        if config.joint_map != "auto":  # a wrong map should fail before the long part
+            given = JointMap.load(config.joint_map, target=config.mapped_skeleton().name)
+        self.maps = JointMaps(given, {})
 
+    def plan(self, settings: PlanSettings) -> ConversionPlan[BvhClip]:
+        plan = plan_bvh(self.config, settings)
+        if self.maps.given is None:
+            plan, self.maps = _guessed(self.config, plan, settings.maps)
+        return plan
 
-@dataclass(frozen=True)
-class BvhClips:
-    """Turns clips into samples; holds what all clips of a conversion share."""
+    def depends_on(self, clip: BvhClip) -> list[object]:
+        return [clip.id, clip.found.sha256, [caption.dump() for caption in clip.texts]]
 
-    config: BvhConfig
-    maps: JointMaps
+    def options(self) -> dict[str, object]:
+        path = self.config.joint_map
+        if path == "auto":
+            sources = {key: joint_map.sources for key, joint_map in self.maps.guessed.items()}
+            used = {"file": "auto", "sha256": sha256_of_json(sources)}
+        else:
+            used = digest_of(path)
+        return super().options() | {"joint_map": used}
 
-    @cached_property
-    def layout(self) -> MotionLayout:
-        """The layout of the samples."""
-        return self.config.motion_layout()
+    def subset(self, clip: BvhClip) -> str:
+        return clip.subset
 
-    def __call__(self, clip: BvhClip) -> Sample:
-        """One clip by itself. An archive is read up to the clip: for many clips, make the batch."""
-        return self._sample(clip, self.features(clip.label(), self._read(clip)))
+    def in_order(self, clip: BvhClip) -> bool:
+        return clip.batch.archive is not None
 
-    def see(self, clip: BvhClip) -> SourceJoints:
-        """The joints of one clip as the map reads them, and the joints that no row of it names."""
+    def features(self, plan: ConversionPlan[BvhClip], made_from: str) -> FeatureStep[BvhClip]:
+        groups: dict[int, list[BvhClip]] = {}
+        for _, clip in plan.items:
+            groups.setdefault(clip.number, []).append(clip)
+        batches = []
+        for number, group in sorted(groups.items()):
+            labels = tuple(clip.label() for clip in group)
+            digest = sha256_of_json([self.version, made_from, labels])
+            made = partial(self._batch, group[0].batch, labels)
+            batches.append(FeatureBatch(number, labels, self.layout.dim, digest, made))
+        return FeatureStep(batches, operator.attrgetter("number"), self._sample)
+
+    def convert(self, clip: BvhClip) -> Sample:
+        """An archive is read up to the clip: for many clips, make the batch."""
+        return self._sample(clip, self.encode(clip.label(), self._read(clip)))
+
+    def joints(self, clip: BvhClip) -> SourceJoints:
+        """The joints as the map reads them, and the joints that no row of it names."""
         motion = read_bvh(self._read(clip), name=clip.label())
         joint_map = self.maps.of(motion)
         joints = joint_map.apply(motion, unit=self.config.unit, up=self.config.up)
@@ -142,20 +116,7 @@ class BvhClips:
         names = tuple(names[0] if len(names) == 1 else names for names in joint_map.sources)
         return SourceJoints(joints, self.config.source_fps or motion.fps, names, tuple(remarks))
 
-    def _read(self, clip: BvhClip) -> bytes:
-        batch = clip.batch
-        if batch.archive is None:  # no need to read the loose files before it
-            batch = Batch(batch.root, None, (clip.found.path,))
-        for file in batch.read(SUFFIX):
-            if file.path == clip.found.path and not file.error:
-                return file.data
-        raise UserError(f"{clip.label()}: no longer in the source")
-
-    def take(self, clip: BvhClip, folder: Path) -> Sample:
-        """One clip from the files of the features step."""
-        return self._sample(clip, stored_features(_path(folder, clip.number), clip.label()))
-
-    def features(self, label: str, data: bytes) -> NDArray[np.float32]:
+    def encode(self, label: str, data: bytes) -> NDArray[np.float32]:
         """Features [T', D] of one file; `label` names it in errors."""
         config = self.config
         motion = read_bvh(data, name=label)
@@ -169,67 +130,32 @@ class BvhClips:
         except UserError as error:
             raise UserError(f"{label}: {error} (read with unit '{config.unit}', up '{config.up}')") from None
 
+    def _read(self, clip: BvhClip) -> bytes:
+        batch = clip.batch
+        if batch.archive is None:  # no need to read the loose files before it
+            batch = Batch(batch.root, None, (clip.found.path,))
+        for file in batch.read(SUFFIX):
+            if file.path == clip.found.path and not file.error:
+                return file.data
+        raise UserError(f"{clip.label()}: no longer in the source")
+
     def _sample(self, clip: BvhClip, motion: NDArray[np.float32]) -> Sample:
-        layout = self.layout
-        meta = layout.clip_meta(
-            clip.id,
-            source=clip.label(),
-            split=clip.split,
-            frames=len(motion),
-            licence=self.config.licence,
-            has_hands=layout.num_joints > BODY_JOINTS and self.config.fingers != "missing",
-            has_face=False,
-        )
-        return Sample(meta=meta, motion=motion, texts=list(clip.texts))
+        hands = self.layout.num_joints > BODY_JOINTS and self.config.fingers != "missing"
+        return Sample(meta=self.meta(clip, motion, hands=hands), motion=motion, texts=list(clip.texts))
 
-
-@dataclass(frozen=True)
-class BvhBatch:
-    """One archive, or a run of loose files: read once, all its clips converted on the way."""
-
-    clips: BvhClips
-    batch: Batch
-    number: int
-    labels: tuple[str, ...]
-    options: str
-    """Digest of what the features depend on, the content of the source included."""
-
-    @property
-    def size(self) -> int:
-        """Number of clips."""
-        return len(self.labels)
-
-    def is_made(self, folder: Path) -> bool:
-        """Whether an earlier run made it from the same inputs."""
-        return stored_batch(_path(folder, self.number), self._fingerprint()) is not None
-
-    def make(self, folder: Path) -> None:
-        """Convert the clips into a batch file."""
-        dim, fingerprint = self.clips.layout.dim, self._fingerprint()
-        store_batch(_path(folder, self.number), self._made(), dim=dim, fingerprint=fingerprint)
-
-    def trial(self, seconds: float) -> int:
-        """Convert clips for about this long without keeping them; returns how many."""
-        end = time.perf_counter() + seconds
-        for count, _ in enumerate(self._made(), start=1):
-            if time.perf_counter() > end:
-                return count
-        return self.size
-
-    def _fingerprint(self) -> str:
-        return sha256_of_json([CONVERTER_VERSION, self.options, self.labels])
-
-    def _made(self) -> Iterator[tuple[str, NDArray[np.float32] | Dropped]]:
-        waiting = set(self.labels)
+    def _batch(
+        self, batch: Batch, labels: tuple[str, ...]
+    ) -> Iterator[tuple[str, NDArray[np.float32] | Dropped]]:
+        waiting = set(labels)
         try:
-            for file in self.batch.read(SUFFIX):
+            for file in batch.read(SUFFIX):
                 if file.label not in waiting:  # a second member of the same name finds nothing
                     continue
                 waiting.remove(file.label)
                 try:
                     if file.error:
                         raise UserError(f"{file.label}: {file.error}")
-                    yield file.label, self.clips.features(file.label, file.data)
+                    yield file.label, self.encode(file.label, file.data)
                 except MemoryError:
                     raise
                 except Exception as error:  # whatever a bad file makes of the libraries below
@@ -237,10 +163,20 @@ class BvhBatch:
                 if not waiting:
                     return
         except UserError as error:
-            for label in self.labels:
+            for label in labels:
                 if label in waiting:
                     yield label, drop(label, error)
 
 
-def _path(folder: Path, number: int) -> Path:
-    return folder / f"{number:06d}.bin"
+def _guessed(
+    config: BvhConfig, plan: ConversionPlan[BvhClip], folder: Path | None
+) -> tuple[ConversionPlan[BvhClip], JointMaps]:
+    clips = ((clip.batch, clip.label(), clip.found.skeleton) for _, clip in plan.items)
+    guesses = guess_maps(clips, config.mapped_skeleton(), config.source, folder)
+    notes = [
+        f"{map_name(number)}: guessed from {guess.source}; {guess.summary()}"
+        for number, guess in enumerate(guesses.values(), start=1)
+    ]
+    maps = {key: guess.joint_map(f"the guess from {guess.source}") for key, guess in guesses.items()}
+    plan.notes += notes
+    return plan, JointMaps(None, maps)

@@ -1,26 +1,137 @@
-"""BVH conversion, planning: options, and a plan of what becomes of every file of the source."""
+"""BVH conversion, planning: options, the joint map of each skeleton, and what becomes of every file.
+
+Clips have one skeleton when names and parents of their joints are the same; bone lengths may differ. A
+skeleton is guessed once, from the first clip of the plan that has it, so that the number of workers and the
+order of their work change nothing.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from motionloom.datasets.convert.bvh.maps import SUFFIX, MapChoice, skeleton_key
-from motionloom.datasets.convert.common.archives import Batch, list_batches
-from motionloom.datasets.convert.common.caption_options import CaptionConfig, digest_of, settle_captions
+from motionloom.datasets.base.files import sha256_of_json, write_text
+from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
+from motionloom.datasets.convert.captions.options import CaptionConfig, CaptionedPlan, settle_captions
+from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
-from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft
-from motionloom.datasets.convert.common.scan import BatchScan, FoundFile, scan_batches
-from motionloom.datasets.convert.common.splits import check_id, hash_split
-from motionloom.datasets.motion.bvh_text import find_motion, load_text, parse_hierarchy
-from motionloom.datasets.motion.joint_map import Unit, Up
+from motionloom.datasets.convert.common.files import check_id
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.scan import Batch, BatchScan, FoundFile, list_batches, scan_batches
+from motionloom.datasets.convert.common.splits import hash_split
+from motionloom.datasets.motion.bvh.joint_map import JointMap, Unit, Up
+from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
+from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Split, UserError
+
+MapChoice = Annotated[
+    Path | Literal["auto"], BeforeValidator(lambda given: "auto" if str(given) == "auto" else given)
+]
+"""A map file, or `auto` (from the command line also as a path) for one that is guessed."""
+
+SUFFIX = ".bvh"
+
+
+@dataclass(frozen=True)
+class JointMaps:
+    """The joint maps of a conversion."""
+
+    given: JointMap | None
+    """The user's, for every clip."""
+    guessed: Mapping[str, JointMap]
+    """By `skeleton_key`, where none is given."""
+
+    def of(self, motion: BvhMotion) -> JointMap:
+        if self.given is not None:
+            return self.given
+        try:
+            return self.guessed[skeleton_key(motion.joints, motion.parents)]
+        except KeyError:
+            raise UserError(
+                f"{motion.name}: its skeleton was not there when the source was planned"
+            ) from None
+
+
+def skeleton_key(joints: Sequence[str], parents: Sequence[int]) -> str:
+    """What clips with one skeleton share."""
+    return sha256_of_json([list(joints), list(parents)])[:16]
+
+
+def guess_maps(
+    clips: Iterable[tuple[Batch, str, str]], target: Skeleton, source: Path, folder: Path | None
+) -> dict[str, JointGuess]:
+    """A certain guess for every skeleton of the planned clips (batch, label, skeleton's key).
+
+    With `folder` each is written there as a map file. `UserError` when one is not certain, or when another
+    map lies there already: it may have been corrected by hand.
+    """
+    wanted: dict[Batch, dict[str, str]] = {}
+    for batch, label, key in clips:
+        wanted.setdefault(batch, {})[label] = key
+    guesses: dict[str, JointGuess] = {}
+    for batch, labels in wanted.items():
+        missing = {key for key in labels.values() if key} - set(guesses)
+        with suppress(UserError):  # a damaged archive; its clips are reported when they are converted
+            for file in batch.read(SUFFIX) if missing else ():
+                if labels.get(file.label) not in missing:
+                    continue
+                with suppress(UserError):  # likewise; the next clip of this skeleton may be whole
+                    guess = guess_joint_map(read_bvh(file.data, name=file.label), target)
+                    guesses[labels[file.label]] = guess
+                    missing.remove(labels[file.label])
+                if not missing:
+                    break
+    written = {key: _written(guess, number, folder) for number, (key, guess) in enumerate(guesses.items(), 1)}
+    for key, guess in guesses.items():
+        if not guess.certain:
+            which = f" (skeleton of {guess.source})" if len(guesses) > 1 else ""
+            raise UserError(
+                f"{source}: the joint map{which} is not certain: {guess.doubts()}; {written[key]}"
+            )
+    return guesses
+
+
+def map_name(number: int) -> str:
+    """File name of the map of the n-th skeleton of a source."""
+    return "joint_map.json" if number == 1 else f"joint_map-{number}.json"
+
+
+def guess_source(source: Path, target: Skeleton) -> JointGuess:
+    """The guess for the first clip of a .bvh file, of a folder of such files, or of an archive."""
+    batches, _ = list_batches(source, SUFFIX)
+    for batch in batches:
+        for file in batch.read(SUFFIX):
+            if file.error:
+                raise UserError(f"{file.label}: {file.error}")
+            return guess_joint_map(read_bvh(file.data, name=file.label), target)
+    raise UserError(f"{source}: no {SUFFIX} file in it")
+
+
+def _written(guess: JointGuess, number: int, folder: Path | None) -> str:
+    if folder is None:
+        return f"`motionloom data joints {guess.source} -o joint_map.json` writes a map to complete"
+    path = folder / map_name(number)
+    name = guess.target.name
+    if path.exists():
+        try:
+            rows = json.loads(path.read_text(encoding="utf-8-sig")).get(name)
+        except (OSError, ValueError, AttributeError):
+            rows = None
+        if rows != json.loads(guess.text())[name]:
+            raise UserError(
+                f"{path}: not the joint map that is guessed; use it with --joint-map {path}, or delete it"
+            )
+    else:
+        write_text(path, guess.text())
+    return f"complete {path} and pass it with --joint-map {path}"
 
 
 class BvhConfig(CaptionConfig):
@@ -46,13 +157,12 @@ class BvhConfig(CaptionConfig):
     """Upward axis of the files."""
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton."""
-    fingers: Literal["recorded", "resting", "missing"] = Field("recorded", json_schema_extra={"later": True})
+    fingers: Literal["recorded", "resting", "missing"] = "recorded"
     """Of layouts with hands: the files have them (`recorded`, which needs a joint map with fingers); they
     have none, and each clip gets hands at rest, which count as motion (`resting`) or do not (`missing`).
     """
 
     def motion_layout(self) -> MotionLayout:
-        """The layout of the written shards."""
         layout = super().motion_layout()
         if layout.family == "raw":
             raise UserError(f"layout {self.layout} cannot be made from joints; use body133 or h3d263")
@@ -62,18 +172,6 @@ class BvhConfig(CaptionConfig):
         """The skeleton that the joint map reads: without fingers where the files have none."""
         own = self.motion_layout().skeleton
         return own if self.fingers == "recorded" else Skeleton.named("smpl22")
-
-    def options(self, *local: str) -> dict[str, Any]:
-        """What the output depends on, for the manifest: files by name and checksum instead of local paths."""
-        given = super().options(*local)
-        for key in ("joint_map", "captions"):
-            path: MapChoice | None = getattr(self, key)
-            if path != "auto":
-                given[key] = digest_of(path) if path else None
-        given["splits"] = bool(self.splits)
-        if self.fingers == "recorded":  # as before there was a choice: shards made then stay valid
-            del given["fingers"]
-        return given
 
 
 @dataclass(frozen=True)
@@ -95,19 +193,15 @@ class BvhClip:
         return self.batch.archive or (folders[0] if folders else "")
 
     def label(self) -> str:
-        """Name of the clip in reports."""
         return self.found.label
 
 
-def plan_bvh(
-    config: BvhConfig, *, workers: int = 1, progress: bool = False, scan: Path | None = None
-) -> ConversionPlan[BvhClip]:
-    """Find every clip and decide what becomes of it, without converting anything.
-
-    `scan` is a file that remembers what unchanged files hold.
-    """
+def plan_bvh(config: BvhConfig, settings: PlanSettings) -> ConversionPlan[BvhClip]:
+    """Find every clip and decide what becomes of it, without converting anything."""
     batches, ignored = list_batches(config.source, SUFFIX)
-    scans = scan_batches(batches, SUFFIX, _header, keep=scan, workers=workers, progress=progress)
+    scans = scan_batches(
+        batches, SUFFIX, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
+    )
     return _decide(config, batches, scans, ignored)
 
 
@@ -124,18 +218,16 @@ def _header(data: bytes, label: str) -> tuple[int, float, str]:
 def _decide(
     config: BvhConfig, batches: list[Batch], scans: list[BatchScan], ignored: int
 ) -> ConversionPlan[BvhClip]:
-    """Which of the files found become samples, in which split."""
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
     refused = config.licence_problem(config.licence)
     table = config.matched(file.path for _, file in found)
     listed, notes = config.listed_splits()
     broken = [scan.problem for scan in scans if scan.problem is not None]
-    draft: PlanDraft[BvhClip] = PlanDraft(config, broken=broken, notes=notes)
+    draft = CaptionedPlan[BvhClip](config, broken=broken, notes=notes)
     ids: dict[str, str] = {}
     contents: dict[str, str] = {}
     unreadable: set[str] = set()
-    other_rate = captioned = 0
-    bare_clips: list[str] = []
+    other_rate = 0
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
     for number, clip in sorted(found, key=lambda pair: pair[1].path not in table.rows):
         row = table.rows.get(clip.path)
@@ -149,8 +241,6 @@ def _decide(
             draft.fail(clip.label, UserError(clip.problem))
             continue
         texts = row.texts if row else ()
-        if config.captions and not texts:
-            draft.uncaptioned.append(clip.label)
         other_rate += bool(row and row.fps and abs(row.fps - clip.fps) > 0.01 * clip.fps)
         if clip_id in ids:
             reason = f"second file for clip id '{clip_id}'; the first is {ids[clip_id]}"
@@ -164,21 +254,16 @@ def _decide(
             reason = refused or config.length_problem(clip.frames / (config.source_fps or clip.fps))
         ids.setdefault(clip_id, clip.label)
         contents.setdefault(clip.sha256, clip.label)
-        captioned += bool(texts) and not reason
-        if config.captions and not texts and not reason:
-            bare_clips.append(clip.label)
-            reason = "" if config.uncaptioned == "keep" else "no captions"
-        if reason:
-            draft.leave_out(clip.label, reason)
-            continue
         split = listed.get(clip_id) or (row.split if row else None) or hash_split(clip_id)
-        draft.take(BvhClip(batches[number], number, clip, clip_id, split, texts))
+        made = BvhClip(batches[number], number, clip, clip_id, split, texts)
+        needed, keep = config.captions is not None, config.uncaptioned == "keep"
+        draft.decide(made, texts, reason, needed=needed, keep=keep)
     if other_rate:
         draft.notes.append(
             f"{other_rate} captions state another frame rate than their file; the file's counts"
         )
     draft.limit(lambda clip: clip.id)
-    settle_captions(config, draft, table, bare_clips, captioned)
+    settle_captions(config, draft, table)
     wanted = {row.id: row.file or row.id for row in table.unused}
     wanted |= {clip_id: clip_id for clip_id in listed if clip_id not in wanted}
     for clip_id, name in wanted.items():

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -23,12 +23,8 @@ Limit = float | NDArray[np.float64]
 
 
 def load_array(
-    path: Path,
-    *,
-    width: int | tuple[int, ...],
-    name: str | None = None,
-    limit: Limit | None = None,
-) -> NDArray[Any]:
+    path: Path, *, width: int | tuple[int, ...], name: str | None = None, limit: Limit | None = None
+) -> NDArray[np.floating]:
     """The array [T, width] of an `.npy` file, T >= 1: float32 or float64 as stored, native bytes, C order.
 
     `width` may be a tuple: (22, 3) reads joints [T, 22, 3]. `name` stands for the file in errors (default:
@@ -36,12 +32,10 @@ def load_array(
     `UserError` for everything listed in the module's docstring, naming frame and column of a bad value.
     """
     label = str(path) if name is None else name
-    columns = (width,) if isinstance(width, int) else width
     try:
         with path.open("rb") as file:
             shape, dtype = _header(file, label)
-            _check_shape(shape, columns, label)
-            _check_dtype(dtype, label)
+            _check_header(shape, dtype, width, label)
             file.seek(0)
             found = npy_format.read_array(file, allow_pickle=False)
     except OSError as error:
@@ -51,7 +45,7 @@ def load_array(
     return values
 
 
-def read_array_header(path: Path, *, name: str | None = None) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def read_array_header(path: Path, *, name: str | None = None) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
     """(shape, dtype) of an `.npy` file without reading its data; `UserError` if it is not whole.
 
     The size of the file is compared with the header, so a cut file is found here. Shape and dtype are as
@@ -67,15 +61,12 @@ def read_array_header(path: Path, *, name: str | None = None) -> tuple[tuple[int
 
 def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | None = None) -> int:
     """T of a file that `load_array` accepts as far as header and size tell; `UserError` otherwise."""
-    label = str(path) if name is None else name
-    shape, dtype = read_array_header(path, name=label)
-    _check_shape(shape, (width,) if isinstance(width, int) else width, label)
-    _check_dtype(dtype, label)
+    shape, dtype = read_array_header(path, name=name)
+    _check_header(shape, dtype, width, str(path) if name is None else name)
     return shape[0]
 
 
-def _header(file: BinaryIO, label: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and dtype at the start of an open file whose size fits them."""
+def _header(file: BinaryIO, label: str) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
     size = os.fstat(file.fileno()).st_size
     if size == 0:
         raise UserError(f"{label}: empty file")
@@ -100,10 +91,15 @@ def _header(file: BinaryIO, label: str) -> tuple[tuple[int, ...], np.dtype[Any]]
     return shape, dtype
 
 
-def _check_shape(shape: tuple[int, ...], columns: tuple[int, ...], label: str) -> None:
+def _check_header(
+    shape: tuple[int, ...], dtype: np.dtype[np.generic], width: int | tuple[int, ...], label: str
+) -> None:
+    columns = (width,) if isinstance(width, int) else width
     if len(shape) > 1 and shape[0] == 0:
         raise UserError(f"{label}: zero length, no frames")
     if shape[1:] == columns and len(shape) == len(columns) + 1:
+        if dtype.kind != "f" or dtype.itemsize not in (4, 8):
+            raise UserError(f"{label}: values are {dtype.name}; expected float32 or float64")
         return
     hint = ""
     if shape == columns:
@@ -116,12 +112,7 @@ def _check_shape(shape: tuple[int, ...], columns: tuple[int, ...], label: str) -
     raise UserError(f"{label}: expected [T, {wanted}], found {list(shape)}{hint}")
 
 
-def _check_dtype(dtype: np.dtype[Any], label: str) -> None:
-    if dtype.kind != "f" or dtype.itemsize not in (4, 8):
-        raise UserError(f"{label}: values are {dtype.name}; expected float32 or float64")
-
-
-def _check_values(values: NDArray[Any], limit: Limit | None, label: str) -> None:
+def _check_values(values: NDArray[np.floating], limit: Limit | None, label: str) -> None:
     """`UserError` for the first value (in time order) that is not finite or beyond the limit."""
     finite = np.isfinite(values)
     if not finite.all():

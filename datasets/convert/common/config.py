@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import get_args
 
 from pydantic import ConfigDict, Field
+from pydantic.fields import FieldInfo
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config
-from motionloom.datasets.shards.sample import MotionType
+from motionloom.datasets.schema import Config, MotionType
 
 
 class ConvertConfig(Config):
@@ -42,18 +42,19 @@ class ConvertConfig(Config):
     standing on a floor is refused."""
 
     def motion_layout(self) -> MotionLayout:
-        """The layout of the written shards."""
         return MotionLayout.named(self.layout, fps=self.fps)
 
-    def options(self, *local: str) -> dict[str, Any]:
-        """What the output depends on, for the manifest: without `source` and other `local` paths."""
-        return {key: value for key, value in self.dump().items() if key not in ("source", "look", *local)}
+    def options(self) -> dict[str, object]:
+        """What the output depends on, for the manifest: never a local path, whose content counts instead."""
+        fields = type(self).model_fields
+        kept = {name for name, field in fields.items() if not _is_local(field)}
+        return {key: value for key, value in self.dump().items() if key in kept}
 
     def licence_problem(self, licence: str) -> str:
         """Why a clip under `licence` is left out; empty when it may come."""
         if not self.allow_licence or licence in self.allow_licence:
             return ""
-        return f"licence '{licence}' is not allowed (--allow-licence {', '.join(self.allow_licence)})"
+        return f"licence '{licence}' is not allowed (allow_licence: {', '.join(self.allow_licence)})"
 
     def length_problem(self, seconds: float) -> str:
         """Why a clip of this length is left out; empty when it may come."""
@@ -62,3 +63,9 @@ class ConvertConfig(Config):
         if self.max_seconds is not None and seconds > self.max_seconds:
             return f"{seconds:.2f} s, longer than {self.max_seconds:g} s"
         return ""
+
+
+def _is_local(field: FieldInfo) -> bool:
+    extra = field.json_schema_extra
+    runtime = isinstance(extra, dict) and bool(extra.get("runtime"))
+    return runtime or field.annotation is Path or Path in get_args(field.annotation)

@@ -1,97 +1,169 @@
 """The features step, for sources that can only be read front to back.
 
 An archive is read once, in its own order, while shards are shuffled: so features are made batch by batch (an
-archive is a batch) into a folder, and the shard writer then picks clips from there in its own order.
+archive is a batch) into a folder, one flat file and one index each, and the shard writer then picks clips
+from there in its own order. A batch is whole or absent; it is kept on a second run when its fingerprint fits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
+from operator import methodcaller
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Generic
 
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.base.files import atomic_file, write_json
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.convert.common.plan import C
+from motionloom.datasets.schema import Config, Dropped, UserError
 from motionloom.datasets.shards.options import WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.tasks import Convert
 
-T = TypeVar("T")
-Take = Callable[[T, Path], Sample | list[Sample]]
+Features = NDArray[np.float32]
+
+_VALUES = np.dtype("<f4")
 
 
-class FeatureBatch(Protocol):
-    """The clips that are read together. Picklable and small: it travels to a worker."""
+class BatchIndex(Config):
+    """What one batch file holds."""
 
-    @property
-    def size(self) -> int:
-        """Number of clips."""
-        ...
-
-    def is_made(self, folder: Path) -> bool:
-        """Whether an earlier run made it from the same inputs."""
-        ...
-
-    def make(self, folder: Path) -> None:
-        """Convert every clip into files under `folder`. A clip that fails is recorded there, not raised."""
-        ...
-
-    def trial(self, seconds: float) -> int:
-        """Convert clips for about this long without keeping them; returns how many."""
-        ...
+    fingerprint: str
+    dim: int
+    clips: dict[str, tuple[int, int]]
+    """Label -> first frame and number of frames."""
+    dropped: list[Dropped]
 
 
 @dataclass(frozen=True)
-class FeatureStep(Generic[T]):
+class FeatureBatch:
+    """The clips that are read together. Picklable: it travels to a worker."""
+
+    number: int
+    labels: tuple[str, ...]
+    dim: int
+    fingerprint: str
+    """Digest of what the features depend on, the content of the source included."""
+    clips: Callable[[], Iterator[tuple[str, Features | Dropped]]]
+    """(label, features [T, D] or the reason for none) of each clip, one in memory at a time."""
+
+    @property
+    def size(self) -> int:
+        return len(self.labels)
+
+    def is_made(self, folder: Path) -> bool:
+        path = _path(folder, self.number)
+        try:
+            found = BatchIndex.load_json(path.with_suffix(".json"))
+        except UserError:
+            return False
+        size = sum(count for _, count in found.clips.values()) * found.dim * _VALUES.itemsize
+        return found.fingerprint == self.fingerprint and path.is_file() and path.stat().st_size == size
+
+    def make(self, folder: Path) -> None:
+        """Convert every clip into a file under `folder`. A clip that fails is recorded there, not raised."""
+        index = BatchIndex(fingerprint=self.fingerprint, dim=self.dim, clips={}, dropped=[])
+        frames, path = 0, _path(folder, self.number)
+        with atomic_file(path) as file:
+            for label, made in self.clips():
+                if isinstance(made, Dropped):
+                    index.dropped.append(made)
+                    continue
+                if made.ndim != 2 or made.shape[1] != self.dim or label in index.clips:
+                    raise UserError(
+                        f"{label}: features {list(made.shape)} are not [T, {self.dim}], or came twice"
+                    )
+                file.write(made.astype(_VALUES, copy=False).tobytes())
+                index.clips[label] = (frames, len(made))
+                frames += len(made)
+        write_json(path.with_suffix(".json"), index.dump())
+
+    def trial(self, seconds: float) -> int:
+        """Convert clips for about this long without keeping them; returns how many."""
+        end = time.perf_counter() + seconds
+        for count, _ in enumerate(self.clips(), start=1):
+            if time.perf_counter() > end:
+                return count
+        return self.size
+
+
+@dataclass(frozen=True)
+class FeatureStep(Generic[C]):
     """How the features of a conversion are made batch by batch, and how a clip is picked from them."""
 
     batches: Sequence[FeatureBatch]
-    batch_of: Callable[[T], int]
-    """Position in `batches` of the batch that an item is in."""
-    take: Take[T]
-    """The sample of an item, from the files of its batch. Picklable; raises what stopped the clip."""
+    number_of: Callable[[C], int]
+    """Number of the batch that a clip is in. Picklable."""
+    sample: Callable[[C, Features], Sample]
+    """The sample of a clip with its features. Picklable."""
 
     def make(
         self,
-        items: Sequence[T],
+        clips: Sequence[C],
         folder: Path,
         pool: Workers,
         how: WriteOptions,
-        say: Callable[[str], None] | None = None,
-    ) -> Convert[T]:
-        """Make the batches that `items` need and that are not there: all, or those of a part.
+        say: Callable[[str], None],
+    ) -> Convert[C]:
+        """Make the batches that `clips` need and that are not there: all, or those of a part.
 
-        `say` gets a line when an earlier run made some of them. Returns the function from item to sample. A
+        `say` gets a line when an earlier run made some of them. Returns the function from clip to sample. A
         part of the shards makes no batch: `UserError` when one is missing.
         """
-        needed = sorted({self.batch_of(item) for item in items})
+        numbers = {self.number_of(clip) for clip in clips}
+        needed = [(at, batch) for at, batch in enumerate(self.batches) if batch.number in numbers]
         if how.features_only:
-            needed = [position for position in needed if how.has(position)]
-        todo = [self.batches[position] for position in needed if not self.batches[position].is_made(folder)]
+            needed = [(at, batch) for at, batch in needed if how.has(at)]
+        todo = [batch for _, batch in needed if not batch.is_made(folder)]
         if todo and how.part is not None and not how.features_only:
             raise UserError(
                 f"{folder}: features of {len(todo)} batches are missing; "
                 f"run the parts of step 'features' first"
             )
+        left = sum(batch.size for batch in todo)
         made = len(needed) - len(todo)
-        if say is not None and made and todo:
-            clips = sum(self.batches[position].size for position in needed) - sum(b.size for b in todo)
-            say(f"{folder.parent}: goes on after {made:,} of {len(needed):,} batches ({clips:,} clips)")
+        if made and todo:
+            count = sum(batch.size for _, batch in needed) - left
+            say(f"{folder.parent}: goes on after {made:,} of {len(needed):,} batches ({count:,} clips)")
         if todo:
             folder.mkdir(parents=True, exist_ok=True)
-        clips = sum(batch.size for batch in todo)
-        with Meter("converting clips", clips, shown=how.progress and bool(items)) as meter:
-            for position, _ in pool.run(partial(_make, folder), todo):
+        with Meter("converting clips", left, shown=how.progress and bool(clips)) as meter:
+            for position, _ in pool.run(methodcaller("make", folder), todo):
                 meter.advance(todo[position].size)
-        return partial(_take, self.take, folder)
+        return partial(_take, self.sample, self.number_of, folder)
 
 
-def _make(folder: Path, batch: FeatureBatch) -> None:
-    batch.make(folder)
+def _path(folder: Path, number: int) -> Path:
+    return folder / f"{number:06d}.bin"
 
 
-def _take(take: Take[T], folder: Path, item: T) -> Sample | list[Sample]:
-    return take(item, folder)
+def _take(
+    sample: Callable[[C, Features], Sample], number_of: Callable[[C], int], folder: Path, clip: C
+) -> Sample:
+    return sample(clip, _stored_features(_path(folder, number_of(clip)), clip.label()))
+
+
+def _stored_features(path: Path, label: str) -> Features:
+    index_file = path.with_suffix(".json")
+    index = _open(index_file, index_file.stat().st_mtime_ns)
+    if label not in index.clips:
+        reasons = [drop.reason for drop in index.dropped if drop.source == label]
+        raise UserError(reasons[-1] if reasons else "not in its batch; convert again")
+    first, frames = index.clips[label]
+    values = np.fromfile(
+        path, dtype=_VALUES, count=frames * index.dim, offset=first * index.dim * _VALUES.itemsize
+    )
+    return values.reshape(frames, index.dim).astype(np.float32, copy=False)
+
+
+@lru_cache(maxsize=256)
+def _open(path: Path, changed: int) -> BatchIndex:
+    """Clips of one shard come from many batches, so indices are kept; `changed` tells versions apart."""
+    return BatchIndex.load_json(path)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName
 from motionloom.datasets.motion.canonical import canonicalize, resample, retarget
-from motionloom.datasets.motion.features import encode
+from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.smpl import BodyModel, SkeletonName
 from motionloom.datasets.schema import UserError
 
 FIGURE_METRES = (0.5, 4.0)
@@ -27,11 +26,11 @@ def body_of(model: Path | None, skeleton: SkeletonName) -> BodyModel:
 
 
 def features_of(
-    joints: NDArray[Any],
+    joints: NDArray[np.floating],
     fps: float,
     layout: MotionLayout,
     *,
-    face: NDArray[Any] | None = None,
+    face: NDArray[np.floating] | None = None,
     same_bones: bool = False,
 ) -> NDArray[np.float32]:
     """World joints [T, N, 3] in metres, Y up, at `fps` -> features [T', D] at the layout's rate.
@@ -47,7 +46,7 @@ def features_of(
     return encode(canonicalize(joints), layout, None if face is None else resample(face, fps, layout.fps))
 
 
-def require_human(joints: NDArray[Any], fps: float) -> None:
+def require_human(joints: NDArray[np.floating], fps: float) -> None:
     """`UserError` for NaN, a figure of the wrong size, or joints that jump."""
     if not np.isfinite(joints).all():
         frame, joint = np.argwhere(~np.isfinite(joints).all(axis=-1))[0]

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TypeVar
 
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.convert.common.splits import check_id
 from motionloom.datasets.schema import UserError
 
 T = TypeVar("T")
@@ -43,6 +42,20 @@ def read_text_file(path: Path, name: str | None = None) -> str:
             f"{name}: not UTF-8 text at byte {at} (0x{raw[at]:02x}); save the file as UTF-8"
         ) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def check_id(clip_id: str, where: str) -> str:
+    """The id, if it can never leave a folder when something is named after it; `UserError` otherwise."""
+    parts = clip_id.split("/")
+    if (
+        not clip_id
+        or "\\" in clip_id
+        or not clip_id.isprintable()
+        or any(part in ("", ".", "..") for part in parts)
+        or ":" in parts[0]
+    ):
+        raise UserError(f"{where}: clip id '{clip_id[:80]!s}' is not a plain relative name")
+    return clip_id
 
 
 def inside(root: Path, relative: str, name: str | None = None) -> Path:

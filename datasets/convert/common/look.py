@@ -2,17 +2,17 @@
 
 A plan made of names and headers is the same for a wrong joint map, a wrong length unit and a wrong upward
 axis, and so is everything after it but the people. So a few clips are read the way the conversion would read
-them, and measured (`datasets/motion/standing.py`, as the check of a data set does). Where that is no person
-standing on a floor, the same clips are tried with two joints exchanged, along the other axes and in the other
-units; what makes people of them is suggested, by the option or the lines of the joint map to change.
+them, and measured as the check of a data set does (`motion/plausibility.py`). Where that is no person
+standing on a floor, the same clips are tried along the other axes and in the other units, and the option that
+makes people of them is suggested.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +21,119 @@ from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.corrections import (
-    Names,
-    SeenClip,
-    Suggestion,
-    crowd_of,
-    head_axis,
-    suggest,
-)
+from motionloom.datasets.motion.bvh.joint_map import METRES
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.motion.swapped_joints import find_swap
+from motionloom.datasets.motion.plausibility import MOST, PERSON_METRES, PlausibilityStats, measure
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import grouped
+
+Names = tuple[str | tuple[str, ...], ...]
+"""What stands for each joint in a file; empty where no joint map says it."""
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A change that makes people of what was seen."""
+
+    option: Literal["up", "unit", "joint_map", "source"]
+    value: str
+    """What to give it: an axis, a unit, or lines of the joint map; a sentence where no option helps."""
+    why: str
+
+    def __str__(self) -> str:
+        if self.option in ("up", "unit"):
+            return f"--{self.option} {self.value} ({self.why})"
+        return f"{'in the joint map: ' if self.option == 'joint_map' else ''}{self.value} ({self.why})"
+
+
+@dataclass(frozen=True)
+class SeenClip:
+    """One clip that was read: its frames at about ten a second."""
+
+    subset: str
+    joints: NDArray[np.float64]
+    fps: float
+    file_fps: float
+
+
+def stats_of(clips: Iterable[SeenClip]) -> PlausibilityStats:
+    """The clips measured."""
+    stats = PlausibilityStats()
+    for clip in clips:
+        stats.add(measure(clip.joints, clip.fps))
+    return stats
+
+
+def suggest(clips: list[SeenClip], config: ConvertConfig, names: Names, up: str) -> list[Suggestion]:
+    """Changes that together make people of the clips, one after the other: axis, unit, sides."""
+    out: list[Suggestion] = []
+    now = stats_of(clips)
+    if now.upright <= MOST:
+        axis = head_axis(clips, up)
+        clips = [replace(clip, joints=_turned(clip.joints, up, axis)) for clip in clips]
+        out.append(_axis_suggestion(axis, config))
+        now = stats_of(clips)
+    if not PERSON_METRES[0] <= now.height <= PERSON_METRES[1]:
+        factor, suggestion = _unit_suggestion(now.height, config)
+        out.append(suggestion)
+        now = stats_of([replace(clip, joints=clip.joints * factor) for clip in clips])
+    if any(oddity.kind == "left and right" and oddity.is_error for oddity in now.oddities()):
+        mapped = Suggestion("joint_map", "exchange the left and the right rows", "the feet point backwards")
+        plain = Suggestion("source", "exchange left and right in the source", mapped.why)
+        out.append(mapped if names else plain)
+    return out
+
+
+def _axis_suggestion(axis: str, config: ConvertConfig) -> Suggestion:
+    why = f"the head is above the pelvis along the {axis} axis of the files"
+    if hasattr(config, "up") and axis in ("+y", "+z"):
+        return Suggestion("up", axis[1], why)
+    return Suggestion("source", "turn the files so that y or z points up", why)
+
+
+def _unit_suggestion(height: float, config: ConvertConfig) -> tuple[float, Suggestion]:
+    given = METRES.get(getattr(config, "unit", "m"), 1.0)
+    factors = {unit: metres / given for unit, metres in METRES.items()}
+    fits = {u: f for u, f in factors.items() if PERSON_METRES[0] <= height * f <= PERSON_METRES[1]}
+    if not fits:
+        why = f"the figures are {height:.3g} m tall, and no unit makes 1.2 to 2.2 m of it"
+        return 1.7 / max(height, 1e-9), Suggestion("source", "scale the files", why)
+    unit, factor = min(fits.items(), key=lambda item: abs(np.log(height * item[1] / 1.7)))
+    why = f"then the figures are {height * factor:.2f} m tall"
+    if hasattr(config, "unit"):
+        return factor, Suggestion("unit", unit, why)
+    return factor, Suggestion("source", f"the lengths look like {unit}: scale the files to metres", why)
+
+
+def _file_axes(vectors: NDArray[np.floating], up: str) -> NDArray[np.floating]:
+    """Vectors [..., 3] with Y up, in the axes of the files, of which `up` was taken for the upward one."""
+    if up == "z":
+        return np.stack([vectors[..., 0], -vectors[..., 2], vectors[..., 1]], axis=-1)
+    return vectors
+
+
+def head_axis(clips: Iterable[SeenClip], up: str) -> str:
+    """The axis of the files along which the head lies from the pelvis in most clips."""
+    found: Counter[str] = Counter()
+    for clip in clips:
+        way = _file_axes(np.array(measure(clip.joints, clip.fps).up), up)
+        axis = int(np.abs(way).argmax())
+        found[("+" if way[axis] > 0 else "-") + "xyz"[axis]] += 1
+    return found.most_common(1)[0][0]
+
+
+def _turned(joints: NDArray[np.float64], up: str, axis: str) -> NDArray[np.float64]:
+    x, y, z = np.moveaxis(_file_axes(joints, up), -1, 0)
+    turned = {
+        "+y": (x, y, z),
+        "-y": (x, -y, -z),
+        "+z": (x, z, -y),
+        "-z": (x, -z, y),
+        "+x": (-y, x, z),
+        "-x": (y, -x, z),
+    }[axis]
+    return np.stack(turned, axis=-1)
+
 
 MOST_CLIPS = 96
 """Clips that are looked at in all; of sources with more subsets, fewer a subset and then fewer subsets."""
@@ -46,7 +147,7 @@ T = TypeVar("T")
 class SourceJoints:
     """A clip as a converter reads it, before anything is made canonical."""
 
-    joints: NDArray[Any]
+    joints: NDArray[np.floating]
     """World positions [T, N, 3] in metres, Y up, after the options for unit and axis."""
     fps: float
     names: Names = ()
@@ -95,15 +196,12 @@ class Look:
 
     @property
     def clips(self) -> int:
-        """Clips that were read."""
         return sum(subset.clips for subset in self.subsets)
 
-    def dump(self) -> dict[str, Any]:
-        """As plain JSON values."""
+    def dump(self) -> dict[str, object]:
         return asdict(self)
 
     def table(self) -> Table:
-        """What was seen, a row a subset, for a terminal."""
         of = "" if len(self.subsets) == self.all_subsets else f" ({len(self.subsets)} of {self.all_subsets})"
         table = Table(
             *(f"subset{of}", "clips", "height", "head above pelvis", "lowest joint", "walking", "fps"),
@@ -124,7 +222,6 @@ class Look:
         return table
 
     def lines(self) -> list[str]:
-        """What follows from it, most serious first; empty lines are never among them."""
         return [
             *(f"problem: {text}" for text in self.problems),
             *(f"try: {suggestion}" for suggestion in self.suggestions),
@@ -133,7 +230,6 @@ class Look:
         ]
 
     def require_people(self, source: str) -> None:
-        """`UserError` when these are no people standing on a floor."""
         if not self.problems:
             return
         tries = "".join(f"; try {suggestion}" for suggestion in self.suggestions)
@@ -223,17 +319,17 @@ def _choose(
 
 
 def _subset(name: str, clips: list[SeenClip], unreadable: int, up: str) -> SubsetLook:
-    crowd = crowd_of(clips)
+    stats = stats_of(clips)
     return SubsetLook(
         name=name,
         clips=len(clips),
         unreadable=unreadable,
-        height=round(crowd.height, 4) if clips else None,
-        upright=round(crowd.upright * len(clips)) if clips else 0,
+        height=round(stats.height, 4) if clips else None,
+        upright=round(stats.upright * len(clips)) if clips else 0,
         head=head_axis(clips, up) if clips else "",
-        above_floor=round(crowd.above_floor, 4) if clips else None,
-        walking=crowd.walking,
-        backwards=crowd.backwards,
+        above_floor=round(stats.above_floor, 4) if clips else None,
+        walking=stats.walking,
+        backwards=stats.backwards,
         fps=tuple(sorted({clip.file_fps for clip in clips})),
     )
 
@@ -241,9 +337,7 @@ def _subset(name: str, clips: list[SeenClip], unreadable: int, up: str) -> Subse
 def _judge(
     clips: list[SeenClip], config: ConvertConfig, names: Names, up: str
 ) -> tuple[list[str], list[str], list[Suggestion]]:
-    """Problems, warnings, and what would make people of the clips."""
-    oddities = crowd_of(clips).oddities()
-    swap = find_swap([clip.joints for clip in clips])
+    oddities = stats_of(clips).oddities()
     problems = [oddity.text for oddity in oddities if oddity.is_error]
     warnings = [oddity.text for oddity in oddities if not oddity.is_error]
     by_subset: dict[str, list[SeenClip]] = defaultdict(list)
@@ -254,10 +348,7 @@ def _judge(
         if len(by_subset) > 1:
             warnings += [
                 f"{name}: {oddity.text}"
-                for oddity in crowd_of(members).oddities()
+                for oddity in stats_of(members).oddities()
                 if oddity.is_error and oddity.kind not in known
             ]
-    if swap is not None:
-        first, second = swap.names
-        problems.insert(0, f"{first} and {second} stand in each other's place")
-    return problems, warnings, suggest(clips, swap, config, names, up) if problems else []
+    return problems, warnings, suggest(clips, config, names, up) if problems else []

@@ -7,9 +7,9 @@ and why, so nothing is skipped silently (`convert ... --plan` prints it and stop
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from rich.markup import escape
 from rich.table import Table
@@ -17,8 +17,7 @@ from rich.table import Table
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import Look
-from motionloom.datasets.schema import Dropped, Split, UserError
-from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
 from motionloom.datasets.shards.left_out import grouped, grouped_notes
 
 
@@ -26,9 +25,12 @@ class PlannedClip(Protocol):
     """A clip of a plan: what a converter hands to its function from clip to sample."""
 
     @property
-    def split(self) -> Split:
-        """Where it goes."""
+    def id(self) -> str:
+        """Its name in the data set."""
         ...
+
+    @property
+    def split(self) -> Split: ...
 
     def label(self) -> str:
         """Name in reports. A changed file must change it: name and size will do."""
@@ -53,15 +55,18 @@ class Subset:
     """Clips of the official release; None where it states no number."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class ConversionPlan(Generic[C]):
-    """What a conversion would do. `items` become samples; everything else is listed with its reason."""
+    """What a conversion would do. `items` become samples; everything else is listed with its reason.
 
-    name: str
-    items: list[tuple[Split, C]]
-    frames: dict[Split, int]
+    A converter fills it while it decides what becomes of every file, and ends with `finish`.
+    """
+
+    config: ConvertConfig
+    items: list[tuple[Split, C]] = field(default_factory=list)
+    frames: dict[Split, int] = field(default_factory=dict)
     """Expected frames a split, at the target frame rate."""
-    found: int
+    found: int = 0
     """Motion files in the source."""
     missing: list[Dropped] = field(default_factory=list)
     """Listed by captions or split files, but not in the source."""
@@ -90,107 +95,15 @@ class ConversionPlan(Generic[C]):
     look: Look | None = None
     """What a few clips showed; None when none was looked at."""
 
-    def counts(self) -> dict[Split, int]:
-        """Clips a split."""
-        return {split: sum(s == split for s, _ in self.items) for split in SPLITS}
-
-    def table(self) -> Table:
-        """The plan for a terminal."""
-        table = Table("what", "clips", "frames", "detail", title=escape(f"plan: {self.name}"))
-        counts = self.counts()
-        table.add_row("found in the source", str(self.found), "", f"{self.ignored} other files ignored")
-        for split in SPLITS:
-            table.add_row(split, str(counts[split]), str(self.frames.get(split, 0)), "")
-        table.add_row("without captions", str(len(self.uncaptioned)), "", escape(_some(self.uncaptioned)))
-        kinds = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
-        for title, drops in kinds:
-            table.add_row(title, str(len(drops)), "", escape(_some(grouped(drops))))
-        for licence, count in sorted(self.licences.items()):
-            table.add_row("licence", str(count), "", escape(licence))
-        if self.bytes_needed is not None:
-            table.add_row("disk", "", "", f"{self.bytes_needed / 2**20:,.1f} MiB")
-        if self.seconds_needed is not None:
-            table.add_row("time", "", "", _duration(self.seconds_needed))
-        for note in grouped_notes(self.notes):
-            table.add_row("note", "", "", escape(note))
-        if self.stop:
-            table.add_row("stops here", "", "", escape(self.stop))
-        return table
-
-    def dump(self) -> dict[str, Any]:
-        """The plan as plain JSON values, every clip that is left out by name and reason."""
-        left: dict[str, list[dict[str, str]]] = {
-            name: [{"source": drop.source, "reason": drop.reason} for drop in drops]
-            for name, drops in (
-                ("missing", self.missing), ("rejected", self.dropped), ("unreadable", self.broken)
-            )
-        }  # fmt: skip
-        return {
-            "name": self.name,
-            "found": self.found,
-            "clips": dict(self.counts()),
-            "frames": dict(self.frames),
-            **left,
-            "uncaptioned": list(self.uncaptioned),
-            "ignored": self.ignored,
-            "notes": list(self.notes),
-            "subsets": {name: asdict(subset) for name, subset in self.subsets.items()},
-            "licences": dict(self.licences),
-            "bytes_needed": self.bytes_needed,
-            "seconds_needed": self.seconds_needed,
-            "look": None if self.look is None else self.look.dump(),
-        }
-
-    def subset_table(self) -> Table | None:
-        """Found and missing per subset beside the official release; None for a source without subsets."""
-        if not self.subsets:
-            return None
-        table = Table("subset", "found", "to convert", "missing", "official release", title="subsets")
-        for name, subset in sorted(self.subsets.items()):
-            expected = "" if subset.expected is None else str(subset.expected)
-            table.add_row(escape(name), str(subset.found), str(subset.used), str(subset.missing), expected)
-        return table
-
-    def left_out(self) -> list[Dropped]:
-        """Everything that will not become a sample, with reasons."""
-        return [
-            *(drop.model_copy(update={"kind": "missing"}) for drop in self.missing),
-            *(drop.model_copy(update={"kind": "unreadable"}) for drop in self.broken),
-            *self.dropped,
-        ]
-
-    def require_settled(self) -> None:
-        """`UserError` when the user has something to decide first."""
-        if self.stop:
-            raise UserError(self.stop)
-
-    def require_whole(self) -> None:
-        """`UserError` when anything is missing or broken (`--strict`)."""
-        bad = [*self.broken, *self.missing]
-        if bad:
-            raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")
-
-
-@dataclass
-class PlanDraft(Generic[C]):
-    """What a converter collects while it decides what becomes of every file; `finish` makes the plan."""
-
-    config: ConvertConfig
-    items: list[tuple[Split, C]] = field(default_factory=list)
-    missing: list[Dropped] = field(default_factory=list)
-    uncaptioned: list[str] = field(default_factory=list)
-    dropped: list[Dropped] = field(default_factory=list)
-    broken: list[Dropped] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    captions: str = ""
-    stop: str = ""
+    @property
+    def name(self) -> str:
+        return f"{self.config.source.name} -> {self.config.name}"
 
     def take(self, clip: C) -> None:
-        """This clip becomes a sample."""
         self.items.append((clip.split, clip))
 
     def leave_out(self, source: str, reason: str) -> None:
-        """This one could, but does not."""
+        """This one could become a sample, but does not."""
         self.dropped.append(Dropped(source=source, reason=reason))
 
     def miss(self, source: str, reason: str) -> None:
@@ -217,26 +130,102 @@ class PlanDraft(Generic[C]):
         ignored: int = 0,
         subsets: Mapping[str, Subset] | None = None,
     ) -> ConversionPlan[C]:
-        """The plan; `frames` (at the target frame rate) and `licence` are asked about every clip of it."""
-        total: dict[Split, int] = dict.fromkeys(SPLITS, 0)
+        """Itself, with its totals; `frames` (at the target rate) and `licence` are asked about every clip."""
+        self.found, self.ignored, self.subsets = found, ignored, dict(subsets or {})
+        self.frames = dict.fromkeys(SPLITS, 0)
         for split, clip in self.items:
-            total[split] += frames(clip)
-        return ConversionPlan(
-            name=f"{self.config.source.name} -> {self.config.name}",
-            items=self.items,
-            frames=total,
-            found=found,
-            missing=self.missing,
-            uncaptioned=self.uncaptioned,
-            dropped=self.dropped,
-            broken=self.broken,
-            ignored=ignored,
-            notes=self.notes,
-            subsets=dict(subsets or {}),
-            licences=dict(sorted(Counter(licence(clip) for _, clip in self.items).items())),
-            captions=self.captions,
-            stop=self.stop,
-        )
+            self.frames[split] += frames(clip)
+        self.licences = dict(sorted(Counter(licence(clip) for _, clip in self.items).items()))
+        return self
+
+    def counts(self) -> dict[Split, int]:
+        return {split: sum(s == split for s, _ in self.items) for split in SPLITS}
+
+    def table(self) -> Table:
+        table = Table("what", "clips", "frames", "detail", title=escape(f"plan: {self.name}"))
+        counts = self.counts()
+        table.add_row("found in the source", str(self.found), "", f"{self.ignored} other files ignored")
+        for split in SPLITS:
+            table.add_row(split, str(counts[split]), str(self.frames.get(split, 0)), "")
+        table.add_row("without captions", str(len(self.uncaptioned)), "", escape(_some(self.uncaptioned)))
+        kinds = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
+        for title, drops in kinds:
+            table.add_row(title, str(len(drops)), "", escape(_some(grouped(drops))))
+        for licence, count in sorted(self.licences.items()):
+            table.add_row("licence", str(count), "", escape(licence))
+        if self.bytes_needed is not None:
+            table.add_row("disk", "", "", f"{self.bytes_needed / 2**20:,.1f} MiB")
+        if self.seconds_needed is not None:
+            table.add_row("time", "", "", _duration(self.seconds_needed))
+        for note in grouped_notes(self.notes):
+            table.add_row("note", "", "", escape(note))
+        if self.stop:
+            table.add_row("stops here", "", "", escape(self.stop))
+        return table
+
+    def dump(self) -> dict[str, object]:
+        left: dict[str, list[dict[str, str]]] = {
+            name: [{"source": drop.source, "reason": drop.reason} for drop in drops]
+            for name, drops in (
+                ("missing", self.missing), ("rejected", self.dropped), ("unreadable", self.broken)
+            )
+        }  # fmt: skip
+        return {
+            "name": self.name,
+            "found": self.found,
+            "clips": dict(self.counts()),
+            "frames": dict(self.frames),
+            **left,
+            "uncaptioned": list(self.uncaptioned),
+            "ignored": self.ignored,
+            "notes": list(self.notes),
+            "subsets": {name: asdict(subset) for name, subset in self.subsets.items()},
+            "licences": dict(self.licences),
+            "bytes_needed": self.bytes_needed,
+            "seconds_needed": self.seconds_needed,
+            "look": None if self.look is None else self.look.dump(),
+        }
+
+    def subset_table(self) -> Table | None:
+        if not self.subsets:
+            return None
+        table = Table("subset", "found", "to convert", "missing", "official release", title="subsets")
+        for name, subset in sorted(self.subsets.items()):
+            expected = "" if subset.expected is None else str(subset.expected)
+            table.add_row(escape(name), str(subset.found), str(subset.used), str(subset.missing), expected)
+        return table
+
+    def left_out(self) -> list[Dropped]:
+        return [
+            *(drop.model_copy(update={"kind": "missing"}) for drop in self.missing),
+            *(drop.model_copy(update={"kind": "unreadable"}) for drop in self.broken),
+            *self.dropped,
+        ]
+
+    def require_settled(self) -> None:
+        if self.stop:
+            raise UserError(self.stop)
+
+    def require_whole(self) -> None:
+        """`UserError` when anything is missing or broken (`--strict`)."""
+        bad = [*self.broken, *self.missing]
+        if bad:
+            raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")
+
+
+def count_subsets(
+    found: Iterable[str],
+    used: Iterable[str],
+    missing: Iterable[str],
+    expected: Mapping[str, int] | None = None,
+) -> dict[str, Subset]:
+    """By name, from the subset of every motion file, of every clip used and of every missing one."""
+    here, taken, absent = Counter(found), Counter(used), Counter(missing)
+    official = expected or {}
+    return {
+        name: Subset(here[name], taken[name], absent[name], official.get(name))
+        for name in sorted(here.keys() | absent.keys() | official.keys())
+    }
 
 
 def limited(
@@ -253,6 +242,11 @@ def drop(label: str, error: Exception) -> Dropped:
     """The manifest's record of a clip that failed."""
     text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     return Dropped(source=label, reason=text.removeprefix(f"{label}: "))
+
+
+def first_notes(notes: list[str], most: int, what: str) -> list[str]:
+    """The first notes of a kind, and how many more there are."""
+    return notes[:most] + ([f"... and {len(notes) - most} more {what}"] if len(notes) > most else [])
 
 
 def _duration(seconds: float) -> str:

@@ -1,24 +1,122 @@
-"""What the motion files of a source hold, batch by batch, remembered between runs.
+"""Motion files of a source, loose or in tar archives, and what they hold, remembered between runs.
 
-To know which clips an archive holds it must be unpacked, and planning needs to know. So what was found is
-kept in one JSON file, each batch under a digest of its files' names, sizes and times of change: the next run,
-or the next machine, looks only at batches that changed.
+Nothing is ever extracted: a member's name is only a label, links and devices are skipped, and compressed
+archives are read once from front to back (xz cannot do otherwise), one member in memory at a time. What was
+found is kept in one JSON file, each batch under a digest of its files' names, sizes and times of change: the
+next run, or the next machine, looks only at batches that changed.
 """
 
 from __future__ import annotations
 
 import hashlib
+import lzma
+import tarfile
 import time
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from motionloom.datasets.base.files import sha256_of_json, write_json
-from motionloom.datasets.convert.common.archives import Batch
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.schema import Config, Dropped, UserError
+
+ARCHIVES = (".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2")
+LOOSE_FILES_PER_BATCH = 64
+MAX_FILE_BYTES = 1 << 30
+"""A motion file beyond this is refused unread: a few hours of text, or a bomb."""
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """One motion file: `label` names it in reports, `path` inside the source or the archive."""
+
+    label: str
+    path: str
+    data: bytes
+    error: str = ""
+    """Why there are no data (unreadable, too large)."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The unit of parallel work: one archive, or a run of loose files."""
+
+    root: Path
+    archive: str | None
+    files: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        return self.archive or self.files[0]
+
+    def state(self) -> list[tuple[str, int, int]]:
+        out = []
+        for name in (self.archive,) if self.archive is not None else self.files:
+            try:
+                about = (self.root / name).stat()
+                out.append((name, about.st_size, about.st_mtime_ns))
+            except OSError:
+                out.append((name, -1, 0))
+        return out
+
+    def read(self, suffix: str) -> Iterator[SourceFile]:
+        """Every file with `suffix`, in archive order. `UserError` when the archive is damaged there."""
+        if self.archive is not None:
+            yield from _read_archive(self.root / self.archive, self.archive, suffix)
+            return
+        for name in self.files:
+            path = self.root / name
+            try:
+                problem = _too_large(path.stat().st_size)
+                yield SourceFile(name, name, b"" if problem else path.read_bytes(), problem)
+            except OSError as error:
+                yield SourceFile(name, name, b"", f"cannot read ({error.strerror})")
+
+
+def list_batches(source: Path, suffix: str) -> tuple[list[Batch], int]:
+    """Batches under `source` (a folder, a motion file or an archive), in name order, and how many others."""
+    if source.is_file():
+        names, root = [source.name], source.parent
+    elif source.is_dir():
+        root = source
+        names = sorted(p.relative_to(source).as_posix() for p in source.rglob("*") if p.is_file())
+    else:
+        raise UserError(f"{source}: no such file or folder")
+    archives = [name for name in names if name.lower().endswith(ARCHIVES)]
+    loose = [name for name in names if name.lower().endswith(suffix)]
+    batches = [Batch(root, name) for name in archives]
+    for first in range(0, len(loose), LOOSE_FILES_PER_BATCH):
+        batches.append(Batch(root, None, tuple(loose[first : first + LOOSE_FILES_PER_BATCH])))
+    if not batches:
+        raise UserError(f"{source}: no {suffix} file and no archive ({', '.join(ARCHIVES)}) in it")
+    return batches, len(names) - len(archives) - len(loose)
+
+
+def _read_archive(path: Path, label: str, suffix: str) -> Iterator[SourceFile]:
+    last = "the start"
+    try:
+        with tarfile.open(path, "r|*") as archive:
+            for member in archive:
+                if not member.isreg() or not member.name.lower().endswith(suffix):
+                    continue
+                where = f"{label}/{member.name}"
+                problem = _too_large(member.size)
+                file = None if problem else archive.extractfile(member)
+                yield SourceFile(where, member.name.removeprefix("./"), file.read() if file else b"", problem)
+                last = f"'{member.name}'"
+    except (tarfile.TarError, EOFError, OSError, lzma.LZMAError, zlib.error) as error:
+        raise UserError(f"{label}: damaged archive after {last} ({error or type(error).__name__})") from None
+
+
+def _too_large(size: int) -> str:
+    if size <= MAX_FILE_BYTES:
+        return ""
+    return f"{size} bytes, more than a motion file may have ({MAX_FILE_BYTES})"
+
 
 _VERSION = 2
 _SAVE_SECONDS = 30.0
@@ -53,8 +151,6 @@ Header = Callable[[bytes, str], tuple[int, float, str]]
 
 
 class _Memory(Config):
-    """The file that remembers: batches by the digest of their state."""
-
     batches: dict[str, BatchScan]
 
 
@@ -71,25 +167,21 @@ def scan_batches(
     keys = [sha256_of_json([_VERSION, suffix, batch.state()]) for batch in batches]
     known = _load(keep)
     kept = {key: known[key] for key in keys if key in known}
-    todo = [batch for key, batch in zip(keys, batches, strict=True) if key not in kept]
-    made: list[BatchScan] = []
-    saved, changed = time.monotonic(), bool(todo) or len(kept) < len(known)
-    missing = [key for key in keys if key not in kept]
-    scans = read_in_threads(
-        partial(_scan, suffix, header), todo, workers=workers, progress=progress, before=len(kept)
-    )
-    for key, (found, certain) in zip(missing, scans, strict=True):
-        made.append(found)
+    todo = [(key, batch) for key, batch in zip(keys, batches, strict=True) if key not in kept]
+    found, saved = dict(kept), time.monotonic()
+    read = partial(_scan, suffix, header)
+    new = [batch for _, batch in todo]
+    scans = read_in_threads(read, new, workers=workers, progress=progress, before=len(kept))
+    for (key, _), (scan, certain) in zip(todo, scans, strict=True):
+        found[key] = scan
         if certain:
-            kept[key] = found
+            kept[key] = scan
         if time.monotonic() - saved > _SAVE_SECONDS:
             _save(keep, kept)
             saved = time.monotonic()
-    if changed:
+    if todo or len(kept) < len(known):
         _save(keep, kept)
-    new = iter(made)
-    missed = set(missing)
-    return [next(new) if key in missed else kept[key] for key in keys]
+    return [found[key] for key in keys]
 
 
 def _load(path: Path | None) -> dict[str, BatchScan]:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
-from motionloom.datasets.schema import Split, UserError
-from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.convert.common.files import check_id, read_text_file
+from motionloom.datasets.schema import SPLITS, Split, UserError
 
 TRAIN_SHARE, VAL_SHARE = 0.80, 0.05
 """80/5/15, the split of HumanML3D and Motion-X, where a source brings none."""
@@ -66,16 +66,15 @@ class SplitNames:
         return "drop" if self._others == "drop" else None
 
     def require_known(self) -> None:
-        """`UserError` about the names that `of` did not know."""
         if not self._unknown:
             return
         name = next(iter(self._unknown))
         counts = ", ".join(f"'{other}' ({count})" for other, count in list(self._unknown.items())[:5])
         more = f"; unknown names and how often: {counts}" if len(self._unknown) > 1 else ""
         raise UserError(
-            f"{self._first}: split '{name}' is none of {', '.join(_SYNONYMS)}{more}; say what it means with "
-            f"--splits-map '{name}=train' (in a recipe splits_map), or val, test, drop (leave its clips out) "
-            f"or ignore (as if it were not stated)"
+            f"{self._first}: split '{name}' is none of {', '.join(_SYNONYMS)}{more}; say what it means: "
+            f"--set splits_map='{name}=train' (in a recipe splits_map), or val, test, drop (leave its clips "
+            f"out) or ignore (as if it were not stated)"
         )
 
     def files(self, folder: Path) -> list[tuple[Split, Path]]:
@@ -102,54 +101,56 @@ def hash_splits(ids: Iterable[str]) -> tuple[dict[str, Split], list[str]]:
     return {clip_id: hash_split(original_of(clip_id) or clip_id) for clip_id in ids}, [note]
 
 
-def check_id(clip_id: str, where: str) -> str:
-    """The id, if it can never leave a folder when something is named after it; `UserError` otherwise."""
-    parts = clip_id.split("/")
-    if (
-        not clip_id
-        or "\\" in clip_id
-        or not clip_id.isprintable()
-        or any(part in ("", ".", "..") for part in parts)
-        or ":" in parts[0]
-    ):
-        raise UserError(f"{where}: clip id '{clip_id[:80]!s}' is not a plain relative name")
-    return clip_id
-
-
 def read_split_files(folder: Path, names: SplitNames | None = None) -> tuple[dict[str, Split], list[str]]:
     """`train.txt`, `val.txt`, `test.txt` (one id a line) -> split of every id, and notes on repeated lines.
 
     Files may also have the usual other names (`valid.txt`, `dev.txt`) and those that `names` knows. An id in
     two splits is a leak and an error; blank lines and CRLF are fine.
     """
-    splits: dict[str, Split] = {}
-    origin: dict[str, str] = {}
-    notes: list[str] = []
     files = (names or SplitNames()).files(folder)
     if not files:
         raise UserError(f"{folder}: no train.txt, val.txt or test.txt")
+    return join_splits(files)
+
+
+def join_splits(
+    files: Iterable[tuple[Split, Path]], suffixes: tuple[str, ...] = ()
+) -> tuple[dict[str, Split], list[str]]:
+    """Split of every id of some lists, and notes on repeated lines; `UserError` for an id in two splits.
+
+    `suffixes` may stand after the ids.
+    """
+    splits: dict[str, Split] = {}
+    origin: dict[str, str] = {}
+    notes: list[str] = []
     for split, path in files:
-        try:
-            lines = path.read_text(encoding="utf-8-sig").splitlines()
-        except UnicodeDecodeError as error:
-            raise UserError(f"{path}: not UTF-8 text (byte {error.start})") from None
-        here: set[str] = set()
-        for number, line in enumerate(lines, start=1):
-            clip_id = line.strip()
-            if not clip_id:
-                continue
-            where = f"{path}:{number}"
-            check_id(clip_id, where)
-            known = splits.setdefault(clip_id, split)
-            if known != split:
+        ids, repeated = read_ids(path, suffixes)
+        notes += repeated
+        for clip_id, number in ids.items():
+            if splits.setdefault(clip_id, split) != split:
+                where = f"{path}:{number}"
                 raise UserError(
                     f"{where}: '{clip_id}' is also in {origin[clip_id]}; a clip in two splits leaks"
                 )
             origin.setdefault(clip_id, path.name)
-            if clip_id in here:
-                notes.append(f"{path.name}:{number}: '{clip_id}' is listed twice; the first line counts")
-            here.add(clip_id)
     return splits, notes
+
+
+def read_ids(path: Path, suffixes: tuple[str, ...] = ()) -> tuple[dict[str, int], list[str]]:
+    """The ids of a list, one a line, and the line of each; and notes on repeated lines."""
+    lines: dict[str, int] = {}
+    notes: list[str] = []
+    for number, line in enumerate(read_text_file(path).split("\n"), start=1):
+        clip_id = line.strip()
+        for suffix in suffixes:
+            clip_id = clip_id.removesuffix(suffix)
+        if not clip_id:
+            continue
+        check_id(clip_id, f"{path}:{number}")
+        if clip_id in lines:
+            notes.append(f"{path.name}:{number}: '{clip_id}' is listed twice; line {lines[clip_id]} counts")
+        lines.setdefault(clip_id, number)
+    return lines, notes
 
 
 def original_of(clip_id: str) -> str | None:
@@ -180,7 +181,6 @@ def keep_mirrors_together(
 
 
 def _line_of(clip_id: str, split: Split, folder: Path | None) -> str:
-    """Where a split file lists an id."""
     if folder is None:
         return f"{split}.txt"
     for path in (path for found, path in SplitNames().files(folder) if found == split):

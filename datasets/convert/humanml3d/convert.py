@@ -15,94 +15,69 @@ Choices:
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.arrays import load_array
-from motionloom.datasets.convert.common.conversion import Conversion
+from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.look import SourceJoints
+from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.humanml3d.plan import (
     FPS,
-    LICENCE,
     WIDTHS,
     HumanMl3dClip,
     HumanMl3dConfig,
     plan_humanml3d,
 )
 from motionloom.datasets.motion.canonical import resample
-from motionloom.datasets.motion.features import decode
-from motionloom.datasets.motion.h3d import encode_h3d
+from motionloom.datasets.motion.features.codec import decode
+from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
-
-__all__ = ["HumanMl3dConfig", "convert_clip", "plan_humanml3d", "prepare_humanml3d"]
-
-CONVERTER = "humanml3d"
-CONVERTER_VERSION = 1
 
 AGREEMENT = 0.01
 """Metres by which new_joints/ may differ from decoded new_joint_vecs/; the published pairs agree to 1e-6."""
 
 
-def prepare_humanml3d(
-    config: HumanMl3dConfig, *, workers: int = 1, progress: bool = False
-) -> Conversion[HumanMl3dClip]:
-    """Look at the whole source and decide what becomes of every file; nothing is converted yet."""
-    plan = plan_humanml3d(config, workers=workers, progress=progress)
-    content = []
-    for _, clip in plan.items:
-        sizes = [(config.source / file).stat().st_size for file in clip.files]
-        content.append([clip.id, clip.files, sizes, [caption.dump() for caption in clip.texts]])
-    return Conversion(
-        config=config,
-        plan=plan,
-        convert=partial(convert_clip, config),
-        licence=config.licence or LICENCE,
-        converter=CONVERTER,
-        version=CONVERTER_VERSION,
-        options=config.options() | {"source_sha256": sha256_of_json(content)},
-        see=partial(see_clip, config),
-    )
+class HumanMl3d(Converter[HumanMl3dConfig, HumanMl3dClip]):
+    """The HumanML3D converter."""
 
+    name = "humanml3d"
+    title = "HumanML3D"
+    summary = "HumanML3D: new_joints or new_joint_vecs, texts and split files to shards."
+    example = "HumanML3D shards"
+    config_class = HumanMl3dConfig
 
-def see_clip(config: HumanMl3dConfig, clip: HumanMl3dClip) -> SourceJoints:
-    """The joints of one clip."""
-    return SourceJoints(_joints(_load(config, clip, clip.files[0])), FPS)
+    def plan(self, settings: PlanSettings) -> ConversionPlan[HumanMl3dClip]:
+        return plan_humanml3d(self.config, settings)
 
+    def depends_on(self, clip: HumanMl3dClip) -> list[object]:
+        sizes = [(self.config.source / file).stat().st_size for file in clip.files]
+        return [clip.id, clip.files, sizes, [caption.dump() for caption in clip.texts]]
 
-def convert_clip(config: HumanMl3dConfig, clip: HumanMl3dClip) -> Sample:
-    """Read one clip and make its features. `UserError` for anything that cannot be a person's motion."""
-    layout = config.motion_layout()
-    stored = [_load(config, clip, file) for file in clip.files]
-    joints = _joints(stored[0])
-    require_human(joints, FPS)
-    if len(stored) > 1:
-        _require_same(joints, _joints(stored[1]), clip)
-    if config.keeps_vectors and stored[0].ndim == 2:
-        motion = stored[0].astype(np.float32, copy=False)
-    elif layout.family == "exact":
-        motion = features_of(joints, FPS, layout, same_bones=config.retarget)
-    else:
-        bones = None if config.retarget else own_bones(joints, layout)
-        motion = encode_h3d(resample(joints, FPS, layout.fps), layout, bones)
-    meta = layout.clip_meta(
-        clip.id,
-        source=clip.label(),
-        split=clip.split,
-        frames=len(motion),
-        licence=clip.licence,
-        has_hands=False,
-        has_face=False,
-        mirror_of=original_of(clip.id),
-    )
-    return Sample(meta=meta, motion=motion, texts=list(clip.texts))
+    def joints(self, clip: HumanMl3dClip) -> SourceJoints:
+        return SourceJoints(_joints(_load(self.config, clip, clip.files[0])), FPS)
+
+    def convert(self, clip: HumanMl3dClip) -> Sample:
+        config, layout = self.config, self.layout
+        stored = [_load(config, clip, file) for file in clip.files]
+        joints = _joints(stored[0])
+        require_human(joints, FPS)
+        if len(stored) > 1:
+            _require_same(joints, _joints(stored[1]), clip)
+        if config.keeps_vectors and stored[0].ndim == 2:
+            motion = stored[0].astype(np.float32, copy=False)
+        elif layout.family == "exact":
+            motion = features_of(joints, FPS, layout, same_bones=config.retarget)
+        else:
+            bones = None if config.retarget else own_bones(joints, layout)
+            motion = encode_h3d(resample(joints, FPS, layout.fps), layout, bones)
+        meta = self.meta(clip, motion, licence=clip.licence, mirror_of=original_of(clip.id))
+        return Sample(meta=meta, motion=motion, texts=list(clip.texts))
 
 
 def own_bones(joints: NDArray[np.float64], layout: MotionLayout) -> NDArray[np.float64]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,15 +15,15 @@ from typing import Literal
 
 from pydantic import Field
 
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header
 from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
-from motionloom.datasets.convert.common.files import inside, read_in_threads
-from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
-from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset, drop
+from motionloom.datasets.convert.common.files import check_id, inside, read_in_threads
+from motionloom.datasets.convert.common.plan import ConversionPlan, count_subsets, drop, first_notes
 from motionloom.datasets.convert.common.splits import (
     SplitNames,
-    check_id,
     hash_splits,
     keep_mirrors_together,
     original_of,
@@ -32,7 +31,6 @@ from motionloom.datasets.convert.common.splits import (
 )
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
-from motionloom.datasets.shards.index import SPLITS
 
 FPS = 20.0
 VECS, JOINTS = "new_joint_vecs", "new_joints"
@@ -42,7 +40,7 @@ LICENCE = (
     "HumanML3D: motion derived from AMASS (non-commercial research only, no redistribution) and HumanAct12; "
     "captions MIT"
 )
-RELEASED: dict[Split, int] = {"train": 23384, "val": 1460, "test": 4384}
+RELEASED: dict[str, int] = {"train": 23384, "val": 1460, "test": 4384}
 """Ids in the official split files, mirrored ones included."""
 
 _SIDE = re.compile(r"\b(?:left|right|(?:counter|anti)?-?clockwise)\b", re.IGNORECASE)
@@ -68,7 +66,6 @@ class HumanMl3dConfig(ConvertConfig):
     """What to do with clips that have no usable caption."""
 
     def motion_layout(self) -> MotionLayout:
-        """The layout of the written shards; 22 joints hold no hands."""
         if self.layout not in LAYOUTS:
             raise UserError(f"layout {self.layout} cannot be made from HumanML3D; use {' or '.join(LAYOUTS)}")
         return super().motion_layout()
@@ -80,7 +77,6 @@ class HumanMl3dConfig(ConvertConfig):
 
     @property
     def folders(self) -> tuple[str, ...]:
-        """Motion folders to read, the preferred one first."""
         if self.use != "auto":
             return (VECS,) if self.use == "vecs" else (JOINTS,)
         return (VECS, JOINTS) if self.keeps_vectors else (JOINTS, VECS)
@@ -100,14 +96,11 @@ class HumanMl3dClip:
     licence: str
 
     def label(self) -> str:
-        """Name of the clip in reports."""
         return self.files[0]
 
 
 @dataclass(frozen=True)
 class _Scanned:
-    """What one clip's files say."""
-
     files: tuple[str, ...]
     frames: int = 0
     texts: tuple[Caption, ...] = ()
@@ -115,26 +108,30 @@ class _Scanned:
     problems: tuple[str, ...] = ()
 
 
-def plan_humanml3d(
-    config: HumanMl3dConfig, *, workers: int = 1, progress: bool = False
-) -> ConversionPlan[HumanMl3dClip]:
+def plan_humanml3d(config: HumanMl3dConfig, settings: PlanSettings) -> ConversionPlan[HumanMl3dClip]:
     """Find every clip and decide what becomes of it, without converting anything."""
     layout = config.motion_layout()
     if not config.source.is_dir():
         raise UserError(f"{config.source}: no such folder")
     present, strange = _list_motion(config)
-    texts = _list_texts(config)
+    folder, texts = _list_texts(config)
     splits, notes = _read_splits(config, sorted(present))
     ids = sorted(present)
-    scan = partial(_scan, config, texts, present)
-    scanned = dict(zip(ids, read_in_threads(scan, ids, workers=workers, progress=progress), strict=True))
+    scan = partial(_scan, config, folder, texts, present)
+    found_here = read_in_threads(scan, ids, workers=settings.workers, progress=settings.progress)
+    scanned = dict(zip(ids, found_here, strict=True))
 
     licence = config.licence or LICENCE
-    draft: PlanDraft[HumanMl3dClip] = PlanDraft(config, broken=strange, notes=notes)
+    draft = ConversionPlan[HumanMl3dClip](config, broken=strange, notes=notes)
     whole = {clip_id: found for clip_id, found in scanned.items() if found.frames}
     for clip_id, found in whole.items():
         split = splits.get(clip_id)
-        reason = "in no split file" if split is None else _problem(config, found, licence)
+        if split is None:
+            reason = "in no split file"
+        elif not found.texts and config.uncaptioned == "drop":
+            reason = "no usable caption"
+        else:
+            reason = config.licence_problem(licence) or config.length_problem(found.frames / FPS)
         if split is None or reason:
             draft.leave_out(found.files[0], reason)
             continue
@@ -142,9 +139,9 @@ def plan_humanml3d(
     draft.broken += [problem for found in scanned.values() for problem in found.broken]
     draft.uncaptioned += [found.files[0] for found in whole.values() if not found.texts]
     draft.notes += _caption_notes(scanned)
-    strays = len(texts.ids.keys() - present.keys())
+    strays = len(texts.keys() - present.keys())
     if strays:
-        draft.notes.append(f"{strays} caption files in {texts.folder}/ belong to no motion file here")
+        draft.notes.append(f"{strays} caption files in {folder}/ belong to no motion file here")
     draft.limit(HumanMl3dClip.label)
 
     missing = {clip_id: split for clip_id, split in splits.items() if clip_id not in present}
@@ -153,25 +150,20 @@ def plan_humanml3d(
         draft.miss(clip_id, f"listed in {split}.txt, but not in {wanted}/")
     return draft.finish(
         found=len(present),
-        frames=lambda clip: _frames_made(config, clip, layout),
+        frames=lambda clip: (
+            clip.frames  # vectors that are kept lose none
+            if config.keeps_vectors and clip.files[0].startswith(VECS)
+            else frames_after(clip.frames, FPS, layout)
+        ),
         licence=lambda clip: clip.licence,
-        ignored=_count_ignored(config, texts.folder),
-        subsets=_subsets(present, splits, missing, draft.items),
+        ignored=_count_ignored(config, folder),
+        subsets=count_subsets(
+            (splits.get(clip_id, "in no split") for clip_id in present),
+            (split for split, _ in draft.items),
+            missing.values(),
+            RELEASED,
+        ),
     )
-
-
-def _frames_made(config: HumanMl3dConfig, clip: HumanMl3dClip, layout: MotionLayout) -> int:
-    """Frames in the shards: vectors that are kept lose none."""
-    if config.keeps_vectors and clip.files[0].startswith(VECS):
-        return clip.frames
-    return frames_after(clip.frames, FPS, layout)
-
-
-def _problem(config: HumanMl3dConfig, found: _Scanned, licence: str) -> str:
-    """Why a clip of a split is left out; empty when it may come."""
-    if not found.texts and config.uncaptioned == "drop":
-        return "no usable caption"
-    return config.licence_problem(licence) or config.length_problem(found.frames / FPS)
 
 
 def _list_motion(config: HumanMl3dConfig) -> tuple[dict[str, tuple[str, ...]], list[Dropped]]:
@@ -194,31 +186,20 @@ def _list_motion(config: HumanMl3dConfig) -> tuple[dict[str, tuple[str, ...]], l
     return {clip_id: tuple(files) for clip_id, files in found.items()}, strange
 
 
-@dataclass(frozen=True)
-class _Texts:
-    """The caption files of the source."""
-
-    folder: str
-    """Its name in the source; empty without one."""
-    ids: dict[str, str]
-    """Clip id -> file name."""
-
-
-def _list_texts(config: HumanMl3dConfig) -> _Texts:
-    """The caption files; some unpack texts.zip one level too deep."""
+def _list_texts(config: HumanMl3dConfig) -> tuple[str, dict[str, str]]:
+    """The folder of the caption files in the source (empty without one), and clip id -> file name."""
     for folder in ("texts/texts", "texts"):
         if (config.source / folder).is_dir():
             names = [path.name for path in (config.source / folder).iterdir()]
             texts = [name for name in names if name.endswith(".txt") and not name.startswith(".")]
-            return _Texts(folder, {name.removesuffix(".txt"): name for name in texts})
+            return folder, {name.removesuffix(".txt"): name for name in texts}
     if config.uncaptioned == "keep":
-        return _Texts("", {})
+        return "", {}
     hint = "unpack texts.zip" if (config.source / "texts.zip").exists() else "clips would have no captions"
     raise UserError(f"{config.source}: no texts/ in it; {hint} (or --uncaptioned keep)")
 
 
 def _read_splits(config: HumanMl3dConfig, ids: list[str]) -> tuple[dict[str, Split], list[str]]:
-    """Split of every id, by the split files, else by hash of the id that a clip has unmirrored."""
     if not SplitNames().files(config.source):
         return hash_splits(ids)
     splits, notes = read_split_files(config.source)
@@ -227,9 +208,12 @@ def _read_splits(config: HumanMl3dConfig, ids: list[str]) -> tuple[dict[str, Spl
 
 
 def _scan(
-    config: HumanMl3dConfig, texts: _Texts, present: dict[str, tuple[str, ...]], clip_id: str
+    config: HumanMl3dConfig,
+    text_folder: str,
+    texts: dict[str, str],
+    present: dict[str, tuple[str, ...]],
+    clip_id: str,
 ) -> _Scanned:
-    """Headers and captions of one clip."""
     found = _Scanned(present[clip_id])
     lengths = {}
     for label in found.files:
@@ -244,11 +228,11 @@ def _scan(
         reason = f"frames differ ({lengths_found}); choose one with --use vecs or --use joints"
         return replace(found, broken=(Dropped(source=found.files[0], reason=reason),))
     found = replace(found, frames=lengths[found.files[0]])
-    if clip_id not in texts.ids:
+    if clip_id not in texts:
         return found
-    label = f"{texts.folder}/{texts.ids[clip_id]}"
+    label = f"{text_folder}/{texts[clip_id]}"
     try:
-        path = inside(config.source / texts.folder, texts.ids[clip_id], label)
+        path = inside(config.source / text_folder, texts[clip_id], label)
         captions, problems = read_humanml_captions(path, seconds=found.frames / FPS, name=label)
     except UserError as error:
         return replace(found, broken=(drop(label, error),))
@@ -259,9 +243,7 @@ def _scan(
 def _caption_notes(scanned: dict[str, _Scanned]) -> list[str]:
     """Caption lines that were left out, and mirrored clips that still name the side of their original."""
     wrong = [problem for found in scanned.values() for problem in found.problems]
-    notes = wrong[:_NOTED_FILES]
-    if len(wrong) > _NOTED_FILES:
-        notes.append(f"... and {len(wrong) - _NOTED_FILES} more caption files with lines left out")
+    notes = first_notes(wrong, _NOTED_FILES, "caption files with lines left out")
     copied = []
     for clip_id, found in scanned.items():
         original = scanned.get(original_of(clip_id) or "")
@@ -291,20 +273,3 @@ def _count_ignored(config: HumanMl3dConfig, texts: str) -> int:
             end = ends.get(here)
             count += sum(end is None or not name.endswith(end) or name.startswith(".") for name in names)
     return count
-
-
-def _subsets(
-    present: dict[str, tuple[str, ...]],
-    splits: dict[str, Split],
-    missing: dict[str, Split],
-    items: list[tuple[Split, HumanMl3dClip]],
-) -> dict[str, Subset]:
-    """By split file: the release does not say which clip came from which of its sources."""
-    found, absent = Counter(splits.get(clip_id) for clip_id in present), Counter(missing.values())
-    used = Counter(split for split, _ in items)
-    table: dict[str, Subset] = {}
-    for split in SPLITS:
-        table[split] = Subset(found[split], used[split], absent[split], RELEASED[split])
-    if found[None]:
-        table["in no split"] = Subset(found=found[None])
-    return table

@@ -17,17 +17,16 @@ Choices:
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.arrays import load_array
-from motionloom.datasets.convert.common.conversion import Conversion
+from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
 from motionloom.datasets.convert.common.look import SourceJoints
+from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import original_of
+from motionloom.datasets.convert.motionx.files import read_frame_texts
 from motionloom.datasets.convert.motionx.parameters import (
     BETAS,
     EXPRESSION,
@@ -49,81 +48,71 @@ from motionloom.datasets.convert.motionx.plan import (
     MotionXConfig,
     plan_motionx,
 )
-from motionloom.datasets.convert.motionx.text import read_frame_texts
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.text.emotions import emotion_of
-
-__all__ = ["MotionXConfig", "convert_clip", "plan_motionx", "prepare_motionx", "read_parameters"]
-
-CONVERTER = "motionx"
-CONVERTER_VERSION = 2  # emotion words of captions
+from motionloom.datasets.text.clean import emotion_of
 
 
-def prepare_motionx(
-    config: MotionXConfig, *, workers: int = 1, progress: bool = False
-) -> Conversion[MotionXClip]:
-    """Look at the whole source and decide what becomes of every file; nothing is converted yet."""
-    body = body_of(config.body_model, config.skeleton)  # a wrong one should fail before the long part
-    plan = plan_motionx(config, workers=workers, progress=progress)
-    content = []
-    for _, clip in plan.items:
-        sizes = [(config.source / file).stat().st_size for file in clip.files]
+class MotionX(Converter[MotionXConfig, MotionXClip]):
+    """The Motion-X converter."""
+
+    name = "motionx"
+    title = "Motion-X"
+    summary = "Motion-X: SMPL-X parameters (322-d), body, hand and face texts to shards."
+    example = "Motion-X shards"
+    config_class = MotionXConfig
+
+    def __init__(self, config: MotionXConfig) -> None:
+        super().__init__(config)
+        self.body = body_of(config.body_model, config.skeleton)  # a wrong one fails here
+
+    def plan(self, settings: PlanSettings) -> ConversionPlan[MotionXClip]:
+        return plan_motionx(self.config, settings)
+
+    def depends_on(self, clip: MotionXClip) -> list[object]:
+        sizes = [(self.config.source / file).stat().st_size for file in clip.files]
         texts = [caption.dump() for caption in (*clip.texts, *clip.face_texts)]
-        content.append([clip.id, clip.files, sizes, clip.licence, texts])
-    return Conversion(
-        config=config,
-        plan=plan,
-        convert=partial(convert_clip, config, body),
-        licence=config.licence or (next(iter(plan.licences)) if len(plan.licences) == 1 else LICENCE),
-        converter=CONVERTER,
-        version=CONVERTER_VERSION,
-        options=config.options()
-        | {
-            "splits": bool(config.splits),
-            "body_model": body.statement,
-            "source_sha256": sha256_of_json(content),
-        },
-        see=partial(see_clip, config, body),
-        subset_of=lambda clip: clip.subset,
-    )
+        return [clip.id, clip.files, sizes, clip.licence, texts]
 
+    def options(self) -> dict[str, object]:
+        return super().options() | {"body_model": self.body.statement}
 
-def see_clip(config: MotionXConfig, body: BodyModel, clip: MotionXClip) -> SourceJoints:
-    """The joints of one clip in metres, Y up."""
-    return SourceJoints(parameters_to_joints(read_parameters(config, clip), body), FPS)
+    def licence(self, plan: ConversionPlan[MotionXClip]) -> str:
+        return self.config.licence or (next(iter(plan.licences)) if len(plan.licences) == 1 else LICENCE)
 
+    def subset(self, clip: MotionXClip) -> str:
+        return clip.subset
 
-def convert_clip(config: MotionXConfig, body: BodyModel, clip: MotionXClip) -> Sample:
-    """Read one clip and make its features. `UserError` for anything that cannot be a person's motion."""
-    layout = config.motion_layout()
-    values = read_parameters(config, clip)
-    has_face = bool(values[:, EXPRESSION].any())
-    joints = parameters_to_joints(values, body)
-    if layout.family == "raw":
-        require_human(joints, FPS)
-        motion = resample_parameters(values, FPS, layout.fps).astype(np.float32)
-    else:
-        face = values[:, EXPRESSION] if layout.has("face") and has_face else None
-        motion = features_of(joints, FPS, layout, face=face, same_bones=config.retarget)
-    meta = layout.clip_meta(
-        clip.id,
-        source=clip.label(),
-        split=clip.split,
-        frames=len(motion),
-        licence=clip.licence,
-        has_hands=layout.num_joints > BODY_JOINTS and bool(values[:, HANDS].any()),
-        has_face=layout.has("face") and has_face,
-        mirror_of=original_of(clip.id),
-    )
-    texts = [*clip.texts, *_frame_captions(config, clip)]
-    faces = list(clip.face_texts)
-    emotion = None if faces or not meta.has_face else emotion_of(caption.text for caption in clip.texts)
-    if emotion is not None:
-        faces = [Caption(text=emotion, source="emotion")]
-    return Sample(meta=meta, motion=motion, texts=texts, face_texts=faces)
+    def joints(self, clip: MotionXClip) -> SourceJoints:
+        return SourceJoints(parameters_to_joints(read_parameters(self.config, clip), self.body), FPS)
+
+    def convert(self, clip: MotionXClip) -> Sample:
+        config, layout = self.config, self.layout
+        values = read_parameters(config, clip)
+        has_face = bool(values[:, EXPRESSION].any())
+        joints = parameters_to_joints(values, self.body)
+        if layout.family == "raw":
+            require_human(joints, FPS)
+            motion = resample_parameters(values, FPS, layout.fps).astype(np.float32)
+        else:
+            face = values[:, EXPRESSION] if layout.has("face") and has_face else None
+            motion = features_of(joints, FPS, layout, face=face, same_bones=config.retarget)
+        meta = self.meta(
+            clip,
+            motion,
+            licence=clip.licence,
+            hands=layout.num_joints > BODY_JOINTS and bool(values[:, HANDS].any()),
+            face=layout.has("face") and has_face,
+            mirror_of=original_of(clip.id),
+        )
+        texts = [*clip.texts, *_frame_captions(config, clip)]
+        faces = list(clip.face_texts)
+        emotion = None if faces or not meta.has_face else emotion_of(caption.text for caption in clip.texts)
+        if emotion is not None:
+            faces = [Caption(text=emotion, source="emotion")]
+        return Sample(meta=meta, motion=motion, texts=texts, face_texts=faces)
 
 
 def read_parameters(config: MotionXConfig, clip: MotionXClip) -> NDArray[np.float64]:

@@ -5,10 +5,14 @@ came from (`motionx_seq_text_v1.1`), holds that kind of file, at most a few leve
 follows it in a path is the clip's id: `motion_data/smplx_322/GRAB/s8/mug_toast_1.npy` is
 `GRAB/s8/mug_toast_1`, and so is `texts/GRAB_txt/s8/mug_toast_1.txt`. Base names repeat over the folders, so
 the whole id is the key.
+
+`humanml/` holds HumanML3D's caption lines, whose segments are in seconds of the 30 fps motion (HumanTOMATO's
+loader takes 20). Everywhere else a file is plain sentences, one a line, some of them only the clip's name.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections import Counter
@@ -18,10 +22,70 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
+from motionloom.datasets.convert.common.files import check_id, inside, read_text_file
 from motionloom.datasets.convert.common.plan import drop
-from motionloom.datasets.convert.common.splits import check_id
-from motionloom.datasets.schema import Dropped, UserError
+from motionloom.datasets.schema import Caption, Dropped, UserError
+from motionloom.datasets.text.clean import clean_caption, usable_caption
+
+HUMANML = "humanml"
+SOURCE = "motionx"
+
+
+def read_motionx_captions(
+    path: Path, *, subset: str, seconds: float, name: str
+) -> tuple[list[Caption], list[str]]:
+    """The usable captions of one clip, and what is wrong with the other lines (`line N: ...`).
+
+    `UserError` when the file cannot be read or is not UTF-8; `name` stands for it in messages.
+    """
+    if subset == HUMANML:
+        return read_humanml_captions(path, seconds=seconds, source=SOURCE, name=name)
+    return read_sentences(path, source=SOURCE, name=name)
+
+
+def read_sentences(path: Path, *, source: str, name: str) -> tuple[list[Caption], list[str]]:
+    """Plain sentences, one a line, each once; and the lines that say nothing."""
+    found: dict[str, Caption] = {}
+    problems: list[str] = []
+    for number, line in enumerate(read_text_file(path, name).split("\n"), start=1):
+        if not line.strip():
+            continue
+        text = clean_caption(line)
+        if usable_caption(line):
+            found.setdefault(text, Caption(text=text, source=source))
+        else:
+            problems.append(f"line {number}: no usable caption ('{text[:60]}')")
+    return list(found.values()), problems
+
+
+def read_frame_texts(path: Path, *, source: str, frames: int, fps: float, name: str) -> list[Caption]:
+    """`{"frame": sentence}` as captions of the frames' seconds; equal sentences in a row become one.
+
+    Frames beyond the clip are left out: the sentences were made for the authors' own cut of it. `UserError`
+    for anything but such a table.
+    """
+    try:
+        table = json.loads(read_text_file(path, name))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{name}: not valid JSON ({error})") from None
+    if not isinstance(table, dict):
+        raise UserError(f"{name}: expected an object of frame numbers and sentences")
+    sentences: dict[int, str] = {}
+    for key, text in table.items():
+        if not (key.isdecimal() and key.isascii()) or not isinstance(text, str):
+            raise UserError(f"{name}: '{key[:20]}' is not a frame number with a sentence")
+        if int(key[:18]) < frames and usable_caption(text):
+            sentences[int(key)] = clean_caption(text)
+    made: list[Caption] = []
+    for frame, text in sorted(sentences.items()):
+        start, end = frame / fps, (frame + 1) / fps
+        if made and made[-1].text == text and made[-1].end == start:
+            made[-1] = made[-1].model_copy(update={"end": end})
+        else:
+            made.append(Caption(text=text, start=start, end=end, source=source))
+    return made
+
 
 Kind = Literal["motion", "face motion", "captions", "face texts", "body texts", "hand texts"]
 
@@ -80,7 +144,6 @@ class MotionXFiles:
     """Files of no kind."""
 
     def notes(self) -> list[str]:
-        """Which folders were taken for what."""
         lines = []
         for kind, folders in self.folders.items():
             named = [f"{folder or '.'}/ ({count} files)" for folder, count in sorted(folders.items())]
@@ -91,8 +154,6 @@ class MotionXFiles:
 
 @dataclass(frozen=True)
 class _Place:
-    """What the path of a folder says."""
-
     kind: Kind
     root: str
     """Folder taken for the kind."""
@@ -188,7 +249,6 @@ def _walk(
 
 @lru_cache(maxsize=256)
 def _place(parts: tuple[str, ...]) -> _Place | None:
-    """Kind, root and id folders of a path; None for a folder of no kind."""
     if "__MACOSX" in parts:
         return None
     for depth, part in enumerate(parts[:_DEEP]):
@@ -209,7 +269,6 @@ def _place(parts: tuple[str, ...]) -> _Place | None:
 
 
 def _subset_first(parts: tuple[str, ...]) -> tuple[str, ...]:
-    """Folders of an id with the subset's official name."""
     if not parts:
         return parts
     by_script = _SCRIPTS.fullmatch(parts[0])

@@ -6,7 +6,7 @@ Columns are named by the layout `smplx322`. None of the functions changes its ar
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ def value_limits() -> NDArray[np.float64]:
     return limits
 
 
-def aist_scale(values: NDArray[Any]) -> AistScale:
+def aist_scale(values: NDArray[np.floating]) -> AistScale:
     """Which state the translations of an `aist/` clip are in."""
     most = float(np.abs(values[:, TRANS]).max())
     return "raw" if most > _AIST_RAW else "twice" if most < _AIST_TWICE else "scaled"
@@ -79,7 +79,9 @@ def z_up_to_y_up(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def with_face(values: NDArray[np.float64], face: NDArray[Any], *, keep_jaw: bool) -> NDArray[np.float64]:
+def with_face(
+    values: NDArray[np.float64], face: NDArray[np.floating], *, keep_jaw: bool
+) -> NDArray[np.float64]:
     """Jaw, expression and face shape from a face file [T', 153], stretched to the clip's T frames."""
     stretched = stretch(face, len(values))
     out = values.copy()
@@ -90,7 +92,7 @@ def with_face(values: NDArray[np.float64], face: NDArray[Any], *, keep_jaw: bool
     return out
 
 
-def stretch(values: NDArray[Any], frames: int) -> NDArray[np.float64]:
+def stretch(values: NDArray[np.floating], frames: int) -> NDArray[np.float64]:
     """[T', D] -> [frames, D], linear over the whole length.
 
     Frames are intervals, not instants (the centres of the first intervals need not meet): what Motion-X's

@@ -7,7 +7,7 @@ motion is required: splits, captions, face motion and face texts are taken where
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,9 +16,10 @@ from typing import Literal
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import read_in_threads
-from motionloom.datasets.convert.common.plan import ConversionPlan, PlanDraft, Subset, drop
+from motionloom.datasets.convert.common.plan import ConversionPlan, count_subsets, drop, first_notes
 from motionloom.datasets.convert.common.splits import (
     SplitNames,
     hash_splits,
@@ -27,18 +28,20 @@ from motionloom.datasets.convert.common.splits import (
     read_split_files,
 )
 from motionloom.datasets.convert.motionx.files import (
+    HUMANML,
     OFFICIAL,
+    Kind,
     MotionXFiles,
     find_files,
     official_id,
+    read_motionx_captions,
+    read_sentences,
     subset_of,
 )
 from motionloom.datasets.convert.motionx.parameters import FACE_WIDTH, RAW, aist_scale
-from motionloom.datasets.convert.motionx.text import HUMANML, read_motionx_captions, read_sentences
+from motionloom.datasets.motion.body.smpl import SkeletonName
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.smpl import SkeletonName
-from motionloom.datasets.schema import Caption, Dropped, Split, UserError
-from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.schema import SPLITS, Caption, Dropped, Split, UserError
 
 FPS = 30.0
 LAYOUTS = ("wholebody363", "wholebody313", "body133", "tomato623", "h3d263", "smplx322")
@@ -93,14 +96,12 @@ class MotionXConfig(ConvertConfig):
     source `body` and `hand`. They are many: about one a frame."""
 
     def motion_layout(self) -> MotionLayout:
-        """The layout of the written shards."""
         if self.layout not in LAYOUTS:
             raise UserError(f"layout {self.layout} cannot be made from Motion-X; use {', '.join(LAYOUTS)}")
         return super().motion_layout()
 
     @property
     def skeleton(self) -> SkeletonName:
-        """The skeleton of the layout."""
         return "smpl22" if self.motion_layout().skeleton_name == "smpl22" else "smplx52"
 
 
@@ -123,7 +124,6 @@ class MotionXClip:
 
     @property
     def subset(self) -> str:
-        """The clip's folder in the release."""
         return subset_of(self.id)
 
     @property
@@ -132,14 +132,11 @@ class MotionXClip:
         return (self.path, *([self.face] if self.face else []), *(file for _, file in self.frame_texts))
 
     def label(self) -> str:
-        """Name of the clip in reports."""
         return self.path
 
 
 @dataclass(frozen=True)
 class _Scanned:
-    """What the files of one clip say."""
-
     id: str
     frames: int = 0
     texts: tuple[Caption, ...] = ()
@@ -149,9 +146,7 @@ class _Scanned:
     problems: tuple[str, ...] = ()
 
 
-def plan_motionx(
-    config: MotionXConfig, *, workers: int = 1, progress: bool = False
-) -> ConversionPlan[MotionXClip]:
+def plan_motionx(config: MotionXConfig, settings: PlanSettings) -> ConversionPlan[MotionXClip]:
     """Find every clip and decide what becomes of it, without converting anything."""
     layout = config.motion_layout()
     files = find_files(config.source)
@@ -162,10 +157,10 @@ def plan_motionx(
         raise UserError(f"{config.source}: none of {config.subsets} in it, but {', '.join(present)}")
     splits, split_files, notes = _read_splits(config, files, ids)
     scan = partial(_scan, config.source, files)
-    scanned = list(read_in_threads(scan, ids, workers=workers, progress=progress))
+    scanned = list(read_in_threads(scan, ids, workers=settings.workers, progress=settings.progress))
 
     broken = [*files.broken, *(problem for found in scanned for problem in found.broken)]
-    draft: PlanDraft[MotionXClip] = PlanDraft(
+    draft = ConversionPlan[MotionXClip](
         config, dropped=list(files.repeated), broken=broken, notes=[*files.notes(), *notes]
     )
     for found in scanned:
@@ -201,14 +196,24 @@ def plan_motionx(
         *_subset_notes(config, files, scanned),
         *([f"{unwanted} clips of other subsets are not asked for"] if unwanted else []),
         *([f"{len(texts_alone)} caption files have no motion"] if texts_alone else []),
-        *_text_notes(scanned),
+        *first_notes(
+            [problem for found in scanned for problem in found.problems],
+            _NOTED_FILES,
+            "text files with lines left out",
+        ),
     ]
+    expected = {name: OFFICIAL[name] for name in map(_folder, (*motion, *missing)) if name in OFFICIAL}
     return draft.finish(
         found=len(ids) + len(files.repeated),
         frames=lambda clip: frames_after(clip.frames, FPS, layout),
         licence=lambda clip: clip.licence,
         ignored=len(files.others - split_files) + unwanted,
-        subsets=_subsets(motion, missing, draft.items),
+        subsets=count_subsets(
+            map(_folder, motion),
+            (_folder(clip.id) for _, clip in draft.items),
+            map(_folder, missing),
+            expected,
+        ),
     )
 
 
@@ -253,7 +258,6 @@ def _read_splits(
 
 
 def _scan(source: Path, files: MotionXFiles, clip_id: str) -> _Scanned:
-    """Headers and texts of one clip."""
     label = files.by_kind["motion"][clip_id]
     broken: list[Dropped] = []
     problems: list[str] = []
@@ -261,24 +265,24 @@ def _scan(source: Path, files: MotionXFiles, clip_id: str) -> _Scanned:
         frames = check_array_header(source / label, width=RAW.dim, name=label)
     except UserError as error:
         return _Scanned(clip_id, broken=(drop(label, error),))
-    texts: list[Caption] = []
-    face_texts: list[Caption] = []
-    file = files.by_kind["captions"].get(clip_id)
-    if file is not None:
+
+    def sentences(kind: Kind, read: Callable[[Path, str], tuple[list[Caption], list[str]]]) -> list[Caption]:
+        file = files.by_kind[kind].get(clip_id)
+        if file is None:
+            return []
         try:
-            texts, wrong = read_motionx_captions(
-                source / file, subset=subset_of(clip_id), seconds=frames / FPS, name=file
-            )
-            problems += [f"{file}: {'; '.join(wrong)}"] if wrong else []
+            texts, wrong = read(source / file, file)
         except UserError as error:
             broken.append(drop(file, error))
-    file = files.by_kind["face texts"].get(clip_id)
-    if file is not None:
-        try:
-            face_texts, wrong = read_sentences(source / file, source="face", name=file)
-            problems += [f"{file}: {'; '.join(wrong)}"] if wrong else []
-        except UserError as error:
-            broken.append(drop(file, error))
+            return []
+        problems.extend([f"{file}: {'; '.join(wrong)}"] if wrong else [])
+        return texts
+
+    seconds, subset = frames / FPS, subset_of(clip_id)
+    texts = sentences(
+        "captions", lambda path, name: read_motionx_captions(path, subset=subset, seconds=seconds, name=name)
+    )
+    face_texts = sentences("face texts", lambda path, name: read_sentences(path, source="face", name=name))
     face = files.by_kind["face motion"].get(clip_id)
     if face is not None:
         try:
@@ -295,7 +299,6 @@ def _frame_texts(files: MotionXFiles, clip_id: str) -> tuple[tuple[str, str], ..
 
 
 def _subset_notes(config: MotionXConfig, files: MotionXFiles, scanned: list[_Scanned]) -> list[str]:
-    """What single subsets need: HumanML3D's captions, and the scale of the dances."""
     notes = []
     humanml = [found for found in scanned if subset_of(found.id) == HUMANML]
     if humanml and not any(found.texts for found in humanml):
@@ -324,19 +327,5 @@ def _subset_notes(config: MotionXConfig, files: MotionXFiles, scanned: list[_Sca
     return notes
 
 
-def _text_notes(scanned: list[_Scanned]) -> list[str]:
-    """Lines of texts that were left out."""
-    wrong = [problem for found in scanned for problem in found.problems]
-    more = [f"... and {len(wrong) - _NOTED_FILES} more text files with lines left out"]
-    return wrong[:_NOTED_FILES] + (more if len(wrong) > _NOTED_FILES else [])
-
-
-def _subsets(
-    motion: Iterable[str], missing: list[str], items: list[tuple[Split, MotionXClip]]
-) -> dict[str, Subset]:
-    found, absent = Counter(map(subset_of, motion)), Counter(map(subset_of, missing))
-    used = Counter(clip.subset for _, clip in items)
-    return {
-        name or "(no folder)": Subset(found[name], used[name], absent[name], OFFICIAL.get(name))
-        for name in sorted(found.keys() | absent.keys())
-    }
+def _folder(clip_id: str) -> str:
+    return subset_of(clip_id) or "(no folder)"

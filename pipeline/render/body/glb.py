@@ -12,20 +12,29 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file
-from motionloom.datasets.motion.rigid import RigidMotion, on_one_skeleton
+from motionloom.datasets.motion.body.arkit import ARKIT
+from motionloom.datasets.motion.body.rigid import RigidMotion, on_one_skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body.mesh import Body, Faces, body_for, colour_strip, neutral_body
+from motionloom.pipeline.render.body.face import EXPRESSIONS
+from motionloom.pipeline.render.body.mesh import FIRST_OF_HEAD, Body, body_for, colours
 
 _FLOAT, _SHORT, _BYTE = 5126, 5123, 5121
 _VERTICES, _INDICES = 34962, 34963
-_LINEAR, _CLAMP = 9729, 33071
+_NEAREST, _CLAMP = 9728, 33071
+_STRIP = 16
+"""Columns of the colours' picture: one a swatch."""
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+
+
+Faces = Literal["expressions", "arkit"]
+"""Morph targets of the head: those of the synthetic basis, or ARKit's 52."""
+Values = NDArray[np.generic]
 
 
 @dataclass(frozen=True)
@@ -35,9 +44,9 @@ class GlbClip:
     name: str
     figure: RigidMotion
     fps: float
-    expression: NDArray[Any] | None = None
-    """Weights [T, E] of the face's shapes: `face.expression_weights` [T, 8], or of ARKit's [T, 52]."""
-    facts: dict[str, Any] = field(default_factory=dict)
+    expression: NDArray[np.floating] | None = None
+    """Weights [T, E] of the face's shapes: `face.expression_weights` [T, 8], or ARKit's [T, 52]."""
+    facts: dict[str, object] = field(default_factory=dict)
     """Goes into the animation's `extras`, plain JSON."""
 
 
@@ -49,12 +58,17 @@ def write_glb(path: Path, clips: Sequence[GlbClip], faces: Faces = "expressions"
     """
     if not clips:
         raise UserError(f"{path}: a GLB needs at least one motion")
-    shapes = len(neutral_body("smplx52", faces).expressions)
+    names = ARKIT if faces == "arkit" else EXPRESSIONS
     for clip in clips:
-        _check(path, clip, shapes)
+        _check(path, clip, len(names))
     figures = on_one_skeleton([clip.figure for clip in clips])
-    body = body_for(figures[0].skeleton, faces)
-    data = b"".join(_Scene(body, clips, figures).gltf.save_to_bytes())
+    body = body_for(figures[0].skeleton, names)
+    try:
+        data = b"".join(_Scene(body, clips, figures).gltf.save_to_bytes())
+    except ModuleNotFoundError as error:
+        if error.name != "pygltflib":
+            raise
+        raise UserError(f"{path}: GLB files need pygltflib; pip install 'motionloom[glb]'") from None
     with atomic_file(path) as file:
         file.write(data)
     return figures
@@ -64,11 +78,10 @@ class _Scene:
     """The file while it is put together."""
 
     def __init__(self, body: Body, clips: Sequence[GlbClip], figures: Sequence[RigidMotion]) -> None:
-        from pygltflib import GLTF2, Asset, Attributes, Node, Scene, Skin
+        from pygltflib import GLTF2, Asset, Node, Scene, Skin
 
         self.gltf = GLTF2(asset=Asset(version="2.0", generator="motionloom"), scene=0)
         self.blob = bytearray()
-        self.attributes = Attributes
         skeleton, count = body.skeleton, len(body.skeleton)
         self.lift = np.array([0.0, -float(body.vertices[:, 1].min()), 0.0])
         """From the body, whose pelvis is the origin, to one that stands on the floor at rest."""
@@ -79,9 +92,8 @@ class _Scene:
             place = [float(value) for value in skeleton.offsets[joint] + lift]
             self.gltf.nodes.append(Node(name=name, translation=place, children=children))
         bind = np.tile(np.eye(4), (count, 1, 1))
-        bind[:, 3, :3] = -(
-            skeleton.rest_joints + self.lift
-        )  # column-major: the last row here is the last column there
+        # Column-major: the last row here is the last column there.
+        bind[:, 3, :3] = -(skeleton.rest_joints + self.lift)
         self.gltf.skins = [
             Skin(
                 name="skeleton",
@@ -90,9 +102,7 @@ class _Scene:
             )
         ]
         self._material()
-        moving = np.any([move.any(axis=1) for move in body.expressions.values()], axis=0)
-        # A triangle is the head's if one corner moves or belongs to it as a whole: meshes share no vertex.
-        head = _connected(body.triangles, moving)
+        head = body.swatch >= FIRST_OF_HEAD
         self._mesh("body", body, ~head, expressions=False)
         self._mesh("head", body, head, expressions=True)
         self.gltf.nodes += [Node(name="body", mesh=0, skin=0), Node(name="head_mesh", mesh=1, skin=0)]
@@ -108,10 +118,12 @@ class _Scene:
         from pygltflib import Image, Material, PbrMetallicRoughness, Sampler, Texture, TextureInfo
 
         stream = io.BytesIO()
-        Picture.fromarray(colour_strip()).save(stream, "PNG")
+        swatches = np.zeros((_STRIP, _STRIP, 3), np.uint8)  # square and a power of two, for old players
+        swatches[:, : len(colours())] = colours()
+        Picture.fromarray(swatches).save(stream, "PNG")
         view = self._view(stream.getvalue(), None)
         self.gltf.images = [Image(name="colours", mimeType="image/png", bufferView=view)]
-        sampler = Sampler(magFilter=_LINEAR, minFilter=_LINEAR, wrapS=_CLAMP, wrapT=_CLAMP)
+        sampler = Sampler(magFilter=_NEAREST, minFilter=_NEAREST, wrapS=_CLAMP, wrapT=_CLAMP)
         self.gltf.samplers = [sampler]
         self.gltf.textures = [Texture(source=0, sampler=0)]
         colour = PbrMetallicRoughness(
@@ -120,19 +132,16 @@ class _Scene:
         self.gltf.materials = [Material(name="figure", pbrMetallicRoughness=colour)]
 
     def _mesh(self, name: str, body: Body, chosen: NDArray[np.bool_], *, expressions: bool) -> None:
-        from pygltflib import Mesh, Primitive
+        from pygltflib import Attributes, Mesh, Primitive
 
         number = np.cumsum(chosen) - 1
         triangles = number[body.triangles[chosen[body.triangles[:, 0]]]]
-        order = np.argsort(-body.weights[chosen], axis=1, kind="stable")[:, :4]
-        weights = np.take_along_axis(body.weights[chosen], order, axis=1)
-        joints = np.where(weights > 0, order, 0)
-        shares = weights.astype(np.float32)
-        shares /= shares.sum(axis=1, keepdims=True)
-        attributes = self.attributes(
+        joints, shares = _merged(body.joints[chosen], body.shares[chosen])
+        uv = np.column_stack([(body.swatch[chosen] + 0.5) / _STRIP, np.full(int(chosen.sum()), 0.5)])
+        attributes = Attributes(
             POSITION=self._add(body.vertices[chosen] + self.lift, target=_VERTICES, bounds=True),
             NORMAL=self._add(_unit(body.normals[chosen]), target=_VERTICES),
-            TEXCOORD_0=self._add(body.uv[chosen], target=_VERTICES),
+            TEXCOORD_0=self._add(uv, target=_VERTICES),
             JOINTS_0=self._add(joints, _BYTE, _VERTICES),
             WEIGHTS_0=self._add(shares, target=_VERTICES),
         )
@@ -140,7 +149,7 @@ class _Scene:
         primitive = Primitive(attributes=attributes, indices=indices, material=0)
         mesh = Mesh(name=name, primitives=[primitive])
         if expressions:
-            moves = body.expressions
+            moves = body.shapes
             at_rest = [not move.any() for move in moves.values()]
             still = self._zeros(int(chosen.sum())) if any(at_rest) else 0
             primitive.targets = [
@@ -161,7 +170,7 @@ class _Scene:
         every = self._add((np.arange(frames) / clip.fps)[:, None], bounds=True)
         first = self._add(np.zeros((1, 1)), bounds=True)
 
-        def channel(node: int, path: str, values: NDArray[Any]) -> None:
+        def channel(node: int, path: str, values: Values) -> None:
             still = len(values) == frames and not (values != values[:1]).any()
             kept = values[:1] if still else values
             if path == "weights":
@@ -185,7 +194,7 @@ class _Scene:
         self.gltf.animations.append(animation)
 
     def _add(
-        self, values: NDArray[Any], kind: int = _FLOAT, target: int | None = None, bounds: bool = False
+        self, values: Values, kind: int = _FLOAT, target: int | None = None, bounds: bool = False
     ) -> int:
         """Number of a new accessor of values [count, width]."""
         from pygltflib import Accessor
@@ -225,19 +234,19 @@ class _Scene:
         self.gltf.set_binary_blob(bytes(self.blob))
 
 
-def _connected(triangles: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The chosen vertices and all that hang together with them by triangles."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+def _merged(joints: NDArray[np.int64], shares: Values) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Joints and shares [V, 4] where no joint is named twice, as stiff hands have it; shares sum to 1."""
+    joints, shares = joints.copy(), shares.astype(np.float32)
+    for k in range(1, 4):
+        for first in range(k):
+            same = joints[:, k] == joints[:, first]
+            shares[same, first] += shares[same, k]
+            shares[same, k] = 0
+    joints[shares == 0] = 0
+    return joints, shares / shares.sum(axis=1, keepdims=True)
 
-    pairs = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(chosen), len(chosen)))
-    _, label = connected_components(graph, directed=False)
-    out: NDArray[np.bool_] = np.isin(label, np.unique(label[chosen]))
-    return out
 
-
-def _unit(vectors: NDArray[Any]) -> NDArray[np.float32]:
+def _unit(vectors: Values) -> NDArray[np.float32]:
     """Unit vectors [..., C] to float32's last digit, as validators ask."""
     rounded = np.asarray(vectors, dtype=np.float64)
     out: NDArray[np.float32] = (rounded / np.linalg.norm(rounded, axis=-1, keepdims=True)).astype(np.float32)

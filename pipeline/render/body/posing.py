@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
-from motionloom.datasets.motion.rigid import RigidMotion, share_twist
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 
@@ -70,7 +69,7 @@ def human_skeleton(parents: Sequence[int]) -> Skeleton | None:
     return next((skeleton for skeleton in known if skeleton.parents == key), None)
 
 
-def posing_of(joints: NDArray[Any], skeleton: Skeleton, figure: RigidMotion | None = None) -> Posing:
+def posing_of(joints: NDArray[np.floating], skeleton: Skeleton, figure: RigidMotion | None = None) -> Posing:
     """The body's pose at joints [T, N, 3] in metres; `figure` has their rotations, where they are known."""
     if figure is not None:
         if figure.joints.shape != joints.shape:

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from llvmlite import binding
 
 from motionloom.datasets.audio import compiled
 
@@ -59,7 +58,7 @@ def test_who_finds_the_mark_does_not_wait(cache: Path, monkeypatch: pytest.Monke
 def test_a_mark_holds_for_one_cache_and_one_processor(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here = compiled._mark()
     assert here.parent == cache
-    monkeypatch.setattr(binding, "get_host_cpu_name", lambda: "another")
+    monkeypatch.setattr(compiled, "_processor", lambda: "another")
     assert compiled._mark().name != here.name
     monkeypatch.undo()
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,7 @@ import pytest
 import soundfile
 
 from motionloom.datasets.audio import sound
-from motionloom.datasets.audio.headers import mp3_samples
-from motionloom.datasets.audio.sound import (
-    Sound,
-    read_sound,
-    require_audible,
-    resample_sound,
-    sound_seconds,
-)
+from motionloom.datasets.audio.sound import Sound, read_sound, require_audible, resample_sound, sound_seconds
 from motionloom.datasets.schema import UserError
 
 RATE = 16_000
@@ -132,29 +124,6 @@ def test_damaged_flac_and_unknown_files(tmp_path: Path, tone: np.ndarray) -> Non
         read_sound(tmp_path / "absent.wav")
 
 
-def test_a_header_that_promises_more_than_can_be_read(tmp_path: Path, tone: np.ndarray) -> None:
-    path = tmp_path / "a.wav"
-    soundfile.write(path, tone, RATE, subtype="PCM_16")
-    raw = bytearray(path.read_bytes())
-    raw[40:44] = struct.pack("<I", 0xFFFFFFF0)
-    path.write_bytes(raw)
-    with pytest.raises(UserError, match="32000 bytes of sound, 4294967280 expected"):
-        read_sound(path)
-
-
-@pytest.mark.parametrize(
-    ("rate_in", "rate_out"), [(8000, 30720), (16000, 8000), (22050, 30720), (44100, 16000)]
-)
-def test_resampling_equals_librosa(rate_in: int, rate_out: int) -> None:
-    import librosa
-
-    rng = np.random.default_rng(0)
-    for size in (1, 10, 4001):
-        sound = rng.uniform(-1, 1, size).astype(np.float32)
-        wanted = librosa.resample(sound, orig_sr=rate_in, target_sr=rate_out, res_type="soxr_hq")
-        assert np.array_equal(resample_sound(sound, rate_in, rate_out), wanted)
-
-
 def test_resampling_equals_the_golden_vectors(shared: Path) -> None:
     with np.load(shared / "golden/t5_audio_A.npz", allow_pickle=False) as golden:
         track = golden["syn_wav"].astype(np.float32) / 32768
@@ -244,34 +213,41 @@ def mp3(path: Path, samples: np.ndarray, rate: int = 44100, **how: Any) -> bytes
     return path.read_bytes()
 
 
-def frames_of(raw: bytes) -> bytes:
-    """Without the first frame, in which the encoder states the length."""
-    return raw[raw.index(raw[:2], 10) :]
-
-
-@pytest.mark.parametrize("rate", [8000, 16000, 22050, 24000, 32000, 44100, 48000])
+@pytest.mark.parametrize("rate", [8000, 22050, 48000])
 @pytest.mark.parametrize("channels", [1, 2])
 def test_mp3s_of_every_rate(tmp_path: Path, tone: np.ndarray, rate: int, channels: int) -> None:
     path = tmp_path / "a.mp3"
     mp3(path, np.repeat(tone[:, None], channels, axis=1), rate)
     samples, found = read_sound(path)
     assert (found, samples.shape) == (rate, tone.shape)
-    counted = mp3_samples(path)
-    assert counted is not None and counted[1] and len(tone) < counted[0] < len(tone) + 5 * 1152
 
 
-def test_mp3s_with_tags_and_without_a_stated_length(tmp_path: Path, tone: np.ndarray) -> None:
-    path = tmp_path / "a.mp3"
-    whole = mp3(path, np.tile(tone, 5), bitrate_mode="CONSTANT", compression_level=0.6)
-    header = b"ID3\x04\0\0\0\0\x10\0" + bytes(2048)
-    for raw in (frames_of(whole), header + frames_of(whole), frames_of(whole) + b"TAG" + bytes(125)):
-        path.write_bytes(raw)
+ID3 = b"ID3\x04\0\0\0\0\x10\0" + bytes(2048)
+
+
+@pytest.mark.parametrize("mode", ["CONSTANT", "VARIABLE"])
+@pytest.mark.parametrize("stated", [True, False])
+def test_no_sound_of_an_mp3_is_lost_or_added(
+    tmp_path: Path, tone: np.ndarray, mode: str, *, stated: bool
+) -> None:
+    """Quiet, then loud: a guess of the length from the size and the first frame is four times too short."""
+    path, noise = tmp_path / "a.mp3", np.random.default_rng(0).uniform(-0.5, 0.5, 5 * RATE)
+    sound = np.concatenate([np.tile(tone, 5), noise.astype(np.float32)])
+    raw = mp3(path, sound, bitrate_mode=mode, compression_level=0.3)
+    if not stated:
+        raw = raw[raw.index(raw[:2], 10) :]  # the encoder states the length in the first frame
+    for whole in (raw, ID3 + raw, raw + b"TAG" + bytes(125)):
+        path.write_bytes(whole)
         samples, _ = read_sound(path)
-        assert 0 <= len(samples) - 5 * len(tone) < 5 * 1152
+        assert 0 <= len(samples) - len(sound) < (1 if stated else 4 * 1152)
+        assert np.abs(samples[-4 * 1152 - 500 : -4 * 1152]).max() > 0.2
         assert sound_seconds(path) == len(samples) / 44100
-    path.write_bytes(frames_of(mp3(path, np.tile(tone, 5))))
-    with pytest.raises(UserError, match=r"a\.mp3: an MP3 of varying bit rate that does not state its length"):
-        read_sound(path)
+        half = read_sound(path, rate=22050)[0]
+        assert len(half) == -(-len(samples) // 2)
+    for cut in (raw[: len(raw) // 2 + 10], (ID3 + raw)[: -len(raw) // 3]):  # in the midst of a frame
+        path.write_bytes(cut)
+        with pytest.raises(UserError, match=r"a\.mp3: .*cut short"):
+            read_sound(path)
 
 
 def test_damaged_mp3s_and_oggs(tmp_path: Path, tone: np.ndarray) -> None:
@@ -279,9 +255,9 @@ def test_damaged_mp3s_and_oggs(tmp_path: Path, tone: np.ndarray) -> None:
     raw = mp3(path, np.tile(tone, 5))
     half = len(raw) // 2
     for damaged, reason in (
-        (raw[:half], r"cut short: \d+ samples of 80000"),
+        (raw[:-1], r"cut short: 1 bytes"),
         (raw[:half] + bytes(4000) + raw[half + 4000 :], "not readable sound .damaged"),
-        (raw[:200], "not readable sound .of no known format"),
+        (raw[:200], "cut short"),
         (b"not sound at all" * 100, "not readable sound .of no known format"),
         (b"", "empty file"),
     ):

@@ -6,16 +6,11 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from motionloom.datasets.check.files import FileRules, Verdict, check_file, check_folder
 from motionloom.datasets.check.foreign import inspect_tar
-from motionloom.datasets.convert.common.arrays import load_array
-from motionloom.datasets.convert.common.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.splits import read_split_files
-from motionloom.datasets.convert.humanml3d.convert import HumanMl3dConfig, prepare_humanml3d
-from motionloom.datasets.motion.bvh import read_bvh
 from motionloom.datasets.schema import UserError
 
 OK = None
@@ -129,15 +124,6 @@ def test_a_folder_is_checked_file_by_file(broken: Path) -> None:
     }
 
 
-def test_valid_files_hold_what_the_control_holds(broken: Path) -> None:
-    control = load_array(broken / "npy/control_ok.npy", width=322)
-    for name in ("big_endian", "fortran_order"):
-        np.testing.assert_array_equal(load_array(broken / f"npy/{name}.npy", width=322), control)
-    clip, same = read_bvh(broken / "bvh/control_ok.bvh"), read_bvh(broken / "bvh/crlf_bom.bvh")
-    np.testing.assert_array_equal(clip.values, same.values)
-    assert clip.joints == same.joints
-
-
 def test_shards_are_counted_and_noted(broken: Path) -> None:
     assert inspect_tar(broken / "shards/control_ok.tar").samples == 3
     unfinished = inspect_tar(broken / "shards/no_end_blocks.tar")
@@ -145,49 +131,13 @@ def test_shards_are_counted_and_noted(broken: Path) -> None:
     assert inspect_tar(broken / "shards/truncated.tar").samples == 1
 
 
-def test_caption_files(broken: Path) -> None:
-    (nan,), none = read_humanml_captions(broken / "texts/nan_tags.txt", seconds=10.0)
-    assert (nan.start, nan.end, none) == (0.0, None, [])
-    (hash_mark,), _ = read_humanml_captions(broken / "texts/extra_hash.txt", seconds=10.0)
-    assert hash_mark.text == "a person does move #3"
-    assert hash_mark.tokens == ["a/DET", "person/NOUN", "do/VERB", "move/NOUN"]
-    plain = check_file(broken / "texts/too_few_fields.txt", FileRules(texts="plain"))
-    assert plain.ok and plain.what == "2 captions"
-
-
-def split_folder(tmp_path: Path, **files: Path) -> Path:
+def test_splits_that_overlap_are_an_error(broken: Path, tmp_path: Path) -> None:
     folder = tmp_path / "split_folder"
     folder.mkdir()
-    for split, path in files.items():
-        shutil.copy(path, folder / f"{split}.txt")
-    return folder
-
-
-def test_split_files(broken: Path, tmp_path: Path) -> None:
-    ids, notes = read_split_files(split_folder(tmp_path, train=broken / "splits/crlf_blank.txt"))
-    assert (list(ids), notes) == (["900001", "900002"], [])
-    again = check_file(broken / "splits/duplicate_ids.txt")
-    assert again.what == "2 ids" and "'900001'" in again.notes[0] and "line 3" in again.notes[0]
-
-
-def test_splits_that_overlap_are_an_error(broken: Path, tmp_path: Path) -> None:
-    folder = split_folder(
-        tmp_path, train=broken / "splits/overlap_train.txt", test=broken / "splits/overlap_test.txt"
-    )
+    for split in ("train", "test"):
+        shutil.copy(broken / f"splits/overlap_{split}.txt", folder / f"{split}.txt")
     with pytest.raises(UserError, match=r"'900002' is also in train\.txt"):
         read_split_files(folder)
     verdicts: list[Verdict] = list(check_folder(folder))
     assert [verdict.ok for verdict in verdicts] == [False, True, True]
     assert "900002" in str(verdicts[0])
-
-
-def test_ids_without_files_count_as_missing(broken: Path, shared: Path, tmp_path: Path) -> None:
-    source = tmp_path / "HumanML3D"
-    for part in ("new_joint_vecs", "texts"):
-        shutil.copytree(shared / "data/layouts/humanml3d" / part, source / part)
-    shutil.copy(broken / "splits/missing_file_id.txt", source / "train.txt")
-    plan = prepare_humanml3d(HumanMl3dConfig(source=source)).plan
-    assert [drop.source for drop in plan.missing] == ["123456"]
-    assert [clip.id for _, clip in plan.items] == ["900001"]
-    with pytest.raises(UserError, match="strict"):
-        plan.require_whole()

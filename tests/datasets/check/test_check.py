@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import io
 import tarfile
-from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,12 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.check.dataset import CheckReport, check, examine
-from motionloom.datasets.check.duplicates import ClipTable, _runs
 from motionloom.datasets.check.files import FileRules, check_file, check_folder
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.check.foreign import inspect_tar
 from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
 from motionloom.datasets.motion.canonical import canonicalize, mirror
-from motionloom.datasets.motion.features import encode
+from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
@@ -215,19 +213,6 @@ def test_findings_are_bounded_and_counted() -> None:
         assert len(listed) == LISTED + 1 and str(listed[-1]).startswith("root: 500 more: ")
 
 
-def test_a_million_clips_fit(tmp_path: Path) -> None:
-    table = ClipTable(tmp_path, [], LAYOUT)
-    meta = convert(Made("a")).meta
-    for row in range(100):
-        table.add(0, row, meta, features(0))
-    assert len(table) == 100
-    assert sum(len(v) * v.itemsize for v in vars(table).values() if isinstance(v, array)) == 40 * 100
-    values = array("Q", range(200_000))
-    values[150_000] = values[7]
-    assert list(_runs(values)) == [[7, 150_000]]
-    assert list(_runs(array("Q"))) == [] and list(_runs(array("Q", [0, 0, 0]))) == [[0, 1, 2]]
-
-
 # ---- shards without a manifest
 
 
@@ -326,15 +311,3 @@ def test_files_that_nothing_reads(tmp_path: Path) -> None:
     for wrong in ({"texts": "verse"}, {"layout": "smpl76"}):
         with pytest.raises(UserError, match=r"humanml|smplx322"):
             FileRules(**wrong)
-
-
-def test_split_lists_are_known_by_name(tmp_path: Path) -> None:
-    for name in ("train", "test"):
-        (tmp_path / f"{name}.txt").write_text(f"clip-{name}\n")
-    assert [str(v).partition(": ")[2] for v in check_folder(tmp_path)] == [
-        "ok, splits train, test: 2 ids, none in two",
-        "ok, 1 ids",
-        "ok, 1 ids",
-    ]
-    (tmp_path / "train.txt").write_text("\n")
-    assert "no ids" in str(check_file(tmp_path / "train.txt"))

@@ -54,32 +54,6 @@ def test_big_endian_and_old_numpy_names(tmp_path: Path) -> None:
     assert motion.trans.dtype == np.float32
 
 
-def test_the_real_annotation(shared: Path) -> None:
-    motion = read_aist_motion(shared / "data/layouts/aistpp/motions/gBR_sBM_cAll_d04_mBR0_ch01.pkl")
-    assert (motion.poses.shape, motion.trans.shape) == ((720, 72), (720, 3))
-    assert motion.scaling == pytest.approx(93.78, abs=0.01)
-    assert 1.0 < motion.metres()[:, 1].min() < motion.metres()[:, 1].max() < 2.5
-
-
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("gBR_sBM_cAll_d04_mBR0_ch66_malicious", "refused, the file asks for 'io.open'"),
-        ("missing_key", "no key 'smpl_scaling'"),
-        ("length_mismatch", "9 frames of smpl_poses, but 8 of smpl_trans"),
-        ("zero_scaling", "smpl_scaling is 0"),
-        ("truncated", "cut short or damaged"),
-    ],
-)
-def test_broken_annotations(
-    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=rf"{name}\.pkl: .*{reason}"):
-        read_aist_motion(shared / f"data/broken/aist/{name}.pkl")
-    assert not list(tmp_path.iterdir())  # no PWNED file, nothing at all
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

@@ -12,15 +12,16 @@ import pytest
 import soundfile
 
 from motionloom.datasets.check.dataset import check
-from motionloom.datasets.convert.aistpp.convert import AistppConfig, prepare_aistpp
+from motionloom.datasets.convert.aistpp.convert import AistppConfig
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.aistpp.plan import MOTION_LICENCE, MUSIC_LICENCE, plan_aistpp
+from motionloom.datasets.convert.aistpp.plan import MUSIC_LICENCE
 from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
 from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 
@@ -63,7 +64,7 @@ def silent(source: Path, **options: Any) -> AistppConfig:
 
 
 def convert(config: AistppConfig, out: Path, **options: Any) -> Manifest:
-    return run_conversion(prepare_aistpp(config), out, progress=False, **options)
+    return run_conversion(prepare(config), out, progress=False, **options)
 
 
 def clip_of(out: Path, split: str, clip_id: str) -> tuple[ShardDataset, int]:
@@ -132,16 +133,11 @@ def test_joints_and_parameters_tell_the_same_motion(fixture: Path, tmp_path: Pat
             assert motion.shape == (frames - 1, 263)
 
 
-def test_layouts_that_need_fingers_are_refused(fixture: Path) -> None:
-    with pytest.raises(UserError, match="wholebody313 cannot be made from AIST"):
-        prepare_aistpp(silent(fixture, layout="wholebody313"))
-
-
 # ---- plan
 
 
 def test_plan_of_the_fixture(fixture: Path) -> None:
-    plan = plan_aistpp(AistppConfig(source=fixture))
+    plan = prepare(AistppConfig(source=fixture)).plan
     assert [(split, clip.id) for split, clip in plan.items] == [("train", REAL), ("test", TEST)]
     assert plan.frames == {"train": 240, "val": 0, "test": 60}
     assert plan.found == 3
@@ -157,7 +153,7 @@ def test_plan_of_the_fixture(fixture: Path) -> None:
 
 
 def test_official_lists_are_read_whole(fixture: Path) -> None:
-    plan = plan_aistpp(silent(fixture, splits=fixture / "official_splits"))
+    plan = prepare(silent(fixture, splits=fixture / "official_splits")).plan
     notes = plan.notes
     told = {split: plan.subsets[f"crossmodal {split}"] for split in ("train", "val", "test")}
     assert {split: subset.expected for split, subset in told.items()} == {"train": 980, "val": 20, "test": 20}
@@ -172,82 +168,17 @@ def test_official_lists_are_read_whole(fixture: Path) -> None:
 def test_ignore_list_with_suffixes_and_unlisted_sequences(source: Path) -> None:
     (source / "ignore_list.txt").write_text(f"\n{REAL}.json \r\n\n{IGNORED}.pkl")
     save_motion(source, "gPO_sFM_cAll_d10_mPO0_ch01")
-    plan = plan_aistpp(silent(source))
+    plan = prepare(silent(source)).plan
     assert {d.source.split("/")[1]: d.reason for d in plan.dropped} == {
         f"{REAL}.pkl": "on the ignore list",
         f"{IGNORED}.pkl": "on the ignore list",
         "gPO_sFM_cAll_d10_mPO0_ch01.pkl": "in no split file",
     }
-    assert len(plan_aistpp(silent(source, unlisted="hash")).items) == 2
+    assert len(prepare(silent(source, unlisted="hash")).plan.items) == 2
     shutil.rmtree(source / "splits")
-    plan = plan_aistpp(silent(source))
+    plan = prepare(silent(source)).plan
     assert len(plan.items) == 2
     assert "no split files: split 80/5/15 by a hash of the music" in plan.notes
-
-
-def test_a_sequence_in_two_splits_and_names_that_leave_the_folder(source: Path) -> None:
-    (source / "splits/crossmodal_val.txt").write_text(f"{TEST}\n")
-    with pytest.raises(UserError, match=f"crossmodal_test.txt: '{TEST}' is also in crossmodal_val.txt"):
-        plan_aistpp(silent(source))
-    (source / "splits/crossmodal_val.txt").write_text("../../etc/passwd\n")
-    with pytest.raises(UserError, match="not a plain relative name"):
-        plan_aistpp(silent(source))
-
-
-def test_shared_music_is_noted(source: Path) -> None:
-    name = "gHO_sBM_cAll_d98_mHO9_ch02"
-    save_motion(source, name)
-    with (source / "splits/crossmodal_train.txt").open("a") as file:
-        file.write(f"\n{name}\n")
-    plan = plan_aistpp(AistppConfig(source=source))
-    assert "1 pieces of music are in train and in test: mHO9" in plan.notes
-
-
-def test_missing_folders_are_named(source: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no motions/ in it"):
-        plan_aistpp(AistppConfig(source=tmp_path))
-    shutil.rmtree(source / "wavs")
-    with pytest.raises(UserError, match="no such folder of music; give --music-folder"):
-        plan_aistpp(AistppConfig(source=source))
-    plan = plan_aistpp(AistppConfig(source=source, music="optional"))
-    assert len(plan.items) == 2
-    assert plan.licences == {MOTION_LICENCE: 2}
-    assert "2 sequences have no music" in plan.notes
-
-
-def test_licences_can_be_filtered(fixture: Path) -> None:
-    plan = plan_aistpp(AistppConfig(source=fixture, allow_licence=(MOTION_LICENCE,)))
-    assert plan.items == []
-    assert all("is not allowed" in d.reason for d in plan.dropped if "ignore" not in d.reason)
-    assert len(plan_aistpp(silent(fixture, allow_licence=(MOTION_LICENCE,))).items) == 2
-
-
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("gBR_sBM_cAll_d04_mBR0_ch66_malicious", "asks for 'io.open'"),
-        ("missing_key", "no key 'smpl_scaling'"),
-        ("length_mismatch", "9 frames of smpl_poses, but 8 of smpl_trans"),
-        ("zero_scaling", "smpl_scaling is 0"),
-        ("truncated", "cut short"),
-    ],
-)
-def test_broken_annotations_are_left_out(
-    shared: Path, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str
-) -> None:
-    work = tmp_path / "cwd"
-    work.mkdir()
-    monkeypatch.chdir(work)
-    shutil.copy(shared / f"data/broken/aist/{name}.pkl", source / f"motions/{LISTED}.pkl")
-    manifest = convert(silent(source), tmp_path / "out")
-    (told,) = (d for d in manifest.dropped if LISTED in d.source)
-    assert told.source == f"motions/{LISTED}.pkl"
-    assert reason in told.reason
-    assert sum(shard.samples for shard in manifest.shards) == 2
-    assert list(work.iterdir()) == []
-    assert not list(tmp_path.rglob("PWNED*"))
-    with pytest.raises(UserError, match=LISTED):
-        convert(silent(source), tmp_path / "strict", strict=True)
 
 
 def test_wrong_units_and_strange_names_are_left_out(source: Path, tmp_path: Path) -> None:
@@ -271,7 +202,7 @@ def test_music_goes_with_the_motion(fixture: Path, tmp_path: Path) -> None:
     assert manifest.audio is not None
     assert str(tmp_path) not in str(manifest.dump()) and str(fixture) not in str(manifest.dump())
     reader, i = clip_of(out, "train", REAL)
-    audio, wav = reader.audio(i), reader.wav(i)
+    audio, wav = reader.array(i, "audio.npy"), reader.wav(i)
     assert audio is not None and wav is not None
     assert reader.motion(i).shape[0] == 720
     assert audio.shape == (720, 438)
@@ -279,6 +210,7 @@ def test_music_goes_with_the_motion(fixture: Path, tmp_path: Path) -> None:
     assert (wav[1], rate) == (8000, 8000)
     assert np.array_equal(wav[0], music)
     assert [caption.text for caption in reader.texts(i)] == ["a dancer performs break dance"]
+    assert reader.meta(i).song == "mBR0", "which other dances share"
     # The click track has 80 beats a minute: the onsets lie where the clicks are.
     onset = audio[:, 52]
     times = np.flatnonzero(onset > 0.5 * onset.max()) / 60
@@ -293,7 +225,7 @@ def test_twenty_frames_and_an_offset(source: Path, tmp_path: Path) -> None:
     for out in (whole, late):
         reader, i = clip_of(out, "val", LISTED)
         assert reader.motion(i).shape[0] == 80
-        audio, wav = reader.audio(i), reader.wav(i)
+        audio, wav = reader.array(i, "audio.npy"), reader.wav(i)
         assert audio is not None and wav is not None
         assert audio.shape == (80, 438)
         assert len(wav[0]) == 4 * 8000
@@ -307,49 +239,17 @@ def test_twenty_frames_and_an_offset(source: Path, tmp_path: Path) -> None:
     assert any("12.00 s of motion, but 10.50 s of music" in d.reason for d in manifest.dropped)
 
 
-def test_published_rate_of_features_beside_slower_motion(fixture: Path, tmp_path: Path) -> None:
-    slow, fast = tmp_path / "slow", tmp_path / "fast"
-    convert(AistppConfig(source=fixture, fps=20.0, audio_fps=60.0, sound_rate=0), slow)
-    convert(AistppConfig(source=fixture, fps=60.0, sound_rate=0), fast)
-    reader, i = clip_of(slow, "train", REAL)
-    other, j = clip_of(fast, "train", REAL)
-    assert reader.motion(i).shape[0] == 240
-    assert reader.wav(i) is None
-    assert reader.manifest.audio == other.manifest.audio
-    assert np.array_equal(reader.audio(i), other.audio(j))
-    with pytest.raises(UserError, match="whole number of Hz"):
-        prepare_aistpp(AistppConfig(source=fixture, fps=23.976))
-
-
 def test_lengths_that_differ_are_cut_or_left_out(source: Path) -> None:
     music, rate = soundfile.read(source / "wavs/mBR0.wav", dtype="float32")
     soundfile.write(source / "wavs/mBR0.wav", music[: round(11.3 * rate)], rate, subtype="FLOAT")
-    plan = plan_aistpp(AistppConfig(source=source))
+    plan = prepare(AistppConfig(source=source)).plan
     clip = next(clip for _, clip in plan.items if clip.id == REAL)
     assert (clip.frames, clip.used) == (720, 678)
     assert plan.frames["train"] == 226
     assert "1 sequences end with their music, at most 1 s early" in plan.notes
     soundfile.write(source / f"wavs/{REAL}.wav", music[: round(10.9 * rate)], rate)  # its own comes first
-    plan = plan_aistpp(AistppConfig(source=source))
+    plan = prepare(AistppConfig(source=source)).plan
     assert any("12.00 s of motion, but 10.90 s of music" in d.reason for d in plan.dropped)
-
-
-def test_stereo_music_of_a_sequence(source: Path, tmp_path: Path) -> None:
-    save_motion(source, LISTED, frames=60)
-    path = source / f"wavs/{LISTED}.wav"
-    shutil.copy(source / "wavs/synthetic_stereo24.wav", path)
-    plan = plan_aistpp(AistppConfig(source=source, max_music_gap=0.5))
-    assert any("1.00 s of motion, but 0.25 s of music" in d.reason for d in plan.dropped)
-    stereo, rate = soundfile.read(path, dtype="float32")
-    long = np.tile(stereo, (10, 1))
-    soundfile.write(path, long, rate, subtype="PCM_24")
-    manifest = convert(AistppConfig(source=source, audio_features=False, sound_rate=rate), tmp_path / "out")
-    assert any("music of their own that goes on for more than 1 s" in note for note in manifest.notes)
-    reader, i = clip_of(tmp_path / "out", "val", LISTED)
-    wav = reader.wav(i)
-    assert reader.audio(i) is None and wav is not None
-    assert len(wav[0]) == rate
-    assert np.abs(wav[0] - long.mean(axis=1)[:rate]).max() < 2**-14
 
 
 @pytest.mark.parametrize("name", ["truncated", "zero_samples", "sample_rate_zero", "not_riff"])
@@ -364,22 +264,3 @@ def test_broken_music_is_named_and_its_dances_left_out(
     assert str(tmp_path) not in str(told)
     with pytest.raises(UserError, match=r"mHO9\.wav"):
         convert(AistppConfig(source=source), tmp_path / "strict", strict=True)
-
-
-def test_nan_within_music_is_found_when_it_is_read(source: Path, tmp_path: Path) -> None:
-    music, rate = soundfile.read(source / "wavs/mHO9.wav", dtype="float32")
-    music[12345] = np.nan
-    soundfile.write(source / "wavs/mHO9.wav", music, rate, subtype="FLOAT")
-    manifest = convert(AistppConfig(source=source, audio_features=False), tmp_path / "out")
-    told = {d.source: d.reason for d in manifest.dropped}
-    assert told[f"motions/{TEST}.pkl"].endswith("wavs/mHO9.wav: NaN or infinity at sample 12345")
-
-
-def test_workers_do_not_change_a_byte(fixture: Path, tmp_path: Path) -> None:
-    config = AistppConfig(source=fixture, layout="smpl75")
-    for workers in (1, 2):
-        convert(config, tmp_path / str(workers), workers=workers, clips_per_shard=1)
-    names = sorted(path.name for path in (tmp_path / "1").iterdir())
-    assert names == sorted(path.name for path in (tmp_path / "2").iterdir())
-    for name in names:
-        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()

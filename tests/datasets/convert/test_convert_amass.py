@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.convert.amass.convert import AmassConfig, prepare_amass
+from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
-from motionloom.datasets.convert.common.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.common.splits import hash_split
-from motionloom.datasets.motion.canonical import heading
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.canonical import canonicalize, mirror
+from motionloom.datasets.motion.features.codec import decode
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 
@@ -35,25 +36,6 @@ def test_every_frame_rate_gives_the_same_motion(amass: ModuleType, fps: float, t
     # Linear interpolation between 60 Hz frames bends an arc by less than 0.2 mm.
     np.testing.assert_allclose(joints, wanted, atol=3e-4)
     assert (manifest.layout, manifest.fps, manifest.licence) == ("body133", 20.0, "AMASS-noncommercial")
-
-
-def test_the_figure_stands_upright_walks_forward_and_turns_left(amass: ModuleType, tmp_path: Path) -> None:
-    amass.save(tmp_path / "in/KIT/3/walk_poses.npz", **amass.walk(120.0))
-    amass.make(tmp_path / "in", tmp_path / "out")
-    layout = MotionLayout.named("body133")
-    (motion,) = amass.features(tmp_path / "out").values()
-    joints = decode(motion, layout)
-    names = layout.skeleton
-    assert joints[0, names.index("head"), 1] > 1.4 and abs(joints[:, :, 1].min()) < 1e-5
-    assert joints[0, names.index("left_wrist"), 0] > 0.3  # left is +X when facing +Z
-    seconds = (len(joints) - 1) / 20
-    turned = heading(joints, 20.0)
-    assert turned[-1] - turned[0] == pytest.approx(amass.TURN * seconds, abs=1e-3)
-    assert joints[1, 0, 2] / (1 / 20) == pytest.approx(amass.SPEED, rel=0.02)  # first step: straight ahead
-    angle = amass.TURN * seconds
-    path = amass.SPEED / amass.TURN * np.array([1 - math.cos(angle), math.sin(angle)])  # an arc to the left
-    np.testing.assert_allclose(joints[-1, 0, [0, 2]], path, atol=2e-3)
-    assert joints[:, names.index("left_ankle"), 1].min() > joints[:, names.index("right_ankle"), 1].max()
 
 
 def test_smplh_smplx_and_parts_agree_and_fingers_come_from_the_hands(
@@ -121,13 +103,6 @@ def test_bones_come_from_the_body_model_of_the_gender(amass: ModuleType, tmp_pat
     assert list(amass.features(tmp_path / "x")) == ["A/b/x_stageii"]
 
 
-def test_without_a_body_model_the_manifest_says_so(amass: ModuleType, tmp_path: Path) -> None:
-    amass.save(tmp_path / "in/A/b/c_poses.npz", **amass.walk(60.0))
-    manifest = amass.make(tmp_path / "in", tmp_path / "out")
-    assert manifest.options["bodies"]["neutral"]["kind"] == "neutral skeleton"
-    assert any("No body model" in note for note in manifest.notes)
-
-
 def test_plan_accounts_for_every_file(amass: ModuleType, tmp_path: Path) -> None:
     source = tmp_path / "in"
     clip = amass.walk(60.0)
@@ -142,7 +117,7 @@ def test_plan_accounts_for_every_file(amass: ModuleType, tmp_path: Path) -> None
     (source / "CMU/elsewhere").symlink_to(tmp_path)
     (source / "CMU/02/link_poses.npz").symlink_to(tmp_path / "outside.npz")
     amass.save(tmp_path / "outside.npz", **clip)
-    plan = prepare_amass(AmassConfig(source=source)).plan
+    plan = prepare(AmassConfig(source=source)).plan
     assert plan.found == 4 and plan.ignored == 3
     assert [clip.id for _, clip in plan.items] == ["CMU/01/01_01_poses", "KIT/3/good_poses"]
     assert {d.source: d.reason for d in plan.dropped} == {"KIT/3/short_poses.npz": "0.52 s, shorter than 1 s"}
@@ -166,7 +141,7 @@ def test_plan_reads_no_motion(amass: ModuleType, tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[1000] ^= 0xFF  # inside `poses`
     path.write_bytes(data)
-    assert len(prepare_amass(AmassConfig(source=tmp_path / "in")).plan.items) == 2
+    assert len(prepare(AmassConfig(source=tmp_path / "in")).plan.items) == 2
     manifest = amass.make(tmp_path / "in", tmp_path / "out")
     assert "array 'poses' is damaged" in amass.reasons(manifest)["A/b/bad_poses.npz"]
     assert list(amass.features(tmp_path / "out")) == ["A/b/good_poses"]
@@ -227,7 +202,7 @@ def test_broken_clips_are_left_out_with_their_reason(
     assert list(amass.features(tmp_path / "out")) == ["A/b/good_poses"]
     assert not (tmp_path / "PWNED_amass").exists()
     with pytest.raises(UserError, match=r"bad_poses\.npz"):
-        conversion = prepare_amass(AmassConfig(source=tmp_path / "in"))
+        conversion = prepare(AmassConfig(source=tmp_path / "in"))
         run_conversion(conversion, tmp_path / "strict", strict=True, progress=False)
 
 
@@ -300,6 +275,29 @@ def test_captions_splits_and_missing_clips(amass: ModuleType, tmp_path: Path) ->
     assert amass.reasons(manifest)["KIT/3/a_poses.npz (first)"] == "in no split file"
 
 
+def test_parameters_are_kept_for_ude(amass: ModuleType, tmp_path: Path) -> None:
+    """`smpl75` poses the same joints, mirrored ones too; others than SMPL have hands at rest."""
+    clip = amass.walk(60.0)
+    amass.save(tmp_path / "in/KIT/3/walk_poses.npz", **clip)
+    (tmp_path / "index.csv").write_text(
+        "source_path,start_frame,end_frame,new_name\n./pose_data/KIT/3/walk_poses.npy,0,-1,000001.npy\n"
+    )
+    poses = np.concatenate([clip["poses"][:, :66], np.full((len(clip["poses"]), 6), 0.25)], axis=1)
+    amass.save(tmp_path / "smpl/KIT/3/walk_poses.npz", **{**clip, "poses": poses})
+    index = {"humanml_index": tmp_path / "index.csv", "mirror": True, "uncaptioned": "keep"}
+    layout, wanted = MotionLayout.named("smpl75"), amass.expected_joints(20.0)
+    for source, palms in (("in", 0.0), ("smpl", 0.25)):
+        amass.make(tmp_path / source, tmp_path / f"{source}-out", layout="smpl75", **index)
+        found = amass.features(tmp_path / f"{source}-out")
+        joints = joints_of(found["000001"], layout)
+        assert found["000001"].shape[1] == 75 and len(joints) >= 59
+        np.testing.assert_allclose(joints, wanted[: len(joints)], atol=2e-3)
+        other = joints_of(found["M000001"], layout)
+        image = canonicalize(mirror(wanted, layout.skeleton))[: len(other)]
+        np.testing.assert_allclose(other, image, atol=2e-3)
+        np.testing.assert_allclose(found["000001"][:, 69:], palms, atol=1e-6)
+
+
 def test_options_that_exclude_each_other(tmp_path: Path) -> None:
     for options, message in (
         ({"mirror": True}, "need humanml_index"),
@@ -309,33 +307,8 @@ def test_options_that_exclude_each_other(tmp_path: Path) -> None:
             AmassConfig.parse({"source": str(tmp_path), **options}, "options")
     for layout in ("wholebody363", "smplx322"):
         with pytest.raises(UserError, match="cannot be made from AMASS"):
-            prepare_amass(AmassConfig(source=tmp_path, layout=layout))
+            prepare(AmassConfig(source=tmp_path, layout=layout))
     with pytest.raises(UserError, match=r"no \.npz file with motion in it"):
-        prepare_amass(AmassConfig(source=tmp_path))
+        prepare(AmassConfig(source=tmp_path))
     with pytest.raises(UserError, match="no such folder"):
-        prepare_amass(AmassConfig(source=tmp_path / "none"))
-
-
-def test_licence_limit_and_lengths(amass: ModuleType, tmp_path: Path) -> None:
-    for i in range(5):
-        amass.save(tmp_path / f"in/A/b/{i}_poses.npz", **amass.walk(60.0, seconds=1.5))
-    plan = prepare_amass(AmassConfig(source=tmp_path / "in", limit=2)).plan
-    assert len(plan.items) == 2 and "limited to 2 of 5 clips" in plan.notes
-    plan = prepare_amass(AmassConfig(source=tmp_path / "in", allow_licence=("CC0",))).plan
-    assert not plan.items and "licence 'AMASS-noncommercial' is not allowed" in plan.dropped[0].reason
-    plan = prepare_amass(AmassConfig(source=tmp_path / "in", max_seconds=1.0)).plan
-    assert "longer than 1 s" in plan.dropped[0].reason
-    manifest = amass.make(tmp_path / "in", tmp_path / "out", licence="mine")
-    assert manifest.licences == {"mine": 5}
-
-
-def test_reading_one_clip(amass: ModuleType, tmp_path: Path) -> None:
-    path = amass.save(tmp_path / "a.npz", **amass.as_smplx(amass.walk(60.0)))
-    header = read_motion_header(path, "a")
-    assert (header.frames, header.fps, header.kind, header.gender, header.hands) == (
-        181, 60.0, "SMPL-X", "female", True,
-    )  # fmt: skip
-    motion = read_motion(path, "a", hands=True, frames=slice(10, 30))
-    assert motion.rotations.shape == (20, 52, 3) and motion.trans.shape == (20, 3)
-    np.testing.assert_array_equal(motion.rotations.reshape(20, 156), amass.walk(60.0)["poses"][10:30])
-    np.testing.assert_array_equal(motion.betas, amass.walk(60.0)["betas"])
+        prepare(AmassConfig(source=tmp_path / "none"))

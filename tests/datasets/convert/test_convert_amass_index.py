@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 
-from motionloom.datasets.convert.amass.convert import AmassConfig, prepare_amass
 from motionloom.datasets.convert.amass.index import IndexRow, clip_key, read_index
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, mirror
-from motionloom.datasets.motion.features import decode
+from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
 from motionloom.datasets.schema import UserError
 
 
@@ -85,14 +83,6 @@ def test_humanml_index_cuts_names_mirrors_and_captions(amass: ModuleType, humanm
     }  # fmt: skip
 
 
-def test_humanml_index_counts_missing_clips_a_subset(humanml: Path) -> None:
-    config = AmassConfig(source=humanml / "amass", humanml_index=humanml / "index.csv")
-    plan = prepare_amass(config).plan
-    table = {name: (s.found, s.used, s.missing) for name, s in plan.subsets.items()}
-    assert table == {"CMU": (1, 0, 0), "HDM05": (1, 1, 0), "KIT": (1, 1, 1), "MoSh": (1, 1, 0),
-                     "humanact12": (0, 0, 1)}  # fmt: skip
-
-
 def test_humanml_index_at_250_frames_a_second_is_thinned_to_20_83(amass: ModuleType, humanml: Path) -> None:
     """60 frames of the index are 59 * 12 steps of 1/250 s = 2.832 s, and its texts are as much shorter."""
     options = {"humanml_index": humanml / "index.csv", "humanml_texts": humanml / "texts"}
@@ -150,14 +140,3 @@ def test_keys_join_the_releases() -> None:
     assert row.cut(1000, 60.0) == (75, 88)
     assert IndexRow("1", "CMU/a/b.npy", 0, -1).cut(61, 60.0) == (0, 58)
     assert row.cut(60, 60.0) == (0, 0)
-
-
-def test_workers_get_everything_they_need_and_make_the_same(humanml: Path) -> None:
-    config = AmassConfig(source=humanml / "amass", humanml_index=humanml / "index.csv", mirror=True)
-    conversion = prepare_amass(config)
-    convert, items = pickle.loads(pickle.dumps((conversion.convert, conversion.plan.items)))
-    again = prepare_amass(config, workers=3)
-    assert items == conversion.plan.items == again.plan.items
-    assert conversion.options == again.options
-    for (_, sent), (_, kept) in zip(items, conversion.plan.items, strict=True):
-        np.testing.assert_array_equal(convert(sent).motion, conversion.convert(kept).motion)

@@ -15,14 +15,12 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.base.lock import LOCK_FILE
-from motionloom.datasets.convert.bvh.convert import BvhClips, BvhConfig, plan_bvh, prepare_bvh
-from motionloom.datasets.convert.common.archives import Batch
-from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
+from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
+from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.convert.common.splits import hash_split
-from motionloom.datasets.motion.bvh import read_bvh
-from motionloom.datasets.motion.canonical import canonicalize, resample
-from motionloom.datasets.motion.features import decode
-from motionloom.datasets.motion.joint_map import JointMap
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, Split, UserError
 from motionloom.datasets.shards.options import Part
@@ -76,7 +74,7 @@ def config(folder: Path, **changes: Any) -> BvhConfig:
 
 
 def convert(given: BvhConfig, out: Path, *, workers: int = 1, **options: Any) -> Manifest:
-    prepared = prepare_bvh(given, workers=workers, scan=out / SCAN_FILE)
+    prepared = prepare(given, workers=workers, out=out)
     return run_conversion(prepared, out, workers=workers, progress=False, **options)
 
 
@@ -113,17 +111,6 @@ def test_clips_become_samples_with_captions_split_and_licence(clips: Path, tmp_p
             assert abs(len(dataset.motion(i)) - row["frames"] * 20 / 30) < 1.5
 
 
-def test_features_are_those_of_the_clip(clips: Path, tmp_path: Path) -> None:
-    convert(config(clips), tmp_path / "out")
-    dataset = ShardDataset.open(tmp_path / "out", "val")
-    motion = read_bvh(clip_file(clips, "bow_childish"))
-    joints = JointMap.load(clips / "joint_map.json").apply(motion)
-    expected = canonicalize(resample(joints, 30.0, 20.0))
-    got = decode(np.array(dataset.motion(0)), MotionLayout.named("body133"))
-    np.testing.assert_allclose(got, expected, atol=1e-4)
-    assert expected[..., 1].min() == pytest.approx(0, abs=1e-9)
-
-
 def test_worker_count_changes_no_byte(copy: Path, tmp_path: Path) -> None:
     pack(copy, 2)
     outs = [tmp_path / "one", tmp_path / "two"]
@@ -153,7 +140,7 @@ def test_a_killed_run_resumes_to_the_same_bytes(
 ) -> None:
     pack(copy, 3)
     convert(config(copy), tmp_path / "whole")
-    real, calls = BvhClips.features, []
+    real, calls = Bvh.encode, []
 
     def dies(*args: Any) -> Any:
         calls.append(args)
@@ -161,7 +148,7 @@ def test_a_killed_run_resumes_to_the_same_bytes(
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(BvhClips, "features", dies)
+    monkeypatch.setattr(Bvh, "encode", dies)
     with pytest.raises(KeyboardInterrupt):
         convert(config(copy), tmp_path / "out")
     assert len(list((tmp_path / "out" / WORK_FOLDER).glob("*.json"))) == 2
@@ -187,11 +174,11 @@ def test_a_finished_conversion_reads_nothing_again(
 
 def test_a_clip_by_itself_is_the_same_sample(copy: Path, tmp_path: Path) -> None:
     pack(copy, 2)
-    prepared = prepare_bvh(config(copy))
+    prepared = prepare(config(copy))
     run_conversion(prepared, tmp_path / "out", progress=False)
     dataset = ShardDataset.open(tmp_path / "out", "val")
     (clip,) = [item for split, item in prepared.plan.items if split == "val"]
-    sample = prepared.convert(clip)
+    sample = prepared.converter.convert(clip)
     assert not isinstance(sample, list)
     np.testing.assert_array_equal(sample.motion, dataset.motion(0))
     assert (sample.meta, sample.texts) == (dataset.meta(0), dataset.texts(0))
@@ -224,7 +211,7 @@ def test_parts_and_one_last_run_give_the_same_bytes(copy: Path, tmp_path: Path, 
 
 
 def run_part(given: BvhConfig, out: Path, part: Part) -> Manifest:
-    prepared = prepare_bvh(given, scan=out / SCAN_FILE)
+    prepared = prepare(given, out=out)
     return run_conversion(prepared, out, clips_per_shard=2, progress=False, part=part)
 
 
@@ -246,7 +233,7 @@ def test_broken_files_are_reported_and_skipped(copy: Path, shared: Path, tmp_pat
     for path in (shared / "data/broken/bvh").glob("*.bvh"):
         shutil.copy(path, copy)
     given = config(copy, uncaptioned="keep", min_seconds=0)
-    plan = plan_bvh(given)
+    plan = prepare(given).plan
     assert len(plan.broken) == 2  # frame_time_zero, no_motion: the header alone shows it
     manifest = convert(given, tmp_path / "out")
     told = reasons(manifest)
@@ -265,7 +252,7 @@ def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> Non
     (copy / "unknown.bvh").write_text(extra)
     clip_file(copy, "bow_active").unlink()
     (copy / "notes.txt").touch()
-    plan = plan_bvh(config(copy))
+    plan = prepare(config(copy)).plan
     assert plan.found == 8
     assert plan.counts() == {"train": 3, "val": 1, "test": 1}
     assert plan.frames["val"] == 65
@@ -275,7 +262,7 @@ def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> Non
     told = Counter(d.reason.split(",")[0] for d in plan.dropped)
     assert told == {"same bytes as dataset-1/dataset-1_bow_angry_001.bvh": 1, "no captions": 1, "0.67 s": 1}
     assert "8" in {str(cell) for column in plan.table().columns for cell in column.cells}
-    kept = plan_bvh(config(copy, captions=None))
+    kept = prepare(config(copy, captions=None)).plan
     assert any("same bytes as" in d.reason for d in kept.dropped)
     with pytest.raises(UserError, match="strict"):
         plan.require_whole()
@@ -285,7 +272,7 @@ def test_expected_frames_are_the_written_ones(clips: Path, tmp_path: Path) -> No
     for layout in ("body133", "h3d263"):
         given = config(clips, layout=layout, fps=20.0)
         manifest = convert(given, tmp_path / layout)
-        assert {s.split: s.frames for s in manifest.shards} == plan_bvh(given).frames
+        assert {s.split: s.frames for s in manifest.shards} == prepare(given).plan.frames
 
 
 def test_splits_come_from_files_then_captions_then_hash(copy: Path, tmp_path: Path) -> None:
@@ -294,20 +281,13 @@ def test_splits_come_from_files_then_captions_then_hash(copy: Path, tmp_path: Pa
     ids = [f"dataset-1_{name}_001" for name in NAMES]
     (folder / "train.txt").write_bytes(("\r\n".join(ids[:3]) + "\r\n\r\n").encode())
     (folder / "test.txt").write_text("\n".join([*ids[3:5], ids[3], "nobody"]))
-    plan = plan_bvh(config(copy, splits=folder))
+    plan = prepare(config(copy, splits=folder)).plan
     assert plan.counts() == {"train": 3, "val": 0, "test": 2}
     assert [d.source for d in plan.missing] == ["nobody"]
     assert any("listed twice" in note for note in plan.notes)
     assert sum(d.reason == "in no split file" for d in plan.dropped) == 2
-    hashed = plan_bvh(config(copy, captions=None))
+    hashed = prepare(config(copy, captions=None)).plan
     assert all(split == hash_split(clip.id) for split, clip in hashed.items)
-
-
-def test_bad_caption_lines_are_named(copy: Path) -> None:
-    with (copy / "captions.jsonl").open("a") as file:
-        file.write('\n{"id": "dataset-1_bow_angry_001", "captions": []}')
-    with pytest.raises(UserError, match=r"captions\.jsonl:8:1: clip id .* has a line already"):
-        plan_bvh(config(copy))
 
 
 def test_archive_members_are_labels_never_paths(clips: Path, tmp_path: Path) -> None:
@@ -342,16 +322,6 @@ def test_damaged_archive_keeps_what_came_before(copy: Path, tmp_path: Path) -> N
         convert(config(copy), tmp_path / "strict", strict=True)
 
 
-def test_wrong_unit_and_wrong_map_are_explained(copy: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"measures .* is the length unit right\? \(read with unit 'm'"):
-        convert(config(copy, unit="m", look=0), tmp_path / "out")
-    data = json.loads((copy / "joint_map.json").read_text())
-    data["smpl22"][0][2] = "Pelvis"
-    (copy / "joint_map.json").write_text(json.dumps(data))
-    with pytest.raises(UserError, match="no joint 'Pelvis'"):
-        convert(config(copy), tmp_path / "out")
-
-
 def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
     layout = MotionLayout.named("body133")
     convert(config(copy, retarget=True, limit=2), tmp_path / "out")
@@ -367,9 +337,9 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
     assert total == 2
     (tmp_path / "nothing").mkdir()
     with pytest.raises(UserError, match=r"no \.bvh file"):
-        plan_bvh(config(copy, source=tmp_path / "nothing"))
+        prepare(config(copy, source=tmp_path / "nothing"))
     with pytest.raises(UserError, match="no such file or folder"):
-        plan_bvh(config(copy, source=tmp_path / "none"))
+        prepare(config(copy, source=tmp_path / "none"))
     with pytest.raises(UserError, match="cannot be made from joints"):
         convert(config(copy, layout="smpl75"), tmp_path / "raw")
 

@@ -1,4 +1,4 @@
-"""BVH conversion without a joint map: a guess for each skeleton, as good as a hand-written map."""
+"""BVH conversion without a joint map (a guess for each skeleton) and without fingers (at rest or masked)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bvh_clips import write_clip, write_map
 from foreign_figures import Built, build, write_figure
 from foreign_tools import FOREIGN
 from numpy.typing import NDArray
 
-from motionloom.datasets.convert.bvh.convert import BvhConfig, prepare_bvh
-from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
-from motionloom.datasets.convert.table import converter_named
+from motionloom.datasets.convert.bvh.convert import BvhConfig
+from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.bvh.joint_map import JointMap, map_text
 from motionloom.datasets.motion.canonical import canonicalize, resample
-from motionloom.datasets.motion.features import decode
-from motionloom.datasets.motion.joint_map import JointMap, map_text
+from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Manifest, Split, UserError
@@ -31,7 +33,7 @@ SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 def convert(source: Path, out: Path, **changes: Any) -> Manifest:
     config = BvhConfig(source=source, licence="CC0", name="x", **changes)
-    prepared = prepare_bvh(config, scan=out / SCAN_FILE, maps=out)
+    prepared = prepare(config, out=out)
     return run_conversion(prepared, out, progress=False)
 
 
@@ -134,16 +136,9 @@ def test_swapped_sides_are_refused(tmp_path: Path) -> None:
         next((swap[s] + n.removeprefix(s) for s in swap if n.startswith(s)), n) for n in built.names
     ]
     write_figure(tmp_path / "mocap/a.bvh", built, frames=66, twisted=True)
-    with pytest.raises(UserError) as caught:
-        convert(tmp_path / "mocap", tmp_path / "out")
-    said = str(caught.value)
-    assert "the names call 'LeftUpLeg' the left leg, but as the feet point it is the right" in said
-    assert "the names call 'LeftArm' the left arm" in said and "joint_map.json" in said
-    # The map says what the names say: with it a look at the clips refuses them too, unless none is taken.
-    given = tmp_path / "out/joint_map.json"
     with pytest.raises(UserError, match="exchange the left and the right rows"):
-        convert(tmp_path / "mocap", tmp_path / "out", joint_map=given)
-    assert not convert(tmp_path / "mocap", tmp_path / "out", joint_map=given, look=0).dropped
+        convert(tmp_path / "mocap", tmp_path / "out")
+    assert not convert(tmp_path / "mocap", tmp_path / "out", look=0).dropped
 
 
 def test_a_guess_needs_no_whole_first_file_and_no_folder(tmp_path: Path) -> None:
@@ -153,13 +148,44 @@ def test_a_guess_needs_no_whole_first_file_and_no_folder(tmp_path: Path) -> None
     text = (source / "a.bvh").read_text()
     (source / "a.bvh").write_text(text[: -len(text) // 3])
     config = BvhConfig(source=source, licence="CC0")
-    prepared = prepare_bvh(config)
+    prepared = prepare(config)
     assert "guessed from b.bvh" in prepared.plan.notes[0] and "22 by name" in prepared.plan.notes[0]
     assert not [p for p in tmp_path.rglob("*") if p.suffix != ".bvh" and p.is_file()]
     manifest = convert(source, tmp_path / "out")
     assert [d.source for d in manifest.dropped] == ["a.bvh"]
-    again = converter_named("bvh").prepare(config, out=tmp_path / "out")
+    again = prepare(config, out=tmp_path / "out")
     assert again.options == prepared.options, "neither the folder nor an earlier run matters"
     toeless(tmp_path / "other")
     with pytest.raises(UserError, match=r"`motionloom data joints a.bvh -o joint_map.json` writes a map"):
-        prepare_bvh(BvhConfig(source=tmp_path / "other", licence="CC0"))
+        prepare(BvhConfig(source=tmp_path / "other", licence="CC0"))
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("clips")
+    write_clip(folder / "sway.bvh", 1)
+    return folder
+
+
+@pytest.mark.parametrize("fingers", ["resting", "missing"])
+def test_hands_are_added_and_the_body_stays(clips: Path, tmp_path: Path, fingers: str) -> None:
+    manifest = convert(clips, tmp_path / "whole", look=0, layout="wholebody363", fingers=fingers)
+    convert(clips, tmp_path / "body", look=0)
+    (shard,) = (one for one in manifest.shards if one.samples)
+    whole, body = (ShardDataset.open(tmp_path / name, shard.split) for name in ("whole", "body"))
+    layout = MotionLayout.named("wholebody363", fps=20.0)
+    assert whole.layout == layout
+    assert whole.meta(0).has_hands is (fingers == "resting") and not whole.meta(0).has_face
+    motion = np.array(whole.motion(0))
+    np.testing.assert_allclose(motion[:, layout.part("body")], np.array(body.motion(0)), atol=1e-5)
+    assert not motion[:, layout.slice("face")].any()
+    joints = decode(motion, layout)
+    # Made at 30 fps and resampled along straight lines: close, not equal.
+    np.testing.assert_allclose(joints, with_resting_hands(joints[:, :22]), atol=0.01)
+
+
+def test_a_map_without_fingers_is_refused_where_fingers_are_recorded(clips: Path, tmp_path: Path) -> None:
+    path = write_map(tmp_path / "map.json")
+    with pytest.raises(UserError, match="'smplx52'; found smpl22"):
+        convert(clips, tmp_path / "out", layout="wholebody313", joint_map=path, look=0)
+    convert(clips, tmp_path / "out", layout="wholebody313", joint_map=path, fingers="resting", look=0)

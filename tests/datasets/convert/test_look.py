@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.check.dataset import examine
-from motionloom.datasets.convert.bvh.convert import BvhClips, BvhConfig, prepare_bvh
+from motionloom.datasets.convert.bvh.convert import BvhConfig
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.conversion import Conversion, run_conversion
+from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.look import MOST_CLIPS, Look, SourceJoints, look_at
+from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.schema import Manifest, UserError
-from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, tally
 
 CLIPS = 7
 """The first ones of the archive, one of them cut to half a second below."""
@@ -68,13 +68,6 @@ def with_map(source: Path, folder: Path, change: Callable[[list[list[Any]]], Non
     return path
 
 
-def swap(first: int, second: int) -> Callable[[list[list[Any]]], None]:
-    def change(rows: list[list[Any]]) -> None:
-        rows[first][2], rows[second][2] = rows[second][2], rows[first][2]
-
-    return change
-
-
 def swap_sides(rows: list[list[Any]]) -> None:
     names = [row[1] for row in rows]
     old = {row[1]: row[2] for row in rows}
@@ -84,7 +77,7 @@ def swap_sides(rows: list[list[Any]]) -> None:
 
 
 def look(source: Path, **changes: Any) -> Look:
-    seen = prepare_bvh(config(source, **changes)).look()
+    seen = prepare(config(source, **changes)).look()
     assert seen is not None
     return seen
 
@@ -94,7 +87,7 @@ def said(seen: Look) -> list[str]:
 
 
 def convert(given: BvhConfig, out: Path, **options: Any) -> Manifest:
-    return run_conversion(prepare_bvh(given), out, progress=False, **options)
+    return run_conversion(prepare(given), out, progress=False, **options)
 
 
 def test_real_people_are_seen_as_they_are(source: Path) -> None:
@@ -109,10 +102,10 @@ def test_real_people_are_seen_as_they_are(source: Path) -> None:
         assert subset.above_floor is not None and 0 <= subset.above_floor < 0.1
         assert subset.backwards == 0
     assert seen.clips == 4 and seen.all_subsets == 2
-    plan = prepare_bvh(config(source)).looked().plan
+    plan = prepare(config(source)).looked().plan
     assert json.loads(json.dumps(plan.dump()))["look"]["subsets"][0]["name"] == "one"
     assert plan.dump()["rejected"] == [{"source": plan.dropped[0].source, "reason": plan.dropped[0].reason}]
-    assert prepare_bvh(config(source, look=0)).look() is None
+    assert prepare(config(source, look=0)).look() is None
     assert "look" not in config(source).options()
 
 
@@ -149,23 +142,6 @@ def test_wrong_unit_and_axis_are_named(
         seen.require_people("here")
 
 
-@pytest.mark.parametrize(
-    ("rows", "lines"),
-    [
-        ((4, 5), '[4, "left_knee", "LowerLeg_L"], [5, "right_knee", "LowerLeg_R"]'),
-        ((3, 15), '[3, "spine1", ["Hips", "Spine"]], [15, "head", "Head"]'),
-    ],
-)
-def test_swapped_rows_of_the_map_are_named(
-    source: Path, tmp_path: Path, rows: tuple[int, int], lines: str
-) -> None:
-    path = with_map(source, tmp_path, swap(*rows))
-    assert said(look(source, joint_map=path)) == [f"in the joint map: {lines} (then bones keep their length)"]
-    wrong_too = look(source, joint_map=path, unit="m", up="z")
-    assert said(wrong_too)[0].startswith(f"in the joint map: {lines}")
-    assert [s.option for s in wrong_too.suggestions] == ["joint_map", "up", "unit"]
-
-
 def test_left_for_right_is_seen_by_the_feet(source: Path, tmp_path: Path) -> None:
     seen = look(source, joint_map=with_map(source, tmp_path, swap_sides))
     assert "feet that point backwards" in seen.problems[0]
@@ -198,78 +174,6 @@ def test_a_floating_source_is_refused_and_a_floating_set_fails_the_check(
     report = examine(tmp_path / "out")
     assert report.error_kinds == {"no people standing on a floor": 1}
     assert "6 of 6 clips (100%) show figures whose head is not above the pelvis" in str(report.errors[0])
-
-
-def test_swapped_rows_fail_the_check_and_right_ones_pass(source: Path, tmp_path: Path) -> None:
-    convert(config(source), tmp_path / "right")
-    assert examine(tmp_path / "right").errors == []
-    path = with_map(source, tmp_path, swap(20, 21))
-    convert(config(source, joint_map=path, look=0), tmp_path / "wrong")
-    (problem,) = examine(tmp_path / "wrong").errors
-    assert "left_wrist and right_wrist stand in each other's place" in str(problem)
-
-
-def test_a_second_run_says_that_all_is_there_and_a_resumed_one_where_it_goes_on(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, lines = tmp_path / "out", list[str]()
-    first = convert(config(source), out, say=lines.append, clips_per_shard=2)
-    shards, clips = len(first.shards), sum(shard.samples for shard in first.shards)
-    assert lines == [] and (out / LEFT_OUT_FILE).read_text().startswith("rejected\ttwo/")
-    monkeypatch.setattr(Conversion, "look", lambda _: pytest.fail("nothing is left to look at"))
-    assert convert(config(source), out, say=lines.append, clips_per_shard=2) == first
-    state = f"finished already, {shards} of {shards} shards ({clips} clips); nothing to convert"
-    assert lines == [f"{out}: {state}"]
-    monkeypatch.undo()
-    missing = first.shards[-1]
-    (out / missing.name).unlink()
-    lines.clear()
-    assert convert(config(source), out, say=lines.append, clips_per_shard=2) == first
-    state = f"{shards - 1} of {shards} shards ({clips - missing.samples} clips)"
-    assert lines == [f"{out}: goes on after {state} of an earlier run"]
-
-
-def test_batches_of_a_killed_run_are_counted(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    packed = tmp_path / "packed"
-    packed.mkdir()
-    for name in ("one", "two"):
-        with tarfile.open(packed / f"{name}.tar", "w") as archive:
-            archive.add(source / name, name)
-    given = config(packed, joint_map=source / "joint_map.json")
-    real = BvhClips.features
-
-    def dies(self: BvhClips, label: str, data: bytes) -> Any:
-        if label.startswith("two.tar"):
-            raise KeyboardInterrupt
-        return real(self, label, data)
-
-    monkeypatch.setattr(BvhClips, "features", dies)
-    with pytest.raises(KeyboardInterrupt):
-        convert(given, tmp_path / "out")
-    monkeypatch.undo()
-    lines: list[str] = []
-    convert(given, tmp_path / "out", say=lines.append)
-    assert lines == [f"{tmp_path / 'out'}: goes on after 1 of 2 batches (3 clips)"]
-
-
-def test_twenty_identical_failures_are_one_line_with_their_list(source: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError) as caught:
-        convert(config(source, unit="m", look=0), tmp_path / "out")
-    text = str(caught.value)
-    assert "\n" not in text and text.count("is the length unit right") == 1
-    assert re.search(r"no clip survived the conversion \(6 x the figure measures .* \(the first: ", text)
-    listed = (tmp_path / "out" / LEFT_OUT_FILE).read_text().splitlines()
-    assert f"all of them: {tmp_path / 'out' / LEFT_OUT_FILE}" in text and len(listed) == CLIPS
-    assert {line.split("\t")[0] for line in listed} == {"rejected"}
-
-
-def test_files_that_are_not_there_are_not_rejected(source: Path, tmp_path: Path) -> None:
-    (tmp_path / "captions.jsonl").write_text(json.dumps({"id": "gone", "captions": ["a person bows"]}))
-    given = config(source, captions=tmp_path / "captions.jsonl", uncaptioned="keep")
-    manifest = convert(given, tmp_path / "out")
-    assert tally(manifest.dropped) == "1 rejected, 1 missing"
 
 
 def test_few_clips_of_many_subsets_are_chosen(source: Path) -> None:

@@ -7,26 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motionx_clips import (
-    ALL,
-    BOW,
-    CHAT,
-    DANCE,
-    HUMANML,
-    MIRRORED,
-    MOTION,
-    MUG,
-    TEXTS,
-    TURN,
-    WAVE,
-    config,
-    planned,
-)
+from motionx_clips import ALL, BOW, DANCE, HUMANML, MOTION, MUG, TEXTS, TURN, WAVE, config, planned
 
-from motionloom.datasets.convert.motionx.convert import prepare_motionx
-from motionloom.datasets.convert.motionx.files import find_files
-from motionloom.datasets.convert.motionx.plan import plan_motionx
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.convert.registry import prepare
 
 
 @pytest.fixture
@@ -35,7 +18,7 @@ def fixture(shared: Path) -> Path:
 
 
 def test_plan_tells_subsets_and_frames(fixture: Path) -> None:
-    plan = plan_motionx(config(fixture))
+    plan = prepare(config(fixture)).plan
     assert {clip.id for _, clip in plan.items} == ALL
     assert plan.frames == {"train": 50 + 42 + 45 + 50 + 50, "val": 44, "test": 30 + 41}
     humanml = plan.subsets["humanml"]
@@ -43,14 +26,6 @@ def test_plan_tells_subsets_and_frames(fixture: Path) -> None:
     assert sum(subset.found for subset in plan.subsets.values()) == 8
     assert plan.ignored == 3  # the excerpts of the official split files
     assert any("train 5 ids of 64,867" in note for note in plan.notes)
-
-
-def test_length_decides_about_short_clips(fixture: Path) -> None:
-    """The 30 frames of CHAT are 1.00 s: the default keeps them, a little more does not."""
-    plan = plan_motionx(config(fixture, min_seconds=1.1))
-    assert [(d.source, d.reason) for d in plan.dropped] == [
-        (f"{MOTION}/{CHAT}.npy", "1.00 s, shorter than 1.1 s")
-    ]
 
 
 # Texts
@@ -71,7 +46,7 @@ def test_captions_of_both_grammars(fixture: Path) -> None:
     assert {c.source for clip in clips.values() for c in clip.texts} == {"motionx"}
     assert [c.text for c in clips[BOW].face_texts] == ["happy"]
     assert clips[BOW].face_texts[0].source == "face"
-    notes = plan_motionx(config(fixture)).notes
+    notes = prepare(config(fixture)).plan.notes
     assert any(f"{HUMANML}.txt: line 3: the segment 0.5..2.5 s" in note for note in notes)
 
 
@@ -86,7 +61,7 @@ def test_names_and_empty_captions(copy: Path) -> None:
     (copy / TEXTS / f"{BOW}.txt").write_text("\n  \n")
     (copy / TEXTS / f"{TURN}.txt").write_bytes(b"caf\xe9 dance")
     (copy / TEXTS / f"{MUG}.txt").unlink()
-    plan = plan_motionx(config(copy))
+    plan = prepare(config(copy)).plan
     clips = {clip.id: clip for _, clip in plan.items}
     assert [c.text for c in clips[WAVE].texts] == ["Dance Break Back Cc"]
     assert {d.source for d in plan.dropped} == {f"{MOTION}/{i}.npy" for i in (BOW, TURN, MUG)}
@@ -95,11 +70,6 @@ def test_names_and_empty_captions(copy: Path) -> None:
     assert [d.source for d in plan.broken] == [f"{TEXTS}/{TURN}.txt"]
     assert "byte 3" in plan.broken[0].reason
     assert set(planned(copy, uncaptioned="keep")) == ALL
-
-
-def test_humanml_without_texts_is_told(copy: Path) -> None:
-    shutil.rmtree(copy / TEXTS / "humanml")
-    assert any("HumanML3D's texts.zip" in note for note in plan_motionx(config(copy)).notes)
 
 
 # Folders and ids
@@ -133,10 +103,10 @@ def test_every_known_naming(copy: Path, fixture: Path, moves: dict[str, str], no
     for old, new in moves.items():
         (copy / new).parent.mkdir(parents=True, exist_ok=True)
         (copy / old).rename(copy / new)
-    plan = plan_motionx(config(copy))
+    plan = prepare(config(copy)).plan
     found = {clip.id: (split, clip.texts, clip.face_texts, bool(clip.face)) for split, clip in plan.items}
     base = {clip.id: (split, clip.texts, clip.face_texts, bool(clip.face))
-            for split, clip in plan_motionx(config(fixture)).items}  # fmt: skip
+            for split, clip in prepare(config(fixture)).plan.items}  # fmt: skip
     assert found == base
     for note in notes:
         assert any(note in told for told in plan.notes), plan.notes
@@ -148,7 +118,7 @@ def test_other_representations_and_copies_are_not_motion(copy: Path) -> None:
     shutil.copytree(copy / MOTION / "GRAB", copy / "motionx_smplx/smplx_322/GRAB")
     shutil.copytree(copy / TEXTS / "GRAB", copy / "GRAB_text")
     (copy / MOTION / "GRAB/s1/._hidden.npy").write_bytes(b"x")
-    plan = plan_motionx(config(copy))
+    plan = prepare(config(copy)).plan
     assert {clip.id for _, clip in plan.items} == ALL
     assert plan.ignored == 3 + 2
     assert plan.found == 9
@@ -159,18 +129,6 @@ def test_other_representations_and_copies_are_not_motion(copy: Path) -> None:
     assert not plan.broken
 
 
-def test_same_base_name_in_two_folders(copy: Path) -> None:
-    (copy / MOTION / "kungfu").mkdir()
-    shutil.copy(copy / MOTION / f"{WAVE}.npy", copy / MOTION / "kungfu" / f"{Path(WAVE).name}.npy")
-    (copy / TEXTS / "kungfu").mkdir()
-    (copy / TEXTS / "kungfu" / f"{Path(WAVE).name}.txt").write_text("a kick")
-    with (copy / "train.txt").open("a") as file:
-        file.write(f"\nkungfu/{Path(WAVE).name}")
-    clips = planned(copy)
-    assert clips[f"kungfu/{Path(WAVE).name}"].texts[0].text == "a kick"
-    assert clips[WAVE].texts[0].text.startswith("A person raises")
-
-
 def test_links(copy: Path, tmp_path: Path) -> None:
     """Whole subsets may lie on another disk; a link to a single file outside is refused, a loop is left."""
     (copy / MOTION / "GRAB").rename(tmp_path / "elsewhere")
@@ -179,19 +137,10 @@ def test_links(copy: Path, tmp_path: Path) -> None:
     outside = tmp_path / "outside.npy"
     shutil.copy(copy / MOTION / f"{BOW}.npy", outside)
     (copy / MOTION / "perform/evil.npy").symlink_to(outside)
-    plan = plan_motionx(config(copy))
+    plan = prepare(config(copy)).plan
     assert {clip.id for _, clip in plan.items} == ALL
     assert [d.source for d in plan.broken] == [f"{MOTION}/perform/evil.npy"]
     assert "link" in plan.broken[0].reason
-
-
-def test_nothing_there(tmp_path: Path, fixture: Path) -> None:
-    with pytest.raises(UserError, match="no such folder"):
-        find_files(tmp_path / "none")
-    with pytest.raises(UserError, match="no Motion-X motion in it"):
-        find_files(tmp_path)
-    with pytest.raises(UserError, match=r"none of .*kungfu.* in it, but EgoBody, GRAB"):
-        plan_motionx(config(fixture, subsets=("kungfu",)))
 
 
 # Splits, subsets, licences
@@ -201,7 +150,7 @@ def test_missing_and_unlisted_clips(copy: Path) -> None:
     (copy / MOTION / f"{MUG}.npy").unlink()
     lines = (copy / "train.txt").read_text().splitlines()
     (copy / "train.txt").write_text("\r\n".join(line for line in lines if line != BOW) + "\r\n\r\n")
-    plan = plan_motionx(config(copy))
+    plan = prepare(config(copy)).plan
     assert [(d.source, d.reason) for d in plan.missing] == [
         (MUG, "listed in val.txt, but its motion is not here")
     ]
@@ -211,33 +160,14 @@ def test_missing_and_unlisted_clips(copy: Path) -> None:
     assert any("1 caption files have no motion" in note for note in plan.notes)
 
 
-def test_without_split_files_mirrors_stay_together(copy: Path) -> None:
-    for name in ("train", "val", "test"):
-        (copy / f"{name}.txt").unlink()
-    plan = plan_motionx(config(copy))
-    splits = {clip.id: split for split, clip in plan.items}
-    assert set(splits) == ALL
-    assert splits[HUMANML] == splits[MIRRORED]
-    assert any("80/5/15" in note for note in plan.notes)
-
-
-def test_mirror_in_another_split_leaks(copy: Path) -> None:
-    lines = (copy / "train.txt").read_text().replace(f"{MIRRORED}\n", "")
-    (copy / "train.txt").write_text(lines.removesuffix(MIRRORED))
-    with (copy / "test.txt").open("a") as file:
-        file.write(f"\n{MIRRORED}")
-    with pytest.raises(UserError, match=f"'{MIRRORED}' mirrors '{HUMANML}'"):
-        plan_motionx(config(copy))
-
-
 def test_subsets_limit_and_licences(fixture: Path) -> None:
-    plan = plan_motionx(config(fixture, subsets=("GRAB", "aist")))
+    plan = prepare(config(fixture, subsets=("GRAB", "aist"))).plan
     assert {clip.id for _, clip in plan.items} == {MUG, DANCE}
     assert plan.ignored == 3 + 6
     assert not plan.missing
-    assert len(plan_motionx(config(fixture, limit=3)).items) == 3
-    plan = plan_motionx(config(fixture, allow_licence=("GRAB-noncommercial",)))
+    assert len(prepare(config(fixture, limit=3)).plan.items) == 3
+    plan = prepare(config(fixture, allow_licence=("GRAB-noncommercial",))).plan
     assert {clip.id for _, clip in plan.items} == {MUG}
-    assert {clip.licence for _, clip in plan_motionx(config(fixture, licence="mine")).items} == {"mine"}
-    assert prepare_motionx(config(fixture, licence="mine")).licence == "mine"
+    assert {clip.licence for _, clip in prepare(config(fixture, licence="mine")).plan.items} == {"mine"}
+    assert prepare(config(fixture, licence="mine")).facts().licence == "mine"
     assert planned(fixture)[DANCE].licence.endswith("AIST++-annotations-CC-BY-4.0")

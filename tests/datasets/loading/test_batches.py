@@ -9,33 +9,22 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from rank_shares import require_rows, require_shares
+from text_samples import WordLengths, caption_batches
 from torch.utils.data import DataLoader
 
-from motionloom.datasets.loading.batches import CaptionBatch, CaptionBatches, EvalBatches, WindowBatches
-from motionloom.datasets.loading.spans import frame_span
-from motionloom.datasets.loading.statistics import FeatureStats, compute
+from motionloom.datasets.loading.batches import WindowBatches
+from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches, EvalBatches
+from motionloom.datasets.loading.crops import frame_span
+from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache
 from motionloom.datasets.text.encoder import EncodedText
-
-
-class WordLengths:
-    """A text encoder in three lines: one token per word, all its values the word's length."""
-
-    name = "word-lengths"
-    dim = 4
-
-    def encode(self, captions: Sequence[str]) -> EncodedText:
-        words = [caption.split() for caption in captions]
-        tokens = np.zeros((len(words), max(map(len, words)), 4), dtype=np.float32)
-        mask = np.zeros(tokens.shape[:2], dtype=bool)
-        for i, row in enumerate(words):
-            tokens[i, : len(row)] = np.array([len(word) for word in row])[:, None]
-            mask[i, : len(row)] = True
-        return EncodedText(np.full((len(words), 4), 0.5, dtype=np.float32), tokens, mask)
+from motionloom.datasets.text.reword import RewordConfig, Rewordings
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +45,13 @@ def text(train: ShardDataset, tmp_path_factory: pytest.TempPathFactory) -> TextC
     return build_with_encoder(tmp_path_factory.mktemp("text"), captions, WordLengths(), progress=False)
 
 
+def place_of(part: np.ndarray, clip: np.ndarray) -> int:
+    """The one frame of a clip at which a part of it begins."""
+    every = range(len(clip) - len(part) + 1)
+    (first,) = [s for s in every if np.allclose(clip[s : s + len(part)], part, atol=1e-5)]
+    return first
+
+
 def test_windows_are_pieces_of_clips(train: ShardDataset, stats: FeatureStats) -> None:
     batches = WindowBatches(train, stats, window=32, batch_size=24, windows_per_clip=4, seed=3)
     normal = [stats.normalize(train.motion(i)) for i in range(len(train))]
@@ -69,29 +65,10 @@ def test_windows_are_pieces_of_clips(train: ShardDataset, stats: FeatureStats) -
             motion, length = batch["motion"][row].numpy(), int(batch["length"][row])
             clip = normal[clips[row // 4]]
             assert length == min(len(clip), 32)
-            fits = [
-                start
-                for start in range(len(clip) - length + 1)
-                if np.allclose(clip[start : start + length], motion[:length], atol=1e-5)
-            ]
-            assert len(fits) == 1
-            starts.add(fits[0] / max(1, len(clip) - length))
+            starts.add(place_of(motion[:length], clip) / max(1, len(clip) - length))
             assert (motion[length:] == 0).all()
     assert min(starts) == 0 and max(starts) == 1, "first and last window of a clip must be reachable"
     assert len(starts) > 50
-
-
-def test_windows_are_the_same_in_any_order_and_epochs_differ(
-    train: ShardDataset, stats: FeatureStats
-) -> None:
-    def build(seed: int = 3) -> WindowBatches:
-        return WindowBatches(train, stats, window=16, batch_size=20, windows_per_clip=2, seed=seed)
-
-    forward = [batch["motion"] for batch in map(build().__getitem__, range(15))]
-    late = build()
-    for k in (14, 0, 7):
-        assert torch.equal(late[k]["motion"], forward[k])
-    assert not torch.equal(forward[0], forward[6]) and not torch.equal(forward[0], build(4)[0]["motion"])
 
 
 @pytest.mark.parametrize("world", [2, 3, 6])
@@ -103,22 +80,13 @@ def test_any_number_of_ranks_sees_the_same_global_batch(
             train, stats, window=16, batch_size=24, windows_per_clip=2, seed=1, rank=rank, world=of
         )
 
-    def captions(rank: int, of: int) -> CaptionBatches:
-        return CaptionBatches(
+    def captions(rank: int, of: int) -> ConditionBatches:
+        return caption_batches(
             train, stats, text, batch_size=12, max_frames=40, min_frames=8, seed=1, rank=rank, world=of
         )
 
-    for k in (0, 4, 9):
-        parts = [windows(rank, world)[k]["motion"] for rank in range(world)]
-        assert torch.equal(torch.cat(parts), windows(0, 1)[k]["motion"])
-        whole = captions(0, 1)[k]
-        parts_c = [captions(rank, world)[k] for rank in range(world)]
-        assert torch.equal(torch.cat([part["index"] for part in parts_c]), whole["index"])
-        assert torch.equal(torch.cat([part["length"] for part in parts_c]), whole["length"])
-        assert [caption for part in parts_c for caption in part["caption"]] == whole["caption"]
-        for part, motion in zip(parts_c, whole["motion"].chunk(world), strict=True):
-            longest = int(part["length"].max())
-            assert torch.equal(part["motion"][:, :longest], motion[:, :longest])
+    require_shares(windows, worlds=[world])
+    require_shares(captions, worlds=[world])
 
 
 def test_loader_workers_change_nothing_and_a_run_resumes_anywhere(
@@ -134,17 +102,8 @@ def test_loader_workers_change_nothing_and_a_run_resumes_anywhere(
             assert torch.equal(one, other)
 
 
-def test_columns_are_what_indexing_gives(train: ShardDataset, stats: FeatureStats) -> None:
-    whole = WindowBatches(train, stats, window=16, batch_size=8, seed=1)[0]["motion"]
-    for columns in (np.array([4]), np.arange(4, 67), np.array([0, 1, 5, 6, 7, 132])):
-        some = WindowBatches(train, stats, window=16, batch_size=8, seed=1, columns=columns)[0]["motion"]
-        assert torch.equal(some, whole[..., columns])
-    with pytest.raises(UserError, match="columns outside layout"):
-        WindowBatches(train, stats, window=16, batch_size=8, columns=np.array([133]))
-
-
 def test_caption_batches(train: ShardDataset, stats: FeatureStats, text: TextCache) -> None:
-    batches = CaptionBatches(train, stats, text, batch_size=16, max_frames=40, min_frames=8, seed=5)
+    batches = caption_batches(train, stats, text, batch_size=16, max_frames=40, min_frames=8, seed=5)
     spans_seen: set[tuple[int, str]] = set()
     for k in range(20):
         batch = batches[k]
@@ -157,12 +116,7 @@ def test_caption_batches(train: ShardDataset, stats: FeatureStats, text: TextCac
             assert length[row] == min(end - first, 40)
             normal = stats.normalize(train.motion(clip)[first:end])
             motion = batch["motion"][row].numpy()
-            fits = [
-                s
-                for s in range(len(normal) - length[row] + 1)
-                if np.allclose(normal[s : s + length[row]], motion[: length[row]], atol=1e-5)
-            ]
-            assert len(fits) == 1
+            place_of(motion[: length[row]], normal)
             assert (motion[length[row] :] == 0).all()
             spans_seen.add((clip, caption))
             words = [len(word) for word in caption.split()]
@@ -178,7 +132,7 @@ def test_caption_batches(train: ShardDataset, stats: FeatureStats, text: TextCac
 def test_short_stretches_give_way_to_long_ones(
     train: ShardDataset, stats: FeatureStats, text: TextCache
 ) -> None:
-    batches = CaptionBatches(train, stats, text, batch_size=16, max_frames=60, min_frames=20, seed=5)
+    batches = caption_batches(train, stats, text, batch_size=16, max_frames=60, min_frames=20, seed=5)
     for k in range(5):
         batch = batches[k]
         assert all("walks" in caption for caption in batch["caption"]), "the other stretch has ten frames"
@@ -191,15 +145,15 @@ def test_face_batches_take_face_captions_and_columns(
     with_face = set(np.flatnonzero(train.has("face_texts.json")).tolist())
     assert 0 < len(with_face) < len(train)
     columns = np.arange(10, 20)
-    batches = CaptionBatches(
-        train, stats, text, batch_size=8, max_frames=40, min_frames=8, face=True, columns=columns
+    batches = caption_batches(
+        train, stats, text, about="face", batch_size=8, max_frames=40, min_frames=8, columns=columns
     )
     for k in range(8):
         batch = batches[k]
         assert set(batch["caption"]) == {"happy"} and set(batch["index"].tolist()) <= with_face
         assert batch["motion"].shape[2] == 10
     with pytest.raises(UserError, match="layout body133 has no field 'face'"):
-        CaptionBatches(train, stats, text, batch_size=8, max_frames=40, min_frames=8, face=True)
+        caption_batches(train, stats, text, about="face", batch_size=8, max_frames=40, min_frames=8)
 
 
 @pytest.mark.parametrize("world", [1, 2, 4])
@@ -208,7 +162,17 @@ def test_evaluation_sees_every_clip_once_in_order(
 ) -> None:
     clips: list[int] = []
     ranks = [
-        EvalBatches(train, stats, text, batch_size=16, max_frames=40, min_frames=25, rank=rank, world=world)
+        EvalBatches(
+            train,
+            stats,
+            {"text": text},
+            captioned="body",
+            batch_size=16,
+            max_frames=40,
+            min_frames=25,
+            rank=rank,
+            world=world,
+        )
         for rank in range(world)
     ]
     for k in range(len(ranks[0])):
@@ -222,11 +186,8 @@ def test_evaluation_sees_every_clip_once_in_order(
                 assert part["caption"][row] == train.texts(clip)[0].text
                 length = int(part["length"][row])
                 assert length == min(40, train.frames[clip])
-                np.testing.assert_allclose(
-                    part["motion"][row, :length].numpy(),
-                    stats.normalize(train.motion(clip)[:length]),
-                    atol=1e-5,
-                )
+                wanted = stats.normalize(train.motion(clip)[:length])
+                np.testing.assert_allclose(part["motion"][row, :length].numpy(), wanted, atol=1e-5)
     assert clips == np.flatnonzero(train.frames >= 25).tolist()
     without = EvalBatches(train, stats, batch_size=16, max_frames=40)
     assert sum(int(without[k]["valid"].sum()) for k in range(len(without))) == len(train)
@@ -249,8 +210,8 @@ class Likeness(WordLengths):
 def test_batches_hold_the_embeddings_that_say_what_is_alike(
     train: ShardDataset, stats: FeatureStats, text: TextCache, tmp_path: Path
 ) -> None:
-    def batch_of(cache: TextCache) -> CaptionBatch:
-        return CaptionBatches(train, stats, cache, batch_size=8, max_frames=40, min_frames=8)[0]
+    def batch_of(cache: TextCache) -> ConditionBatch:
+        return caption_batches(train, stats, cache, batch_size=8, max_frames=40, min_frames=8)[0]
 
     plain = batch_of(text)
     assert torch.equal(plain["similarity"], plain["conditions"]["text"].pooled), "one encoder for both"
@@ -280,26 +241,59 @@ def test_mistakes_are_named(train: ShardDataset, stats: FeatureStats, text: Text
     with pytest.raises(UserError, match="does not divide over 3 ranks"):
         WindowBatches(train, stats, window=16, batch_size=8, world=3)
     with pytest.raises(UserError, match="lower min_frames"):
-        CaptionBatches(train, stats, text, batch_size=8, max_frames=2000, min_frames=1000)
+        caption_batches(train, stats, text, batch_size=8, max_frames=2000, min_frames=1000)
     with pytest.raises(UserError, match="need 1 <= min_frames"):
-        CaptionBatches(train, stats, text, batch_size=8, max_frames=20, min_frames=30)
+        caption_batches(train, stats, text, batch_size=8, max_frames=20, min_frames=30)
     other = MotionLayout.named("body133", fps=30.0)
     with pytest.raises(UserError, match=r"feature statistics: holds layout body133 .exact, 30 fps"):
         WindowBatches(train, FeatureStats(stats.mean, stats.std, other), window=16, batch_size=8)
 
 
-def test_samples_say_which_frames_a_batch_holds(
-    train: ShardDataset, stats: FeatureStats, text: TextCache
+class Letters:
+    """One token a letter, its code; the sentence is their mean direction."""
+
+    dim = 2
+
+    def __init__(self, name: str = "letters") -> None:
+        self.name = name
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        tokens = np.zeros((len(captions), max(map(len, captions)), 2), dtype=np.float32)
+        for row, caption in zip(tokens, captions, strict=True):
+            row[: len(caption), 0] = [ord(letter) / 128 for letter in caption]
+            row[: len(caption), 1] = 1
+        sentence = tokens.sum(1) / np.linalg.norm(tokens.sum(1), axis=1, keepdims=True)
+        return EncodedText(sentence, tokens, tokens[..., 1] > 0)
+
+
+def said(batch: ConditionBatch) -> list[str]:
+    """The words that were encoded, read from the tokens."""
+    words = batch["conditions"]["text"]
+    codes = (words.features[..., 0] * 128).round().int()
+    return ["".join(map(chr, row[mask].tolist())) for row, mask in zip(codes, words.mask, strict=True)]
+
+
+def test_rewordings_stand_in_by_clip_and_turn(
+    train: ShardDataset, stats: FeatureStats, tmp_path: Path
 ) -> None:
-    """Read again from the data set by what they say, they are the batch."""
-    windows = WindowBatches(
-        train, stats, window=32, batch_size=24, windows_per_clip=4, seed=3, rank=1, world=2
-    )
-    captions = CaptionBatches(train, stats, text, batch_size=12, max_frames=40, min_frames=8, seed=5)
-    for batches in (windows, captions):
-        for k in (0, 7):
-            batch, samples = batches[k], batches.samples(k)
-            assert [sample.length for sample in samples] == batch["length"].tolist()
-            for row, (clip, first, length) in zip(batch["motion"].numpy(), samples, strict=True):
-                frames = train.motion(train.ids.index(clip))[first : first + length]
-                assert np.allclose(stats.normalize(frames), row[:length], atol=1e-5)
+    """Any number of ranks reads the same ones; a share of 0 is as without; other encoders are refused."""
+    captions = {caption.text for i in range(len(train)) for caption in train.texts(i)}
+    text = build_with_encoder(tmp_path / "text", captions, Letters(), progress=False)
+    how = {"batch_size": 12, "max_frames": 40, "min_frames": 8, "seed": 1}
+
+    def build(share: float, name: str = "letters", **ranks: int) -> ConditionBatches:
+        config = RewordConfig(share=share, drop=0.4, count=3)
+        folder = tmp_path / f"{name}{share}"
+        made = Rewordings.build(folder, captions, Letters(name), [], config, progress=False)
+        return caption_batches(train, stats, text, rewordings=made, **how, **ranks)
+
+    require_shares(lambda rank, world: build(0.6, rank=rank, world=world), worlds=[2])
+    batch, replaced = build(0.6), []
+    for k in (0, 4, 9):
+        whole = batch[k]
+        assert torch.equal(whole["similarity"], torch.from_numpy(text.sentence(whole["caption"])))
+        replaced += [a != b for a, b in zip(said(whole), whole["caption"], strict=True)]
+    assert any(replaced) and not all(replaced)
+    require_rows(caption_batches(train, stats, text, **how)[3], [build(0.0)[3]])
+    with pytest.raises(UserError, match="rewordings by the encoder others, captions by letters"):
+        build(0.5, "others")

@@ -9,18 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from text_samples import OneToken
+from rank_shares import require_rows
+from text_samples import OneToken, caption_batches
 
 from motionloom.datasets.check.dataset import check
-from motionloom.datasets.loading.batches import CaptionBatches, EvalBatches, WindowBatches
+from motionloom.datasets.loading.batches import WindowBatches
+from motionloom.datasets.loading.condition_batches import EvalBatches
+from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.loading.mix import MixedDataset
-from motionloom.datasets.loading.statistics import STD_FLOOR, FeatureStats, Moments, compute, from_moments
+from motionloom.datasets.loading.statistics import STD_FLOOR, Moments, compute, from_moments
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import FACE, HANDS, UserError
 from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.shards.reading import Reading
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache
 
@@ -59,16 +61,6 @@ def openings(root: Path, *kinds: str) -> list[ClipDataset]:
         "mixed": MixedDataset([(opened(), 1.0), (opened("test"), 2.0)]),
     }
     return [known[kind] for kind in kinds or known]
-
-
-def test_columns_of_each_part() -> None:
-    layout = MotionLayout.named("wholebody363")
-    present = layout.present_columns
-    assert present.shape == (4, 363) and present[3].all()
-    assert np.flatnonzero(~present[FACE]).tolist() == layout.part("hand").tolist()
-    assert np.flatnonzero(~present[HANDS]).tolist() == layout.part("face").tolist()
-    assert np.flatnonzero(present[0]).tolist() == layout.part("body").tolist()
-    assert MotionLayout.named("body133").present_columns.all()
 
 
 def test_the_index_says_what_the_metadata_says(roots: list[Path], made: ModuleType) -> None:
@@ -122,7 +114,7 @@ def test_a_part_that_no_clip_holds_has_mean_zero_and_std_one(made: ModuleType, t
         assert (stats.std[: face[0]] > STD_FLOOR).all() and (stats.std[: face[0]] != 1).all()
     with pytest.raises(UserError, match="no clip of split 'train' holds hands or a face"):
         WindowBatches(dataset, group, window=8, batch_size=4)
-    with pytest.raises(UserError, match="no clip of split 'train' has captions, the hands or face"):
+    with pytest.raises(UserError, match="no clip of split 'train' has 1 frames and the body parts"):
         EvalBatches(dataset, group, batch_size=4, max_frames=16, columns=face)
     WindowBatches(dataset, group, window=8, batch_size=4, columns=dataset.layout.part("bodyhand"))
 
@@ -152,8 +144,8 @@ def batches_of(dataset: ClipDataset, stats: FeatureStats, text: TextCache, **kin
     spans: dict[str, Any] = {"max_frames": 20, "min_frames": 4}
     return [
         WindowBatches(dataset, stats, window=16, batch_size=6, windows_per_clip=2, seed=1, **kind),
-        CaptionBatches(dataset, stats, text, batch_size=4, seed=1, **spans, **kind),
-        EvalBatches(dataset, stats, text, batch_size=4, **spans, **kind),
+        caption_batches(dataset, stats, text, batch_size=4, seed=1, **spans, **kind),
+        EvalBatches(dataset, stats, {"text": text}, captioned="body", batch_size=4, **spans, **kind),
         EvalBatches(dataset, stats, batch_size=4, max_frames=16, **kind),
     ]
 
@@ -164,17 +156,11 @@ def test_garbage_changes_no_batch(roots: list[Path], text: TextCache, part: str)
     layout = stats.layout
     columns = layout.part(part)  # type: ignore[arg-type]
     for clean, dirty in zip(openings(roots[0]), openings(roots[1]), strict=True):
-        pairs = zip(
-            batches_of(clean, stats, text, columns=columns),
-            batches_of(dirty, stats, text, columns=columns),
-            strict=True,
-        )
-        for one, other in pairs:
+        both = (batches_of(dataset, stats, text, columns=columns) for dataset in (clean, dirty))
+        for one, other in zip(*both, strict=True):
             for k in range(min(len(one), 5)):
                 a, b = one[k], other[k]
-                assert a.keys() == b.keys()
-                for name in ("motion", "length", "present"):
-                    assert torch.equal(a[name], b[name]), name
+                require_rows(a, [b])
                 assert a["present"].shape == (len(a["motion"]), len(columns)) and a["present"].any(1).all()
                 assert (a["motion"].masked_select(~a["present"][:, None]) == 0).all()
                 assert part not in ("hand", "face") or a["present"].all()
@@ -190,8 +176,10 @@ def test_clips_without_a_face_are_never_drawn_for_it(roots: list[Path], text: Te
         assert 0 < len(with_face) < len(dataset)
         face = dataset.layout.part("face")
         windows = WindowBatches(dataset, stats, window=16, batch_size=6, columns=face)
-        captions = CaptionBatches(dataset, stats, text, batch_size=4, max_frames=20, min_frames=4, face=True)
-        held_out = EvalBatches(dataset, stats, text, batch_size=4, max_frames=20, face=True)
+        captions = caption_batches(
+            dataset, stats, text, about="face", batch_size=4, max_frames=20, min_frames=4
+        )
+        held_out = EvalBatches(dataset, stats, {"text": text}, captioned="face", batch_size=4, max_frames=20)
         drawn = {int(i) for k in range(8) for i in windows.clips[windows.plan.batch(k)[1]]}
         assert drawn <= set(with_face) and len(drawn) > len(with_face) / 2
         assert {int(i) for k in range(8) for i in captions[k]["index"]} <= set(with_face)

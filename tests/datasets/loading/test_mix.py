@@ -12,17 +12,20 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from text_samples import OneToken
+from rank_shares import require_shares
+from text_samples import OneToken, caption_batches
 
-from motionloom.datasets.loading.batches import CaptionBatches, EvalBatches, WindowBatches
+from motionloom.datasets.loading.batches import WindowBatches
+from motionloom.datasets.loading.condition_batches import EvalBatches
+from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.loading.mix import MixedDataset
 from motionloom.datasets.loading.plan import BatchPlan
-from motionloom.datasets.loading.statistics import FeatureStats, compute
+from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.order import Source, shares
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.shards.reading import Reading
 from motionloom.datasets.text.build import build_with_encoder
 
 
@@ -53,28 +56,13 @@ def test_clips_are_numbered_through(mix: MixedDataset, roots: tuple[Path, Path])
         np.testing.assert_array_equal(mix.motion(i), dataset.motion(own))
         assert mix.texts(i) == dataset.texts(own) and mix.face_texts(i) == dataset.face_texts(own)
         assert mix.meta(i) == dataset.meta(own) and mix.ids[i] == dataset.ids[own]
-        assert np.array_equal(mix.audio(i), dataset.audio(own))
+        assert np.array_equal(mix.array(i, "audio.npy"), dataset.array(own, "audio.npy"))
         assert mix.frames[i] == dataset.frames[own] and (mix.wav(i) is None) == (dataset.wav(own) is None)
         assert mix.has("audio.npy")[i] == dataset.has("audio.npy")[own]
     with pytest.raises(IndexError):
         mix.motion(72)
     copy = pickle.loads(pickle.dumps(mix))
     np.testing.assert_array_equal(copy.motion(65), mix.motion(65))
-
-
-def test_shares_are_exact_each_epoch_and_even_in_each_batch(mix: MixedDataset) -> None:
-    plan = BatchPlan(len(mix), 8, 5, sources=mix.sources())
-    assert plan.batches_per_epoch == 9
-    for epoch in range(4):
-        batches = [plan.batch(epoch * 9 + j)[1] for j in range(9)]
-        assert sum(int((items >= 60).sum()) for items in batches) == 54
-        assert {int((items >= 60).sum()) for items in batches} <= {5, 6, 7}
-    drawn = [np.stack(plan.batch(k), axis=1) for k in range(36)]
-    counts = Counter(map(tuple, np.concatenate(drawn).tolist()))
-    assert set(counts.values()) == {1}, "an item comes once in a turn of its data set"
-    small = Counter(item for _, item in counts if item >= 60)
-    big = Counter(item for _, item in counts if item < 60)
-    assert set(small.values()) == {18} and set(big.values()) <= {1, 2} and len(big) == 60
 
 
 @settings(max_examples=60, deadline=None)
@@ -111,19 +99,8 @@ def test_the_mixed_order_is_fixed_for_ever() -> None:
     assert items.tolist() == [4, 0, 5, 5, 1, 4] and turns.tolist() == [2, 0, 2, 3, 0, 3]
 
 
-def test_pools_by_length_keep_the_shares() -> None:
-    sources = (Source(0, 400, 1.0), Source(400, 100, 1.0))
-    lengths = np.random.default_rng(0).integers(1, 100, 500)
-    plan = BatchPlan(500, 5, 5, lengths, sources)
-    for pool in range(12):
-        items = np.concatenate([plan.batch(k)[1] for k in range(pool * 8, pool * 8 + 8)])
-        assert int((items >= 400).sum()) == 20
-
-
 @pytest.mark.parametrize("order", ["global", "streamed"])
-def test_batches_are_the_same_for_any_number_of_ranks(
-    order: str, roots: tuple[Path, Path], tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_batches_are_the_same_for_any_number_of_ranks(order: str, roots: tuple[Path, Path]) -> None:
     data = mixed(roots, order=order, shards_per_group=2)
     stats = compute(data)
 
@@ -132,14 +109,10 @@ def test_batches_are_the_same_for_any_number_of_ranks(
             dataset, stats, window=16, batch_size=24, windows_per_clip=2, seed=1, rank=rank, world=world
         )
 
-    for k in (0, 4, 9):
-        whole = windows(0, 1)[k]["motion"]
-        for world in (2, 3):
-            parts = [windows(rank, world)[k]["motion"] for rank in range(world)]
-            assert torch.equal(torch.cat(parts), whole)
-        if order == "streamed":
-            streamed = mixed(roots, order=order, shards_per_group=2, mode="streamed")
-            assert torch.equal(windows(0, 1, streamed)[k]["motion"], whole)
+    require_shares(windows)
+    if order == "streamed":
+        streamed = mixed(roots, order=order, shards_per_group=2, mode="streamed")
+        assert torch.equal(windows(0, 1, streamed)[4]["motion"], windows(0, 1)[4]["motion"])
     evaluated = EvalBatches(data, stats, batch_size=16, max_frames=40)
     seen = [i for k in range(len(evaluated)) for i in evaluated[k]["index"].tolist()]
     assert seen == list(range(72)), "evaluation does not weigh"
@@ -159,12 +132,12 @@ def test_a_clip_drawn_again_gives_another_window(mix: MixedDataset) -> None:
 def test_caption_batches_draw_only_from_data_sets_with_captions(mix: MixedDataset, tmp_path: Path) -> None:
     captions = [c.text for i in range(len(mix)) for c in mix.texts(i)]
     text = build_with_encoder(tmp_path, captions, OneToken(), progress=False)
-    batches = CaptionBatches(mix, compute(mix), text, batch_size=8, max_frames=40, min_frames=30, seed=2)
+    batches = caption_batches(mix, compute(mix), text, batch_size=8, max_frames=40, min_frames=30, seed=2)
     usable = set(np.flatnonzero(mix.frames >= 30).tolist())
     seen = Counter(int(i >= 60) for k in range(8) for i in batches[k]["index"].tolist())
     assert set(batches[0]["index"].tolist()) <= usable and seen[1] == 48 and seen[0] == 16
-    long = CaptionBatches(mix, compute(mix), text, batch_size=8, max_frames=90, min_frames=60, seed=2)
-    assert len(long.plan.sources) == 1 and long[0]["index"].max() < 60
+    long = caption_batches(mix, compute(mix), text, batch_size=8, max_frames=90, min_frames=60, seed=2)
+    assert long[0]["index"].max() < 60
 
 
 def test_statistics_are_weighted_and_natural_weights_change_nothing(roots: tuple[Path, Path]) -> None:

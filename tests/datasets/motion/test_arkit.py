@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from motionloom.datasets.motion.arkit import ARKIT, ArkitBases, bounded_least_squares, write_arkit_csv
+from motionloom.datasets.motion.body.arkit import ARKIT, ArkitBases, bounded_least_squares, write_arkit_csv
 from motionloom.datasets.schema import UserError
 
 

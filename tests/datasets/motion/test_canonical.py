@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from motionloom.datasets.motion.canonical import (
     canonicalize,
     facing,
-    ground,
     heading,
     mirror,
     resample,
@@ -44,12 +43,6 @@ def walk(turned: float, seconds: float = 5.0, fps: float = FPS, skeleton: Skelet
     return forward_kinematics(local, root, skeleton.offsets, skeleton.parents)[0]
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.5, -0.5, 3.0, -3.0])
-def test_heading_of_a_standing_figure_is_the_angle_it_was_turned_by(angle: float) -> None:
-    joints = turn(np.repeat(BODY.rest_joints[None], 10, axis=0), angle)
-    np.testing.assert_allclose(heading(joints, FPS), angle, atol=1e-12)
-
-
 def test_left_is_plus_x_and_a_left_turn_makes_the_heading_grow() -> None:
     joints = walk(np.pi / 2)
     angle = heading(joints, FPS)
@@ -68,19 +61,6 @@ def test_the_mirror_image_of_a_left_turn_turns_right() -> None:
     assert mirrored[-1, 0, 0] < -2.0
     left, right = BODY.index("left_foot"), BODY.index("right_foot")
     np.testing.assert_allclose(mirrored[:, left], joints[:, right] * [-1, 1, 1])
-
-
-@pytest.mark.parametrize("name", ["smpl22", "smplx52"])
-def test_mirror_twice_is_the_same_and_the_rest_pose_is_its_own_mirror(name: str) -> None:
-    skeleton = Skeleton.named(name)
-    joints = np.random.default_rng(0).normal(size=(4, len(skeleton), 3))
-    np.testing.assert_array_equal(mirror(mirror(joints, skeleton), skeleton), joints)
-    np.testing.assert_allclose(mirror(skeleton.rest_joints, skeleton), skeleton.rest_joints, atol=1e-12)
-
-
-def test_a_steady_spin_of_three_turns_is_followed_without_lag() -> None:
-    joints = walk(6 * np.pi)
-    np.testing.assert_allclose(heading(joints, FPS), np.linspace(0, 6 * np.pi, len(joints)), atol=1e-9)
 
 
 @given(st.integers(2, 60), st.integers(0, 2**31 - 1))
@@ -140,11 +120,6 @@ def test_canonicalize_keeps_the_float_type_and_the_input() -> None:
     np.testing.assert_array_equal(joints, before)
     batch = np.stack([joints, turn(joints, 1.0) + np.float32(1.0)])
     np.testing.assert_allclose(canonicalize(batch)[1], canonicalize(joints), atol=1e-5)
-
-
-def test_ground_turns_left_by_multiplication() -> None:
-    forward = np.array([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(ground(forward) * np.exp(1j * np.pi / 2), ground(np.array([1.0, 0, 0])))
 
 
 @pytest.mark.parametrize(("fps_in", "fps_out"), [(60, 20), (30, 20), (20, 30), (24, 20), (29.97, 20)])

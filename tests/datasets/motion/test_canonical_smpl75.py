@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motionloom.datasets.convert.aistpp.convert import canonical_smpl75
+from motionloom.datasets.convert.common.smpl75 import canonical_smpl75
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
 
 NEUTRAL = BodyModel.neutral("smpl22")
 MODEL = BodyModel(  # like a real model: the pelvis is not at the origin

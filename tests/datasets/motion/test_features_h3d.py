@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.canonical import retarget
-from motionloom.datasets.motion.features import decode, encode, face_of
-from motionloom.datasets.motion.h3d import decode_h3d, encode_h3d, uniform_joints
+from motionloom.datasets.motion.features.codec import decode, encode, face_of
+from motionloom.datasets.motion.features.h3d import decode_h3d, encode_h3d, uniform_joints
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.motion.feet import FeetOptions, foot_contacts, plant_feet
+from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
+from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.skeleton import Skeleton
 
 FPS = 20.0
@@ -122,9 +122,3 @@ def test_without_contacts_nothing_changes() -> None:
     same, report = plant_feet(fitted, fitted.joints, np.zeros((60, 2), bool), FPS)
     assert same is fitted
     assert "no foot stands" in str(report)
-
-
-def test_options_are_checked() -> None:
-    assert FeetOptions.parse({"speed": 1.0}, "feet").speed == 1.0
-    with pytest.raises(Exception, match="height"):
-        FeetOptions.parse({"height": 0}, "feet")

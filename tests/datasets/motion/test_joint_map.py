@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from motionloom.datasets.motion.bvh import read_bvh
-from motionloom.datasets.motion.joint_map import JointMap
+from motionloom.datasets.motion.bvh.joint_map import JointMap
+from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 

@@ -1,15 +1,42 @@
-"""Joints of any layout's columns, against the joints that the columns were made from."""
+"""Layouts and the joints of their columns, at once and in chunks."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from motionloom.datasets.motion.canonical import turn
-from motionloom.datasets.motion.joints import joints_of, local_joints_of
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.features.flow import JointFlow
+from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
+from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, make_sample
+
+FLOWING = [
+    MotionLayout.named("body133"),
+    MotionLayout.named("wholebody363"),
+    MotionLayout.named("wholebody363", family="h3d"),
+    MotionLayout.named("h3d263"),
+    MotionLayout.named("smpl75"),
+]
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_without_face_is_the_layout_of_the_body_and_hand_columns(name: str) -> None:
+    layout = MotionLayout.named(name, fps=12.5)
+    if layout.family == "raw" and layout.has("face"):
+        with pytest.raises(UserError, match="no counterpart without the face"):
+            layout.without_face()
+        return
+    bare, columns = layout.without_face(), layout.part("bodyhand")
+    assert (bare.dim, bare.fps, bare.family) == (len(columns), 12.5, layout.family)
+    assert bare.skeleton_name == layout.skeleton_name and not bare.has("face")
+    numbers = np.arange(layout.dim)
+    for field, _ in bare.fields:  # the same columns under the same name
+        np.testing.assert_array_equal(numbers[columns][bare.slice(field)], numbers[layout.slice(field)])
+    assert (bare is layout) == (not layout.has("face"))
 
 
 @pytest.mark.parametrize("name", ["body133", "wholebody313", "wholebody363", "smpl75"])
@@ -22,14 +49,6 @@ def test_columns_give_back_the_joints(name: str) -> None:
         # Single precision, added up over a clip by the velocities of the root.
         np.testing.assert_allclose(found, joints, atol=2e-4)
         np.testing.assert_array_equal(joints_of(motion[:, layout.part("bodyhand")], layout), found)
-
-
-def test_batches_of_clips_equal_single_ones() -> None:
-    config = SynthConfig(clips=2, layout="smpl75", fps=20)
-    clips = np.stack([make_sample(i, config).motion[:20] for i in range(2)])
-    together = joints_of(clips, config.motion_layout)
-    for one, motion in zip(together, clips, strict=True):
-        np.testing.assert_allclose(one, joints_of(motion, config.motion_layout), atol=1e-12)
 
 
 def test_columns_that_do_not_fit_are_refused() -> None:
@@ -51,3 +70,23 @@ def test_a_pose_does_not_depend_on_place_and_heading() -> None:
     np.testing.assert_allclose(local[:, 1:], positions, atol=2e-4)
     elsewhere = turn(joints, 1.1) + np.array([3.0, 0.5, -2.0])
     np.testing.assert_allclose(local_joints_of(elsewhere, layout.fps), local, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("layout", FLOWING, ids=lambda layout: f"{layout.name} {layout.family}")
+def test_chunks_are_the_whole_to_the_bit(layout: MotionLayout, dtype: type) -> None:
+    features = np.random.default_rng(0).normal(size=(61, layout.dim)).astype(dtype)
+    cuts = [0, 1, 2, 9, 9, 30, 60, 61]
+    flow = JointFlow(layout)
+    made = [flow(features[a:b]) for a, b in pairwise(cuts)]
+    np.testing.assert_array_equal(np.concatenate(made), joints_of(features, layout))
+
+
+def test_columns_of_body_and_hands_alone() -> None:
+    layout = MotionLayout.named("wholebody363")
+    features = np.random.default_rng(1).normal(size=(20, layout.dim)).astype(np.float32)
+    body = features[:, layout.part("bodyhand")]
+    flow = JointFlow(layout)
+    np.testing.assert_array_equal(np.concatenate([flow(body[:7]), flow(body[7:])]), joints_of(body, layout))
+    with pytest.raises(UserError, match="363 columns"):
+        flow(features[:, :5])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.motion.body.resting_hands import relaxed_fingers, with_resting_hands
 from motionloom.datasets.motion.kinematics import forward_kinematics
-from motionloom.datasets.motion.resting_hands import relaxed_fingers, with_resting_hands
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.motion.chain_solver import solve_poses
-from motionloom.datasets.motion.joints import joints_of, rotations_of
+from motionloom.datasets.motion.body.chain_solver import solve_poses
+from motionloom.datasets.motion.body.rigid import fit_rigid, measured_skeleton, share_twist
+from motionloom.datasets.motion.features.joints import joints_of, rotations_of
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.rigid import fit_rigid, measured_skeleton, share_twist
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 
@@ -90,13 +90,13 @@ def test_bones_of_stretched_figures_keep_one_length_and_directions_stay() -> Non
 def test_the_solver_finds_what_scipy_finds_frame_by_frame() -> None:
     """An independent, slow reference: all local rotation vectors and the root, `least_squares` in float64."""
     skeleton = Skeleton.named("smpl22")
-    _, _, clean = moving(skeleton, 4, seed=5, size=0.4)
+    _, _, clean = moving(skeleton, 2, seed=5, size=0.4)
     joints = stretched(clean, skeleton, seed=6, amount=0.15)
     own = measured_skeleton(joints, skeleton)
     start = joints_to_rotations(joints, own)
     turned, root = solve_poses(joints, own.offsets, own.parents, start, joints[:, 0])
     posed, _ = forward_kinematics(turned, root, own.offsets, own.parents)
-    for frame in range(4):
+    for frame in range(2):
 
         def residual(values: Floats, frame: int = frame) -> Floats:
             local = Rotation.from_rotvec(values[3:].reshape(-1, 3)).as_matrix()
@@ -108,20 +108,6 @@ def test_the_solver_finds_what_scipy_finds_frame_by_frame() -> None:
         cost = float(np.square(posed[frame] - joints[frame]).sum() / 2)
         assert cost <= reference.cost * (1 + 1e-4)
         np.testing.assert_allclose((posed[frame] - joints[frame]).ravel(), reference.fun, atol=5e-4)
-
-
-def test_weights_decide_who_gives_way() -> None:
-    skeleton = Skeleton.named("smpl22")
-    local, root, joints = moving(skeleton, 3, seed=7, size=0.3)
-    hand = skeleton.index("left_wrist")
-    targets = joints.copy()
-    targets[:, hand] += [0.0, 0.03, 0.05]
-    weights = np.ones(len(skeleton))
-    weights[hand] = 1e4
-    turned, place = solve_poses(targets, skeleton.offsets, skeleton.parents, local, root, weights)
-    posed, _ = forward_kinematics(turned, place, skeleton.offsets, skeleton.parents)
-    assert np.linalg.norm(posed[:, hand] - targets[:, hand], axis=-1).max() < 1e-3
-    np.testing.assert_allclose(lengths(posed, skeleton), lengths(joints, skeleton), atol=1e-9)
 
 
 def test_known_rotations_keep_their_twist() -> None:

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.motion.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.schema import UserError
 
-SKELETONS: tuple[SkeletonName, ...] = ("smpl22", "smplx52")
 SMPL_TREE = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19]
 FINGER_STARTS = [0, 3, 6, 9, 12]
 
@@ -46,34 +45,6 @@ def rodrigues(vector: list[float]) -> list[list[float]]:
         [y * x * (1 - c) + z * s, c + y * y * (1 - c), y * z * (1 - c) - x * s],
         [z * x * (1 - c) - y * s, z * y * (1 - c) + x * s, c + z * z * (1 - c)],
     ]
-
-
-def matmul(a: list[list[float]], b: list[list[float]]) -> list[list[float]]:
-    return [[sum(a[i][k] * b[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
-
-
-def slow_joints(
-    rotvecs: NDArray[Any], trans: NDArray[Any], rest: NDArray[Any], parents: list[int]
-) -> NDArray[np.float64]:
-    """One frame, one joint, one number at a time, in Python floats."""
-    frames = []
-    for rotations, move in zip(rotvecs.tolist(), trans.tolist(), strict=True):
-        world: list[list[list[float]]] = []
-        joints: list[list[float]] = []
-        for joint, parent in enumerate(parents):
-            local = rodrigues(rotations[joint])
-            if parent < 0:
-                world.append(local)
-                joints.append([float(rest[0][k]) + move[k] for k in range(3)])
-                continue
-            bone = [float(rest[joint][k] - rest[parent][k]) for k in range(3)]
-            above = world[parent]
-            joints.append(
-                [joints[parent][i] + sum(above[i][k] * bone[k] for k in range(3)) for i in range(3)]
-            )
-            world.append(matmul(above, local))
-        frames.append(joints)
-    return np.array(frames)
 
 
 def made_up_model(joints: int, shapes: int = 10, *, rigid: bool = False, seed: int = 0) -> dict[str, Any]:
@@ -131,34 +102,6 @@ def posed_mesh(
 
 def chosen(joints: int, skeleton: SkeletonName) -> list[int]:
     return [*range(22), *range(joints - 30, joints)] if skeleton == "smplx52" else list(range(22))
-
-
-def random_pose(skeleton: SkeletonName, frames: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    rng = np.random.default_rng(1)
-    return rng.normal(size=(frames, len(Skeleton.named(skeleton)), 3)), rng.normal(size=(frames, 3))
-
-
-@pytest.mark.parametrize("skeleton", SKELETONS)
-def test_equals_a_slow_reference(skeleton: SkeletonName) -> None:
-    body = BodyModel.neutral(skeleton)
-    rotvecs, trans = random_pose(skeleton, 12)
-    rotvecs[0] = 0.0
-    rotvecs[1] *= 1e-9
-    rotvecs[2] *= math.pi / np.linalg.norm(rotvecs[2], axis=-1, keepdims=True)
-    rotvecs[3] *= 5.0
-    joints = smpl_joints(rotvecs, trans, body)
-    expected = slow_joints(rotvecs, trans, body.template, list(body.skeleton.parents))
-    assert joints.dtype == np.float64
-    np.testing.assert_allclose(joints, expected, atol=1e-13)
-    np.testing.assert_allclose(joints[0], body.template + trans[0], atol=1e-15)
-
-
-def test_several_clips_in_one_call_are_the_same_as_one_by_one() -> None:
-    body = BodyModel.neutral("smplx52")
-    rotvecs, trans = random_pose("smplx52", 12)
-    several = smpl_joints(rotvecs.reshape(3, 4, 52, 3), trans.reshape(3, 4, 3), body)
-    np.testing.assert_allclose(several.reshape(12, 52, 3), smpl_joints(rotvecs, trans, body), atol=1e-14)
-    assert smpl_joints(rotvecs.astype(np.float32), trans, body).shape == (12, 52, 3)
 
 
 def test_golden_body_joints(shared: Path) -> None:
@@ -227,16 +170,21 @@ def test_joints_of_a_mesh_model(joints: int, skeleton: SkeletonName, rigid: bool
     np.savez(path, **model)
     body = BodyModel.load(path, skeleton)
     rng = np.random.default_rng(2)
-    rotvecs, trans = rng.normal(size=(3, joints, 3)), rng.normal(size=(3, 3))
+    rotvecs, trans = rng.normal(size=(4, joints, 3)), rng.normal(size=(4, 3))
+    rotvecs[0, ::2] = 0.0
+    rotvecs[1] *= 1e-9
+    rotvecs[2] *= math.pi / np.linalg.norm(rotvecs[2], axis=-1, keepdims=True)
     betas = rng.normal(size=10)
     mine = chosen(joints, skeleton)
     made = smpl_joints(rotvecs[:, mine], trans, body, betas)
-    for frame in range(3):
+    for frame in range(4):
         vertices, posed = posed_mesh(model, rotvecs[frame], trans[frame], betas)
         np.testing.assert_allclose(made[frame], posed[mine], atol=1e-12)
         regressed = model["J_regressor"] @ vertices
         close = np.allclose(regressed[mine], posed[mine], atol=1e-9)
-        assert close == rigid  # through a soft mesh they are other points, which is why nobody wants them
+        assert (
+            close == rigid or frame == 1
+        )  # through a soft mesh they are other points, which is why nobody wants them
 
 
 def test_statement_names_the_file_and_the_kind(tmp_path: Path) -> None:
@@ -261,13 +209,6 @@ def test_shape_values_may_be_fewer_or_more_than_the_model_has(tmp_path: Path) ->
     np.testing.assert_array_equal(neutral.rest_joints(betas), neutral.template)
     with pytest.raises(UserError, match=r"betas are \[1, 10\]"):
         body.rest_joints(betas[None, :10])
-
-
-@pytest.mark.parametrize(("width", "shapes"), [(20, 10), (400, 300)])
-def test_expression_of_smplx_is_no_shape(width: int, shapes: int, tmp_path: Path) -> None:
-    path = tmp_path / "model.npz"
-    np.savez(path, **made_up_model(55, shapes=width))
-    assert BodyModel.load(path, "smplx52").directions.shape == (52, 3, shapes)
 
 
 def test_regressor_as_non_zeros(tmp_path: Path) -> None:
@@ -329,14 +270,6 @@ def test_missing_arrays_fingers_and_files_are_named(tmp_path: Path) -> None:
         BodyModel.load(path, "smpl22")
     with pytest.raises(UserError, match=r"none\.npz: cannot be read \(No such file"):
         BodyModel.load(tmp_path / "none.npz", "smpl22")
-
-
-def test_shapes_of_the_parameters_are_checked() -> None:
-    body = BodyModel.neutral("smpl22")
-    with pytest.raises(UserError, match=r"needs rotations \[T, 22, 3\].*not \[5, 24, 3\]"):
-        smpl_joints(np.zeros((5, 24, 3)), np.zeros((5, 3)), body)
-    with pytest.raises(UserError, match=r"not \[5, 22, 3\] and \[4, 3\]"):
-        smpl_joints(np.zeros((5, 22, 3)), np.zeros((4, 3)), body)
 
 
 def test_npz_reads_headers_and_refuses_what_does_not_fit(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid, with_offsets
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
+from motionloom.datasets.motion.body.smplx_file import smplx_parameters, write_smplx
 from motionloom.datasets.motion.kinematics import forward_kinematics
-from motionloom.datasets.motion.rigid import RigidMotion, fit_rigid, with_offsets
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
-from motionloom.datasets.motion.smplx_file import smplx_parameters, write_smplx
 from motionloom.datasets.schema import UserError
 
 Floats = NDArray[np.float64]

@@ -10,11 +10,10 @@ from types import ModuleType
 import pytest
 
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards import cache as cache_module
-from motionloom.datasets.shards import retry
-from motionloom.datasets.shards.cache import FileCache
+from motionloom.datasets.shards import store as retry
+from motionloom.datasets.shards.cache import CacheConfig, FileCache
+from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.shards.reading import CacheConfig, Reading
 
 
 def content(number: int) -> tuple[str, bytes]:
@@ -133,10 +132,3 @@ def test_processes_that_want_one_file_download_it_once(
 def fetch_shared(url: str, folder: str, out: multiprocessing.Queue) -> None:
     dataset = ShardDataset.open(url, "train", reading=Reading(cache=CacheConfig(folder=folder)))
     out.put(float(sum(dataset.motion(i).sum() for i in range(len(dataset)))))
-
-
-def test_the_default_cache_is_the_users(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert cache_module.default_folder() == Path("/somewhere/motionloom/shards")
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert cache_module.default_folder() == Path.home() / ".cache/motionloom/shards"

@@ -4,17 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from motionloom.datasets.schema import Dropped
-from motionloom.datasets.shards.left_out import (
-    LEFT_OUT_FILE,
-    grouped,
-    grouped_notes,
-    kind_of_reason,
-    tally,
-    write_left_out,
-)
+from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, kind_of_reason, tally, write_left_out
 
 
 def drops(*reasons: str) -> list[Dropped]:
@@ -26,19 +17,6 @@ def test_twenty_identical_messages_are_one_line() -> None:
     assert str(group) == "20 x no captions (the first: take/0.bvh)" and group.count == 20
 
 
-@pytest.mark.parametrize(
-    ("reasons", "line"),
-    [
-        (("0.67 s, shorter than 1 s", "0.80 s, shorter than 1 s"), "2 x … s, shorter than 1 s"),
-        (("same bytes as a/1.bvh", "same bytes as b/22.bvh"), "2 x same bytes as …"),
-        (("second file for clip id 'a'", "second file for clip id 'b c'"), "2 x second file for clip id '…'"),
-    ],
-)
-def test_what_differs_is_left_open(reasons: tuple[str, ...], line: str) -> None:
-    (group,) = grouped(drops(*reasons))
-    assert str(group) == f"{line} (the first: take/0.bvh)"
-
-
 def test_reasons_stay_apart_the_largest_first_and_single_ones_whole() -> None:
     groups = grouped(drops("in no split file", "NaN at frame 3", "in no split file"))
     assert list(map(str, groups)) == [
@@ -48,16 +26,6 @@ def test_reasons_stay_apart_the_largest_first_and_single_ones_whole() -> None:
     assert kind_of_reason("take/1.bvh: line 7 of x.txt moves at 41.5 m/s", "take/1.bvh") == (
         "…: line … of … moves at … …"
     )
-
-
-def test_notes_of_a_kind_are_one_note() -> None:
-    notes = [f"texts/{k}.txt: line {k}: no usable caption ('x{k}')" for k in range(9)]
-    assert grouped_notes(["splits: given", *notes, "limited to 3 of 9 clips"]) == [
-        "splits: given",
-        "texts/0.txt: line 0: no usable caption ('x0') (and 8 more like it)",
-        "limited to 3 of 9 clips",
-    ]
-    assert grouped_notes(notes[:3]) == notes[:3]
 
 
 def test_each_thing_is_counted_once_and_by_its_kind() -> None:

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter, defaultdict
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from motionloom.datasets.audio.features import audio_features, beats
+from motionloom.datasets.audio.lineup import settings_at
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, facing
-from motionloom.datasets.motion.smpl import BodyModel, smpl_joints
-from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.shards.sample import encode_sample
-from motionloom.datasets.synth.dance_plan import DanceConditions, DanceConfig, beats_of
+from motionloom.datasets.synth.dances import DanceConditions, DanceConfig, beats_of
 from motionloom.datasets.synth.generate import (
     Clip,
     SynthConfig,
@@ -24,14 +19,10 @@ from motionloom.datasets.synth.generate import (
     make_clip,
     make_sample,
     split_of,
-    synthesize,
 )
 from motionloom.datasets.synth.genres import GENRES
-from motionloom.datasets.synth.measure import agrees
-from motionloom.datasets.synth.measure_dance import kinetic_beats, measure_dance
-from motionloom.datasets.synth.music_rows import settings_for, song_rows
+from motionloom.datasets.synth.measure import agrees, kinetic_beats, measure_dance
 from motionloom.datasets.synth.song import render_song
-from motionloom.datasets.synth.truth import FACES, HANDS
 
 FPS = 20.0
 CONFIG = SynthConfig(
@@ -40,24 +31,14 @@ CONFIG = SynthConfig(
     actions=["dance"],
     min_seconds=5.0,
     max_seconds=8.0,
-    clips=48,
-    dances=DanceConfig(songs=24, song_seconds=16.0),
+    clips=36,
+    dances=DanceConfig(songs=18, song_seconds=12.0),
 )
 
 
 @pytest.fixture(scope="module")
 def clips() -> list[Clip]:
     return [make_clip(index, CONFIG) for index in range(CONFIG.clips)]
-
-
-def test_the_table_is_sound() -> None:
-    for genre in GENRES.values():
-        assert genre.hand in HANDS
-        assert genre.face in FACES
-        for rhythm in (genre.kick, genre.snare, genre.hat, genre.bass, genre.chord):
-            assert len(rhythm) == 16
-            assert set(rhythm) <= set("xo.")
-    assert Counter(genre.style for genre in GENRES.values()) == {"step": 2, "bounce": 2, "sway": 2}
 
 
 def test_motion_says_its_genre_tempo_hands_and_face(clips: list[Clip]) -> None:
@@ -83,7 +64,7 @@ def test_kinetic_beats_lie_on_the_beats_of_the_music(clips: list[Clip]) -> None:
 
 def test_beats_of_the_sound_are_heard_where_the_truth_has_them(clips: list[Clip]) -> None:
     recall, precision = [], []
-    for clip in clips:
+    for clip in clips[::2]:
         assert clip.wav is not None
         true = np.array(beats_of(clip.truth, len(clip.joints) / FPS))
         gap = np.abs(true[:, None] - beats(*clip.wav))
@@ -104,7 +85,7 @@ def test_the_genre_is_heard_in_songs_never_heard_before(clips: list[Clip]) -> No
     features = np.stack([timbre(clip) for clip in clips])
     genres = np.array([clip.truth["genre"] for clip in clips])
     songs = np.array([clip.truth["song"] for clip in clips])
-    new = songs < 12
+    new = songs < 6
     features = (features - features[~new].mean(0)) / (features[~new].std(0) + 1e-6)
     centres = {name: features[~new & (genres == name)].mean(0) for name in GENRES}
     guess = [min(centres, key=lambda name: float(np.linalg.norm(x - centres[name]))) for x in features[new]]
@@ -119,22 +100,12 @@ def test_audio_rows_belong_to_motion_frames(clips: list[Clip]) -> None:
         assert clip.audio is not None
         assert clip.wav is not None
         assert clip.audio.shape == (len(clip.joints), 438)
-        whole = audio_features(render_song(dance.song, 16_000), 16_000, settings_for(FPS))
+        whole = audio_features(render_song(dance.song, 16_000), 16_000, settings_at(FPS))
         assert np.array_equal(clip.audio, whole[dance.start : dance.start + dance.frames])
         sound, rate = clip.wav
         first = round(dance.start / FPS * rate)
         assert np.array_equal(sound, render_song(dance.song, rate)[first : first + len(sound)])
         assert abs(len(sound) / rate - len(clip.joints) / FPS) < 1 / rate + 1e-9
-
-
-def test_a_frame_rate_without_whole_samples_takes_the_nearest_published_rows() -> None:
-    dance = dance_of(0, CONFIG)
-    assert dance is not None
-    rows = song_rows(dance.song, 16_000, 29.97)
-    published = audio_features(render_song(dance.song, 16_000), 16_000)
-    at = [min(round(t / 29.97 * 60), len(published) - 1) for t in range(len(rows))]
-    assert len(rows) == int(16.0 * 29.97)
-    assert np.array_equal(rows, published[at])
 
 
 def test_songs_never_cross_splits() -> None:
@@ -180,48 +151,6 @@ def test_music_decides_the_dance_and_words_name_it(clips: list[Clip]) -> None:
             assert any(word in text for word in (*genre.words, *genre.moves))
 
 
-def test_shards_of_dances_are_the_same_whoever_makes_them(tmp_path: Path) -> None:
-    config = SynthConfig(
-        layout="body133",
-        actions=["dance"],
-        clips=8,
-        dances=DanceConfig(songs=4, song_seconds=8.0, hold_out_songs=0.25),
-    )
-    one = synthesize(config, tmp_path / "one", workers=1, progress=False)
-    two = synthesize(config, tmp_path / "two", workers=2, progress=False)
-    assert [shard.sha256 for shard in one.shards] == [shard.sha256 for shard in two.shards]
-    assert one.audio == settings_for(20.0).dump()
-    data = ShardDataset.open(tmp_path / "one", "train")
-    audio = data.audio(0)
-    assert audio is not None
-    assert audio.shape == (data.frames[0], 438)
-    truth = data.meta(0).truth
-    assert truth is not None
-    assert {"genre", "song", "bpm", "first_beat", "bar_beat", "song_start"} <= set(truth)
-
-
-def test_configs_without_songs_stay_as_they_were() -> None:
-    """Digests of clips made before there were songs; since then captions of faces, which the first has, are
-    about the person of the body's."""
-    assert "dances" not in SynthConfig().dump()
-    assert SynthConfig.parse(SynthConfig().dump(), "config") == SynthConfig()
-    assert _digest(SynthConfig(seed=2024, music=True, clips=60), 42) == "62ea2e6567495fb52c465ee9"
-    held_out: list[dict[str, Any]] = [{"action": "kick"}]
-    assert _digest(SynthConfig(seed=3, layout="body133", hold_out=held_out), 42) == "683313e4d715c35b984d535f"
-
-
-def _digest(config: SynthConfig, count: int) -> str:
-    out = hashlib.sha256()
-    for index in range(count):
-        sample = make_sample(index, config)
-        members = encode_sample(
-            sample, split=sample.meta.split, layout=config.motion_layout, motion_type="float32"
-        )
-        for name, content in sorted(members.items()):
-            out.update(name.encode() + content)
-    return out.hexdigest()[:24]
-
-
 def test_smpl_columns_pose_the_joints_of_the_clip() -> None:
     body = BodyModel.neutral("smpl22")
     config = SynthConfig(
@@ -241,21 +170,3 @@ def test_smpl_columns_pose_the_joints_of_the_clip() -> None:
         assert np.linalg.norm(values[:, 3:].reshape(-1, 3), axis=-1).max() < np.pi + 1e-6
         if clip.truth.get("genre"):
             assert measure_dance(joints, 20.0).genre == clip.truth["genre"]
-
-
-@pytest.mark.parametrize(
-    ("fields", "named"),
-    [
-        ({"dances": {"genres": ["polka"]}}, "polka"),
-        ({"dances": {"tempo": [90, 300]}}, "tempi"),
-        ({"dances": {"hold_out_tempi": [[120, 100]]}}, "tempi"),
-        ({"dances": {"conditions": {"both": 0}}}, "weight"),
-        ({"dances": {}, "music": True}, "music"),
-        ({"dances": {}, "actions": ["walk"]}, "share"),
-        ({"dances": {"share": 0.5}, "actions": ["dance"]}, "other actions"),
-        ({"dances": {"song_seconds": 3}, "min_seconds": 4}, "song_seconds"),
-    ],
-)
-def test_wrong_options_are_named(fields: dict[str, Any], named: str) -> None:
-    with pytest.raises(UserError, match=named):
-        SynthConfig.parse(fields, "data synth")

@@ -1,10 +1,10 @@
-"""Captions made tidy, and captions that are only names refused."""
+"""Captions made tidy, and captions that are only names refused; emotions that captions name."""
 
 from __future__ import annotations
 
 import pytest
 
-from motionloom.datasets.text.clean import clean_caption, usable_caption
+from motionloom.datasets.text.clean import clean_caption, emotion_of, usable_caption
 
 
 @pytest.mark.parametrize(
@@ -71,3 +71,20 @@ def test_words_are_usable(text: str) -> None:
 )
 def test_names_and_ids_are_not(text: str) -> None:
     assert not usable_caption(text)
+
+
+@pytest.mark.parametrize(
+    ("captions", "emotion"),
+    [
+        (["A person happily waves."], "happy"),
+        (["someone walks", "someone walks, smiling"], "happy"),
+        (["he is unhappy"], "sad"),
+        (["she does not smile"], None),
+        (["without anger he turns"], None),
+        (["a person laughs and then cries"], None),
+        (["a person made a cake"], None),
+        ([], None),
+    ],
+)
+def test_emotions(captions: list[str], emotion: str | None) -> None:
+    assert emotion_of(captions) == emotion

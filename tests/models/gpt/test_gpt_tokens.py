@@ -12,7 +12,6 @@ from motionloom.models.gpt.tokens import (
     closing_length,
     deinterleave,
     interleave,
-    kind_of_slot,
     pad_sequences,
     stream_names,
 )
@@ -90,11 +89,6 @@ def test_paper_length() -> None:
     assert out.length.tolist() == [149]
     assert out.tokens[0, -2:].tolist() == [512, 512]
     assert out.kinds[0, -5:].tolist() == [0, 0, 1, 0, 1]
-
-
-def test_kinds_follow_first_appearance() -> None:
-    assert stream_names(("hand", "body", "hand")) == ("hand", "body")
-    assert kind_of_slot(("hand", "body", "hand")) == [0, 1, 0]
 
 
 def test_mistakes_are_named() -> None:

@@ -101,16 +101,6 @@ def test_it_goes_on_as_the_slow_version(gpt: InterleavedGPT, context: int, scale
     assert made == slow(gpt, texts, context=kept, scale=scale, seed=5)
 
 
-def test_another_text_changes_only_what_follows(gpt: InterleavedGPT) -> None:
-    both = [TokenStream(gpt, how=HOW, context=2, seed=1) for _ in range(2)]
-    for stream in both:
-        stream.condition(text(0))
-    first = [drawn(stream, 5) for stream in both]
-    both[1].condition(text(7))
-    then = [drawn(stream, 6) for stream in both]
-    assert first[0] == first[1] and then[0] != then[1]
-
-
 def test_memory_is_one_block(gpt: InterleavedGPT) -> None:
     stream = TokenStream(gpt, how=HOW, context=2, seed=1)
     stream.condition(text(0))

@@ -14,7 +14,7 @@ from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.stage_module import OptimConfig
-from motionloom.pipeline.evaluation.nearest import local_joints
+from motionloom.pipeline.evaluation.answers import local_joints
 
 LAYOUT = MotionLayout.named("wholebody363")
 RNG = np.random.default_rng(0)
@@ -92,16 +92,6 @@ def test_turning_a_wrist_leaves_the_shape_of_its_hand() -> None:
         assert (spread < 1e-3) if skeleton.parents[joint] != 21 else (spread > 0.1)
 
 
-def test_moving_an_arm_leaves_its_fingers() -> None:
-    basis, x = basis_of(), torch.zeros(1, 1, 313)
-    moved = x.clone()
-    for joint in [20, *range(22, 37)]:  # the left wrist and its fingers
-        column = at(joint).start
-        moved[..., column] = 0.05 / float(STD[column])
-    changed = (basis.encode(moved) - basis.encode(x)).abs() > 1e-5
-    assert changed[0, 0].nonzero()[:, 0].tolist() == [at(20).start]
-
-
 def test_without_gains_nothing_changes_and_nothing_is_saved() -> None:
     basis, x = basis_of(root_gain=1.0, finger_gain=0.0), torch.randn(1, 4, 313)
     assert torch.equal(basis.encode(x), x) and torch.equal(basis.decode(x), x) and not basis.state_dict()
@@ -120,7 +110,7 @@ def test_a_tokenizer_with_gains_gives_the_papers_features(config: type[H2VQConfi
     x[1, 8:] = 0
     codes = net.eval().encode(x, length)
     out = net(x, length)
-    recon = net.features(out.written, length)
+    recon = net.features(out.reconstruction, length)
     # The palms of these random hands magnify float32's rounding some hundred times.
     torch.testing.assert_close(net.decode(codes, length), recon, rtol=1e-3, atol=1e-3)
     assert not recon[1, 8:].any(), "padding stays zero"
@@ -139,33 +129,13 @@ def test_the_loss_is_of_what_is_seen() -> None:
     present = torch.from_numpy(LAYOUT.present_columns[[3, 0]])[:, LAYOUT.part("bodyhand")]
     batch = {"motion": x, "length": torch.tensor([8, 8]), "present": present}
     values = module.losses(batch)
-    error = (net.basis.encode(net.features(net(x, present=present).written)) - net.basis.encode(x)).square()
+    error = (
+        net.basis.encode(net.features(net(x, present=present).reconstruction)) - net.basis.encode(x)
+    ).square()
     want = error[present[:, None].expand_as(error)].mean()
     torch.testing.assert_close(values["recon"], want)
     garbage = {**batch, "motion": torch.where(present[:, None], x, 7.0)}
     torch.testing.assert_close(module.losses(garbage), values, rtol=0, atol=0)
-
-
-def test_hand_codes_read_the_shape_and_body_codes_the_turn() -> None:
-    torch.manual_seed(0)
-    net = build_tokenizer(H2VQConfig.model_validate({**SIZES, "num_codes": 256, "finger_gain": 2.0}), LAYOUT)
-    net.basis.learn(np.zeros(313), np.full(313, 0.05))
-    x = torch.randn(4, 16, 313)
-    net(x)  # the first batch makes the codebooks
-    seen = net.eval().basis.encode(x)
-    turned, bent = seen.clone(), seen.clone()
-    turned[..., net.basis.knuckles] = 5.0 * seen[..., net.basis.knuckles].flip(1)
-    bent[..., net.basis.bent] *= -3.0
-
-    def moved(coordinates: torch.Tensor, stream: str) -> float:
-        """Share of code vectors that change; twins of a vector among the first codes are one."""
-        book = net.codebooks()[stream]
-        before, after = (book.vectors(net.encode(f)[stream]) for f in (x, net.basis.decode(coordinates)))
-        return float(((before - after).abs().amax(-1) > 1e-3).float().mean())
-
-    assert moved(seen, "body") == 0 and moved(seen, "hand") == 0
-    assert moved(turned, "hand") == 0 and moved(turned, "body") > 0.3
-    assert moved(bent, "hand") > 0.3
 
 
 @pytest.mark.parametrize("part", ["body", "hand", "face"])

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -12,12 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from motionloom.models.metrics.retrieval import matching_score, r_precision, ranks, recall
-
-
-@pytest.fixture(scope="module")
-def golden(shared: Path) -> dict[str, torch.Tensor]:
-    with np.load(shared / "golden" / "t6_metrics_A.npz", allow_pickle=False) as data:
-        return {key: torch.from_numpy(np.asarray(data[key])) for key in data.files}
 
 
 def close(value: torch.Tensor, expected: torch.Tensor) -> None:

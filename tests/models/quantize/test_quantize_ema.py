@@ -1,4 +1,4 @@
-"""`EmaQuantizer`: golden T2M-GPT vectors, our reset semantics, masks, float32 state, checkpoints."""
+"""`EmaQuantizer` and `ResidualQuantizer`: golden vectors, our reset semantics, float32 state, checkpoints."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from motionloom.models.quantize.draws import draw_rows
-from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, cluster_sums, nearest
+from motionloom.models.quantize.base import draw_rows, nearest
+from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, ResidualQuantizer, cluster_sums
 
 
 @pytest.fixture(scope="module")
@@ -104,15 +104,6 @@ def test_codes_are_the_nearest() -> None:
     )
 
 
-def test_straight_through_gradient_is_identity() -> None:
-    quantizer = EmaQuantizer(QuantizerConfig(num_codes=8, dim=4)).eval()
-    z = torch.randn(2, 5, 4, requires_grad=True)
-    weight = torch.randn(2, 5, 4)
-    (quantizer(z).quantized * weight).sum().backward()
-    assert z.grad is not None
-    assert torch.equal(z.grad, weight)
-
-
 def test_first_batch_initialises_with_its_own_distinct_rows() -> None:
     quantizer = EmaQuantizer(QuantizerConfig(num_codes=16, dim=4))
     z = torch.randn(4, 10, 4)
@@ -153,47 +144,6 @@ def test_draws_are_distinct_valid_and_uniform() -> None:
     assert few.bincount().max() == 3
 
 
-def test_masked_batch_equals_truncated_batch() -> None:
-    torch.manual_seed(0)
-    config = QuantizerConfig(num_codes=6, dim=4)
-    padded, plain = EmaQuantizer(config), EmaQuantizer(config)
-    for _ in range(4):
-        z = torch.randn(1, 12, 4)
-        filler = torch.full((1, 5, 4), float("nan"))  # must not be read at all
-        mask = torch.arange(17)[None] < 12
-        a, b = padded(torch.cat([z, filler], 1), mask), plain(z)
-        assert torch.equal(a.codes[:, :12], b.codes)
-        close(a.penalty, b.penalty)
-        for name, value in b.metrics.items():
-            close(a.metrics[name], value)
-    for name, value in plain.state_dict().items():
-        torch.testing.assert_close(padded.state_dict()[name], value)
-
-
-def test_padding_gets_no_gradient_from_the_penalty() -> None:
-    z = torch.randn(2, 6, 4, requires_grad=True)
-    mask = torch.tensor([[True] * 6, [True] * 2 + [False] * 4])
-    EmaQuantizer(QuantizerConfig(num_codes=3, dim=4)).eval()(z, mask).penalty.backward()
-    assert z.grad is not None
-    assert (z.grad[~mask] == 0).all()
-    assert (z.grad[mask] != 0).any(-1).all()
-
-
-@pytest.mark.parametrize("how", ["eval", "frozen", "update=False"])
-def test_never_updates(how: str) -> None:
-    quantizer = EmaQuantizer(QuantizerConfig(num_codes=8, dim=4))
-    quantizer(torch.randn(2, 20, 4))
-    before = {k: v.clone() for k, v in quantizer.state_dict().items()}
-    if how == "eval":
-        quantizer.eval()
-    elif how == "frozen":
-        quantizer.freeze()
-        quantizer.train()
-    for _ in range(3):
-        quantizer(torch.randn(2, 20, 4), update=how != "update=False")
-    assert all(torch.equal(v, before[k]) for k, v in quantizer.state_dict().items())
-
-
 def test_state_stays_float32_under_casts_and_autocast() -> None:
     torch.manual_seed(0)
     config = QuantizerConfig(num_codes=8, dim=16)
@@ -229,30 +179,46 @@ def test_resumed_training_equals_undisturbed_training() -> None:
     assert {"codebook", "ema_sum", "ema_count", "initialised", "draws"} == set(whole.state_dict())
 
 
-def test_agrees_with_vector_quantize_pytorch() -> None:
-    """An independent oracle, its count smoothing off: codes, outputs and three EMA updates."""
-    oracle_module = pytest.importorskip("vector_quantize_pytorch")
-    oracle = oracle_module.VectorQuantize(8, 16, decay=0.99, eps=1e-12, commitment_weight=1.0)
-    codebook = torch.randn(16, 8)
-    quantizer = with_state(codebook, 100.0)
-    inner = oracle._codebook
-    inner.embed.data.copy_(codebook[None])
-    inner.embed_avg.data.copy_(codebook[None] * 100)
-    inner.cluster_size.data.fill_(100.0)
-    for _ in range(3):
-        z = torch.randn(4, 30, 8)
-        quantized, codes, loss = oracle(z)
-        out = quantizer(z)
-        assert torch.equal(out.codes, codes)
-        close(out.quantized, quantized.detach())
-        close(out.penalty, loss.detach().squeeze())
-    close(quantizer.codebook, inner.embed[0].detach())
+def test_golden_residual_levels(golden: dict[str, Tensor]) -> None:
+    """As lucidrains has them, with a penalty on every level."""
+    quantizer = ResidualQuantizer(QuantizerConfig(num_codes=64, dim=16), 4)
+    for i in range(4):
+        quantizer.level(i).codebook.copy_(golden["rvq_codebooks"][i])
+    quantizer.freeze()
+    quantizer.train()
+    out = quantizer(rows(golden["x"]))
+    assert torch.equal(out.codes, golden["rvq_indices"])
+    close(out.quantized, golden["rvq_out"])
+    close(quantizer.vectors(out.codes), golden["rvq_out"])
+    for i in range(4):
+        close(quantizer.level(i).vectors(out.codes[..., i]), golden["rvq_all_codes"][i])
+    close(out.metrics["penalty"], golden["rvq_commit_loss"].flatten())
+    close(out.penalty, golden["rvq_commit_loss"].sum())
 
 
-@pytest.mark.slow
-def test_compiles_to_one_graph() -> None:
-    quantizer = EmaQuantizer(QuantizerConfig(num_codes=8, dim=4))
-    z = torch.randn(2, 20, 4)
-    quantizer(z)
-    explained = torch._dynamo.explain(quantizer)(z)
-    assert explained.graph_break_count == 0
+def test_every_level_pulls_on_z_and_shrinks_the_residual() -> None:
+    torch.manual_seed(0)
+    quantizer = ResidualQuantizer(QuantizerConfig(num_codes=16, dim=4), 3)
+    for _ in range(100):
+        quantizer(torch.randn(4, 32, 4))
+    z = torch.randn(4, 32, 4, requires_grad=True)
+    out = quantizer.eval()(z)
+    out.penalty.backward()
+    total = torch.zeros_like(z)
+    expected = torch.zeros_like(z)
+    penalties = []
+    for i in range(3):
+        total = total + quantizer.level(i).vectors(out.codes[..., i])
+        expected += 2 * (z.detach() - total) / z.numel()
+        penalties.append((z.detach() - total).square().mean())
+    assert z.grad is not None
+    torch.testing.assert_close(z.grad, expected, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(out.metrics["penalty"], torch.stack(penalties))
+    assert penalties[0] > 1.5 * penalties[1] > 2 * penalties[2]
+
+
+def test_levels_do_not_start_from_the_same_rows() -> None:
+    """Rows that made level 0 have a zero residual; were level 1 made of them, it would be all zero."""
+    quantizer = ResidualQuantizer(QuantizerConfig(num_codes=16, dim=4), 2)
+    quantizer(torch.randn(4, 50, 4))
+    assert (quantizer.level(1).codebook.norm(dim=1) > 1e-3).float().mean() > 0.7

@@ -51,11 +51,3 @@ def test_gradient_passes_the_rounding() -> None:
     quantizer(z).quantized.sum().backward()
     # Slope of the bound at 0, (L - 1) / 2 x (1 + margin), over the half width L // 2.
     torch.testing.assert_close(z.grad, torch.full_like(z, 2 * 1.001 / 2))
-
-
-def test_padding_is_not_counted() -> None:
-    quantizer = plain((4, 4))
-    z = torch.cat([torch.zeros(1, 3, 2), torch.full((1, 3, 2), 9.0)], dim=1)
-    mask = torch.tensor([[True] * 3 + [False] * 3])
-    assert quantizer(z, mask).metrics["usage"] == pytest.approx(1 / 16)
-    assert quantizer(z).metrics["usage"] == pytest.approx(2 / 16)

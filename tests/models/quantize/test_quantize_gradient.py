@@ -67,28 +67,6 @@ def test_gradients_of_both_terms_are_those_of_the_formula() -> None:
     torch.testing.assert_close(out.quantized.detach(), codebook[codes], rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.parametrize("start", ["uniform", "data"])
-def test_masked_batch_equals_truncated_batch(start: str) -> None:
-    config = SMALL.model_copy(update={"start": start})
-    padded, plain = GradientQuantizer(config), GradientQuantizer(config)
-    padded.load_state_dict(plain.state_dict())
-    for _ in range(3):
-        z = torch.randn(1, 12, 4)
-        filler = torch.full((1, 5, 4), float("nan"))
-        mask = torch.arange(17)[None] < 12
-        wide = torch.cat([z, filler], 1).requires_grad_()
-        a, b = padded(wide, mask), plain(z)
-        assert torch.equal(a.codes[:, :12], b.codes)
-        a.penalty.backward()
-        assert wide.grad is not None
-        assert (wide.grad[:, 12:] == 0).all()
-        torch.testing.assert_close(a.penalty, b.penalty)
-        for name, value in b.metrics.items():
-            torch.testing.assert_close(a.metrics[name], value)
-    for name, value in plain.state_dict().items():
-        torch.testing.assert_close(padded.state_dict()[name], value)
-
-
 def test_data_start_takes_rows_of_the_first_batch_once() -> None:
     quantizer = GradientQuantizer(SMALL.model_copy(update={"start": "data"}))
     z = torch.randn(3, 10, 4)
@@ -102,46 +80,3 @@ def test_data_start_takes_rows_of_the_first_batch_once() -> None:
     again(torch.randn(3, 10, 4))
     assert torch.equal(quantizer.codebook, before)
     assert torch.equal(again.codebook, before)
-
-
-def test_dead_codes_are_those_not_used_any_more() -> None:
-    quantizer = with_codebook(torch.cat([torch.randn(3, 4), torch.full((5, 4), 100.0)]))
-    for _ in range(2):
-        out = quantizer(torch.randn(4, 30, 4))
-    assert out.metrics["dead"] == 5
-    assert out.metrics["resets"] == 0
-    assert out.metrics["usage"] == pytest.approx(3 / 8)
-
-
-@pytest.mark.parametrize("how", ["eval", "frozen", "update=False"])
-def test_never_counts(how: str) -> None:
-    quantizer = GradientQuantizer(SMALL)
-    quantizer(torch.randn(2, 20, 4))
-    before = {k: v.clone() for k, v in quantizer.state_dict().items()}
-    if how == "eval":
-        quantizer.eval()
-    elif how == "frozen":
-        quantizer.freeze()
-        assert not quantizer.codebook.requires_grad
-    quantizer(torch.randn(2, 20, 4), update=how != "update=False")
-    assert all(torch.equal(v, before[k]) for k, v in quantizer.state_dict().items())
-
-
-def test_learns_cluster_centres() -> None:
-    """Codes must end on the centres of well-parted clusters, by gradient alone."""
-    centres = 4 * torch.randn(6, 4)
-    z = centres.repeat_interleave(20, dim=0) + 0.1 * torch.randn(120, 4)
-    quantizer = GradientQuantizer(GradientQuantizerConfig(num_codes=16, dim=4, start="data"))
-    optimizer = torch.optim.Adam(quantizer.parameters(), lr=0.05)
-    first = quantizer(z[None]).penalty.item()
-    for _ in range(400):
-        optimizer.zero_grad()
-        quantizer(z[None]).penalty.backward()
-        optimizer.step()
-    assert quantizer(z[None]).penalty.item() < min(0.05, first)  # the clusters' own variance makes 0.02
-
-
-def test_compiles_to_one_graph() -> None:
-    quantizer = GradientQuantizer(SMALL)
-    explained = torch._dynamo.explain(quantizer)(torch.randn(2, 20, 4))
-    assert explained.graph_break_count == 0

@@ -40,14 +40,6 @@ def test_padding_changes_nothing(net: Tma) -> None:
         assert (decoded[i, n:] == 0).all()
 
 
-@torch.no_grad()
-def test_order_of_frames_matters(net: Tma) -> None:
-    motion, length = torch.randn(1, 10, 6), torch.tensor([10])
-    mu, _ = net.encode_motion(motion, length)
-    back, _ = net.encode_motion(motion.flip(1), length)
-    assert (mu - back).abs().max() > 1e-3
-
-
 @pytest.mark.usefixtures("float64")
 @torch.no_grad()
 @pytest.mark.parametrize("stride", [2, 3])
@@ -57,29 +49,17 @@ def test_frame_stride_sees_every_nth_frame_only(stride: int) -> None:
     full = Tma(TINY, 6, 5).eval()
     full.load_state_dict(net.state_dict())
     motion, length = torch.randn(2, 11, 6), torch.tensor([11, 5])
-    strided, frames = net.strided(motion, length)
+    strided, frames = net.subsample(motion, length)
     assert frames.tolist() == [-(-11 // stride), -(-5 // stride)]
     torch.testing.assert_close(net.encode_motion(motion, length)[0], full.encode_motion(strided, frames)[0])
     z = torch.randn(2, 32)
     torch.testing.assert_close(net.decode(z, length, 11), full.decode(z, frames, strided.shape[1]))
 
 
-def test_wrong_widths_are_refused(net: Tma) -> None:
-    with pytest.raises(ValueError, match="6 motion features, got 4"):
-        net.encode_motion(torch.zeros(1, 8, 4), torch.tensor([8]))
-    with pytest.raises(ValueError, match="5 text features, got 4"):
-        net.encode_text(torch.zeros(1, 8, 4), torch.ones(1, 8, dtype=torch.bool))
-
-
 def test_paper_config() -> None:
     config = TmaConfig()
-    assert (config.latent, config.ff, config.layers, config.heads, config.frame_stride) == (
-        256,
-        1024,
-        6,
-        4,
-        1,
-    )
+    sizes = (config.latent, config.ff, config.layers, config.heads, config.frame_stride)
+    assert sizes == (256, 1024, 6, 4, 1)
     with torch.device("meta"):
         count = sum(p.numel() for p in Tma(config, 313, 384).parameters())
     per_layer = 4 * 256 * 256 + 2 * 256 * 1024

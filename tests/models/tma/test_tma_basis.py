@@ -56,7 +56,7 @@ def test_it_is_the_plain_network_between_the_coordinates(stride: int) -> None:
     for found, wanted in zip((mu, logvar), plain(net).encode_motion(seen, LENGTH), strict=True):
         torch.testing.assert_close(found, wanted)
     written = plain(net).decode(mu, LENGTH, 12)
-    torch.testing.assert_close(net.write(mu, LENGTH, 12), written)
+    torch.testing.assert_close(net.decode_coordinates(mu, LENGTH, 12), written)
     features = net.decode(mu, LENGTH, 12)
     # Features come rounded to float32; a finger's bone reads that in m over its unit.
     rounding = torch.finfo(torch.float32).eps * features.abs().max() * net.basis.std.max()
@@ -73,7 +73,7 @@ def test_hands_that_a_clip_does_not_hold_say_nothing() -> None:
     present[1] = True
     one, other = motion(), motion()
     other[0][:, HANDS] = 7.0
-    assert (net.read(one, present)[0][:, HANDS] == 0).all()
+    assert (net.coordinates(one, present)[0][:, HANDS] == 0).all()
     for a, b in zip(
         net.encode_motion(one, LENGTH, present), net.encode_motion(other, LENGTH, present), strict=True
     ):

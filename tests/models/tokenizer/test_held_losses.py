@@ -12,7 +12,6 @@ from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
-from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.build import build_tokenizer
@@ -100,21 +99,6 @@ def test_all_held_is_the_same_as_not_told(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["h2vq", "separate"])
-def test_hand_codes_learn_from_clips_with_hands_alone(kind: str) -> None:
-    """The hand codebook after a mixed batch is that after the clips with hands by themselves."""
-    books = []
-    for rows in ([0, 1, 2, 3], [0, 1]):
-        module = module_of(CONFIGS[kind])
-        batch = batch_of(module.net.columns, [3, 1, 2, 0])
-        part = {name: value[rows] for name, value in batch.items()}
-        for _ in range(3):
-            out = module.net(part["motion"], part["length"], part["present"])
-        assert out.codes["hand"].max() < 8
-        books.append((module.net.codebooks()["hand"].codebook, out.metrics["penalty_hand"]))
-    torch.testing.assert_close(*books)
-
-
-@pytest.mark.parametrize("kind", ["h2vq", "separate"])
 def test_a_batch_without_hands_teaches_the_hands_nothing(kind: str) -> None:
     module = module_of(CONFIGS[kind])
     columns = module.net.columns
@@ -128,29 +112,6 @@ def test_a_batch_without_hands_teaches_the_hands_nothing(kind: str) -> None:
     for name, parameter in module.net.named_parameters():
         if "hand_encoder" in name or "encoders.hand" in name or "decoders.hand" in name:
             assert (parameter.grad == 0).all(), name
-
-
-def test_decoding_knows_of_no_hands_as_training_does() -> None:
-    net = module_of(CONFIGS["h2vq"]).net
-    batch = batch_of(net.columns, HELD)
-    net(batch["motion"], batch["length"], batch["present"])
-    net.eval()
-    out = net(batch["motion"], batch["length"], batch["present"])
-    decoded = net.decode(out.codes, batch["length"], batch["present"])
-    torch.testing.assert_close(decoded, net.features(out.written, batch["length"]), rtol=1e-4, atol=1e-5)
-
-
-def test_a_quantizer_waits_for_its_first_vectors() -> None:
-    torch.manual_seed(0)
-    book = EmaQuantizer(QuantizerConfig(num_codes=4, dim=3, reset_below=0.5))
-    before = book.codebook.clone()
-    z = torch.randn(2, 8, 3)
-    out = book(z, torch.zeros(2, 8, dtype=torch.bool))
-    assert torch.equal(book.codebook, before) and out.penalty == 0 and out.metrics["resets"] == 0
-    for _ in range(4):
-        book(z)
-    rows = z.reshape(-1, 3)
-    assert (torch.cdist(book.codebook, rows).min(1).values < 1).all(), "random codes are replaced"
 
 
 def captioned(present: list[int], columns: Tensor) -> dict[str, Tensor]:

@@ -35,7 +35,7 @@ from torch.nn.parallel import DistributedDataParallel
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.conditions import Condition
-from motionloom.models.layers import draws
+from motionloom.models.layers import random
 from motionloom.models.training.distributed import alone, rank, sum_over_ranks, world_size
 from motionloom.models.training.stage_module import StageModule
 
@@ -43,14 +43,6 @@ pytestmark = pytest.mark.slow
 
 PHASES = ((0, 4), (4, 8), (8, 12))
 """Steps on two ranks, on one, on two again."""
-
-
-class Place:
-    """What a module asks its trainer."""
-
-    def __init__(self) -> None:
-        self.world_size, self.global_rank, self.global_step = world_size(), rank(), 0
-        self.accumulate_grad_batches = 1
 
 
 def trimmed(batch: dict[str, Any]) -> dict[str, Any]:
@@ -74,12 +66,11 @@ def elastic(case: str, steps: range, state: Path | None = None) -> list[dict[str
     module, batches = ELASTIC[case]()
     module.train().net.double()
     module.draw_by_sample = True
-    optimizer = module.configure_optimizers()["optimizer"]
+    optimizer = module.configure_optimizers()[0]
     if state is not None and state.is_file():
         saved = torch.load(state, weights_only=True)
         module.net.load_state_dict(saved["net"])
         optimizer.load_state_dict(saved["optimizer"])
-    module.trainer = place = Place()  # type: ignore[assignment]
     model: nn.Module = Wrapped(module)
     if world_size() > 1:
         model = DistributedDataParallel(model, forward_sync_buffers=False)
@@ -87,7 +78,7 @@ def elastic(case: str, steps: range, state: Path | None = None) -> list[dict[str
     mine = slice(rank() * size, (rank() + 1) * size)
     rows = []
     for step in steps:
-        place.global_step = step
+        module.step = step
         batch = {"length": LENGTH, **batches(step)}
         batch = trimmed(rows_of(batch, mine))
         torch.manual_seed(1000 * rank() + step)  # torch's own draws would differ
@@ -95,7 +86,7 @@ def elastic(case: str, steps: range, state: Path | None = None) -> list[dict[str
         values = model(batch)
         optimizer.zero_grad()
         values["loss"].backward()
-        draws.end()
+        random.end()
         optimizer.step()
         names, figures = list(values), torch.stack([v.detach().double() for v in values.values()])
         rows.append(dict(zip(names, (sum_over_ranks(figures) / world_size()).tolist(), strict=True)))
@@ -133,7 +124,7 @@ def train(case: str) -> dict[str, Any]:
     torch.manual_seed(0)
     module, batches = CASES[case]()
     module.net.double()
-    optimizer = module.configure_optimizers()["optimizer"]
+    optimizer = module.configure_optimizers()[0]
     if case.endswith("compiled"):
         torch.compiler.reset()  # graphs of other tests in this process count too
         module.losses = torch.compile(module.losses, fullgraph=True, backend="eager")  # type: ignore[method-assign]

@@ -1,4 +1,4 @@
-"""Several optimizers: turns, counts, a slow loop in plain torch, precision, one graph."""
+"""Optimizers, one and several: rates, turns, counts, a slow loop in plain torch, precision, one graph."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch.plugins.precision import Precision
+from lightning.fabric.plugins.precision import Precision
 from tiny_players import CRITIC, Duel, Vectors, train
 from torch import Tensor, nn
 
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player
-from motionloom.pipeline.stages import training
+from motionloom.pipeline.training import execution
+from motionloom.pipeline.training import trainer as training
 
 STEPS = 24
 
@@ -76,6 +77,20 @@ def test_turns() -> None:
     assert [step for step in range(15) if over.plays(step)] == [5, 8]
 
 
+def test_drops_multiply_from_their_steps_on() -> None:
+    """T2M-GPT's schedule: a warm-up, then 0.05 times the rate from a step on."""
+    config = OptimConfig(warmup_steps=4, drop_at=(10, 20), drop_factor=0.05)
+    found = [config.factor(step, 100) for step in (0, 3, 9, 10, 19, 20, 99)]
+    assert found == pytest.approx([0.25, 1, 1, 0.05, 0.05, 0.0025, 0.0025])
+    assert config.factor(10, 100) == config.factor(10, 10_000), "a longer training begins the same"
+
+
+def test_drops_and_cosine_multiply() -> None:
+    plain, dropped = OptimConfig(schedule="cosine"), OptimConfig(schedule="cosine", drop_at=(50,))
+    assert dropped.factor(49, 100) == plain.factor(49, 100)
+    assert dropped.factor(50, 100) == pytest.approx(0.1 * plain.factor(50, 100))
+
+
 def test_a_parameter_of_two_players_is_refused() -> None:
     duel = Duel(seed=0, max_steps=1)
     duel.critic = duel.net
@@ -135,9 +150,9 @@ class Scaling(Precision):
         super().__init__()
         self.scaler = Scaler()
 
-    def pre_backward(self, tensor: Tensor, module: Any) -> Tensor:
+    def backward(self, tensor: Tensor, *arguments: Any, **named: Any) -> None:
         """As Lightning's mixed precision does."""
-        return super().pre_backward(self.scaler.scale(tensor), module)
+        super().backward(self.scaler.scale(tensor), *arguments, **named)
 
 
 @pytest.mark.parametrize("parts", [1, 2])
@@ -145,12 +160,12 @@ def test_with_a_gradient_scaler(parts: int, tmp_path: Path, monkeypatch: pytest.
     """One scale for all players of a step, updated once behind them; powers of two change no bit."""
     plain = train(tmp_path / "plain", accumulate=parts)
     scaling = Scaling()
-    build = training.L.Trainer
+    build = execution.Fabric
 
-    def trainer(**arguments: Any) -> Any:
+    def fabric(**arguments: Any) -> Any:
         return build(**{**arguments, "precision": None, "plugins": [scaling]})
 
-    monkeypatch.setattr(training.L, "Trainer", trainer)
+    monkeypatch.setattr(execution, "Fabric", fabric)
     monkeypatch.setattr(training, "prepare_module", without_fused)
     other = train(tmp_path / "scaled", accumulate=parts)
     assert scaling.scaler.updates == STEPS and scaling.scaler.get_scale() > 1024

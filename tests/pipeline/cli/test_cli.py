@@ -1,14 +1,16 @@
-"""The commands as a user meets them: help that teaches, mistakes answered in one sentence, small data."""
+"""The commands as a user meets them: help that teaches, mistakes answered in one sentence, `--json`."""
 
 from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import typer
 from bvh_clips import write_clip, write_map
@@ -16,8 +18,10 @@ from foreign_figures import build, write_figure
 from foreign_tools import FOREIGN
 from safetensors.numpy import load_file
 
-from motionloom.datasets.motion.joint_map import JointMap
+from motionloom.datasets.motion.bvh.joint_map import JointMap
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.main import app
+from motionloom.pipeline.cli.options import plain
 
 Call = Callable[..., Any]
 
@@ -37,28 +41,6 @@ def text_of(out: str) -> str:
     return re.sub(r"[\s│]+", " ", out)
 
 
-def test_the_commands_are_these() -> None:
-    assert {" ".join(words) for words in COMMANDS} >= {
-        "info",
-        "run",
-        "generate",
-        "evaluate",
-        "report",
-        "export",
-        "data synth",
-        "data convert humanml3d",
-        "data convert motionx",
-        "data convert aistpp",
-        "data convert amass",
-        "data convert bvh",
-        "data report",
-        "retrieval",
-        "data check",
-        "data stats",
-        "data joints",
-    }
-
-
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_help_teaches_with_an_example(words: tuple[str, ...], call: Call) -> None:
     shown = call(*words, "--help")
@@ -68,16 +50,10 @@ def test_help_teaches_with_an_example(words: tuple[str, ...], call: Call) -> Non
     assert f"Example: motionloom {' '.join(words)} " in text
 
 
-def test_without_a_command_the_help_is_shown(call: Call) -> None:
-    for words in ((), ("data",), ("data", "convert")):
-        shown = call(*words)
-        assert "Usage: motionloom" in shown.out + shown.err
-
-
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A few synthetic clips (made once; the tests that damage them copy them)."""
-    from motionloom.datasets.synth.generate import SynthConfig, synthesize
+    from motionloom.datasets.synth.generate import SynthConfig
 
     root = tmp_path_factory.mktemp("data") / "shards"
     synthesize(SynthConfig(clips=24, min_seconds=2.0, max_seconds=5.0), root, progress=False)
@@ -99,19 +75,15 @@ def damaged(shards: Path, tmp_path: Path) -> Path:
 
 
 MISTAKES: dict[str, tuple[list[str], str]] = {
-    "unknown command": (["trian"], "trian"),
+    "unknown command": (["genrate"], "Did you mean 'generate'"),
+    "unknown source": (["data", "convert", "bhv"], "did you mean 'bvh'"),
+    "unknown setting": (
+        ["data", "convert", "bvh", "mocap", "out", "--licence", "x", "--set", "looks=3"],
+        "did you mean 'look'",
+    ),
     "unknown option": (["run", "humantomato-tiny", "--outt", "x"], "--outt"),
     "unknown recipe": (["run", "humantomato-tin"], "did you mean 'humantomato-tiny'"),
-    "no recipe file": (["run", "nothing.yaml"], "nothing.yaml: no such recipe file"),
     "unknown stage": (["run", "humantomato-tiny", "--set", "tmaa.optim.lr=1"], "did you mean 'tma'"),
-    "unknown field": (["run", "humantomato-tiny", "--set", "tma.optim.lrr=1"], "did you mean 'lr'"),
-    "wrong type": (["run", "humantomato-tiny", "--set", "tma.train.steps=many"], "train.steps"),
-    "wrong value": (
-        ["run", "humantomato-tiny", "--set", "data.max_seconds=1"],
-        "max_seconds must be at least",
-    ),
-    "no equals sign": (["run", "humantomato-tiny", "--set", "tma.optim.lr"], "stage.field=value"),
-    "unknown kind": (["run", "humantomato-tiny", "--set", "tma.kind=tmaa"], "did you mean 'tma'"),
     "unknown --until": (["run", "humantomato-tiny", "--until", "gtp", "--dry-run"], "did you mean 'gpt'"),
     "unfinished input": (["run", "humantomato-tiny", "--only", "gpt"], "is not finished"),
     "no source folder": (["run", "bvh-body", "--set", "data.source=nowhere"], "nowhere: no such folder"),
@@ -121,14 +93,8 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     ),
     "not a run": (["generate", "nowhere", "a person walks"], "nowhere: no such folder"),
     "no caption": (["generate", "nowhere"], "give at least one caption"),
-    "empty caption": (["generate", "nowhere", "a person walks", " "], "captions[1] is empty"),
-    "no format": (["generate", "nowhere", "a person walks", "-f", ""], "names no format"),
-    "negative seed": (["generate", "nowhere", "a person walks", "--seed", "-1"], "seed -1: a seed is"),
     "unknown format": (["generate", "nowhere", "a person walks", "-f", "npz,bhv"], "did you mean 'bvh'"),
-    "evaluate nothing": (["evaluate", "nowhere"], "nowhere: no such folder"),
-    "report nothing": (["report", "nowhere"], "nowhere: no such folder"),
     "export nothing": (["export", "nowhere"], "nowhere: no such folder"),
-    "retrieval of nothing": (["retrieval", "nowhere"], "nowhere: no such folder"),
     "diffusion of the body": (
         ["run", "baselines-tiny", "--set", "face_diffusion.part=bodyhand"],
         "a diffusion stage makes faces only, not bodyhand",
@@ -141,10 +107,6 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     ),
     "synth of a wrong layout": (["data", "synth", "out", "--layout", "body13"], "layout"),
     "synth of no clips": (["data", "synth", "out", "--clips", "0"], "clips"),
-}
-
-
-WRONG_PLACES: dict[str, tuple[list[str], str]] = {
     "generate": (["generate", "nowhere", "a person walks", "-o", "file"], "file: is a file"),
     "generate below": (["generate", "nowhere", "a person walks", "-o", "file/sub"], "file: is a file"),
     "synth": (["data", "synth", "file", "--clips", "4"], "file: is a file"),
@@ -163,8 +125,8 @@ WRONG_PLACES: dict[str, tuple[list[str], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG_PLACES)
-def test_a_wrong_place_is_answered_in_a_sentence(
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_answered_in_a_sentence(
     name: str, shards: Path, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -175,25 +137,11 @@ def test_a_wrong_place_is_answered_in_a_sentence(
     for path, text in files.items():
         (tmp_path / path).write_text(text)
     before = sorted(tmp_path.rglob("*"))
-    words, says = WRONG_PLACES[name]
-    done = call(*(str(shards) if word == "SHARDS" else word for word in words))
-    assert done.code == 2 and says in text_of(done.err) and "Traceback" not in done.err
-    assert len(done.err.strip().splitlines()) == 1
-    assert sorted(tmp_path.rglob("*")) == before, "a refused command left files behind"
-
-
-@pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_are_answered_in_a_sentence(
-    name: str, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
     words, says = MISTAKES[name]
-    done = call(*words)
-    assert done.code == 2
-    assert says in text_of(done.err)
-    assert "Traceback" not in done.err + done.out
+    done = call(*(str(shards) if word == "SHARDS" else word for word in words))
+    assert done.code == 2 and says in text_of(done.err) and "Traceback" not in done.err + done.out
     assert len(done.err.strip().splitlines()) == 1 or name.startswith("unknown ")
-    assert not list(tmp_path.iterdir()), "a refused command left files behind"
+    assert sorted(tmp_path.rglob("*")) == before, "a refused command left files behind"
 
 
 def test_check_lists_what_is_wrong(shards: Path, damaged: Path, call: Call) -> None:
@@ -228,11 +176,9 @@ def test_stats_describes_and_writes(shards: Path, tmp_path: Path, call: Call) ->
     done = call("data", "stats", shards, "--out", out)
     assert done.code == 0 and "clip length: median" in done.out and "root height" in done.out
     first, stored = out.read_bytes(), load_file(out)
-    assert stored["mean"].shape == stored["std"].shape == (363,) and (stored["std"] > 0).all()
-    assert np.isfinite(stored["mean"]).all()
-    for _ in range(5):
-        call("data", "stats", shards, "--out", out)
-        assert out.read_bytes() == first, "equal statistics must be equal files"
+    assert stored["mean"].shape == (363,) and (stored["std"] > 0).all()
+    call("data", "stats", shards, "--out", out)
+    assert out.read_bytes() == first, "equal statistics must be equal files"
 
 
 def test_convert_plans_and_converts(tmp_path: Path, call: Call) -> None:
@@ -252,35 +198,19 @@ def test_a_forgotten_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, c
     for seed in range(3):
         write_clip(source / f"{seed}.bvh", seed, z_up=True)
     joint_map = write_map(tmp_path / "joint_map.json")
-    words = (
-        "data",
-        "convert",
-        "bvh",
-        source,
-        out,
-        "--joint-map",
-        joint_map,
-        "--licence",
-        "CC0",
-        "--workers",
-        1,
-    )
+    more = ("--joint-map", joint_map, "--licence", "CC0", "--workers", 1)
+    words = ("data", "convert", "bvh", source, out, *more)
     plan = call(*words, "--plan")
     assert plan.code == 0 and not out.exists()
     assert "0 of 3, along +z of the files" in plan.out and "try: --up z" in plan.out
     refused = call(*words)
     assert refused.code == 2 and "no people standing on a floor" in refused.err and "--up z" in refused.err
-    assert "problem" not in call(*words, "--up", "z", "--plan").out
     assert call(*words, "--up", "z").code == 0
     again = call(*words, "--up", "z")
-    assert again.code == 0 and "finished already, " in again.out and "nothing to convert" in again.out
-    assert call("data", "check", out).code == 0
+    assert again.code == 0 and "finished already, " in again.out
     lying = tmp_path / "lying"
-    assert call(*words[:4], lying, *words[5:], "--look", 0).code == 0
-    found = call("data", "check", lying)
-    assert (
-        found.code == 1 and "3 of 3 clips (100%)" in found.out and "head is not above the pelvis" in found.out
-    )
+    assert call(*words[:4], lying, *more, "--set", "look=0").code == 0
+    assert call("data", "check", lying).code == 1
 
 
 def test_joints_of_a_skeleton_and_of_a_file(tmp_path: Path, call: Call) -> None:
@@ -300,16 +230,6 @@ def test_joints_of_a_skeleton_and_of_a_file(tmp_path: Path, call: Call) -> None:
     assert wrong.code == 2 and "nowhere.bvh: no such file or folder" in wrong.err and "smpl22" in wrong.err
 
 
-def test_convert_without_a_map_shows_the_guess(tmp_path: Path, call: Call) -> None:
-    source, out = write_figure_of("Unreal mannequin", tmp_path / "mocap" / "walk.bvh"), tmp_path / "out"
-    words = ("data", "convert", "bvh", source.parent, out, "--licence", "CC0")
-    plan = call(*words, "--plan")
-    assert plan.code == 0 and "guessed from walk.bvh; 22 by name" in text_of(plan.out)
-    assert [path.name for path in out.iterdir()] == ["joint_map.json"]
-    done = call(*words, "--joint-map", "auto", "--workers", 1)
-    assert done.code == 0 and "note: joint_map.json: guessed from walk.bvh; 22 by name" in done.out
-
-
 def write_figure_of(tool: str, path: Path) -> Path:
     write_figure(path, build(next(spec for spec in FOREIGN if spec.tool == tool)), frames=70)
     return path
@@ -318,30 +238,112 @@ def write_figure_of(tool: str, path: Path) -> Path:
 def test_info_says_what_a_bug_report_needs(call: Call) -> None:
     done = call("info")
     assert done.code == 0
-    for word in (
-        "motionloom 0.",
-        "torch 2.",
-        "runs on:",
-        "text encoder: minilm",
-        "humantomato-tiny",
-        "bvh-body",
-    ):
+    for word in ("motionloom 0.", "torch 2.", "runs on:", "encoder: minilm", "humantomato-tiny", "bvh-body"):
         assert word in done.out
 
 
-def test_a_bug_shows_its_traceback_and_gives_1(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise ZeroDivisionError("a bug")
+@pytest.mark.parametrize(
+    ("error", "code", "says"),
+    [
+        (ZeroDivisionError("a bug"), 1, "ZeroDivisionError: a bug"),
+        (KeyboardInterrupt(), 130, "the same command goes on from here"),
+    ],
+    ids=repr,
+)
+def test_bugs_and_ctrl_c(
+    error: BaseException, code: int, says: str, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
 
-    monkeypatch.setattr("motionloom.pipeline.cli.info.show_info", broken)
+    monkeypatch.setattr("motionloom.pipeline.cli.info.show_info", fail)
     done = call("info")
-    assert done.code == 1 and "ZeroDivisionError: a bug" in done.err
+    assert done.code == code and says in done.err
 
 
-def test_ctrl_c_says_how_to_go_on(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
+DRY = """
+name: dry
+stages:
+  data: {kind: synth, clips: 3}
+  stats: {kind: stats}
+"""
 
-    monkeypatch.setattr("motionloom.pipeline.cli.info.show_info", interrupted)
-    done = call("info")
-    assert done.code == 130 and "the same command goes on from here" in done.err
+
+def loaded(text: str) -> Any:
+    """Strict JSON: Python's NaN is none."""
+
+    def refuse(name: str) -> None:
+        raise ValueError(name)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_every_kind_of_value_has_its_form() -> None:
+    @dataclass
+    class Inner:
+        place: Path
+        figures: tuple[float, ...]
+
+    value = {"a": Inner(Path("x/y"), (1.5, float("nan"), float("inf"))), 2: {"b", "a"}, "c": Counter(z=3)}
+    assert plain(value) == {
+        "a": {"place": "x/y", "figures": [1.5, None, None]},
+        "2": ["a", "b"],
+        "c": {"z": 3},
+    }
+    assert plain(SynthConfig(clips=3))["clips"] == 3
+    with pytest.raises(TypeError, match="object has no form in JSON"):
+        plain({"a": object()})
+
+
+def test_a_plan(call: Call, tmp_path: Path) -> None:
+    recipe = tmp_path / "dry.yaml"
+    recipe.write_text(DRY)
+    shown = call("run", recipe, "--out", tmp_path / "run", "--dry-run", "--json")
+    plan = loaded(shown.out)
+    assert [(row["stage"], row["action"], row["reason"]) for row in plan["stages"]] == [
+        ("data", "run", "never run"),
+        ("stats", "run", "never run"),
+    ]
+    assert plan["stages"][1]["inputs"] == {"data": "data"}
+    assert plan["replaces"] == {"finished": [], "started": []}
+    assert not (tmp_path / "run").exists()
+    refused = call("run", recipe, "--out", tmp_path / "run", "--json")
+    assert refused.code == 2 and "give --dry-run too" in refused.err and not refused.out
+
+
+def test_a_check_of_shards_and_of_files(call: Call, shards: Path, tmp_path: Path) -> None:
+    shown = call("data", "check", shards, "--json")
+    found = loaded(shown.out)
+    assert shown.code == 0 and found["problems"] == 0 and found["clips"] == 24 and "no problems" in shown.err
+    (tmp_path / "bad.bvh").write_text("no BVH")
+    shown = call("data", "check", tmp_path / "bad.bvh", "--json")
+    found = loaded(shown.out)
+    assert shown.code == 1 and found["problems"] == 1
+    assert found["files"][0]["ok"] is False and found["files"][0]["problems"]
+
+
+def test_a_conversions_plan(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "mocap").mkdir()
+    write_clip(tmp_path / "mocap" / "a.bvh", 1)
+    words = ("data", "convert", "bvh", tmp_path / "mocap", tmp_path / "out", "--licence", "x")
+    words += ("--joint-map", write_map(tmp_path / "map.json"), "--workers", "1")
+    plan = loaded(call(*words, "--plan", "--json").out)
+    assert plan["found"] == 1 and sum(plan["clips"].values()) == 1 and not plan["unreadable"]
+    refused = call(*words, "--json")
+    assert refused.code == 2 and "give --plan too" in refused.err and not (tmp_path / "out").exists()
+
+
+def test_info_the_version_and_a_table(call: Call) -> None:
+    shown, facts = call("--version"), loaded(call("info", "--json").out)
+    assert shown.code == 0 and shown.out == f"motionloom {facts['motionloom']}\n"
+    assert facts["libraries"]["torch"] == metadata.version("torch") and "humantomato-tiny" in facts["recipes"]
+    refused = call("evaluate", "--tables", "--json")
+    assert refused.code == 2 and "--format json" in refused.err
+
+
+def test_completion_knows_the_commands(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_MOTIONLOOM_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", "motionloom data ch")
+    monkeypatch.setenv("COMP_CWORD", "2")
+    shown = call("data", "ch")
+    assert shown.code == 0 and shown.out.split() == ["check"]

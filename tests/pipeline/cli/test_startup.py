@@ -13,21 +13,9 @@ from typing import Any
 import pytest
 
 HEAVY = (
-    "torch",
-    "torch._dynamo",
-    "lightning",
-    "torchmetrics",
-    "transformers",
-    "sentence_transformers",
-    "huggingface_hub",
-    "scipy",
-    "librosa",
-    "soundfile",
-    "roma",
-    "PIL",
-    "matplotlib",
-    "webdataset",
-)
+    "torch", "torch._dynamo", "lightning", "torchmetrics", "transformers", "sentence_transformers",
+    "huggingface_hub", "scipy", "librosa", "soundfile", "roma", "PIL", "matplotlib", "webdataset",
+)  # fmt: skip
 
 PROGRAM = """
 import contextlib, io, json, sys

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import torch
 
-from motionloom.datasets.motion.joints import joints_of
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import FACE, HANDS, PRESENT_ALL, UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_sample
-from motionloom.pipeline.contract.showing import Clips, JointMap, Matrix
-from motionloom.pipeline.evaluation.cases import Case, extremes, read_cases, write_cases
+from motionloom.pipeline.contract.showing import JointMap, Matrix
 from motionloom.pipeline.evaluation.confusions import (
     ANOTHER,
     CAPTIONS,
@@ -27,10 +26,17 @@ from motionloom.pipeline.evaluation.confusions import (
     nearest_captions,
     retrieval_confusions,
 )
-from motionloom.pipeline.evaluation.detail_rows import detail_showings
-from motionloom.pipeline.evaluation.joint_map import joint_map
+from motionloom.pipeline.evaluation.details import (
+    Case,
+    Clips,
+    detail_showings,
+    extremes,
+    joint_map,
+    read_cases,
+    write_cases,
+)
+from motionloom.pipeline.evaluation.latent_metrics import Latents, caption_distances
 from motionloom.pipeline.evaluation.reconstruction import published_errors
-from motionloom.pipeline.evaluation.text_motion import Latents, caption_distances
 from motionloom.pipeline.evaluation.truth import Truth, digest_of
 
 CONFIG = SynthConfig(clips=40, min_seconds=2.0, max_seconds=5.0)
@@ -194,12 +200,12 @@ def test_cases_come_back_and_are_drawn(truths: list[Truth], tmp_path: Path) -> N
         "fps": 20.0,
         "skeleton": "smplx52",
         "joint_errors_mm": [1.0] * 52,
-        "cases": [case.figures() for case in cases],
+        "cases": [case.record() for case in cases],
         "confusions": [
             {**matrix, "about": "left_hand", "columns": ["wave_fingers", "b"], "counts": [[1, 0], [0, 2]]}
         ],
     }
-    again = read_cases(tmp_path, figures)
+    again = read_cases(tmp_path, figures["cases"])
     assert [(c.of, c.place, c.id, c.error) for c in again] == [
         ("reconstruction", "worst 1", "clip0", 1.235),
         ("generated", "best 1", "clip1", 1.235),
@@ -214,7 +220,7 @@ def test_cases_come_back_and_are_drawn(truths: list[Truth], tmp_path: Path) -> N
     assert {m.group for m in first.motions} == {f"worst 1: {1.235:.3g} mm"}
     assert len(first.motions[0].parents) == len(Skeleton.named("smplx52"))
     with pytest.raises(UserError, match=r"does not fit metrics.json beside it .* evaluate again"):
-        read_cases(tmp_path, {"cases": [*figures["cases"], *figures["cases"]]})
+        read_cases(tmp_path, [*figures["cases"], *figures["cases"]])
     write_cases(tmp_path, [])
-    assert read_cases(tmp_path, figures) == [] and list(tmp_path.iterdir()) == []
-    assert detail_showings(tmp_path, {"split": "test", "clips": 3}) == [], "of an earlier version"
+    assert read_cases(tmp_path, figures["cases"]) == [] and list(tmp_path.iterdir()) == []
+    assert detail_showings(tmp_path, {}) == []

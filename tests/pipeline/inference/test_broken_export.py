@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.pretrained import MotionModel, write_bundle
+from motionloom.pipeline.inference.exported import write_bundle
+from motionloom.pipeline.inference.model import MotionModel
 
 STAGES = [
     "stats", "text", "tokenizer", "tma", "gpt", "face_tokenizer", "face_gpt", "face_vae", "face_diffusion",
@@ -60,31 +62,19 @@ def test_the_hubs_helper_misses_nothing(whole: Path, small_run: Any, monkeypatch
     assert not said
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_a_lost_stage_is_named(stage: str, model: Path) -> None:
-    shutil.rmtree(model / stage)
-    with pytest.raises(UserError, match=f"bundle.json: its stage '{stage}' is not here"):
-        Bundle.open(model)
+def test_a_lost_stage_is_named(model: Path) -> None:
+    for stage in STAGES:
+        (model / stage).rename(model.parent / stage)
+        with pytest.raises(UserError, match=f"bundle.json: its stage '{stage}' is not here"):
+            Bundle.open(model)
+        (model.parent / stage).rename(model / stage)
 
 
-OLD = {
-    "layout": {"name": "wholebody363", "fps": 20.0, "family": "exact"},
-    "text_encoder": "minilm",
-    "parts": ["stats", "tokenizer", "gpt"],
-}
-
-
-@pytest.mark.parametrize("text", [json.dumps(OLD), '{"format": 3}', "[]", "{", "\x00"])
+@pytest.mark.parametrize("text", ['{"parts": ["gpt"]}', '{"format": 3}', "[]", "{", "\x00"])
 def test_a_folder_of_another_version_is_refused(text: str, model: Path) -> None:
-    """One of before `format`, one of a later version, and what is no export."""
     (model / "bundle.json").write_text(text)
-    with pytest.raises(UserError, match=r"bundle.json: .*export the run again"):
+    with pytest.raises(UserError, match=r"bundle.json: .*again"):
         MotionModel.from_pretrained(model)
-
-
-def test_config_json_is_for_the_hub_alone(model: Path) -> None:
-    (model / "config.json").unlink()
-    assert set(MotionModel.from_pretrained(model).bundle.faces) == {"gpt", "vae", "diffusion"}
 
 
 @pytest.mark.parametrize("name", ["../secret", "/etc", "..", ".", "", "a/b", "a\\b", "lost", "some/hub-name"])
@@ -136,7 +126,7 @@ WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
         lambda f: f["stages"]["gpt"].update(kind="os"), "stages.gpt: stage kind 'os' is not known here"
     ),
     "another version": (
-        lambda f: f["stages"]["gpt"].update(version=1), "stages.gpt was made by version 1 of kind gpt"
+        lambda f: f["stages"]["gpt"].update(version=99), "stages.gpt was made by version 99 of kind gpt"
     ),
     "a wrong config": (
         lambda f: f["stages"]["gpt"]["config"].update(priorr=1), "stages.gpt.config: unknown key 'priorr'"
@@ -154,6 +144,12 @@ WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
         "stages.gpt.inputs: 'tma' of kind tma is no tokenizer",
     ),
     "an unknown key": (lambda f: f.update(code="os"), "unknown key 'code'"),
+    "sampling of an unknown key": (
+        lambda f: f.update(sampling={"cfg_scael": 1}), "sampling: unknown key 'cfg_scael'; did you mean"
+    ),
+    "a sum of a file elsewhere": (
+        lambda f: f["stages"]["gpt"].update(sha256={"../stats.safetensors": ""}), "no file of its folder"
+    ),
 }  # fmt: skip
 
 
@@ -195,12 +191,6 @@ def test_a_lost_fact_is_named(stage: str, key: str, model: Path) -> None:
             Bundle.open(model)
 
 
-def test_a_part_that_the_layout_does_not_have_is_named(model: Path) -> None:
-    change(model / "tma/model.json", lambda facts: facts["extra"].update(part="wings"))
-    with pytest.raises(UserError, match=r"model.json: key 'extra.part' = 'wings' is no part of layout"):
-        Bundle.open(model)
-
-
 class Payload:
     """Runs a shell command wherever it is unpickled."""
 
@@ -230,9 +220,6 @@ def test_seeds_go_by_the_place_in_the_list(whole: Path) -> None:
     second = model.generate(["a person walks", "a person waves"], seed=1, seconds=1.0)[1]
     np.testing.assert_array_equal(alone.features, again.features)
     assert not np.array_equal(alone.features, second.features)
-    for given in ("wave", ["wave", ""]):
-        with pytest.raises(UserError, match="captions"):
-            model.generate(given, seconds=1.0)
 
 
 def test_weights_that_were_changed_are_refused(model: Path) -> None:
@@ -243,37 +230,19 @@ def test_weights_that_were_changed_are_refused(model: Path) -> None:
     path.write_bytes(data)
     with pytest.raises(UserError, match=r"gpt/model\.safetensors: is not the file that was exported"):
         Bundle.open(model)
-    change(model / "bundle.json", lambda f: f["stages"]["gpt"].update(sha256={}))
-    assert Bundle.open(model).generator.method == "gpt", "exports of before have no sha256"
-    change(
-        model / "bundle.json", lambda f: f["stages"]["gpt"].update(sha256={"../stats/stats.safetensors": ""})
-    )
-    with pytest.raises(UserError, match="no file of its folder"):
-        Bundle.open(model)
 
 
 def test_an_export_draws_as_it_recommends(small_run: Any, call: Any, tmp_path: Path) -> None:
-    """By command and from Python; what is asked for goes first, field by field."""
+    """What is asked for goes first, field by field."""
     folder = tmp_path / "own"
-    assert (
-        call("export", small_run.folder, "-o", folder, "--cfg-scale", "1.5", "--temperature", "0").code == 0
-    )
+    options = ("--sampling", "cfg_scale=1.5", "--sampling", "temperature=0")
+    assert call("export", small_run.folder, "-o", folder, *options).code == 0
     model = MotionModel.from_pretrained(folder, device="cpu")
     assert model.bundle.recommended.model_dump(exclude_unset=True) == {"cfg_scale": 1.5, "temperature": 0.0}
-    mixed = model.bundle.drawing({"cfg_scale": 2.0, "top_p": 0.8})
+    mixed = model.bundle.drawing(SamplingConfig(cfg_scale=2.0, top_p=0.8))
     assert mixed.model_dump(exclude_unset=True) == {"cfg_scale": 2.0, "temperature": 0.0, "top_p": 0.8}
     words = {"captions": ["a person waves"], "seconds": 1.0, "seed": 4}
     plain = Bundle.open(small_run.folder)
-    (wanted,) = plain.generate(**words, sampling={"cfg_scale": 1.5, "temperature": 0.0})
+    (wanted,) = plain.generate(**words, sampling=SamplingConfig(cfg_scale=1.5, temperature=0.0))
     (made,) = model.generate(**words)
     np.testing.assert_array_equal(made.joints, wanted.joints)
-    (drawn,) = plain.generate(**words)
-    assert not np.array_equal(made.joints, drawn.joints)
-    said = call(
-        "generate", folder, "a person waves", "--seconds", "1", "--seed", "4", "-f", "npz", "-o", tmp_path
-    )
-    with np.load(said.out.split()[0], allow_pickle=False) as file:
-        np.testing.assert_array_equal(file["features"], wanted.features)
-    change(folder / "bundle.json", lambda facts: facts.update(sampling={"cfg_scael": 1}))
-    with pytest.raises(UserError, match=r"bundle.json: sampling: unknown key 'cfg_scael'; did you mean"):
-        Bundle.open(folder)

@@ -17,12 +17,12 @@ from motionloom.datasets.text.build import build_text_cache
 from motionloom.datasets.text.cache import TextCache
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import CPU, Shelf
+from motionloom.pipeline.contract.stage import CPU, StageCache
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.launch.hardware import Hardware, choose_device
-from motionloom.pipeline.stages.tokens import encode_split
-from motionloom.pipeline.store.latents import embed_motions
+from motionloom.pipeline.stages.networks.tokens import encode_split
+from motionloom.pipeline.store.networks import embed_motions
 
 CAPTIONS = ["a person waves with the left hand", "a person walks"]
 
@@ -55,7 +55,7 @@ def test_motions_are_made_where_the_networks_lie(face: str, second: ModuleType, 
     near = Bundle.open(small_run.folder)
     with second.second_device() as device:
         far = Bundle.open(small_run.folder, device)
-        given = far.shelf.given(far.main.inputs)
+        given = far.stage_cache.given(far.main.inputs)
         assert far.device == given["tma"].device == device
         made = far.generate(CAPTIONS, seconds=2.0, seed=3, sampling=sampling)
     assert str(given["text"].encoder._model.device) == str(device)
@@ -71,12 +71,12 @@ def test_tokens_captions_and_clips_are_encoded_where_the_networks_lie(
     second: ModuleType, small_run: Any, tmp_path: Path
 ) -> None:
     stages = finished_stages(small_run.folder)
-    dataset = Shelf().get(stages["data"]).split("test")
+    dataset = StageCache().get(stages["data"]).split("test")
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
 
     def everything(device: torch.device, name: str) -> list[Any]:
-        shelf = Shelf(device)
-        tokenizer, tma = shelf.get(stages["tokenizer"]), shelf.get(stages["tma"])
+        stage_cache = StageCache(device)
+        tokenizer, tma = stage_cache.get(stages["tokenizer"]), stage_cache.get(stages["tma"])
         captions = [truth.caption for truth in truths]
         cache = build_text_cache(tmp_path / name, captions, "minilm", progress=False, device=str(device))
         assert isinstance(cache, TextCache)

@@ -17,12 +17,12 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.build import build_text_cache
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.pretrained import write_bundle
+from motionloom.pipeline.inference.exported import write_bundle
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.graph import Selection
-from motionloom.pipeline.store import encoder_files
+from motionloom.pipeline.runs.plan import Selection
+from motionloom.pipeline.store import text as text_source
 
 RECIPE = """
 extends: t2m-gpt-tiny
@@ -67,7 +67,7 @@ def motions(folder: Path) -> list[np.ndarray]:
 
 def text_encoder_of(run: Path) -> str:
     """The encoder that the run's text stage loads."""
-    return str(Shelf().get(finished_stages(run)["text"]).encoder_name)
+    return str(StageCache().get(finished_stages(run)["text"]).encoder_name)
 
 
 def check_alone(run: Path, exported: Path, *originals: Path) -> None:
@@ -135,8 +135,8 @@ def test_the_hub_is_asked_when_its_cache_lacks_the_model(
         return str(encoder)
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
-    monkeypatch.setattr(encoder_files, "hub_is_away", lambda: False)
-    encoder_files.copy_encoder(HUB_NAME, tmp_path / "text", tmp_path / "copy")
+    monkeypatch.setattr(text_source, "hub_is_away", lambda: False)
+    text_source.copy_encoder(HUB_NAME, tmp_path / "text", tmp_path / "copy")
     assert asked == [True, False] and (tmp_path / "copy/model.safetensors").is_file()
 
 
@@ -145,5 +145,5 @@ def test_another_model_at_the_same_place_is_refused(models: ModuleType, tmp_path
     build_text_cache(tmp_path / "text/cache", CAPTIONS, str(encoder), progress=False)
     models.tiny_distilbert(tmp_path, seed=1)
     with pytest.raises(UserError, match="its weights are not those that encoded this run's captions"):
-        encoder_files.copy_encoder(str(encoder), tmp_path / "text", tmp_path / "copy")
+        text_source.copy_encoder(str(encoder), tmp_path / "text", tmp_path / "copy")
     assert not (tmp_path / "copy").exists()

@@ -1,9 +1,8 @@
-"""A motion as an object: its facts, the files it saves itself as, and what a notebook shows."""
+"""A motion and its files: facts, formats (one more is one function and one line), what a notebook shows."""
 
 from __future__ import annotations
 
 import html
-import json
 import re
 from collections.abc import Callable
 from html.parser import HTMLParser
@@ -12,11 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.inference.motion import WRITERS, GeneratedMotion
+from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.outputs import write_motions
+from motionloom.pipeline.inference.writers import WRITERS, Outputs, Writer, default_formats, formats_help
+from motionloom.pipeline.serve.requests import MotionRequest
+from motionloom.pipeline.stages.results.generate import GenerateConfig
 
 NASTY = "a \"person\" </iframe><script>window.hacked=1</script> & 'waves'"
 
@@ -28,30 +32,12 @@ def motion(walk: Callable[..., Any]) -> GeneratedMotion:
     return GeneratedMotion(Prompt(NASTY), features, walk(30), None, layout, seed=9)
 
 
-def test_its_facts(motion: GeneratedMotion) -> None:
-    assert (motion.fps, motion.seconds, motion.joints.shape) == (20.0, 1.5, (30, 52, 3))
-    assert motion.joint_names[0] == "pelvis" and len(motion.joint_names) == 52
-
-
 @pytest.mark.parametrize("ending", [".npz", ".bvh", ".glb", ".html", ".mp4", ".BVH"])
 def test_saves_by_its_ending(motion: GeneratedMotion, tmp_path: Path, ending: str) -> None:
     path = motion.save(tmp_path / f"made{ending}")
-    start = {
-        ".npz": b"PK",
-        ".bvh": b"HIERARCHY",
-        ".glb": b"glTF",
-        ".html": b"<!doctype html>",
-        ".mp4": b"\0\0\0",
-    }
-    assert path.read_bytes().startswith(start[ending.lower()])
+    start = {"npz": b"PK", "bvh": b"HIER", "glb": b"glTF", "html": b"<!doctype html>", "mp4": b"\0\0\0"}
+    assert path.read_bytes().startswith(start[ending.lower()[1:]])
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
-
-
-def test_what_the_file_holds(motion: GeneratedMotion, tmp_path: Path) -> None:
-    with np.load(motion.save(str(tmp_path / "made.npz")), allow_pickle=False) as file:
-        np.testing.assert_allclose(file["joints"], motion.joints, atol=1e-3)  # of one rigid skeleton
-        facts = json.loads(str(file["metadata"]))
-    assert facts["seed"] == 9 and facts["caption"] == NASTY and facts["fps"] == 20.0
 
 
 def test_endings_that_are_none(motion: GeneratedMotion, tmp_path: Path) -> None:
@@ -61,25 +47,18 @@ def test_endings_that_are_none(motion: GeneratedMotion, tmp_path: Path) -> None:
         motion.save(tmp_path / "made.fbx")
     with pytest.raises(UserError, match="no ending"):
         motion.save(tmp_path / "made")
-    for ending in WRITERS:
+    for ending in (writer.suffix for writer in WRITERS.values()):
         with pytest.raises(UserError, match=r"there is no folder .*missing; make it first"):
             motion.save(tmp_path / "missing" / f"made{ending}")
     assert not list(tmp_path.iterdir())
 
 
-class _Tags(HTMLParser):
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-
 def test_a_notebook_shows_it_apart(motion: GeneratedMotion) -> None:
-    reader = _Tags()
+    tags: list[tuple[str, dict[str, str | None]]] = []
+    reader = HTMLParser()
+    reader.handle_starttag = lambda tag, attrs: tags.append((tag, dict(attrs)))  # type: ignore[method-assign]
     reader.feed(motion._repr_html_())
-    ((tag, attributes),) = reader.tags  # one frame and nothing else, whatever the caption says
+    ((tag, attributes),) = tags  # one frame and nothing else, whatever the caption says
     assert tag == "iframe" and attributes["sandbox"] == "allow-scripts" and attributes["title"] == NASTY
     page = attributes["srcdoc"] or ""
     assert page.startswith("<!doctype html>") and "default-src 'none'" in page
@@ -106,6 +85,36 @@ def test_it_plays_in_the_frame(motion: GeneratedMotion, browser: Any, until: Any
         page.close()
 
 
-def test_every_ending_is_documented() -> None:
-    text = (Path(__file__).resolve().parents[3] / "docs" / "python.md").read_text(encoding="utf-8")
-    assert re.findall(r"^\| `(\.\w+)` \|", text, re.M) == list(WRITERS)
+def write_csv(path: Path, outputs: Outputs) -> None:
+    """A format of somebody else's: a line of root positions a frame."""
+    np.savetxt(path, np.concatenate([clip.shown.joints[:, 0] for clip in outputs.clips]), delimiter=",")
+
+
+@pytest.fixture
+def csv(monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = Writer("_root.csv", "text/csv", "the root's way", write_csv, together="all.csv")
+    monkeypatch.setitem(WRITERS, "root", writer)
+
+
+@pytest.mark.usefixtures("csv")
+def test_a_new_format_is_known_everywhere(walk: Callable[..., np.ndarray], tmp_path: Path) -> None:
+    layout = MotionLayout.named("wholebody363", fps=20.0)
+    motions = [
+        GeneratedMotion(Prompt(name), np.zeros((9, 313), np.float32), walk(9), None, layout) for name in "ab"
+    ]
+    paths = write_motions(tmp_path / "out", motions, ["root"], title="t", seed=0)
+    assert [path.name for path in paths] == ["00-a_root.csv", "01-b_root.csv", "all.csv"]
+    assert len(np.loadtxt(paths[-1], delimiter=",")) == 18
+    assert motions[0].save(tmp_path / "one_root.csv").is_file()
+    assert "root (the root's way)" in formats_help()
+    assert GenerateConfig.parse({"formats": ["root"]}, "generate").formats == ["root"]
+    assert MotionRequest(caption="a", format="root").format == "root"
+
+
+def test_formats_are_names_of_the_table() -> None:
+    assert default_formats() == ["npz", "bvh", "html"]  # a film only where it is asked for
+    with pytest.raises(UserError, match="formats"):
+        GenerateConfig.parse({"formats": ["npz", "fbx"]}, "generate")
+    for name in ("mp4", "fbx"):  # a server does not film
+        with pytest.raises(ValidationError):
+            MotionRequest(caption="a", format=name)

@@ -1,8 +1,10 @@
-"""What a user may ask of generation: lengths, greedy decoding, guidance, steps; what cannot be is refused."""
+"""What a user may ask of generation: lengths, greedy decoding, guidance, steps, draws to choose from."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,9 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 from toy_stages import MadeStage
 
-from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import EncodedText
@@ -20,13 +23,24 @@ from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
+from motionloom.pipeline.contract.generation import GenerationRequest, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished, Shelf
+from motionloom.pipeline.contract.stage import Finished, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generators.diffusion import DiffusionFace
+from motionloom.pipeline.inference.generators.gpt import (
+    GptGenerator,
+    candidate_seeds,
+    nearest_candidates,
+    repeated,
+)
+from motionloom.pipeline.inference.generators.ude import UdeGenerator
+from motionloom.pipeline.inference.generators.vae import VaeMotion
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.requests import require_used
-from motionloom.pipeline.stages.diffusion import DiffusionFace
-from motionloom.pipeline.stages.gpt import GptGenerator
-from motionloom.pipeline.stages.tma import VaeMotion
+from motionloom.pipeline.inference.shipped_models import shipped_models
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.stages.results.evaluate_units import EvaluateConfig
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer
 
 GPT = GptConfig(layers=1, dim=16, heads=2, ff=16, block_size=32)
@@ -80,7 +94,7 @@ def bundle(
         made.append(DiffusionFace(denoiser.eval().requires_grad_(False), layout, given))
     if "vae" in faces:
         made.append(VaeMotion(SimpleNamespace(given=given, part="face")))  # type: ignore[arg-type]
-    return Bundle([stage(f"stage{k}", one) for k, one in enumerate(made)], Shelf())
+    return Bundle([stage(f"stage{k}", one) for k, one in enumerate(made)], StageCache())
 
 
 def stage(name: str, made: Any, **given: Any) -> Finished:
@@ -167,43 +181,37 @@ WRONG_ASKS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
     "one face text": ((), {"face": "abc"}, r"face is one text; .*\['abc'\]"),
     "no text": ((), {"captions": ["a", 3, "b"]}, r"captions\[1\] = 3: not a text"),
     "empty": ((), {"captions": ["a", " ", "b"]}, r"captions\[1\] is empty"),
+    "empty, not strict": ((), {"captions": [""], "strict": False}, r"captions\[0\] is empty"),
+    "nothing": ((), {"captions": None}, "nothing to generate from: give captions, sounds or both"),
     "negative seed": ((), {"seed": -1}, "seed -1: a seed is a whole number"),
     "broken seed": ((), {"seed": 0.5}, "seed 0.5: a seed is a whole number"),
     "misspelt sampling": ((), {"sampling": {"topp": 0.9}}, "unknown key 'topp'; did you mean 'top_p'"),
     "no sampling": ((), {"sampling": 3}, "sampling: "),
     "face of no face": ((), {"face": CAPTIONS}, "this model makes no face"),
-    "guidance of no face": ((), {"sampling": {"face_cfg_scale": 3.0}}, "this model makes no face"),
-    "steps of no face": (
-        (),
-        {"sampling": {"denoising_steps": 9}},
-        r"\(--denoising-steps\): no generator that is used here takes it; leave it out",
-    ),
-    "sampler of a GPT": (("gpt",), {"sampling": {"sampler": "ddim"}}, r"\(--sampler\): .*; leave it out"),
+    "guidance of no face": ((), {"sampling": {"face_cfg_scale": 3.0}}, "face_cfg_scale: no generator"),
+    "guidance of music": ((), {"sampling": {"guidance": {"audio": 2.0}}}, "guidance: no generator"),
+    "steps of no face": ((), {"sampling": {"denoising_steps": 9}}, "denoising_steps: no generator"),
+    "sampler of a GPT": (("gpt",), {"sampling": {"sampler": "ddim"}}, "sampler: no generator"),
+    "guidance of a VAE": (("vae",), {"sampling": {"face_cfg_scale": 2.0}}, "face_cfg_scale: no generator"),
     "steps beside a diffusion model": (
-        ("gpt", "diffusion"),
-        {"sampling": {"denoising_steps": 9}},
-        "choose --face-model diffusion",
+        ("gpt", "diffusion"), {"sampling": {"denoising_steps": 9}}, "set face_model to diffusion"
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", WRONG_ASKS)
 def test_what_has_no_sense_or_no_effect_is_refused(name: str) -> None:
-    faces, asked, says = WRONG_ASKS[name]
+    faces, given, says = WRONG_ASKS[name]
+    asked = {"captions": CAPTIONS, "seconds": 0.2, "strict": True, **given}
     with pytest.raises(UserError, match=says):
-        bundle(faces=faces).generate(**{"captions": CAPTIONS, "seconds": 0.2, "strict": True, **asked})
+        asked["sampling"] = SamplingConfig.of(given.get("sampling"))
+        bundle(faces=faces).generate(**asked)
 
 
 def test_a_face_by_a_vae_takes_no_guidance() -> None:
-    model = bundle(faces=("vae",))
-    require_used(model, CAPTIONS, SamplingConfig(cfg_scale=2.0))
-    with pytest.raises(UserError, match=r"\(--face-cfg-scale\): no generator .* takes it; leave it out"):
-        require_used(model, CAPTIONS, SamplingConfig(face_cfg_scale=2.0))
     both = bundle(faces=("vae", "gpt"))
     assert list(both.faces) == ["gpt", "vae"]
-    with pytest.raises(
-        UserError, match=r"\(--face-cfg-scale\): .*; choose --face-model gpt, or leave it out"
-    ):
+    with pytest.raises(UserError, match=r"face_cfg_scale: .*face_model to gpt"):
         require_used(both, CAPTIONS, SamplingConfig(face_cfg_scale=2.0, face_model="vae"))
 
 
@@ -215,64 +223,141 @@ def test_a_face_is_chosen_by_its_method_or_its_stage() -> None:
         model.choose_face("vae")
 
 
-def test_what_is_asked_without_words_is_refused() -> None:
-    """Also where empty captions are not refused as such: there is nothing to make a motion of."""
-    for captions in ([""], ["a person walks", " "]):
-        with pytest.raises(UserError, match=rf"captions\[{len(captions) - 1}\] is empty"):
-            bundle().generate(captions, seconds=0.2)
-    with pytest.raises(UserError, match="nothing to generate from: give captions, sounds or both"):
-        bundle().generate()
-
-
-def test_sampling_may_be_a_mapping() -> None:
-    model, asked = bundle(faces=("gpt", "diffusion")), {"top_p": 0.5, "temperature": 2.0}
-    ours, theirs = (
-        model.generate(CAPTIONS, seconds=0.4, seed=1, sampling=sampling, strict=True)
-        for sampling in (asked, SamplingConfig(**asked))
-    )
-    for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_array_equal(one.features, other.features)
-    steps = {"denoising_steps": 2, "face_model": "diffusion"}
-    assert len(model.generate(CAPTIONS, seconds=0.2, sampling=steps, strict=True)) == 3
-
-
-def test_the_commands_options_reach_the_sampling(
-    call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+def test_the_commands_settings_reach_the_sampling(
+    call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     seen: dict[str, Any] = {}
-    monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: _Watching(seen))
-    monkeypatch.setattr("motionloom.pipeline.inference.unknown.unknown_captions", lambda *_: [])
-    words = (
-        "--sampler",
-        "dpm++",
-        "--denoising-steps",
-        "7",
-        "--cfg-scale",
-        "3",
-        "--face-cfg-scale",
-        "1.5",
-        "--temperature",
-        "0",
-    )
-    words += ("--music-cfg-scale", "1.2")
+    watching = SimpleNamespace(generate=lambda captions, **options: seen.update(options) or [])
+    monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: watching)
+    monkeypatch.setattr("motionloom.pipeline.inference.bundle.unknown_captions", lambda *_: [])
+    asked = {"sampler": "dpm++", "denoising_steps": 7, "cfg_scale": 3.0, "temperature": 0.0}
+    words = [word for name, value in asked.items() for word in ("--sampling", f"{name}={value}")]
+    words += ["--sampling", "guidance.audio=1.2"]
     assert call("generate", "somewhere", "a person walks", *words, "-o", tmp_path, "-f", "npz").code == 0
-    assert seen["sampling"] == SamplingConfig(
-        sampler="dpm++", denoising_steps=7, cfg_scale=3, face_cfg_scale=1.5, music_cfg_scale=1.2,
-        temperature=0,
-    )  # fmt: skip
-    assert seen["strict"] and seen["sampling"].model_fields_set >= {"sampler", "denoising_steps"}
-    assert call("generate", "somewhere", "a person walks", "-o", tmp_path, "-f", "npz").code == 0
-    assert not seen["sampling"].model_fields_set & {"sampler", "denoising_steps", "face_cfg_scale"}
-    wrong = call("generate", "somewhere", "a person walks", "--sampler", "euler")
-    assert wrong.code == 2 and "sampler" in wrong.err and "ddim" in wrong.err
+    assert seen["strict"]
+    assert seen["sampling"].model_dump(exclude_unset=True) == {**asked, "guidance": {"audio": 1.2}}
+    for wrong in ("sampler=euler", "smapler=ddim", "top_p"):
+        made = call("generate", "somewhere", "a person walks", "--sampling", wrong)
+        assert made.code == 2 and wrong.partition("=")[0] in made.err
 
 
-class _Watching:
-    """Stands in for a model; keeps what it was asked."""
+def test_the_stage_s_sampler_runs_unless_another_is_set(tmp_path: Path) -> None:
+    """Through a recipe with some sampling settings, and through what a run writes down of it."""
+    again = tmp_path / "recipe.yaml"
+    for recipe in ("ude-learning", again):
+        resolved = load_recipe(recipe, strict=False)
+        stages = {one.name: one.config for one in resolved.stages}
+        halves: list[Any] = [SimpleNamespace(modalities={"audio"}, given={}), SimpleNamespace()]
+        engine = UdeGenerator(*halves, stages["ude"])
+        for name in ("generate", "evaluate", "evaluate_dances"):
+            assert engine.denoising(stages[name].sampling) == ("dpm++", 20), name
+        again.write_text(resolved.to_yaml())
+    assert engine.denoising(SamplingConfig(temperature=0.5, sampler="ddim")) == ("ddim", 20)
 
-    def __init__(self, seen: dict[str, Any]) -> None:
-        self.seen = seen
 
-    def generate(self, captions: Sequence[str], **options: Any) -> list[Any]:
-        self.seen.update(options)
-        return []
+def test_a_protocol_names_the_settings_that_were_in_effect() -> None:
+    model = bundle(faces=("gpt", "diffusion"))
+    model.recommended = SamplingConfig(top_p=0.8, cfg_scale=2.0)
+    tokens = {"temperature": 0.5, "top_k": 0, "top_p": 0.8, "cfg_scale": 2.0}
+    assert model.in_effect(SamplingConfig(temperature=0.5)) == tokens
+    assert model.in_effect(SamplingConfig(temperature=0.5, face_model="diffusion")) == {
+        **tokens, "face_sampler": "ddpm", "face_denoising_steps": 50,
+    }  # fmt: skip
+
+
+LAYOUT = MotionLayout.named("wholebody363", fps=20.0)
+WIDTH = len(LAYOUT.part("bodyhand"))
+
+
+class FirstColumns:
+    """Embeds a motion as the mean of its first two columns."""
+
+    layout, part, max_frames = LAYOUT, "bodyhand", 100
+    stats = FeatureStats(np.zeros(363, np.float32), np.ones(363, np.float32), LAYOUT)
+
+    def embed_motion(self, motion: Tensor, length: Tensor, present: Tensor | None = None) -> Tensor:
+        return torch.stack([row[:n, :2].mean(0) for row, n in zip(motion, length.tolist(), strict=True)])
+
+
+def still(a: float, b: float, frames: int = 4) -> np.ndarray:
+    motion = np.zeros((frames, WIDTH), np.float32)
+    motion[:, :2] = a, b
+    return motion
+
+
+def test_a_single_draw_is_the_first_of_several() -> None:
+    assert candidate_seeds([5, 9], 1) == [5, 9]
+    few, more = candidate_seeds([5], 2), candidate_seeds([5, 9], 4)
+    assert more[0] == 5 and more[4] == 9 and more[:2] == few
+    assert len(set(more)) == 8, "no draw is that of another text or of another place"
+    assert repeated("ab", 2) == ["a", "a", "b", "b"]
+
+
+def test_the_draw_of_the_greatest_cosine_is_kept() -> None:
+    """Not the one of the greatest product; draws of one text differ in length."""
+    texts = torch.tensor([[0.0, 2.0], [1.0, 1.0]])
+    drawn = [still(9, 9), still(0, 0.1, frames=8), still(1, 0), still(9, 0), still(0.2, 0.2), still(0, 9)]
+    first, second = nearest_candidates(FirstColumns(), texts, drawn)
+    assert first is drawn[1] and second is drawn[4]
+
+
+@pytest.fixture(scope="module")
+def model() -> MotionModel:
+    """The model of the package, whose GPT's prior is TMA's."""
+    if "synthetic" not in shipped_models():
+        pytest.skip("this tree has no weights in models/pretrained/synthetic")
+    return MotionModel.from_pretrained("synthetic", device="cpu")
+
+
+def test_kept_is_one_of_the_single_draws(model: MotionModel) -> None:
+    """Whatever the batch is, and at asked lengths too."""
+    bundle, count = model.bundle, 3
+    prompts = [Prompt(f"a person {does}") for does in ("kicks with the left leg", "claps twice", "squats")]
+    texts = [prompt.text for prompt in prompts]
+
+    def made(rows: list[int], frames: int | None, seeds: list[int], candidates: int) -> list[Any]:
+        conditions = bundle.encoder(bundle.main).encode(
+            [prompts[row] for row in rows], [texts[row] for row in rows], frozenset({"text"}), model.fps
+        )
+        lengths = None if frames is None else [frames] * len(rows)
+        sampling = SamplingConfig(top_p=0.8, candidates=candidates)
+        return bundle.generator.generate(GenerationRequest(conditions, lengths, seeds, sampling))
+
+    for frames in (None, 38):
+        chosen = made([0, 1, 2], frames, [5, 6, 7], count)
+        drawn = made(repeated([0, 1, 2], count), frames, candidate_seeds([5, 6, 7], count), 1)
+        for row, motion in enumerate(chosen):
+            draws = drawn[count * row : count * (row + 1)]
+            assert any(same(motion, draw) for draw in draws)
+            (alone,) = made([row], frames, [5 + row], count)
+            assert same(motion, alone)
+
+
+def same(one: np.ndarray, other: np.ndarray) -> bool:
+    """Batched products round in their own way."""
+    return one.shape == other.shape and np.allclose(one, other, atol=1e-4)
+
+
+def test_a_model_without_such_a_tma_refuses(model: MotionModel, tmp_path: Path) -> None:
+    sampling = SamplingConfig(candidates=2)
+    require_used(model.bundle, None, sampling)
+    faces = next(iter(model.bundle.faces.values()))
+    assert "candidates" not in model.bundle.of(faces).settings, "TMA reads no faces"
+    sentence = replace(model.bundle.generator, gpt=replace(model.bundle.generator.gpt, prior="sentence"))  # type: ignore[type-var,attr-defined]
+    assert "candidates" not in sentence.settings
+    with pytest.raises(UserError, match=r"a stream shows its motion as it is drawn"):
+        model.stream("a person walks", seconds=1.0, sampling={"candidates": 2})
+    next(model.stream("a person walks", seconds=1.0))  # what the model recommends holds where it can
+
+
+def test_an_evaluation_does_not_let_its_judge_choose() -> None:
+    with pytest.raises(UserError, match="TMA would choose the motions that it then judges"):
+        EvaluateConfig.parse({"sampling": {"candidates": 4}}, "evaluate")
+
+
+def test_an_export_recommends_it(call: Any, tmp_path: Path, model: MotionModel) -> None:
+    said = json.loads((shipped_models()["synthetic"].folder / "bundle.json").read_text())["sampling"]
+    assert said["candidates"] == model.bundle.drawing().candidates == 4
+    assert model.bundle.drawing(SamplingConfig(candidates=1)).candidates == 1
+    made = call("generate", "synthetic", "a person walks", "--sampling", "candidates=0")
+    assert made.code != 0 and "candidates" in made.err

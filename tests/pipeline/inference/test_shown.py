@@ -15,16 +15,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from motionloom.datasets.motion.bvh import read_bvh
-from motionloom.datasets.motion.features import encode
-from motionloom.datasets.motion.feet import FeetOptions
-from motionloom.datasets.motion.joints import joints_of, rotations_of
+from motionloom.datasets.motion.body.feet import FeetOptions
+from motionloom.datasets.motion.bvh.motion import read_bvh
+from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.features.joints import joints_of, rotations_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.face import APEX, BASIS
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import ALL_GLB, write_glb_of, write_motions
+from motionloom.pipeline.inference.outputs import write_motions
 from motionloom.pipeline.inference.shown import FigureOptions, shown
 
 LAYOUT = MotionLayout.named("wholebody363")
@@ -52,9 +52,7 @@ def write(folder: Path, motions: list[GeneratedMotion], **options: Any) -> tuple
     said: list[str] = []
     figure = FigureOptions.parse(options, "figure")
     formats = ["npz", "bvh", "html", "glb", "smplx"]
-    paths = write_motions(
-        folder, motions, formats, title="t", seed=0, figure=figure, say=said.append  # type: ignore[arg-type]
-    )  # fmt: skip
+    paths = write_motions(folder, motions, formats, title="t", seed=0, figure=figure, say=said.append)
     return paths, said
 
 
@@ -74,7 +72,7 @@ def test_all_files_show_one_figure_of_constant_bones(motions: list[GeneratedMoti
     assert names == [
         "00-a-person-walks.npz", "00-a-person-walks.bvh", "00-a-person-walks.glb",
         "00-a-person-walks_smplx.npz", "01-a-person-waves.npz", "01-a-person-waves.bvh",
-        "01-a-person-waves.glb", "01-a-person-waves_smplx.npz", ALL_GLB, "index.html",
+        "01-a-person-waves.glb", "01-a-person-waves_smplx.npz", "motions.glb", "index.html",
     ]  # fmt: skip
     assert all(path.is_file() for path in paths)
     assert [line.split(":")[0] for line in said] == ["00-a-person-walks", "01-a-person-waves"]
@@ -94,10 +92,10 @@ def test_all_files_show_one_figure_of_constant_bones(motions: list[GeneratedMoti
         order = [bvh.joints.index(name) for name in LAYOUT.skeleton.joints]
         np.testing.assert_allclose(bvh.positions()[:, order] / 100, joints, atol=2e-5)
         np.testing.assert_allclose(page_joints(paths[-1], number), joints, atol=1e-4)
-    alone = write_glb_of(tmp_path / "alone.glb", motions[0])
+    alone = motions[0].save(tmp_path / "alone.glb")
     a, b = (pygltflib.GLTF2().load(path) for path in (alone, paths[2]))
     assert a.binary_blob() == b.binary_blob()
-    together = pygltflib.GLTF2().load(tmp_path / "out" / ALL_GLB)
+    together = pygltflib.GLTF2().load(tmp_path / "out" / "motions.glb")
     assert [animation.name for animation in together.animations] == ["a person walks", "a person waves"]
     paths_of = [[c.target.path for c in animation.channels] for animation in together.animations]
     assert ["weights" in found for found in paths_of] == [True, False]
@@ -107,7 +105,7 @@ def test_without_rigid_page_and_npz_show_the_generated_joints(
     motions: list[GeneratedMotion], tmp_path: Path
 ) -> None:
     paths, _ = write(tmp_path / "out", motions[:1], rigid=False)
-    assert ALL_GLB not in [path.name for path in paths]  # one motion has its own file alone
+    assert "motions.glb" not in [path.name for path in paths]  # one motion has its own file alone
     with np.load(paths[0], allow_pickle=False) as file:
         np.testing.assert_allclose(file["joints"], motions[0].joints, atol=1e-6)
         assert json.loads(str(file["metadata"]))["figure"]["rigid"] is False

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from motionloom.datasets.conditions import Condition, Conditions
-from motionloom.datasets.loading.audio_statistics import AudioStats
+from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import Stream
-from motionloom.models.utt.conditioned import ConditionedUtt
-from motionloom.models.utt.network import UttConfig
+from motionloom.models.utt.network import ConditionedUtt, UttConfig
 from motionloom.models.utt.sampling import draw_z, generate
 from motionloom.pipeline.contract.generation import Stretch
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.timeline import TokenTimeline
-from motionloom.pipeline.inference.timeline_flow import TimelineFlow
+from motionloom.pipeline.inference.generators.timeline import TimelineFlow, TokenTimeline
 
 PATTERN = ("body", "body", "hand")
 STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
@@ -30,10 +26,6 @@ WINDOW, CONTEXT = 6, 2
 SEEDS = [11, 2**63 + 5, 13, 14]
 MEAN, STD = 3.0, 2.0
 GREEDY = SamplingConfig(temperature=0.0)
-
-
-def audio_stats() -> AudioStats:
-    return AudioStats(np.full(2, MEAN, np.float32), np.full(2, STD, np.float32), 100)
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +37,7 @@ def net() -> ConditionedUtt:
         {"text": 4, "audio": 2},
         STREAMS,
         PATTERN,
+        timed=["audio"],
     )
     for head in made.utt.heads:
         torch.nn.init.normal_(head.weight, std=0.7)  # peaked, so that a mix-up would show
@@ -58,8 +51,9 @@ def timeline(net: ConditionedUtt) -> TokenTimeline:
 
 
 def line_of(net: ConditionedUtt, **settings: Any) -> TokenTimeline:
-    given = {"window": WINDOW, "context": CONTEXT, "audio": audio_stats(), "inject_z": True, **settings}
-    return TokenTimeline(net, **given)
+    stats = FrameStats(np.full(2, MEAN, np.float32), np.full(2, STD, np.float32), 100)
+    given = {"window": WINDOW, "context": CONTEXT, "prepared": {"audio": stats}, "inject_z": True}
+    return TokenTimeline(net, **{**given, **settings})
 
 
 def text(rows: int, seed: int = 0, words: int = 3) -> Conditions:
@@ -88,48 +82,6 @@ def codes_of(codes: Codes, row: int) -> dict[str, list[int]]:
     return {s.name: codes.codes[s.name][row, : count * s.per_group].tolist() for s in STREAMS}
 
 
-class Spy(TokenTimeline):
-    """Notes what each window is made from."""
-
-    def __init__(self, *args: Any, **settings: Any) -> None:
-        super().__init__(*args, **settings)
-        self.windows: list[tuple[Any, ...]] = []
-
-    def window(self, *args: Any) -> Codes:
-        self.windows.append(args)
-        return super().window(*args)
-
-
-def spy_on(net: ConditionedUtt) -> Spy:
-    return Spy(net, window=WINDOW, context=CONTEXT, audio=audio_stats(), inject_z=True)
-
-
-# ---- one window
-
-
-@pytest.mark.parametrize(
-    "sampling", [GREEDY, SamplingConfig(top_k=3, top_p=0.9), SamplingConfig(cfg_scale=2.0)]
-)
-def test_one_short_stretch_is_a_plain_generate(
-    timeline: TokenTimeline, net: ConditionedUtt, sampling: SamplingConfig
-) -> None:
-    given = text(4)
-    made = timeline.tokens([Stretch(given, [24, 9, 4, 16])], SEEDS, sampling)
-    plain = generate(
-        net.utt,
-        net.mate(given),
-        null=net.mate.unconditional(4),
-        groups=torch.tensor([6, 3, 1, 4]),
-        temperature=sampling.temperature,
-        top_k=sampling.top_k or None,
-        top_p=sampling.top_p,
-        cfg_scale=sampling.cfg_scale,
-        seed=SEEDS,
-    )
-    assert made.groups.tolist() == [6, 3, 1, 4]
-    assert all(codes_of(made, row) == codes_of(plain, row) for row in range(4))
-
-
 def test_free_length_is_a_plain_generate_and_stands_alone(
     timeline: TokenTimeline, net: ConditionedUtt
 ) -> None:
@@ -145,11 +97,8 @@ def test_free_length_is_a_plain_generate_and_stands_alone(
 
 
 def test_music_for_a_model_without_is_refused(net: ConditionedUtt) -> None:
-    with pytest.raises(UserError, match="trained without music; drive it by text"):
-        line_of(net, audio=None).tokens([Stretch(music(1, [8]), [8])], SEEDS[:1], GREEDY)
-
-
-# ---- many windows
+    with pytest.raises(UserError, match="trained without audio"):
+        line_of(net, prepared={}).tokens([Stretch(music(1, [8]), [8])], SEEDS[:1], GREEDY)
 
 
 def windows_by_hand(before: int, wanted: int) -> list[tuple[int, int, int]]:
@@ -163,34 +112,11 @@ def windows_by_hand(before: int, wanted: int) -> list[tuple[int, int, int]]:
     return out
 
 
-def test_each_window_sees_its_frames_of_the_music(net: ConditionedUtt) -> None:
-    """A text, then two songs of other lengths: which frames are read, normalised, and which are masked."""
-    spy = spy_on(net)
-    firsts, seconds, lengths = [8, 20, 4], [64, 24, 41], [70, 24, 30]
-    stretches = [Stretch(text(3), firsts), Stretch(music(3, lengths), seconds)]
-    spy.tokens(stretches, SEEDS[:3], GREEDY)
-    made = [args for args in spy.windows if "audio" in args[0]]
-    plans = [windows_by_hand(-(-a // 4), -(-b // 4)) for a, b in zip(firsts, seconds, strict=True)]
-    assert len(made) == max(map(len, plans))
-    for turn, (conditions, before, _, new, *_) in enumerate(made):
-        rows = [row for row in range(3) if turn < len(plans[row])]
-        features, mask, _ = conditions["audio"]
-        assert len(features) == len(rows)
-        for at, row in enumerate(rows):
-            seen, first, count = plans[row][turn]
-            assert int(new[at]) == count and min(CONTEXT, int(before.groups[at])) == seen
-            frames = list(range(first, first + 4 * (seen + count)))
-            there = [0 <= t < lengths[row] for t in frames]
-            assert mask[at].tolist() == there + [False] * (mask.shape[1] - len(frames))
-            read = features[at][mask[at]] * STD + MEAN
-            assert read[:, 0].tolist() == [t for t, ok in zip(frames, there, strict=True) if ok]
-            assert (read[:, 1] == row).all()
-            assert (features[at][~mask[at]] == 0).all()
-
-
-def slow(net: ConditionedUtt, stretches: list[Stretch], row: int, seed: int) -> list[list[int]]:
+def slow(
+    net: ConditionedUtt, stretches: list[Stretch], row: int, seed: int, inject_z: bool
+) -> list[list[int]]:
     """One row, greedy, window by window with lists; the slots of each group are a list."""
-    z = draw_z([seed], 3)
+    z = draw_z([seed], 3) if inject_z else None
     groups: list[list[int]] = []
     for stretch in stretches:
         own, wanted = row_of(stretch.conditions, row), -(-list(stretch.frames or [])[row] // 4)
@@ -213,14 +139,9 @@ def slow(net: ConditionedUtt, stretches: list[Stretch], row: int, seed: int) -> 
                 torch.tensor([seen]),
             )
             made = generate(
-                net.utt,
-                net.mate(here),
-                z=z,
-                start=start,
-                groups=torch.tensor([new]),
-                temperature=0,
-                seed=[seed],
-            )
+                net.utt, net.mate(here), inject_z=inject_z, z=z, start=start, groups=torch.tensor([new]),
+                temperature=0, seed=[seed],
+            )  # fmt: skip
             body, hand = made.codes["body"][0].tolist(), made.codes["hand"][0].tolist()
             groups += [[body[2 * k], body[2 * k + 1], hand[k]] for k in range(new)]
     return groups
@@ -229,7 +150,7 @@ def slow(net: ConditionedUtt, stretches: list[Stretch], row: int, seed: int) -> 
 def test_music_has_its_own_guidance(timeline: TokenTimeline, net: ConditionedUtt) -> None:
     """Rows with music take it, rows of words alone do not."""
     given = {**text(4), **music(4, [24, 0, 24, 0])}
-    frames, mean = [24] * 4, SamplingConfig(cfg_scale=3.0, music_cfg_scale=1.0)
+    frames, mean = [24] * 4, SamplingConfig(cfg_scale=3.0, guidance={"audio": 1.0})
     made = timeline.tokens([Stretch(given, frames)], SEEDS, mean)
     for sampling, rows in ((SamplingConfig(), (0, 2)), (SamplingConfig(cfg_scale=3.0), (1, 3))):
         plain = timeline.tokens([Stretch(given, frames)], SEEDS, sampling)
@@ -249,12 +170,12 @@ def show() -> list[Stretch]:
     ]
 
 
-def test_a_show_equals_the_slow_version(
-    timeline: TokenTimeline, net: ConditionedUtt, show: list[Stretch]
-) -> None:
-    made = timeline.tokens(show, SEEDS, GREEDY)
+@pytest.mark.parametrize("inject_z", [True, False])
+def test_a_show_equals_the_slow_version(net: ConditionedUtt, show: list[Stretch], inject_z: bool) -> None:
+    """Windows see their frames of the music and the last groups before them; z is one over the motion."""
+    made = line_of(net, inject_z=inject_z).tokens(show, SEEDS, GREEDY)
     for row, seed in enumerate(SEEDS):
-        expected = slow(net, show, row, seed)
+        expected = slow(net, show, row, seed, inject_z)
         assert int(made.groups[row]) == len(expected)
         found = codes_of(made, row)
         assert found["body"] == [code for group in expected for code in group[:2]]
@@ -266,7 +187,7 @@ def test_a_show_equals_the_slow_version(
     [
         SamplingConfig(),
         SamplingConfig(cfg_scale=1.7, top_k=4),
-        SamplingConfig(cfg_scale=1.7, music_cfg_scale=1.0),
+        SamplingConfig(cfg_scale=1.7, guidance={"audio": 1.0}),
     ],
 )
 def test_batches_play_no_part(timeline: TokenTimeline, show: list[Stretch], sampling: SamplingConfig) -> None:
@@ -277,65 +198,6 @@ def test_batches_play_no_part(timeline: TokenTimeline, show: list[Stretch], samp
         alone = [Stretch(row_of(s.conditions, row), [list(s.frames or [])[row]]) for s in show]
         mine = codes_of(timeline.tokens(alone, [seed], sampling), 0)
         assert mine == codes_of(together, row) == codes_of(again, row) != codes_of(other, row)
-
-
-def test_what_comes_later_changes_nothing(timeline: TokenTimeline, show: list[Stretch]) -> None:
-    whole = timeline.tokens(show, SEEDS, SamplingConfig())
-    for count in (1, 2, 3):
-        short = timeline.tokens(show[:count], SEEDS, SamplingConfig())
-        for row in range(4):
-            mine, all_of_it = codes_of(short, row), codes_of(whole, row)
-            assert all(all_of_it[name][: len(values)] == values for name, values in mine.items())
-
-
-def test_a_stretch_goes_on_from_the_one_before(net: ConditionedUtt) -> None:
-    """Its first window stands behind the last groups of the stretch before; without context it does not."""
-    spy = spy_on(net)
-    stretches = [Stretch(text(2, seed=1), [20, 8]), Stretch(text(2, seed=2), [16, 16])]
-    made = spy.tokens(stretches, SEEDS[:2], GREEDY)
-    conditions, before, *_ = next(args for args in spy.windows if args[3].tolist() == [4, 4])
-    assert torch.equal(conditions["text"].features, text(2, seed=2)["text"].features)
-    assert before.groups.tolist() == [5, 2]
-    for row, count in enumerate((5, 2)):
-        assert codes_of(before, row)["hand"] == codes_of(made, row)["hand"][:count]
-    apart = line_of(net, context=0).tokens(stretches, SEEDS[:2], GREEDY)
-    second = line_of(net).tokens(stretches[1:], SEEDS[:2], GREEDY)
-    for row, count in enumerate((5, 2)):
-        assert codes_of(apart, row)["hand"][count:] == codes_of(second, row)["hand"]
-    assert any(codes_of(apart, row) != codes_of(made, row) for row in range(2))
-
-
-def test_no_two_windows_draw_by_one_seed(net: ConditionedUtt, show: list[Stretch]) -> None:
-    spy = spy_on(net)
-    spy.tokens(show, SEEDS, SamplingConfig())
-    drawn = [seed for args in spy.windows for seed in args[4]]
-    assert len(set(drawn)) == len(drawn) > 20
-    assert spy.windows[0][4] == SEEDS
-
-
-def test_z_is_one_and_the_same_over_a_motion(net: ConditionedUtt, show: list[Stretch]) -> None:
-    spy = spy_on(net)
-    spy.tokens(show, SEEDS, GREEDY)
-    drawn: dict[tuple[float, ...], int] = {}
-    for _, _, z, *_ in spy.windows:
-        for row in z.tolist():
-            drawn[tuple(row)] = drawn.get(tuple(row), 0) + 1
-    expected: list[Tensor] = list(draw_z(SEEDS, 3))
-    assert set(drawn) == {tuple(row.tolist()) for row in expected}
-    still = Spy(net, window=WINDOW, context=CONTEXT, audio=audio_stats(), inject_z=False)
-    still.tokens(show, SEEDS, GREEDY)
-    assert all(args[2] is None for args in still.windows)
-
-
-def test_networks_are_left_as_they_were(net: ConditionedUtt) -> None:
-    made: Callable[[], Codes] = lambda: line_of(net).tokens([Stretch(text(1), [40])], [1], GREEDY)  # noqa: E731
-    before = codes_of(made(), 0)
-    net.utt.train()
-    assert codes_of(made(), 0) == before and net.utt.training
-    net.eval()
-
-
-# ---- the same as it comes
 
 
 @pytest.mark.parametrize("hop", [1, 4, 99])

@@ -17,8 +17,7 @@ import pytest
 import soundfile
 
 from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.schema import UserError
-from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import Script, ScriptSegment
 from motionloom.pipeline.inference.shown import shown
 
@@ -93,7 +92,8 @@ def test_a_script_becomes_films_files_and_a_page(
     ude_run: Any, folder: Path, tmp_path: Path, call: Call
 ) -> None:
     out = tmp_path / "out"
-    done = call("generate", ude_run.folder, "--script", folder / "show.yaml", "--samples", 2, "-o", out)
+    words = ("--script", folder / "show.yaml", "--samples", 2, "-f", "npz,bvh,mp4,html")
+    done = call("generate", ude_run.folder, *words, "-o", out)
     assert done.code == 0, done.err
     stem = "a-person-walks-forward-slow-a-person-waves-fast"
     names = {f"0{k}-{stem}" for k in range(2)}
@@ -121,20 +121,16 @@ def test_songs_become_dances_as_long_as_they_are(
 ) -> None:
     out = tmp_path / "out"
     words = ("--audio", folder / "slow.wav", "--audio", folder / "fast.mp3", "--samples", 2, "--seed", 5)
-    done = call("generate", ude_run.folder, *words, "-o", out, "-f", "npz,html,mp4")
+    done = call("generate", ude_run.folder, *words, "-o", out, "-f", "npz,html")
     assert done.code == 0, done.err
     made = [joints_of(path) for path in sorted(out.glob("*.npz"))]
     assert [len(joints) for joints in made] == [100, 100, 80, 80]
     assert np.abs(made[0] - made[1]).max() > 1e-3
     assert [m["sound"] for m in page_of(out)["motions"]] == [0, 0, 1, 1]
-    for film in out.glob("*.mp4"):
-        assert loud(heard_in(film), 0.2, 3.8) > 0.1
     sounds = [Sound.read(folder / name) for name in ("slow.wav", "slow.wav", "fast.mp3", "fast.mp3")]
     again = model.generate(sounds=sounds, seed=5)
     for ours, theirs in zip(made, again, strict=True):
         np.testing.assert_allclose(ours, shown(theirs).joints, atol=1e-6)
-    other = model.generate(sounds=sounds[:1], seed=6)
-    assert np.abs(other[0].joints - made[0]).max() > 1e-3
 
 
 def test_words_beside_a_song_and_words_alone(model: MotionModel, folder: Path) -> None:
@@ -148,8 +144,6 @@ def test_words_beside_a_song_and_words_alone(model: MotionModel, folder: Path) -
     free = model.generate(["a person walks"], seed=1)[0]
     assert 4 <= len(free.joints) <= 64 and free.prompt.sound is None
     some = model.generate(["a person walks", ""], sounds=[None, sound], seconds=2.0, seed=2)
-    cut = model.generate(sounds=[sound.slice(0.0, 2.0)], seconds=2.4, seed=2)  # a little silence is fine
-    assert len(cut[0].joints) == 48
     assert [len(motion.joints) for motion in some] == [40, 40]
 
 
@@ -171,14 +165,6 @@ def test_performances_from_python(model: MotionModel, folder: Path, monkeypatch:
     assert len(made.joints) == 120
 
 
-def test_too_short_a_segment_is_named(model: MotionModel, folder: Path) -> None:
-    script = Script(segments=[ScriptSegment(text="a", seconds=3), ScriptSegment(text="b", seconds=0.09)])
-    with pytest.raises(
-        UserError, match=r"segments\.1 \('b'\) lasts 0\.09 s; the shortest .* makes is 0\.2 s"
-    ):
-        model.perform(script)
-
-
 def test_an_export_gives_the_same_motions(
     ude_run: Any, folder: Path, tmp_path: Path, call: Call, model: MotionModel
 ) -> None:
@@ -196,25 +182,18 @@ def test_an_export_gives_the_same_motions(
         assert np.array_equal(ours.features, theirs.features)
 
 
-# ---- what a model cannot be driven by
-
-
 def refused(done: Any) -> str:
     """The one sentence on standard error."""
     assert done.code == 2 and done.err.count("\n") == 1, done.err
     return str(done.err)
 
 
-def test_a_model_of_words_refuses_music_and_scripts(
-    small_run: Any, folder: Path, tmp_path: Path, call: Call
+def test_models_of_one_modality_refuse_the_other(
+    small_run: Any, ude_run: Any, folder: Path, tmp_path: Path, call: Call
 ) -> None:
-    words = ("generate", small_run.folder, "-o", tmp_path / "no")
+    words = ("generate", small_run.folder, "-o", tmp_path / "out")
     assert "conditioned on text only" in refused(call(*words, "--audio", folder / "slow.wav"))
     assert "scripts need a UDE model" in refused(call(*words, "--script", folder / "show.yaml"))
-    assert not (tmp_path / "no").exists()
-
-
-def test_a_model_of_music_refuses_words(ude_run: Any, folder: Path, tmp_path: Path, call: Call) -> None:
     run = tmp_path / "run"
     shutil.copytree(ude_run.folder, run)
     shutil.rmtree(run / "stages/utt")
@@ -223,8 +202,6 @@ def test_a_model_of_music_refuses_words(ude_run: Any, folder: Path, tmp_path: Pa
     assert done.code == 0, done.err
     words = ("generate", run, "-o", tmp_path / "out", "-f", "npz")
     assert "conditioned on audio only" in refused(call(*words, "a person walks"))
-    both = call(*words, "a person walks", "--audio", folder / "slow.wav")
-    assert "conditioned on audio only" in refused(both)
     assert "conditioned on audio only" in refused(call(*words, "--script", folder / "show.yaml"))
     assert not (tmp_path / "out").exists()
     assert call(*words, "--audio", folder / "slow.wav").code == 0
@@ -234,28 +211,17 @@ def test_a_model_of_music_refuses_words(ude_run: Any, folder: Path, tmp_path: Pa
     ("words", "said"),
     [
         (("--audio", "nothing.wav"), "nothing.wav: no such sound file"),
-        (("--audio", "slow.wav", "--samples", "0"), "--samples 0"),
         (("--audio", "slow.wav", "--seconds", "9"), "9 s were asked for and the music lasts 5.0 s"),
         (("a", "b", "--audio", "slow.wav"), "2 captions but 1 sounds"),
         (("a", "--script", "show.yaml"), "--script says everything"),
-        ((), "at least one caption"),
         (("--script", "nothing.yaml"), "nothing.yaml"),
     ],
 )
 def test_mistakes_of_the_call(
-    words: tuple[str, ...],
-    said: str,
-    ude_run: Any,
-    folder: Path,
-    tmp_path: Path,
-    call: Call,
-    monkeypatch: Any,
+    words: tuple[str, ...], said: str, ude_run: Any, folder: Path, call: Call, monkeypatch: Any
 ) -> None:
     monkeypatch.chdir(folder)
-    assert said in refused(call("generate", ude_run.folder, *words, "-o", tmp_path / "no"))
-
-
-# ---- length
+    assert said in refused(call("generate", ude_run.folder, *words, "-o", "no"))
 
 
 LONG = """
@@ -263,7 +229,7 @@ import resource, sys
 from pathlib import Path
 from motionloom.datasets.audio.sound import Sound
 from motionloom.pipeline.inference.outputs import write_motions
-from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.model import MotionModel
 
 model, folder = MotionModel.from_pretrained(sys.argv[1], device="cpu"), Path(sys.argv[2])
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from typing import Any
+
 import pytest
 import torch
 
@@ -41,3 +44,24 @@ def test_gpus_do_not_heed_it(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_none_is_refused() -> None:
     with pytest.raises(UserError, match="cpu_devices"):
         Hardware.parse({"cpu_devices": 0}, "hardware")
+
+
+@pytest.mark.parametrize(
+    ("gpus", "asked", "refused"),
+    [
+        (0, {"devices": 8}, True),
+        (0, {"devices": 8, "accelerator": "gpu"}, True),
+        (2, {"devices": 3}, True),
+        (2, {"devices": 2}, False),
+        (2, {}, False),
+        (0, {"devices": 8, "accelerator": "cpu"}, False),
+        (0, {"devices": 1}, False),
+    ],
+)
+def test_devices_that_are_not_here_are_refused(
+    gpus: int, asked: dict[str, Any], refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    with pytest.raises(UserError, match=r"hardware\.devices") if refused else nullcontext():
+        Hardware.parse(asked, "hardware").require_devices()

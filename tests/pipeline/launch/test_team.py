@@ -156,19 +156,6 @@ def test_the_environment_is_slurms_only_under_srun(srun: Srun, monkeypatch: pyte
 
 
 @pytest.mark.slow
-def test_a_script_inside_a_job_starts_its_own_processes(
-    srun: Srun, monkeypatch: pytest.MonkeyPatch, start: Callable[..., Any], tmp_path: Path
-) -> None:
-    srun(2)
-    monkeypatch.delenv("SLURM_STEP_NUM_TASKS")
-    (tmp_path / "x.yaml").write_text(RECIPE)
-    process = start("run", tmp_path / "x.yaml", "-o", tmp_path / "run", "--set", "hardware.devices=2")
-    output = process.communicate(timeout=120)[0]
-    assert process.returncode == 0, output
-    assert output.count("[3/3] tokenizer") == 1
-
-
-@pytest.mark.slow
 def test_two_tasks_of_srun_train_together(
     srun: Srun, monkeypatch: pytest.MonkeyPatch, start: Callable[..., Any], tmp_path: Path
 ) -> None:

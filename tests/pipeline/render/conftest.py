@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import json
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 
 @dataclass(frozen=True)
@@ -57,3 +62,40 @@ def visit(browser: Any, until: Callable[..., None]) -> Iterator[Callable[..., An
     for page in pages:
         page.close()
     assert not trouble
+
+
+@pytest.fixture(scope="session")
+def data_of() -> Callable[[Path], dict[str, Any]]:
+    """`data_of(page)`: what a viewer's page carries."""
+
+    def read(page: Path) -> dict[str, Any]:
+        found = re.search(r'id="viewer-data">(.*?)</script>', page.read_text("utf-8"), re.S)
+        assert found is not None
+        data: dict[str, Any] = json.loads(found[1])
+        return data
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def pixels() -> Callable[..., NDArray[np.int64]]:
+    """`pixels(page)`: RGBA [H, W, 4] of a page's first canvas, drawn to date unless `paint` is false."""
+
+    def read(page: Any, paint: bool = True) -> NDArray[np.int64]:
+        address = page.evaluate(
+            """(paint) => {
+                if (paint && window.__viewer) __viewer.paint();
+                return document.querySelector("canvas").toDataURL("image/png");
+            }""",
+            paint,
+        )
+        image = Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGBA")
+        return np.asarray(image).astype(int)
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def webgl_arguments() -> list[str]:
+    """How Chromium is started to have WebGL2 without a GPU."""
+    return ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

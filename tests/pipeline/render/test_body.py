@@ -1,188 +1,257 @@
-"""The skinned body: a closed surface, sound weights, scaled to any bones, expressions that show."""
+"""The body: a closed surface, sound weights, scaled to any bones, with shapes that show."""
 
 from __future__ import annotations
 
+import base64
+import json
+import subprocess
+import sys
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.motion.body.arkit import ARKIT
+from motionloom.datasets.motion.body.rigid import fit_rigid, with_offsets
 from motionloom.datasets.motion.kinematics import forward_kinematics
-from motionloom.datasets.motion.rigid import with_offsets
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.face import APEX, BASIS
-from motionloom.pipeline.render.body.face import EXPRESSIONS, expression_weights
-from motionloom.pipeline.render.body.field import Capsule, Field
-from motionloom.pipeline.render.body.mesh import _whole_body, body_for, colour_strip, neutral_body
-from motionloom.pipeline.render.body.palette import PALETTE
-from motionloom.pipeline.render.body.surface import mesh_of, surface_nets
-from motionloom.pipeline.render.face import synthetic_face_controls
+from motionloom.pipeline.render.body.embed import mesh_data, pack_turns, pose_data
+from motionloom.pipeline.render.body.face import (
+    CONTROLS,
+    EXPRESSIONS,
+    control_weights,
+    expression_weights,
+    own_bases,
+    synthetic_arkit,
+    synthetic_face_controls,
+)
+from motionloom.pipeline.render.body.mesh import Body, asset, body_for, colours, neutral_body
+from motionloom.pipeline.render.body.posing import human_skeleton, posing_of, single_bones
+from motionloom.pipeline.render.scene import Actor
+from motionloom.pipeline.render.viewer import ViewerMotion, has_bodies, viewer_data, viewer_script
 
-SKELETON = Skeleton.named("smplx52")
-
-
-def edges_of(triangles: np.ndarray) -> Counter[tuple[int, int]]:
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    return Counter(map(tuple, sides.tolist()))
-
-
-def test_surface_nets_close_around_a_ball_and_face_outward() -> None:
-    grid = np.stack(np.meshgrid(*[np.arange(14.0)] * 3, indexing="ij"), -1)
-    values = np.linalg.norm(grid - 6.3, axis=-1) - 4.0
-    points, triangles = surface_nets(values)
-    assert np.abs(np.linalg.norm(points - 6.3, axis=-1) - 4.0).max() < 0.35
-    count = edges_of(triangles)
-    assert all(count[b, a] == 1 == n for (a, b), n in count.items())
-    assert len(points) - len(count) // 2 + len(triangles) == 2  # Euler: a sphere
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    volume = np.einsum("ij,ij->i", np.cross(a, b), c).sum() / 6
-    assert volume == pytest.approx(4 / 3 * np.pi * 4.0**3, rel=0.1)  # chords of a coarse grid
+SMPLX = Skeleton.named("smplx52")
+Walk = Callable[..., NDArray[np.float64]]
 
 
-def test_a_fields_gradient_is_its_difference_quotient_and_vertices_lie_on_it() -> None:
-    thin = Capsule(1, (0.3, 0.1, 0), (0.4, 0.3, 0.1), 0.04, 0.02, 0.8)
-    field = Field([Capsule(0, (0, 0, 0), (0.3, 0.1, 0), 0.05, 0.03), thin], 0.01)
-    points = np.random.default_rng(0).uniform(-0.1, 0.45, size=(200, 3))
-    slope = np.stack(
-        [(field.value(points + d) - field.value(points - d)) / 2e-6 for d in 1e-6 * np.eye(3)], axis=-1
-    )
-    unit = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
-    np.testing.assert_allclose(field.normals(points), unit, atol=1e-5)
-    vertices, _ = mesh_of(field, 0.01)
-    assert np.abs(field.value(vertices)).max() < 1e-9
+def numbers(text: str, kind: str) -> NDArray[np.generic]:
+    return np.frombuffer(base64.b64decode(text), kind)
 
 
-def test_the_body_is_small_closed_and_the_same_every_time() -> None:
+def dense(body: Body) -> NDArray[np.float64]:
+    """Weights [V, N] in full precision."""
+    out = np.zeros((len(body.vertices), len(body.skeleton)))
+    np.add.at(out, (np.arange(len(out))[:, None], body.joints), body.shares)
+    return out
+
+
+def test_the_body_is_small_closed_and_faces_outward() -> None:
     body = neutral_body()
-    assert len(body.vertices) <= 15_000
-    assert np.isfinite(body.vertices).all()
+    assert len(body.vertices) <= 15_000 and 1.55 < np.ptp(body.vertices[:, 1]) < 1.85
     np.testing.assert_allclose(np.linalg.norm(body.normals, axis=-1), 1, atol=1e-9)
-    height = np.ptp(body.vertices[:, 1])
-    assert 1.55 < height < 1.85
-    # Trunk, hands, head and nose are closed; the flat features on the face have borders.
-    count = edges_of(body.triangles)
-    open_edges = [edge for edge, n in count.items() if count[edge[::-1]] != n]
-    face_first = min(min(edge) for edge in open_edges)
-    assert (body.weights[face_first:, SKELETON.index("head")] == 1).all()
-    again = _whole_body.__wrapped__()
-    np.testing.assert_array_equal(again.vertices, body.vertices)
-    np.testing.assert_array_equal(again.weights, body.weights)
+    # Vertices between two colours are there twice; but for the flat patches on the face it is closed.
+    _, place = np.unique(body.vertices.round(6), axis=0, return_inverse=True)
+    solid = body.triangles[(body.swatch[body.triangles] <= 4).all(axis=1)]
+    sides = np.concatenate([place[solid][:, [k, (k + 1) % 3]] for k in range(3)])
+    count = Counter(map(tuple, sides.tolist()))
+    assert sum(count[(b, a)] != n for (a, b), n in count.items()) < 0.001 * len(count)
+    corners = body.vertices[body.triangles]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(flat, axis=1)
+    some = size > 1e-7  # a shut mouth has no area
+    along = np.einsum("fi,fi->f", flat[some] / size[some, None], body.normals[body.triangles[some, 0]])
+    assert np.median(along) > 0.97 and (along > 0).mean() > 0.98
 
 
 def test_weights_are_shares_of_a_few_joints_of_one_side() -> None:
-    body = neutral_body()
-    np.testing.assert_allclose(body.weights.sum(axis=1), 1, atol=1e-12)
-    assert (body.weights > 0).sum(axis=1).max() <= 4
-    left = [j for j, name in enumerate(SKELETON.joints) if name.startswith("left")]
-    right = [j for j, name in enumerate(SKELETON.joints) if name.startswith("right")]
-    limbs = [
-        j for j in (*left, *right) if "hip" not in SKELETON.joints[j] and "collar" not in SKELETON.joints[j]
-    ]
-    of_left = body.weights[:, [j for j in limbs if j in left]].sum(axis=1)
-    of_right = body.weights[:, [j for j in limbs if j in right]].sum(axis=1)
-    assert not ((of_left > 0) & (of_right > 0)).any()
+    weights = dense(neutral_body())
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
+    limbs = [j for j, name in enumerate(SMPLX.joints) if "hip" not in name and "collar" not in name]
+    left, right = ([j for j in limbs if SMPLX.joints[j].startswith(side)] for side in ("left", "right"))
+    assert not ((weights[:, left].sum(axis=1) > 0) & (weights[:, right].sum(axis=1) > 0)).any()
     # Every joint but the ends that nothing hangs on moves something.
-    assert (body.weights.max(axis=0) > 0.5).sum() >= 50
-
-
-def test_posed_vertices_follow_their_bones() -> None:
-    """Against a slow loop over a few vertices, and rigidly where one joint has all the weight."""
-    body = neutral_body()
-    rng = np.random.default_rng(1)
-    local = Rotation.from_rotvec(0.5 * rng.normal(size=(2 * 52, 3))).as_matrix().reshape(2, 52, 3, 3)
-    root = rng.normal(size=(2, 3))
-    posed = body.posed(local, root)
-    joints, world = forward_kinematics(local, root, SKELETON.offsets, SKELETON.parents)
-    rest = SKELETON.rest_joints
-    for vertex in rng.integers(0, len(body.vertices), 20):
-        expected = np.zeros((2, 3))
-        for joint, weight in enumerate(body.weights[vertex]):
-            if weight:
-                away = body.vertices[vertex] - rest[joint]
-                expected += weight * (joints[:, joint] + world[:, joint] @ away)
-        np.testing.assert_allclose(posed[:, vertex], expected, atol=1e-12)
+    assert (weights.max(axis=0) > 0.5).sum() >= 50
 
 
 def test_left_is_blue_right_is_orange_and_the_trunk_is_neither() -> None:
-    body, strip = neutral_body(), colour_strip()
-    high, wide = strip.shape[:2]
+    body, owner = neutral_body(), dense(neutral_body()).argmax(axis=1)
+    for joint, colour in {
+        "left_knee": (47, 143, 196), "left_index2": (47, 143, 196), "right_elbow": (229, 121, 63),
+        "right_foot": (229, 121, 63), "spine2": (119, 130, 154),
+    }.items():  # fmt: skip
+        mine = owner == SMPLX.index(joint)
+        assert mine.sum() > 20 and (colours()[body.swatch[mine]] == colour).all()
 
-    def colour(points: np.ndarray) -> np.ndarray:
-        return strip[(points[:, 1] * high).astype(int), (points[:, 0] * wide).astype(int)]
 
-    for joint, code in (
-        ("left_knee", 1),
-        ("left_index2", 1),
-        ("right_elbow", 2),
-        ("right_foot", 2),
-        ("spine2", 0),
-    ):
-        mine = body.weights.argmax(axis=1) == SKELETON.index(joint)
-        assert mine.sum() > 20
-        np.testing.assert_array_equal(colour(body.uv[mine]), np.tile(PALETTE[code], (mine.sum(), 1)))
+@pytest.mark.parametrize("name", ["smplx52", "smpl22"])
+def test_skinning_agrees_with_a_slow_loop(walk: Walk, name: str) -> None:
+    skeleton = Skeleton.named(name)
+    figure = fit_rigid(walk(6, wave=True)[:, : len(skeleton)], skeleton)
+    actor = Actor.of(figure.joints, skeleton, figure, np.tile([0.5, 0, 1, 1, 0], (6, 1)))
+    vertices, normals = actor.at(4, "near")
+    body, face = actor.body("near"), control_weights(np.array([[0.5, 0, 1, 1, 0]]))[0]
+    joints, world = forward_kinematics(
+        figure.rotations, figure.root, figure.skeleton.offsets, skeleton.parents
+    )
+    rest, weights = figure.skeleton.rest_joints, dense(body)
+    for vertex in np.random.default_rng(1).integers(0, len(vertices), 40):
+        still = body.vertices[vertex] + sum(
+            share * body.shapes[shape][vertex] for shape, share in zip(CONTROLS, face, strict=True)
+        )
+        place, normal = np.zeros(3), np.zeros(3)
+        for joint, weight in enumerate(weights[vertex]):
+            place += weight * (joints[4, joint] + world[4, joint] @ (still - rest[joint]))
+            normal += weight * world[4, joint] @ body.normals[vertex]
+        np.testing.assert_allclose(vertices[vertex], place, atol=1e-5)
+        np.testing.assert_allclose(normals[vertex], normal, atol=1e-4)
+    # Bare joints of the same motion give the same body: nothing in them is twisted.
+    bare = Actor.of(figure.joints, skeleton, None, np.tile([0.5, 0, 1, 1, 0], (6, 1)))
+    np.testing.assert_allclose(bare.at(4, "near")[0], vertices, atol=5e-3)
+    with pytest.raises(UserError):
+        Actor.of(figure.joints[:3], skeleton, figure)
+
+
+@pytest.mark.parametrize("joints", [52, 22])
+def test_bones_that_change_length_still_end_at_the_joints(walk: Walk, joints: int) -> None:
+    skeleton = SMPLX if joints == 52 else Skeleton.named("smpl22")
+    loose = walk(5)[:, :joints] + np.random.default_rng(0).normal(0, 0.01, (5, joints, 3))
+    posing = posing_of(loose, skeleton)
+    ends, starts = single_bones(skeleton)
+    bones, own = posing.bones(), posing.skeleton
+    for end, start in zip(ends, starts, strict=True):
+        now = np.linalg.norm(loose[:, end] - loose[:, start], axis=-1) / np.linalg.norm(own.offsets[end])
+        reached = loose[:, start] + bones[:, start] @ own.offsets[end]
+        kept = (now > 0.5) & (now < 2)
+        # A wrist's share of the twist turns forearms about themselves: that moves no end.
+        np.testing.assert_allclose(reached[kept], loose[kept, end], atol=1e-9)
+    assert human_skeleton(skeleton.parents) == skeleton and human_skeleton([-1, 0]) is None
 
 
 def test_the_body_takes_other_bones() -> None:
-    rng = np.random.default_rng(2)
-    other = with_offsets(SKELETON, SKELETON.offsets * rng.uniform(0.85, 1.2, size=(52, 1)))
-    body = body_for(other)
-    np.testing.assert_allclose(body_for(SKELETON).vertices, neutral_body().vertices, atol=1e-12)
+    factors = np.random.default_rng(2).uniform(0.85, 1.2, size=(52, 1))
+    other = with_offsets(SMPLX, SMPLX.offsets * factors)
+    body, plain, weights = body_for(other), neutral_body(), dense(neutral_body())
+    np.testing.assert_allclose(body_for(SMPLX).vertices, plain.vertices, atol=1e-12)
     # The shin's middle stays around the middle of the longer shin.
     for joint, child in (("left_knee", "left_ankle"), ("right_elbow", "right_wrist")):
-        j, c = SKELETON.index(joint), SKELETON.index(child)
-        mine = body.weights[:, j] > 0.97
-        bone = other.offsets[c]
-        along = (body.vertices[mine] - other.rest_joints[j]) @ bone / (bone @ bone)
-        assert along.min() > 0 and along.max() < 1.15  # a forearm's round end lies around the wrist
-        assert along.mean() == pytest.approx(
-            ((neutral_body().vertices[mine] - SKELETON.rest_joints[j]) @ SKELETON.offsets[c]
-             / (SKELETON.offsets[c] @ SKELETON.offsets[c])).mean(), abs=0.03
-        )  # fmt: skip
-    doubled = body_for(with_offsets(SKELETON, 2 * SKELETON.offsets))
-    np.testing.assert_allclose(doubled.vertices, 2 * neutral_body().vertices, atol=1e-9)
-    np.testing.assert_allclose(
-        doubled.expressions["happy"], 2 * neutral_body().expressions["happy"], atol=1e-9
-    )
-
-
-def test_a_skeleton_without_fingers_has_stiff_hands_and_a_strange_one_no_body() -> None:
-    small = Skeleton.named("smpl22")
-    body = body_for(small)
-    assert body.weights.shape[1] == 22
-    np.testing.assert_allclose(body.weights.sum(axis=1), 1, atol=1e-12)
-    np.testing.assert_allclose(body.vertices, neutral_body().vertices, atol=1e-9)
+        j, c = SMPLX.index(joint), SMPLX.index(child)
+        mine = weights[:, j] > 0.97
+        along = [
+            (own.vertices[mine] - bones.rest_joints[j]) @ bones.offsets[c] / np.square(bones.offsets[c]).sum()
+            for own, bones in ((body, other), (plain, SMPLX))
+        ]
+        assert along[0].min() > 0 and along[0].max() < 1.15  # a forearm's round end lies around the wrist
+        assert along[0].mean() == pytest.approx(along[1].mean(), abs=0.03)
+    doubled = body_for(with_offsets(SMPLX, 2 * SMPLX.offsets), EXPRESSIONS)
+    np.testing.assert_allclose(doubled.vertices, 2 * plain.vertices, atol=1e-9)
+    np.testing.assert_allclose(doubled.normals, plain.normals, atol=1e-9)
+    np.testing.assert_allclose(doubled.shapes["happy"], 2 * plain.shapes["happy"], atol=1e-9)
+    stiff = body_for(Skeleton.named("smpl22"))
+    np.testing.assert_allclose(dense(stiff).sum(axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(stiff.vertices, plain.vertices, atol=1e-9)
     with pytest.raises(UserError, match="smplx52 and smpl22"):
         body_for(Skeleton("odd", ("a", "b"), (-1, 0), ((0, 0, 0), (0, 1, 0))))
 
 
-def test_each_column_of_the_synthetic_basis_has_its_expression() -> None:
-    names = list(EXPRESSIONS)
-    for k in range(4):
-        weights = expression_weights((APEX * BASIS[:, k])[None])[0]
-        expected = np.zeros(8)
-        expected[k] = 1
-        np.testing.assert_allclose(weights, expected, atol=1e-9)
-        # The look of the morph target is what the drawn face shows.
-        smile, brow, eye, mouth, frown = synthetic_face_controls((APEX * BASIS[:, k])[None])[0]
-        look = EXPRESSIONS[names[k]]
-        assert (look.smile, look.brow, look.eye_open, look.mouth_open, look.frown) == pytest.approx(
-            (smile, brow, eye, mouth, frown)
-        )
+def test_the_synthetic_basis_moves_the_face_as_it_means() -> None:
+    shapes = neutral_body().shapes
+    moves = np.stack([shapes[name] for name in CONTROLS])
+    for k, name in enumerate(EXPRESSIONS[:4]):
+        apex = (APEX * BASIS[:, k])[None]
+        np.testing.assert_allclose(expression_weights(apex)[0], np.eye(8)[k], atol=1e-9)
+        by_controls = np.einsum("e,evc->vc", control_weights(synthetic_face_controls(apex))[0], moves)
+        assert np.linalg.norm(by_controls - shapes[name], axis=1).max() < 2.5e-3, name
+    happy, sad, angry, surprised = (synthetic_face_controls(APEX * BASIS[None, :, k])[0] for k in range(4))
+    np.testing.assert_allclose(synthetic_face_controls(np.zeros((1, 50)))[0], [0, 0, 1, 0, 0])
+    assert happy[0] > 0.9 and sad[4] > 0.9 and angry[1] < -0.5 < 0.5 < surprised[1] and surprised[2] > 1.3
+    assert synthetic_face_controls(1.6 * BASIS[None, :, 4])[0, 2] == pytest.approx(0, abs=1e-6)
+    # A blink in surprise shuts an eye that is wide open.
     both = expression_weights((APEX * BASIS[:, 3] + 1.6 * BASIS[:, 4])[None])[0]
-    opened = 1 + sum(w * (look.eye_open - 1) for w, look in zip(both, EXPRESSIONS.values(), strict=True))
-    assert opened == pytest.approx(0, abs=1e-9)
+    assert 1 + 0.6 * both[3] - both[4] == pytest.approx(0, abs=1e-9)
 
 
-def test_expressions_move_the_face_and_nothing_else() -> None:
+def test_shapes_move_the_face_and_nothing_else() -> None:
     body = neutral_body()
-    head = body.weights[:, SKELETON.index("head")]
-    for name, move in body.expressions.items():
+    head = dense(body)[:, SMPLX.index("head")]
+    for name, move in body.shapes.items():
         size = np.linalg.norm(move, axis=-1)
-        assert 0.003 < size.max() < 0.03, name
-        assert size[head < 0.2].max() < 1e-3, name
-    # Corners of the mouth: up in joy, down in sorrow.
-    lips = np.flatnonzero(np.abs(body.uv - [0.7, 0.625]).max(axis=1) < 1e-6)
+        assert 0.001 < size.max() < 0.03 and size[head < 0.2].max() < 1e-3, name
+    lips = np.flatnonzero(body.swatch == 8)
     outer = lips[body.vertices[lips, 0].argmax()]
-    assert body.expressions["happy"][outer, 1] > 0 > body.expressions["sad"][outer, 1]
+    assert body.shapes["happy"][outer, 1] > 0 > body.shapes["sad"][outer, 1]
+    left = body.vertices[:, 0] > 0
+    blink = {side: np.linalg.norm(body.shapes[f"eyeBlink{side}"], axis=-1) for side in ("Left", "Right")}
+    assert blink["Left"][left].max() > 0.005 > 1e-3 > blink["Left"][~left].max()
+    both = body.shapes["eyeBlinkLeft"] + body.shapes["eyeBlinkRight"]
+    np.testing.assert_allclose(both, body.shapes["blink"], atol=5e-4)
+
+
+def test_synthetic_faces_become_the_arkit_shapes_that_mean_them() -> None:
+    apex = [0 * BASIS[:, 0], APEX * BASIS[:, 0], APEX * BASIS[:, 1], APEX * BASIS[:, 3], 1.6 * BASIS[:, 4]]
+    rows = np.stack(apex)
+    weights = synthetic_arkit(rows)
+    happy, sad, surprised, blink = (dict(zip(ARKIT, row, strict=True)) for row in weights[1:])
+    assert weights[0].max() < 1e-6
+    assert min(happy["mouthSmileLeft"], happy["mouthSmileRight"]) > 0.6
+    assert min(sad["mouthFrownLeft"], sad["browInnerUp"]) > 0.4
+    assert min(surprised["eyeWideLeft"], surprised["jawOpen"], surprised["browOuterUpRight"]) > 0.5
+    assert min(blink["eyeBlinkLeft"], blink["eyeBlinkRight"]) > 0.9
+    assert max(blink["jawOpen"], blink["mouthSmileLeft"]) < 0.05
+    assert own_bases().residual(expression_weights(rows), weights) < 0.35
+
+
+def unpacked(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Rotation matrices of 32-bit numbers, one at a time, from the words of `embed`'s docstring."""
+    out = []
+    for value in packed.ravel().tolist():
+        left, quaternion = value >> 30, np.zeros(4)
+        for i, shift in ((1, 20), (2, 10), (3, 0)):
+            quaternion[(left + i) % 4] = ((value >> shift & 1023) / 1022 - 0.5) * np.sqrt(2)
+        quaternion[left] = np.sqrt(max(1 - quaternion @ quaternion, 0))
+        out.append(Rotation.from_quat(quaternion).as_matrix())
+    return np.array(out).reshape(*packed.shape, 3, 3)
+
+
+def test_turns_travel_in_32_bits(walk: Walk) -> None:
+    turns = Rotation.random(500, rng=np.random.default_rng(0)).as_matrix().reshape(100, 5, 3, 3)
+    again = unpacked(pack_turns(turns))
+    away = Rotation.from_matrix((again @ turns.swapaxes(-1, -2)).reshape(-1, 3, 3)).magnitude()
+    assert np.degrees(away).max() < 0.3 and np.degrees(away).mean() < 0.12
+    np.testing.assert_allclose(unpacked(pack_turns(np.eye(3)[None])), np.eye(3)[None], atol=1e-9)
+    posing = posing_of(walk(4), SMPLX)
+    data = pose_data(posing)
+    leaves = set(range(52)) - set(SMPLX.parents)
+    assert data["turning"][0] == 0 and not leaves & set(data["turning"])  # ends turn with their parents
+    assert numbers(data["turns"], "<u4").size == 4 * len(data["turning"])
+    with_neck = replace(posing, turns=posing.turns.copy())
+    with_neck.turns[:, 15] = with_neck.turns[:, 15] @ Rotation.from_rotvec([0, 0.3, 0]).as_matrix()
+    assert 15 in pose_data(with_neck)["turning"]
+
+
+def test_pages_carry_the_body_only_where_someone_has_one(walk: Walk) -> None:
+    chain = ViewerMotion(np.zeros((1, 3, 3)), 30, [-1, 0, 1])
+    person = ViewerMotion(walk(2), 20, SMPLX.parents)
+    assert not has_bodies(viewer_data([chain])) and has_bodies(viewer_data([chain, person]))
+    assert (
+        len(viewer_script()) - len(viewer_script(False)) > 400_000 and len(json.dumps(mesh_data())) < 580_000
+    )
+
+
+@pytest.mark.slow
+def test_the_file_is_what_its_script_makes(tmp_path: Path) -> None:
+    script = Path(__file__).parents[3] / "benchmarks" / "body" / "make_body.py"
+    subprocess.run([sys.executable, script, tmp_path / "body.npz"], check=True, capture_output=True)
+    with np.load(tmp_path / "body.npz", allow_pickle=False) as made:
+        assert made.keys() == asset().keys()
+        for name, values in asset().items():
+            if values.dtype.kind == "U":
+                assert made[name].tolist() == values.tolist()
+            else:  # the last digit is the processor's
+                np.testing.assert_allclose(made[name].astype(float), values.astype(float), atol=1, rtol=1e-6)

@@ -1,20 +1,22 @@
-"""Bodies, matrices and marked cells as HTML: right numbers, readable names, nothing unescaped."""
+"""Charts, bodies, matrices and marked cells as HTML: right numbers, readable names, nothing unescaped."""
 
 from __future__ import annotations
 
+import json
 import re
+from html import unescape
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body_map import Scale, body_map
-from motionloom.pipeline.render.charts import Line, line_chart
-from motionloom.pipeline.render.joint_names import joint_label
-from motionloom.pipeline.render.labels import curve_label
-from motionloom.pipeline.render.matrix import matrix_table
+from motionloom.pipeline.render.charts import Line, bar_chart, line_chart, matrix_table
+from motionloom.pipeline.render.labels import curve_label, joint_label
 from motionloom.pipeline.render.page import Cell, Page
 
 NASTY = '<b onclick="x">&'
@@ -40,44 +42,27 @@ class Balanced(HTMLParser):
         assert self.open.pop() == tag
 
 
-@pytest.mark.parametrize(
-    ("joint", "label"),
-    [
-        ("left_index2", "left index finger, middle joint"),
-        ("right_pinky1", "right little finger, knuckle"),
-        ("left_thumb3", "left thumb, last joint"),
-        ("right_foot", "right ball of the foot"),
-        ("left_collar", "left collarbone"),
-        ("spine2", "middle spine"),
-        ("head", "head"),
-        ("tail_base", "tail base"),
-    ],
-)
-def test_joints_have_names_for_people(joint: str, label: str) -> None:
-    assert joint_label(joint) == label
-
-
-@pytest.mark.parametrize(
-    ("key", "words"),
-    [
-        ("ce", "cross-entropy"),
-        ("tokens_ce", "tokens cross-entropy"),
-        ("tokens_accuracy_left_hand", "tokens accuracy: left hand"),
-        ("accuracy_body", "accuracy: body"),
-        ("dead_code", "dead codes"),
-        ("resets_level12", "reset codes: level 12"),
-        ("rec_motion", "reconstructed motion"),
-        ("critic_loss", "critic loss"),
-        ("my_own_figure", "my own figure"),
-    ],
-)
-def test_figures_of_a_log_have_names_for_people(key: str, words: str) -> None:
-    assert curve_label(key) == words
-
-
-def test_every_joint_has_a_name_of_its_own() -> None:
+def test_joints_and_figures_of_a_log_have_names_for_people() -> None:
+    for joint, words in {
+        "left_index2": "left index finger, middle joint",
+        "right_pinky1": "right little finger, knuckle",
+        "left_thumb3": "left thumb, last joint",
+        "right_foot": "right ball of the foot",
+        "left_collar": "left collarbone",
+        "tail_base": "tail base",
+    }.items():
+        assert joint_label(joint) == words
     labels = [joint_label(joint) for joint in WHOLE.joints]
     assert len(set(labels)) == 52 and not any("_" in label for label in labels)
+    for key, words in {
+        "tokens_ce": "tokens cross-entropy",
+        "tokens_accuracy_left_hand": "tokens accuracy: left hand",
+        "dead_code": "dead codes",
+        "resets_level12": "reset codes: level 12",
+        "rec_motion": "reconstructed motion",
+        "my_own_figure": "my own figure",
+    }.items():
+        assert curve_label(key) == words
 
 
 def test_every_joint_is_drawn_with_its_error() -> None:
@@ -109,9 +94,6 @@ def test_colours_run_from_light_to_dark() -> None:
     light = [sum(int(scale.colour(e)[k : k + 2], 16) for k in (1, 3, 5)) for e in (0, 10, 20, 30, 40, 50)]
     assert light == sorted(light, reverse=True) and len(set(light)) == 6
     assert scale.colour(99.0) == scale.colour(50.0)
-
-
-def test_errors_must_fit_the_body() -> None:
     with pytest.raises(UserError, match="3 errors for the 22 joints of smpl22"):
         body_map(BODY, [1.0] * 3)
     with pytest.raises(UserError, match="4 errors of fingers for 30 joints"):
@@ -152,3 +134,35 @@ def test_curves_take_the_colour_they_are_given() -> None:
     assert re.findall(r'polyline class="curve (s\d)"', html) == ["s5", "s5"]
     assert re.findall(r'class="key (s\d)', html) == ["s5", "s5"]
     assert re.findall(r"curve (s\d)", line_chart([Line("a", [0, 1], [0, 1])] * 2)) == ["s0", "s1"]
+
+
+def test_line_chart_keeps_spikes_and_drops_what_is_not_finite() -> None:
+    y = np.ones(5000)
+    y[1234], y[77] = 9.0, np.nan
+    svg = line_chart(
+        [Line("train", np.arange(5000), y), Line("val", [0, 5000], [2, 1], dashed=True)], y_label="loss"
+    )
+    hover = json.loads(unescape(re.search(r'data-hover="([^"]*)"', svg)[1]))
+    train = hover["lines"][0]
+    assert 9.0 in [v for _, v in train["values"]] and len(train["values"]) <= 402
+    assert "nan" not in svg.lower()
+    assert svg.count("<polyline") == 2 and svg.count("stroke-dasharray") == 1
+    inside = np.array(train["at"])
+    assert (inside >= 0).all() and (inside <= [640, 320]).all()
+
+
+@given(st.lists(st.floats(-1e12, 1e12), min_size=1, max_size=20))
+@settings(max_examples=80, deadline=None)
+def test_charts_draw_any_numbers(values: list[float]) -> None:
+    for log in (False, True):
+        svg = line_chart([Line("a", range(len(values)), values)], log_y=log)
+        assert svg.startswith("<svg") and "inf" not in svg and "nan" not in svg
+    assert bar_chart(values).count("<rect") == len(values)
+
+
+def test_charts_without_data_say_so() -> None:
+    assert "no data" in line_chart([]) and "no data" in line_chart([Line("a", [1], [np.nan])])
+    assert "no data" in bar_chart([])
+    assert bar_chart([0] * 20 + [3]).count('class="dead"') == 20
+    with pytest.raises(ValueError, match="line 'a'"):
+        line_chart([Line("a", [1, 2], [1])])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import os
 import shutil
@@ -18,8 +16,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.motion.body.arkit import ARKIT
+from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.kinematics import forward_kinematics
-from motionloom.datasets.motion.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.face import APEX, BASIS
@@ -91,12 +90,7 @@ def test_animations_hold_the_figures_rotations_root_and_times(
         offsets = np.array([node.translation for node in gltf.nodes[:52]])
         joints, _ = forward_kinematics(local, root, offsets, SKELETON.parents)
         np.testing.assert_allclose(joints, figure.joints, atol=1e-5)
-
-
-def test_motions_of_different_bones_share_their_mean(
-    written: tuple[Path, list[RigidMotion]], clips: list[GlbClip]
-) -> None:
-    _, figures = written
+    # Motions of different bones share their mean.
     mean = np.mean([clip.figure.skeleton.offsets for clip in clips], axis=0)
     for figure, clip in zip(figures, clips, strict=True):
         np.testing.assert_allclose(figure.skeleton.offsets, mean, atol=1e-12)
@@ -106,7 +100,7 @@ def test_motions_of_different_bones_share_their_mean(
 
 def test_meshes_are_the_body_and_joints_bind_at_rest(written: tuple[Path, list[RigidMotion]]) -> None:
     path, figures = written
-    gltf, body = pygltflib.GLTF2().load(path), body_for(figures[0].skeleton)
+    gltf, body = pygltflib.GLTF2().load(path), body_for(figures[0].skeleton, EXPRESSIONS)
     parts = [mesh.primitives[0] for mesh in gltf.meshes]
     places = np.concatenate([values(gltf, part.attributes.POSITION) for part in parts])
     assert len(places) == len(body.vertices)
@@ -124,6 +118,19 @@ def test_meshes_are_the_body_and_joints_bind_at_rest(written: tuple[Path, list[R
     rest = figures[0].skeleton.rest_joints
     np.testing.assert_allclose(bind[:, :3, 3], -rest - lift, atol=1e-6)
     np.testing.assert_allclose(gltf.nodes[0].translation, rest[0] + lift, atol=1e-6)
+
+
+def test_a_head_can_carry_all_of_arkits_shapes(clips: list[GlbClip], tmp_path: Path) -> None:
+    weights = np.linspace(0, 1, 40 * 52).reshape(40, 52)
+    write_glb(tmp_path / "a.glb", [GlbClip("smile", clips[0].figure, FPS, weights)], "arkit")
+    gltf = pygltflib.GLTF2().load(tmp_path / "a.glb")
+    assert gltf.meshes[1].extras["targetNames"] == list(ARKIT)
+    stored = [target["POSITION"] for target in gltf.meshes[1].primitives[0].targets]
+    still = {number for number in stored if gltf.accessors[number].bufferView is None}
+    assert len(stored) == 52 and len(still) == 1  # shapes that the head lacks share one that takes no room
+    channel = next(c for c in gltf.animations[0].channels if c.target.path == "weights")
+    keys = gltf.animations[0].samplers[channel.sampler].output
+    np.testing.assert_allclose(values(gltf, keys).reshape(40, 52), weights, atol=1e-6)
 
 
 def test_clips_that_cannot_be_written_are_refused(tmp_path: Path, clips: list[GlbClip]) -> None:
@@ -190,14 +197,14 @@ def test_khronos_validator_finds_nothing(
 
 
 @pytest.fixture(scope="module")
-def three(written: tuple[Path, list[RigidMotion]]) -> Iterator[Any]:
-    """A page in which three.js has loaded the file."""
-    from playwright.sync_api import sync_playwright
+def browser_arguments(webgl_arguments: list[str]) -> list[str]:
+    return webgl_arguments
 
+
+@pytest.fixture(scope="module")
+def three(written: tuple[Path, list[RigidMotion]], browser: Any) -> Iterator[Any]:
+    """A page in which three.js has loaded the file."""
     modules = node_package("three", "build/three.module.js").parents[1]
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if chromium is None:
-        pytest.skip("no Chromium on this machine to drive")
     kinds = {".html": "text/html", ".js": "text/javascript"}
     here = {"/": Path(__file__).parent / "three" / "page.html", "/motion.glb": written[0]}
 
@@ -210,15 +217,12 @@ def three(written: tuple[Path, list[RigidMotion]]) -> Iterator[Any]:
         else:
             route.fulfill(status=404, body="")
 
-    with sync_playwright() as playwright:
-        arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
-        page = browser.new_page(viewport={"width": 480, "height": 480})
-        page.route("**/*", answer)
-        page.goto("http://figure.test/")
-        page.wait_for_function("window.ready === true", timeout=30_000)
-        yield page
-        browser.close()
+    page = browser.new_page(viewport={"width": 480, "height": 480})
+    page.route("**/*", answer)
+    page.goto("http://figure.test/")
+    page.wait_for_function("window.ready === true", timeout=30_000)
+    yield page
+    page.close()
 
 
 @pytest.mark.browser
@@ -230,7 +234,7 @@ def test_three_js_poses_joints_and_skin_as_the_figure_is(
     assert [name for name, _ in facts["animations"]] == [clip.name for clip in clips]
     assert facts["animations"][0][1] == pytest.approx(39 / FPS)
     gltf = pygltflib.GLTF2().load(written[0])
-    body = body_for(written[1][0].skeleton)
+    body = body_for(written[1][0].skeleton, EXPRESSIONS)
     lift = [0.0, body.vertices[:, 1].min(), 0.0]
     in_file = [values(gltf, mesh.primitives[0].attributes.POSITION) + lift for mesh in gltf.meshes]
     rng = np.random.default_rng(0)
@@ -239,8 +243,10 @@ def test_three_js_poses_joints_and_skin_as_the_figure_is(
         three.evaluate("([n, t]) => show(n, t, [1.2, 0.5, 2.8])", [number, frame / FPS])
         seen = np.array(three.evaluate("names => joints(names)", list(SKELETON.joints)))
         np.testing.assert_allclose(seen, figure.joints[frame], atol=1e-4)
-        face = None if clip.expression is None else clip.expression[frame : frame + 1]
-        posed = body.posed(figure.rotations[frame : frame + 1], figure.root[frame : frame + 1], face)[0]
+        face = None if clip.expression is None else clip.expression[frame]
+        local, root = figure.rotations[frame : frame + 1], figure.root[frame : frame + 1]
+        joints, world = forward_kinematics(local, root, body.skeleton.offsets, SKELETON.parents)
+        posed, _ = body.skinned(world[0], joints[0], face)
         for name, places in (("body", in_file[0]), ("head_mesh", in_file[1])):
             some = rng.integers(0, len(places), 40).tolist()
             shown = np.array(three.evaluate("([n, v]) => vertices(n, v)", [name, some]))
@@ -249,14 +255,9 @@ def test_three_js_poses_joints_and_skin_as_the_figure_is(
 
 
 @pytest.mark.browser
-def test_three_js_draws_left_in_blue_and_right_in_orange(three: Any) -> None:
-    from PIL import Image
-
+def test_three_js_draws_left_in_blue_and_right_in_orange(three: Any, pixels: Any) -> None:
     three.evaluate("show(0, 0.5, [0.0, 0.3, 3.4])")
-    data = three.evaluate("document.querySelector('canvas').toDataURL('image/png')")
-    image = np.asarray(Image.open(io.BytesIO(base64.b64decode(data.split(",")[1]))).convert("RGB")).astype(
-        int
-    )
+    image = pixels(three)
     blue = (image[..., 2] - image[..., 0] > 60).nonzero()[1]
     orange = (image[..., 0] - image[..., 2] > 70).nonzero()[1]
     assert len(blue) > 2000 and len(orange) > 2000

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from pathlib import Path
 from typing import Any
 
@@ -39,27 +38,6 @@ def rows(tmp_path_factory: pytest.TempPathFactory, walk: Any) -> Path:
             )
     write_viewer(path, motions, NASTY, NASTY)
     return path
-
-
-def pixels(page: Any, index: int = 0) -> np.ndarray:
-    """RGBA of a canvas [H, W, 4], drawn to date."""
-    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    width, height, data = page.evaluate(
-        """(index) => {
-            const canvas = document.querySelectorAll("canvas")[index], {width, height} = canvas;
-            const copy = Object.assign(document.createElement("canvas"), {width, height});
-            const ctx = copy.getContext("2d", {willReadFrequently: true});
-            ctx.drawImage(canvas, 0, 0);
-            const bytes = ctx.getImageData(0, 0, width, height).data, chunk = 8192;
-            let text = "";
-            for (let k = 0; k < bytes.length; k += chunk) {
-                text += String.fromCharCode(...bytes.subarray(k, k + chunk));
-            }
-            return [width, height, btoa(text)];
-        }""",
-        index,
-    )
-    return np.frombuffer(base64.b64decode(data), np.uint8).reshape(height, width, 4).astype(int)
 
 
 def changed(a: np.ndarray, b: np.ndarray) -> float:
@@ -111,7 +89,7 @@ def test_clock_keeps_time_and_speed(visit: Any, single: Path) -> None:
     assert 0.1 < pace() < 0.32
 
 
-def test_whole_figure_fits_at_first_sight_in_any_frame(visit: Any, single: Path) -> None:
+def test_whole_figure_fits_at_first_sight_in_any_frame(visit: Any, single: Path, pixels: Any) -> None:
     page = visit(single)
     for frame in (0, 20, 40, 59):
         still(page, frame)
@@ -122,7 +100,7 @@ def test_whole_figure_fits_at_first_sight_in_any_frame(visit: Any, single: Path)
         assert bottom - top > 0.5 * height
 
 
-def test_frames_differ_and_keys_step(visit: Any, single: Path) -> None:
+def test_frames_differ_and_keys_step(visit: Any, single: Path, pixels: Any) -> None:
     page = visit(single)
     still(page, 10)
     before = pixels(page)
@@ -139,7 +117,7 @@ def test_frames_differ_and_keys_step(visit: Any, single: Path) -> None:
     assert page.evaluate("__viewer.frame") == 0
 
 
-def test_drag_wheel_and_reset_change_the_view(visit: Any, single: Path) -> None:
+def test_drag_wheel_and_reset_change_the_view(visit: Any, single: Path, pixels: Any) -> None:
     page = visit(single)
     still(page, 10)
     before, camera = pixels(page), page.evaluate("__viewer.camera")
@@ -170,7 +148,7 @@ def test_drag_wheel_and_reset_change_the_view(visit: Any, single: Path) -> None:
     assert changed(before, pixels(page)) < 0.002
 
 
-def test_scrub_bar_and_buttons(visit: Any, until: Any, single: Path) -> None:
+def test_scrub_bar_and_buttons(visit: Any, until: Any, single: Path, pixels: Any) -> None:
     page = visit(single)
     bar = page.get_by_label("Time")
     box = bar.bounding_box()
@@ -191,16 +169,7 @@ def test_scrub_bar_and_buttons(visit: Any, until: Any, single: Path) -> None:
     assert page.evaluate("__viewer.follow") is False
 
 
-def test_face_track_moves_the_face(visit: Any, single: Path) -> None:
-    page = visit(single)
-    page.evaluate("() => { __viewer.setView('front'); __viewer.toggle('close'); }")
-    still(page, 7)
-    smiling = pixels(page)
-    still(page, 22)
-    assert changed(smiling, pixels(page)) > 0.002
-
-
-def test_without_follow_the_whole_way_is_in_view(visit: Any, single: Path) -> None:
+def test_without_follow_the_whole_way_is_in_view(visit: Any, single: Path, pixels: Any) -> None:
     page = visit(single)
     page.keyboard.press("f")
     boxes = []
@@ -237,14 +206,7 @@ def test_untrusted_captions_stay_text(visit: Any, rows: Path) -> None:
     assert page.evaluate("window.hacked") is None
 
 
-def test_narrow_windows_stack_and_nothing_overflows(visit: Any, rows: Path) -> None:
-    page = visit(rows, width=380, height=800)
-    lefts = {page.locator("canvas").nth(k).bounding_box()["x"] for k in range(3)}
-    assert len(lefts) == 1
-    assert page.evaluate("document.documentElement.scrollWidth") <= 380
-
-
-def test_dark_and_light(visit: Any, single: Path) -> None:
+def test_dark_and_light(visit: Any, single: Path, pixels: Any) -> None:
     light, dark = (visit(single, color_scheme=scheme) for scheme in ("light", "dark"))
     back = "getComputedStyle(document.body).backgroundColor"
     assert light.evaluate(back) != dark.evaluate(back)
@@ -262,7 +224,7 @@ def test_reduced_motion_starts_still_but_plays_on_request(visit: Any, until: Any
     until(page, "__viewer.frame > 1")
 
 
-def test_unknown_skeletons_and_single_poses_draw(visit: Any, tmp_path: Path) -> None:
+def test_unknown_skeletons_and_single_poses_draw(visit: Any, tmp_path: Path, pixels: Any) -> None:
     chain = np.array([[[0, 1, 0], [0, 1.5, 0], [0, 1.8, 0], [0.5, 1, 0], [-0.5, 1, 0]]], float)
     write_viewer(tmp_path / "v.html", [ViewerMotion(chain, 30, [-1, 0, 1, 0, 0], "pose")], "still")
     page = visit(tmp_path / "v.html")

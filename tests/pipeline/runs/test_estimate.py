@@ -8,11 +8,17 @@ import pytest
 import torch
 from rich.console import Console
 
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import VqConfig
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.estimate import estimate
+from motionloom.pipeline.runs.dry_run import estimate
 from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.training.memory import _saved_bytes
 
 PAPER = """
 name: paper-sizes
@@ -39,7 +45,7 @@ def paper(tmp_path: Path) -> Path:
     return path
 
 
-def test_paper_counts(paper: Path) -> None:
+def test_paper_counts(paper: Path, tmp_path: Path) -> None:
     rows = cards(paper)
     assert list(rows) == ["tokenizer", "vanilla", "tma", "gpt"]
     assert rows["gpt"].note == "98 body + 49 hand + 2 End = 149 for 196 frames"
@@ -48,6 +54,10 @@ def test_paper_counts(paper: Path) -> None:
     assert rows["tokenizer"].note == "2 body + 1 hand per 4 frames, 202 bit/s"
     assert rows["vanilla"].note == "1 code per 4 frames, 75 bit/s"
     assert {row.local_batch for row in rows.values()} == {64}
+    console = Console(record=True, width=160)
+    run_recipe(paper, tmp_path / "run", dry_run=True, console=console)
+    said = console.export_text()
+    assert rows["gpt"].note in said and "GiB" in said and not (tmp_path / "run").exists()
 
 
 def test_memory_follows_batch_and_checkpointing(paper: Path) -> None:
@@ -62,32 +72,8 @@ def test_memory_follows_batch_and_checkpointing(paper: Path) -> None:
     assert memory("gpt.train.accumulate=2") == half
 
 
-def test_half_precision_keeps_the_losses_whole(paper: Path) -> None:
-    rows = {
-        precision: cards(paper, f"gpt.train.precision={precision}")["gpt"]
-        for precision in ("32-true", "bf16-mixed")
-    }
-    kept = {name: row.memory_bytes - 16 * row.parameters for name, row in rows.items()}
-    assert 0.5 * kept["32-true"] < kept["bf16-mixed"] < 0.9 * kept["32-true"]
-
-
-def test_codebooks_are_told(paper: Path) -> None:
-    row = cards(paper)["vanilla"]
-    assert row.codebook == 1024 * 512
-    other = cards(paper, "vanilla.net.num_codes=4096", "vanilla.net.reset_below=0.1")["vanilla"]
-    # The codebook itself and its running sums, float32.
-    assert other.memory_bytes - row.memory_bytes >= 3072 * 512 * 2 * 4
-
-
 def test_saved_bytes_of_a_known_network() -> None:
     """Against the real thing: sizes of the storages that real tensors keep."""
-    from motionloom.datasets.motion.layout import MotionLayout
-    from motionloom.models.tokenizer.build import build_tokenizer
-    from motionloom.models.tokenizer.config import VqConfig
-    from motionloom.models.tokenizer.module import TokenizerModule
-    from motionloom.models.training.stage_module import OptimConfig
-    from motionloom.pipeline.stages.memory import _saved_bytes
-
     config = VqConfig(width=16, depth=1, code_dim=16, num_codes=32)
     sizes = []
     for fake in (True, False):
@@ -98,24 +84,6 @@ def test_saved_bytes_of_a_known_network() -> None:
             batch = {"motion": torch.zeros(4, 16, 133), "length": torch.full((4,), 16)}
             sizes.append(_saved_bytes(module, batch, None))
     assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
-
-
-def test_bits_of_a_tokenizer() -> None:
-    from motionloom.datasets.motion.layout import MotionLayout
-    from motionloom.models.tokenizer.build import build_tokenizer
-    from motionloom.models.tokenizer.config import RvqConfig
-
-    net = build_tokenizer(RvqConfig(width=8, code_dim=8, num_codes=16), MotionLayout.named("body133", fps=20))
-    assert net.bits_per_second == 5 * 2 * 4
-
-
-def test_dry_run_tells(paper: Path, tmp_path: Path) -> None:
-    console = Console(record=True, width=160)
-    run_recipe(paper, tmp_path / "run", dry_run=True, console=console)
-    said = console.export_text()
-    assert "98 body + 49 hand + 2 End = 149 for 196 frames" in said
-    assert "GiB" in said
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_layout_that_does_not_fit_is_told_with_the_stage() -> None:

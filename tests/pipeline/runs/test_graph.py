@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import Field
 from rich.console import Console
 from toy_stages import register_toys
 
-from motionloom.datasets.base.files import atomic_path
+from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.fingerprint import RUNTIME
-from motionloom.pipeline.contract.stage import Every, FunctionStage, StageConfig, StageContext
-from motionloom.pipeline.runs.graph import Selection, execute, make_plan
+from motionloom.pipeline.contract.stage import RUNTIME, Every, FunctionStage, StageConfig, StageContext
+from motionloom.pipeline.runs.execute import execute
+from motionloom.pipeline.runs.plan import REQUEST_FILE, Request, Selection, make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.files import write_json
@@ -37,17 +35,22 @@ def run_add(context: StageContext) -> None:
     write_json(context.folder / "value.json", sum(above) + context.config.add)
 
 
-@pytest.fixture(autouse=True)
-def toy_kinds(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    register_toys(
-        monkeypatch,
-        FunctionStage("root", "a number", AddConfig, run_add, given_names=NUMBER),
-        FunctionStage(
-            "sum", "a sum", AddConfig, run_add, ("left: number", "right?: number"), given_names=NUMBER
-        ),
-        FunctionStage("all", "a sum", AddConfig, run_add, (Every("numbers", "number"),)),
+def kind(
+    name: str, *takes: str | Every, work: Callable[[StageContext], None] | None = None, **more: Any
+) -> Any:
+    """A kind of stage that adds up, whatever `run_add` is by then."""
+    return FunctionStage(
+        name, "a sum", AddConfig, work or (lambda c: run_add(c)), takes, given_names=NUMBER, **more
     )
-    yield
+
+
+TAKES = ("left: number", "right?: number")
+
+
+@pytest.fixture(autouse=True)
+def toy_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+    every = FunctionStage("all", "a sum", AddConfig, run_add, (Every("numbers", "number"),))
+    register_toys(monkeypatch, kind("root"), kind("sum", *TAKES), every)
 
 
 def recipe(tmp_path: Path, *overrides: str) -> Recipe:
@@ -73,59 +76,33 @@ def value(tmp_path: Path, stage: str) -> int:
     return int((tmp_path / "run/stages" / stage / "value.json").read_text())
 
 
-def test_runs_all_then_nothing(tmp_path: Path) -> None:
-    assert go(tmp_path) == ["left", "right", "both", "one", "top"]
-    assert value(tmp_path, "top") == 122
-    assert go(tmp_path) == []
+ALL = ["left", "right", "both", "one", "top"]
 
 
-def test_a_change_runs_that_stage_and_those_below(tmp_path: Path) -> None:
-    go(tmp_path)
-    assert go(tmp_path, "left.add=2") == ["left", "both", "top"]
-    assert value(tmp_path, "top") == 123
-    assert go(tmp_path, "left.add=2", "top.add=0") == ["top"]
-
-
-def test_runtime_fields_change_nothing(tmp_path: Path) -> None:
-    go(tmp_path)
-    assert go(tmp_path, "left.workers=7", "hardware.workers=3") == []
-
-
-def test_seed_changes_everything(tmp_path: Path) -> None:
-    go(tmp_path)
-    assert go(tmp_path, "seed=5") == ["left", "right", "both", "one", "top"]
-
-
-def test_reason_names_the_field(tmp_path: Path) -> None:
-    go(tmp_path)
-    loaded = recipe(tmp_path, "left.add=2")
-    reasons = {row.stage.name: row.reason for row in make_plan(loaded, tmp_path / "run")}
-    assert reasons["left"] == "changed: add 1 -> 2"
-    assert reasons["both"] == "input left changed"
+def test_runs_all_and_then_what_changed_and_all_below(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert go(tmp_path) == ALL and value(tmp_path, "top") == 122
+    artifact = Artifact.find(tmp_path / "run/stages/both")
+    assert artifact is not None and set(artifact.outputs) == {"value.json"}
+    assert {role: i.stage for role, i in artifact.inputs.items()} == {"left": "left", "right": "right"}
+    plan = make_plan(recipe(tmp_path, "left.add=2"), tmp_path / "run")
+    reasons = {row.stage.name: row.reason for row in plan}
+    assert reasons["left"] == "changed: add 1 -> 2" and reasons["both"] == "input left changed"
     assert reasons["right"] == "finished"
-
-
-def test_lost_output_runs_again(tmp_path: Path) -> None:
-    go(tmp_path)
+    for overrides, ran in (
+        ((), []),
+        (("left.workers=7", "hardware.workers=3"), []),  # they change no number
+        (("left.add=2",), ["left", "both", "top"]),
+        (("left.add=2", "top.add=0"), ["top"]),
+        (("seed=5",), ALL),
+        (("seed=5",), []),
+    ):
+        assert go(tmp_path, *overrides) == ran
     (tmp_path / "run/stages/both/value.json").unlink()
-    assert go(tmp_path) == ["both"]
-
-
-def test_new_version_of_a_kind_runs_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    go(tmp_path)
-    register_toys(
-        monkeypatch,
-        FunctionStage(
-            "sum",
-            "a sum",
-            AddConfig,
-            run_add,
-            ("left: number", "right?: number"),
-            version=2,
-            given_names=NUMBER,
-        ),
-    )
-    assert go(tmp_path) == ["both", "one", "top"]
+    assert go(tmp_path, "seed=5") == ["both"]
+    register_toys(monkeypatch, kind("sum", *TAKES, version=2))
+    assert go(tmp_path, "seed=5") == ["both", "one", "top"]
 
 
 def test_selection(tmp_path: Path) -> None:
@@ -140,6 +117,51 @@ def test_selection(tmp_path: Path) -> None:
     assert go(tmp_path, select=Selection(only="one", force=True)) == ["one"]
     with pytest.raises(UserError, match="is not finished"):
         go(tmp_path, "right.add=4", select=Selection(only="top"))
+
+
+@pytest.mark.parametrize(
+    ("select", "asked"),
+    [
+        (Selection(force=True), ALL),
+        (Selection(first="both"), ["both", "top"]),
+        (Selection(only="one", force=True), ["one"]),
+    ],
+)
+def test_what_a_command_began_to_run_again_the_same_command_goes_on_with(
+    select: Selection, asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed in its last stage: those before it are not made a second time, and that one resumes."""
+    go(tmp_path)
+    run, last = tmp_path / "run", asked[-1]
+    kept = run / "stages" / last / "checkpoint"
+
+    whole = run_add
+
+    def killed(context: StageContext) -> None:
+        whole(context)
+        if context.name == last:
+            kept.touch()
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setitem(globals(), "run_add", killed)
+        go(tmp_path, select=select)
+    again = [row.stage.name for row in make_plan(recipe(tmp_path), run, select) if row.action == "run"]
+    assert again == [] and kept.exists()
+    assert go(tmp_path, select=select) == [last] and kept.exists()
+    assert not (run / REQUEST_FILE).exists()
+    assert go(tmp_path, select=select) == asked, "asked once more, all run again"
+    assert go(tmp_path) == [] and not kept.exists()
+
+
+def test_another_command_between_drops_the_request(tmp_path: Path) -> None:
+    go(tmp_path)
+    select = Selection(force=True)
+    loaded, run = recipe(tmp_path), tmp_path / "run"
+    write_json(run / REQUEST_FILE, Request(id="x", select=asdict(select)).dump())
+    assert [row.action for row in make_plan(loaded, run, Selection(first="left"))].count("run") == 3
+    assert go(tmp_path, "one.add=2") == ["one"] and not (run / REQUEST_FILE).exists()
+    assert go(tmp_path, "one.add=2", select=select) == ALL
 
 
 SEVERAL = """
@@ -170,12 +192,7 @@ def test_a_role_is_filled_by_every_stage_that_gives_it(tmp_path: Path) -> None:
     assert again == loaded, "the resolved recipe is the recipe"
     assert [s.inputs for s in again.stages] == [s.inputs for s in loaded.stages]
     assert {row.action for row in make_plan(again, run)} == {"skip"}
-
-
-def test_the_order_of_a_list_counts(tmp_path: Path) -> None:
-    """The first of several generators is the default, so another order makes something else."""
-    loaded, run = several(tmp_path), tmp_path / "run"
-    execute(loaded, run, make_plan(loaded, run), Console(quiet=True))
+    # The first of several generators is the default, so another order makes something else.
     turned = several(tmp_path, "listed.inputs.numbers=[first, second]")
     rows = {row.stage.name: (row.action, row.reason) for row in make_plan(turned, run)}
     assert rows.pop("listed") == ("run", "seed, source files or the order of inputs changed")
@@ -185,10 +202,7 @@ def test_the_order_of_a_list_counts(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        (
-            "listed.inputs.numbers=[frst]",
-            "numbers: 'frst' is no stage that gives a number; did you mean 'first'",
-        ),
+        ("listed.inputs.numbers=[frst]", "'frst' is no stage that gives a number; did you mean 'first'"),
         ("listed.inputs.numbers=[every]", "'every' is no stage that gives a number"),
         ("listed.inputs.numbers=7", r"numbers must list stages, like \[gpt\]"),
         ("listed.inputs.number=[first]", "unknown role 'number'; did you mean 'numbers'"),
@@ -199,47 +213,11 @@ def test_a_list_of_what_does_not_fit_is_refused(override: str, says: str, tmp_pa
         several(tmp_path, override)
 
 
-def test_artifact_lists_outputs_and_inputs(tmp_path: Path) -> None:
-    go(tmp_path)
-    artifact = Artifact.find(tmp_path / "run/stages/both")
-    assert artifact is not None
-    assert set(artifact.outputs) == {"value.json"}
-    assert {role: i.stage for role, i in artifact.inputs.items()} == {"left": "left", "right": "right"}
-
-
-def test_atomic_leaves_nothing_on_error(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), atomic_path(tmp_path / "file") as temporary:
-        temporary.write_text("half")
-        raise RuntimeError
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_two_processes_do_not_share_a_run(tmp_path: Path) -> None:
-    holder = subprocess.Popen(
-        [
-            sys.executable,
-            "-P",
-            "-c",
-            "import fcntl, sys, time; file = open(sys.argv[1], 'w'); fcntl.flock(file, 2);"
-            "print('held', flush=True); time.sleep(60)",
-            str(lock_file(tmp_path)),
-        ],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert holder.stdout is not None and holder.stdout.readline() == "held\n"
-        with pytest.raises(UserError, match="another motionloom process"):
-            go(tmp_path)
-    finally:
-        os.kill(holder.pid, signal.SIGKILL)
-        holder.wait()
-    assert go(tmp_path) == ["left", "right", "both", "one", "top"]
-
-
-def lock_file(tmp_path: Path) -> Path:
     (tmp_path / "run").mkdir()
-    return tmp_path / "run/.lock"
+    with file_lock(tmp_path / "run/.lock"), pytest.raises(UserError, match="another motionloom process"):
+        go(tmp_path)
+    assert go(tmp_path) == ALL
 
 
 def test_a_seed_of_the_data_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,18 +226,17 @@ def test_a_seed_of_the_data_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     def draw(context: StageContext) -> None:
         write_json(context.folder / "value.json", context.seed)
 
-    takes = ("left: number", "right?: number")
-    register_toys(
-        monkeypatch,
-        FunctionStage("root", "a seed", AddConfig, draw, given_names=NUMBER),
-        FunctionStage("sum", "a seed", AddConfig, draw, takes, given_names=NUMBER),
-        FunctionStage("fit", "a seed", AddConfig, draw, takes, trains=True, given_names=NUMBER),
+    drawing = (
+        kind("root", work=draw),
+        kind("sum", *TAKES, work=draw),
+        kind("fit", *TAKES, work=draw, trains=True),
     )
-    assert go(tmp_path, "both.kind=fit", "data_seed=3", "seed=5") == ["left", "right", "both", "one", "top"]
+    register_toys(monkeypatch, *drawing)
+    assert go(tmp_path, "both.kind=fit", "data_seed=3", "seed=5") == ALL
     seeds = {name: value(tmp_path, name) for name in ("left", "right", "one", "both", "top")}
     assert seeds == {"left": 3, "right": 3, "one": 3, "both": 5, "top": 5}, "top is made from a training"
     assert go(tmp_path, "both.kind=fit", "data_seed=3", "seed=6") == ["both", "top"]
-    assert go(tmp_path, "both.kind=fit", "data_seed=6", "seed=6") == ["left", "right", "both", "one", "top"]
+    assert go(tmp_path, "both.kind=fit", "data_seed=6", "seed=6") == ALL
     assert go(tmp_path, "both.kind=fit", "seed=6") == [], "it is `seed` where it is not given"
     again = load_recipe(tmp_path / "run/recipe.yaml")
     assert again.data_seed is None and "data_seed" not in again.to_yaml()
@@ -268,18 +245,3 @@ def test_a_seed_of_the_data_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert load_recipe(tmp_path / "seeded.yaml") == seeded
     with pytest.raises(UserError, match="data_seed"):
         recipe(tmp_path, "data_seed=-1")
-
-
-@pytest.mark.parametrize(
-    ("select", "says"),
-    [
-        (Selection(first="lefft"), "--from lefft: recipe toy has no stage 'lefft'; did you mean 'left'"),
-        (Selection(until="bot"), "--until bot: .* did you mean 'both'"),
-        (Selection(only="x"), "--only x: .* valid names: left, right, both, one, top"),
-    ],
-)
-def test_a_misspelt_stage_names_the_option_and_the_stage_meant(
-    select: Selection, says: str, tmp_path: Path
-) -> None:
-    with pytest.raises(UserError, match=says):
-        go(tmp_path, select=select)

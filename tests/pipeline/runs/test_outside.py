@@ -11,24 +11,22 @@ from rich.console import Console
 from toy_stages import register_toys
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.compare.runs import _identity
 from motionloom.pipeline.contract.lookup import finished_stages, generators_of
 from motionloom.pipeline.contract.stage import (
     GENERATOR,
     Every,
     FunctionStage,
-    Shelf,
+    StageCache,
     StageConfig,
     StageContext,
 )
-from motionloom.pipeline.published.stages import run_stages
 from motionloom.pipeline.runs.api import evaluate_run, report_run, run_recipe
-from motionloom.pipeline.runs.graph import make_plan
+from motionloom.pipeline.runs.plan import make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.artifact import Artifact, require_consistent
 from motionloom.pipeline.store.files import write_json
-from motionloom.pipeline.store.outside import identity_of
-from motionloom.pipeline.store.run_state import run_state
+from motionloom.pipeline.store.run_folder import identity_of
+from motionloom.pipeline.store.run_state import finished_records, run_state
 
 QUIET = Console(quiet=True)
 
@@ -115,15 +113,14 @@ def test_what_follows_inputs_goes_into_the_other_run(runs: Path) -> None:
     start = stages["net"].inputs["start"]
     assert start.outside and start.name == "other:net" and not start.inputs["data"].inputs
     assert [stage.name for stage in stages["net"].upstream()] == ["data", "other:net", "other:data"]
-    assert Shelf().get(stages["net"]) == 116, "loaded with what is above it there"
+    assert StageCache().get(stages["net"]) == 116, "loaded with what is above it there"
     assert [stage.name for stage in generators_of(run)] == ["net", "other:net"]
-    record = run_stages(run)["judge"]
+    record = finished_records(run)["judge"]
     assert {role: one.name for role, one in record.inputs.items()} == {
         "generators.net": "net",
         "generators.other:net": "other:net",
     }
-    assert list(run_stages(run)) == ["data", "net", "judge", "figures"]
-    assert _identity(runs / "other/stages/net", set()) != _identity(runs / "mine/stages/net", set())
+    assert list(finished_records(run)) == ["data", "net", "judge", "figures"]
     evaluate_run(run, console=QUIET)
     assert json.loads((run / "evaluate/value.json").read_text()) == 132
 
@@ -141,7 +138,7 @@ def test_its_recipe_runs_again_from_anywhere(runs: Path, monkeypatch: pytest.Mon
     plan = make_plan(load_recipe(moved / "mine/recipe.yaml"), moved / "mine")
     assert {row.action for row in plan} == {"skip"}
     require_consistent(moved / "mine", ["judge"])
-    assert Shelf().get(finished_stages(moved / "mine")["net"]) == 116
+    assert StageCache().get(finished_stages(moved / "mine")["net"]) == 116
 
 
 def test_a_recipe_beside_the_run_or_seen_from_here(runs: Path) -> None:
@@ -169,7 +166,9 @@ def test_another_run_that_has_changed_is_noticed(runs: Path) -> None:
         require_consistent(run, ["judge"])
     with pytest.raises(UserError, match="stage 'net' was made from another 'net' of"):
         evaluate_run(run, console=QUIET)
-    assert f"'net' of {runs / 'other'} has been made anew since" in run_state(run).say_unfinished()
+    assert f"'net' of {runs / 'other'} has been made anew since" in "; ".join(
+        stage.why for stage in run_state(run).unfinished
+    )
     with pytest.raises(UserError, match=r"  net: input runs/other/stages/net changed"):
         run_recipe("recipe.yaml", run, console=QUIET)
     run_recipe("recipe.yaml", run, replace=True, console=QUIET)
@@ -198,7 +197,7 @@ def test_another_run_that_is_gone(runs: Path) -> None:
     (runs / "other").rename(runs / "away")
     gone = f"{runs / 'other/stages/net'}, where no finished stage is any more"
     with pytest.raises(UserError, match=f"{run}: stage 'net' was made from {gone}"):
-        Shelf().get(finished_stages(run)["net"])
+        StageCache().get(finished_stages(run)["net"])
     with pytest.raises(UserError, match=r"stages.net.inputs.start: runs/other/stages/net: no such folder"):
         load_recipe(run / "recipe.yaml")
     with pytest.raises(UserError, match=r"inputs.generators: .*runs/other/stages/net: no such folder"):
@@ -219,24 +218,22 @@ def test_another_run_that_is_gone(runs: Path) -> None:
         ("runs/other", r"runs/other: a whole run; name one of its stages.*data, net"),
         ("runs/other/stages", r"no finished stage \(no artifact.json\); name the folder of a stage"),
         ("runs/other/stages/data", r"its input 'start' is the stage '.*data' of kind root, which is no net"),
+        (
+            "[net, runs/other/stages/data]",
+            "'runs/other/stages/data' is no stage that gives a generator",
+        ),
+        (
+            "[runs/other/stages/net, runs/sub/other/stages/net]",
+            "two are called 'other:net'; name each once, or rename",
+        ),
     ],
 )
 def test_what_is_no_stage_is_refused(place: str, says: str, runs: Path) -> None:
     Path("recipe.yaml").write_text(MINE)
-    with pytest.raises(UserError, match=says):
-        load_recipe("recipe.yaml", [f"net.inputs.start={place}"])
-
-
-def test_a_list_refuses_what_gives_something_else(runs: Path) -> None:
-    Path("recipe.yaml").write_text(MINE)
-    with pytest.raises(UserError, match="'runs/other/stages/data' is no stage that gives a generator"):
-        load_recipe("recipe.yaml", ["judge.inputs.generators=[net, runs/other/stages/data]"])
     shutil.copytree(runs / "other", runs / "sub/other")
-    with pytest.raises(UserError, match="two are called 'other:net'; name each once, or rename"):
-        load_recipe(
-            "recipe.yaml",
-            ["judge.inputs.generators=[runs/other/stages/net, runs/sub/other/stages/net]"],
-        )
+    role = "judge.inputs.generators" if place.startswith("[") else "net.inputs.start"
+    with pytest.raises(UserError, match=says):
+        load_recipe("recipe.yaml", [f"{role}={place}"])
 
 
 def test_a_stage_of_another_version_or_with_a_file_missing(
@@ -245,7 +242,7 @@ def test_a_stage_of_another_version_or_with_a_file_missing(
     Path("recipe.yaml").write_text(MINE)
     net = runs / "other/stages/net"
     (net / "value.json").rename(net / "old.json")
-    with pytest.raises(UserError, match=r"value.json is gone or has another size; make it anew: motionloom"):
+    with pytest.raises(UserError, match=r"value.json is gone or has another size; make it again: motionloom"):
         load_recipe("recipe.yaml")
     (net / "old.json").rename(net / "value.json")
     root = Loading("root", "a toy", AddConfig, add_up, version=2, given_names=frozenset({"data"}))
@@ -276,6 +273,6 @@ def test_one_that_changes_while_a_stage_runs_is_noticed(runs: Path, monkeypatch:
     takes = ("data", "start?: net")
     net = Loading("net", "a toy", AddConfig, meddle, takes, trains=True, given_names=frozenset({GENERATOR}))
     register_toys(monkeypatch, net)
-    with pytest.raises(UserError, match="was made anew while this stage ran; run the recipe again"):
+    with pytest.raises(UserError, match="was made again while this stage ran; run the recipe again"):
         go(MINE, "runs/mine")
     assert Artifact.find(runs / "mine/stages/net") is None

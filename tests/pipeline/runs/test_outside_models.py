@@ -1,4 +1,4 @@
-"""A GPT trained on from that of another run, on other data, with its tokenizer; and from an export."""
+"""A GPT trained on from that of another run, on other data, with its tokenizer."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from rich.console import Console
 from safetensors.torch import load_file
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.exported import BundleFile
+from motionloom.pipeline.contract.lookup import BundleFile
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import export_run, run_recipe
-from motionloom.pipeline.runs.graph import Selection
 from motionloom.pipeline.runs.recipe import load_recipe
 
 QUIET = Console(quiet=True)
+pytestmark = pytest.mark.slow
 
 
 def child(folder: Path, run: Path, places: dict[str, str], **changes: Any) -> Path:
@@ -74,31 +74,10 @@ def test_a_gpt_goes_on_from_that_of_another_run(other: Path, tmp_path: Path) -> 
     export_run(run, tmp_path / "exported", console=QUIET)
     facts = BundleFile.load_json(tmp_path / "exported/bundle.json")
     assert facts.generators == ("gpt",) and {"tokenizer", "text", "tma"} <= set(facts.stages)
+    with pytest.raises(UserError, match="a whole export; name one of its stages"):
+        load_recipe(recipe, [f"gpt.inputs.start={tmp_path / 'exported'}"])
     other.rename(tmp_path / "away")
     again = Bundle.open(tmp_path / "exported").generate(["a person waves"], seconds=2.0, seed=1)[0]
     np.testing.assert_array_equal(again.features, made.features)
     with pytest.raises(UserError, match=f"stage 'gpt' was made from {other}/stages/tokenizer, where no"):
         Bundle.open(run)
-
-
-def test_stages_of_an_export_feed_a_run(other: Path, tmp_path: Path) -> None:
-    exported = tmp_path / "exported"
-    export_run(other, exported, console=QUIET)
-    shutil.rmtree(other / "stages")
-    recipe = child(tmp_path, other, stages_in(exported))
-    run = tmp_path / "run"
-    run_recipe(recipe, run, dry_run=True, console=QUIET)
-    run_recipe(recipe, run, select=Selection(until="tokens"), console=QUIET)
-    assert (run / "stages/tokens/tokens-train.safetensors").is_file()
-    plan = Console(record=True, width=300, quiet=False, file=(tmp_path / "out.txt").open("w"))
-    run_recipe(recipe, run, select=Selection(until="tokens"), console=plan)
-    assert "the selected stages are finished (2 of 4)" in plan.export_text()
-    # Another export in the same place is another stage.
-    weights = exported / "tokenizer/model.json"
-    weights.write_text(weights.read_text() + "\n")
-    run_recipe(recipe, run, select=Selection(until="tokens"), dry_run=True, console=plan)
-    assert "tokenizer changed" in plan.export_text()
-    with pytest.raises(UserError, match=r"exported/gtp: no such folder; did you mean 'gpt'"):
-        load_recipe(recipe, [f"gpt.inputs.start={exported}/gtp"])
-    with pytest.raises(UserError, match="a whole export; name one of its stages"):
-        load_recipe(recipe, [f"gpt.inputs.start={exported}"])

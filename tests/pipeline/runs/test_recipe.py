@@ -1,9 +1,11 @@
-"""Recipes: reading, overriding, refusing."""
+"""Recipes: read, extended, overridden, with defaults of kinds; refused by the key; and their schema."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import pytest
 import torch
 from rich.console import Console
@@ -11,78 +13,79 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.estimate import estimate
-from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.runs.shipped import shipped_recipes
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe, recipe_schema
+from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.store.yaml import read_yaml
 
-
-def write(tmp_path: Path, text: str) -> Path:
-    path = tmp_path / "recipe.yaml"
-    path.write_text(text)
-    return path
+QUIET = Console(quiet=True)
 
 
-BASE = """
-name: small
-stages:
-  data: {kind: synth, clips: 8}
-  stats: {kind: stats}
-"""
+@pytest.fixture
+def load(tmp_path: Path) -> Any:
+    """`load(text, *sets, base=...)`: the recipe of a text; with `base` it may extend that text as `base`."""
+
+    def go(text: str, *sets: str, base: str | None = None) -> Recipe:
+        path = tmp_path / "recipe.yaml"
+        path.write_text(text)
+        if base is not None:
+            (tmp_path / "base.yaml").write_text(base)
+        return load_recipe(path, sets)
+
+    return go
+
+
+def names(recipe: Recipe) -> list[str]:
+    return [stage.name for stage in recipe.stages]
+
+
+def config(recipe: Recipe, stage: str) -> Any:
+    return recipe.stage(stage).config
 
 
 @pytest.mark.parametrize("name", sorted({*shipped_recipes()} - {"finetune"}))  # test_finetune.py
-def test_shipped_recipes_load_and_reload(name: str, tmp_path: Path) -> None:
-    recipe = load_recipe(name)
-    assert recipe.description
-    assert load_recipe(write(tmp_path, recipe.to_yaml())) == recipe
-
-
-def test_shipped_recipes_are_named_by_folder_and_size() -> None:
-    for name, path in shipped_recipes().items():
-        if name == "finetune":  # of no family, at the top
-            assert read_yaml(path)["name"] == name == path.stem and path.parent.name == "configs"
-            continue
-        assert read_yaml(path)["name"] == name == f"{path.parent.name}-{path.stem}"
-        assert load_recipe(f"{path.parent.name}/{path.stem}").name == name
-
-
-@pytest.mark.parametrize("name", sorted(name for name in shipped_recipes() if name.startswith("ude-")))
-def test_sizes_of_ude_are_known_before_it_runs(name: str) -> None:
-    recipe = load_recipe(name)
-    cards = estimate(recipe)
-    decoded_by_tokenizer = name.endswith(("vq-decoder", "gru"))
-    assert set(cards) == {stage.name for stage in recipe.stages if stage.kind.trains} >= {"tokenizer", "utt"}
-    assert ("dmd" in cards) == (not decoded_by_tokenizer)
-    assert cards["utt"].note == "40 code + 1 End for 160 frames"
-    for stage in recipe.stages:
-        stage.config.require_fit(recipe.hardware)
+def test_shipped_recipes_load_and_reload(name: str, load: Any) -> None:
+    recipe, path = load_recipe(name), shipped_recipes()[name]
+    assert recipe.description and load(recipe.to_yaml()) == recipe
+    assert read_yaml(path)["name"] == name == f"{path.parent.name}-{path.stem}"
+    assert load_recipe(f"{path.parent.name}/{path.stem}").name == name
 
 
 def test_ablations_of_ude_change_what_they_are_named_for() -> None:
     """Tables 3 to 5; beside what is named, the recipes of a size are equal."""
     for size in ("tiny", "paper"):
         base, gru = load_recipe(f"ude-{size}"), load_recipe(f"ude-{size}-gru")
-        assert base.stage("ude").config.inject_z  # type: ignore[attr-defined]
-        assert "dmd" in base.stage("ude").inputs
+        assert config(base, "ude").inject_z and "dmd" in base.stage("ude").inputs
         for name in ("no-z", "no-z-vq-decoder", "vq-decoder"):
             recipe = load_recipe(f"ude-{size}-{name}")
-            config = recipe.stage("ude").config
-            assert config.inject_z == (name == "vq-decoder")  # type: ignore[attr-defined]
+            assert config(recipe, "ude").inject_z == (name == "vq-decoder")
             assert ("dmd" in recipe.stage("ude").inputs) == (name == "no-z")
             trained = {stage.name: stage for stage in recipe.stages if stage.kind.trains}
             assert all(stage == base.stage(name) for name, stage in trained.items())
-        assert gru.stage("utt").config.net == base.stage("utt").config.net.model_copy(  # type: ignore[attr-defined]
-            update={"kind": "gru"}
-        )
+        wanted = config(base, "utt").net.model_copy(update={"kind": "gru"})
+        assert config(gru, "utt").net == wanted
 
 
 def test_override_changes_one_value() -> None:
-    plain = load_recipe("humantomato-tiny")
-    changed = load_recipe("humantomato-tiny", ["tma.optim.lr=1e-3"])
-    assert changed.stage("tma").config.optim.lr == 1e-3  # type: ignore[attr-defined]
-    same = [s for s in changed.stages if s.name != "tma"]
-    assert same == [s for s in plain.stages if s.name != "tma"]
+    plain, changed = (load_recipe("humantomato-tiny", sets) for sets in ([], ["tma.optim.lr=1e-3"]))
+    assert config(changed, "tma").optim.lr == 1e-3
+    assert [one for one in changed.stages if one.name != "tma"] == [
+        one for one in plain.stages if one.name != "tma"
+    ]
+
+
+TINY = "extends: humantomato-tiny\nname: x\n"
+LISTED = """
+name: two-faces
+stages:
+  data: {kind: synth, clips: 8}
+  stats: {kind: stats}
+  text: {kind: text}
+  face_vae: {kind: tma, part: face, net: {frame_stride: 1}, loss: {contrastive: 0}}
+  diffusion: {kind: diffusion}
+  tma: {kind: tma}
+  latents: {kind: aligned_text}
+  generate: {kind: generate, inputs: {generators: [face_vae, diffusion]}}
+"""
 
 
 @pytest.mark.parametrize(
@@ -98,6 +101,12 @@ def test_override_changes_one_value() -> None:
         ("gpt.net.heads=7", "with --set: stages.gpt: .*dim 160 must be a multiple of heads 7"),
         ("tma.net.heads=3", "latent 128 must be a multiple of heads 3"),
         ("tokenizer.inputs.data=null", "stage 'tokenizer' needs a stage 'None'"),
+        ("sead=3", "no stage 'sead'; did you mean 'seed'"),
+        ("stats=null", r"needs a stage 'stats' \(role 'stats'\), which --set stats=null leaves out"),
+        ("face_tokenizr=null", "--set face_tokenizr=null: no stage .*; did you mean 'face_tokenizer'"),
+        ("stages.tmaa=null", "--set stages.tmaa=null: there is no such stage to remove; did you mean 'tma'"),
+        ("tma.inputs.text=txt", "needs a stage 'txt' .*; did you mean 'text'"),
+        ("generate.inputs.generators=[gptt]", "'gptt' is no stage .*; did you mean 'gpt'"),
     ],
 )
 def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> None:
@@ -105,12 +114,17 @@ def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> N
         load_recipe("humantomato-tiny", [override])
 
 
+def test_a_stage_that_was_left_out_is_not_set(load: Any) -> None:
+    with pytest.raises(UserError, match="no stage 'diffusion'; --set diffusion=null"):
+        load(LISTED, "diffusion=null", "diffusion.net.dim=8")
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         ("name: x\nstages: {stats: {kind: stats}}", "needs a stage 'data'"),
         (
-            "name: x\nstages: {data: {kind: synth}, stats: {kind: stats, inputs: {dat: data}}}",
+            "name: x\nstages: {data: {kind: synth}, s: {kind: stats, inputs: {dat: data}}}",
             "unknown role 'dat'",
         ),
         ("name: x\nstage: {}", "unknown key 'stage'; did you mean 'stages'"),
@@ -119,30 +133,52 @@ def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> N
         ("name: x\nstages: {/tmp/victim: {kind: stats}}", "stage name '/tmp/victim'"),
         ("[1, 2]", "mapping"),
         ("a: [", "not valid YAML"),
+        ("name: x\nstages: {}\nname: y", "key 'name' is in line 1 already.*line 3"),
+        ("name: x\nstages: {data: {kind: synth, clips: 3, clips: 4}}", "key 'clips'"),
+        (TINY + "stages: {toknizer: {train: {steps: 3}}}", "did you mean 'tokenizer'"),
         ("extends: recipe\nname: x", "circle"),
         (
-            "name: x\nstages: {data: {kind: synth}, stats: {kind: stats}, text: {kind: text}, "
-            "face_vae: {kind: tma, part: face, net: {frame_stride: 2}}}",
+            TINY + "stages: {face_vae: {kind: tma, part: face, net: {frame_stride: 2}}}",
             "frame_stride must be 1",
         ),
+        # By kind or by what it gives; what would fit is named.
+        (
+            TINY + "stages: {gpt: {inputs: {tokenizer: tma}}}",
+            "'tma' of kind tma, which is no tokenizer; choose .*face_tokenizer",
+        ),
+        (
+            TINY + "stages: {tma: {inputs: {stats: data}}}",
+            r"'data' of kind synth, which is no stats; choose stats in stages\.tma",
+        ),
+        (TINY + "stages: {face_gpt: {inputs: {start: gpt}}}", "starts from 'gpt', which differs in"),
+        (
+            "extends: base\nname: child\nstages: {face_vae: null}",
+            r"generate.inputs.generators: 'face_vae' is no stage that gives a generator, as "
+            r"stages.face_vae: null in .*recipe.yaml leaves it out; valid names: diffusion",
+        ),
+        (
+            "extends: base\nname: child\nstages: {tma: null}",
+            r"stage 'latents' needs a stage 'tma' \(role 'tma'\), which stages.tma: null in .* leaves",
+        ),
+        (
+            "extends: base\nname: child\nstages: {face_vea: null}",
+            "there is no such stage to remove; did you mean 'face_vae'",
+        ),
+        (LISTED.replace("{kind: diffusion}", "null"), r"stages\.diffusion"),
     ],
 )
-def test_wrong_recipes_are_refused(text: str, says: str, tmp_path: Path) -> None:
+def test_wrong_recipes_are_refused(text: str, says: str, load: Any) -> None:
     with pytest.raises(UserError, match=says):
-        load_recipe(write(tmp_path, text))
+        load(text, base=LISTED)
 
 
-def test_unknown_recipe_names_the_nearest() -> None:
-    with pytest.raises(UserError, match="did you mean 'humantomato-tiny'"):
-        load_recipe("humantomato-tin")
-
-
-def test_extends_merges_into_the_base(tmp_path: Path) -> None:
-    (tmp_path / "base.yaml").write_text(BASE)
-    recipe = load_recipe(write(tmp_path, "extends: base\nname: child\nstages: {data: {clips: 9}}"))
-    assert recipe.name == "child"
-    assert recipe.stage("data").config.clips == 9  # type: ignore[attr-defined]
-    assert [s.name for s in recipe.stages] == ["data", "stats"]
+def test_a_stage_of_the_base_can_be_left_out(load: Any) -> None:
+    child = (
+        "extends: base\nname: child\nstages: {face_vae: null, generate: {inputs: {generators: [diffusion]}}}"
+    )
+    left = ["data", "stats", "text", "diffusion", "tma", "latents", "generate"]
+    assert names(load(child, base=LISTED)) == left
+    assert names(load(LISTED, "face_vae=null", "generate.inputs.generators=[diffusion]")) == left
 
 
 CAPTIONED = """
@@ -159,149 +195,196 @@ stages:
 """
 
 
-def test_a_tma_on_captions_of_another_encoder_is_refused(tmp_path: Path) -> None:
+def test_a_tma_on_captions_of_another_encoder_is_refused(load: Any) -> None:
     with pytest.raises(
         UserError, match=r"'gpt' reads captions as 'clip' .* its TMA 'tma' .* those of 'text'"
     ):
-        load_recipe(write(tmp_path, CAPTIONED))
+        load(CAPTIONED)
     for change in (("inputs: {text: clip}", "inputs: {text: clip, tma: null}"), ("some-clip", "minilm")):
-        load_recipe(write(tmp_path, CAPTIONED.replace(*change)))
-
-
-@pytest.mark.parametrize("override", ["tokenizer.net.reset_below=1.0", "tokenizer.net.num_codes=8192"])
-def test_a_codebook_too_large_for_its_batches_is_refused(override: str, tmp_path: Path) -> None:
-    for dry_run in (True, False):
-        with pytest.raises(UserError, match=r"stage tokenizer: .*net.reset_below to 0\.\d+ or less"):
-            run_recipe(
-                "humantomato-tiny",
-                tmp_path,
-                overrides=[override],
-                dry_run=dry_run,
-                console=Console(quiet=True),
-            )
-    assert not list(tmp_path.rglob("artifact.json")), "refused before anything ran"
-
-
-def test_a_codebook_of_mq_is_reset_only_if_averages_learn_it() -> None:
-    """256 vectors a batch, 256 codes: a threshold of 1 would reset codes for ever, a gradient resets none."""
-    sets = ["tokenizer.net.reset_below=1.0"]
-    with pytest.raises(UserError, match=r"256 codes gets 256 vectors .*net.reset_below to 0\.25 or less"):
-        recipe = load_recipe("ude-tiny", sets)
-        recipe.stage("tokenizer").config.require_fit(recipe.hardware)  # type: ignore[attr-defined]
-    recipe = load_recipe("ude-tiny", [*sets, "tokenizer.net.quantizer=gradient"])
-    recipe.stage("tokenizer").config.require_fit(recipe.hardware)  # type: ignore[attr-defined]
+        load(CAPTIONED.replace(*change))
 
 
 @pytest.mark.parametrize(
-    ("override", "says"),
+    ("recipe", "override", "says"),
     [
-        ("gpt.net.block_size=4", "block_size 4 holds no motion.* take 6"),
-        ("hardware.accelerator=gpu", "no GPU is here; set hardware.devices"),
+        (
+            "humantomato-tiny",
+            "tokenizer.net.reset_below=1.0",
+            r"stage tokenizer: .*net.reset_below to 0\.\d+ or less",
+        ),
+        (
+            "humantomato-tiny",
+            "tokenizer.net.num_codes=8192",
+            r"stage tokenizer: .*net.reset_below to 0\.\d+ or less",
+        ),
+        ("ude-tiny", "tokenizer.net.reset_below=1.0", r"256 codes gets 256 vectors .*to 0\.25 or less"),
+        ("ude-tiny", "utt.max_frames=800", "block_size 48 holds 47 groups .* max_frames to 188"),
+        ("humantomato-tiny", "gpt.net.block_size=4", "block_size 4 holds no motion.* take 6"),
+        ("humantomato-tiny", "hardware.accelerator=gpu", "no GPU is here; set hardware.devices"),
     ],
 )
-def test_a_dry_run_refuses_what_cannot_run(override: str, says: str, tmp_path: Path) -> None:
+def test_what_cannot_run_is_refused_before_anything_runs(
+    recipe: str, override: str, says: str, tmp_path: Path
+) -> None:
     if "gpu" in override and torch.cuda.is_available():
         pytest.skip("there is a GPU here")
-    console = Console(record=True, width=500)
-    with pytest.raises(UserError, match=says):
-        run_recipe("humantomato-tiny", tmp_path, overrides=[override], dry_run=True, console=console)
+    for dry_run in (True, False) if "reset_below" in says else (True,):
+        with pytest.raises(UserError, match=says):
+            run_recipe(recipe, tmp_path, overrides=[override], dry_run=dry_run, console=QUIET)
+    assert not list(tmp_path.rglob("artifact.json"))
 
 
-def test_a_stage_that_cannot_stand_in_a_role(tmp_path: Path) -> None:
-    """By kind (`stats`) or by what it gives (`tokenizer`); what would fit is named."""
-    head = "extends: humantomato-tiny\nname: x\n"
-    wrong = write(tmp_path, head + "stages: {gpt: {inputs: {tokenizer: tma}}}")
-    with pytest.raises(UserError, match=r"'tma' of kind tma, which is no tokenizer; choose .*face_tokenizer"):
-        load_recipe(wrong)
-    wrong = write(tmp_path, head + "stages: {tma: {inputs: {stats: data}}}")
-    with pytest.raises(
-        UserError, match=r"'data' of kind synth, which is no stats; choose stats in stages\.tma"
-    ):
-        load_recipe(wrong)
-    fits = write(tmp_path, head + "stages: {face_gpt: {inputs: {start: gpt}}}")
-    with pytest.raises(UserError, match="starts from 'gpt', which differs in"):
-        load_recipe(fits)
-
-
-def test_windows_longer_than_the_block_are_refused_before_training(tmp_path: Path) -> None:
-    console = Console(quiet=True)
-    with pytest.raises(UserError, match=r"block_size 48 holds 47 groups .* max_frames to 188"):
-        run_recipe("ude-tiny", tmp_path, overrides=["utt.max_frames=800"], dry_run=True, console=console)
+def test_a_codebook_that_a_gradient_learns_is_never_reset() -> None:
+    recipe = load_recipe("ude-tiny", ["tokenizer.net.reset_below=1.0", "tokenizer.net.quantizer=gradient"])
+    config(recipe, "tokenizer").require_fit(recipe.hardware)
 
 
 def test_shards_that_are_not_there_or_of_another_layout(tmp_path: Path) -> None:
     path = tmp_path / "recipe.yaml"
     path.write_text("name: x\nstages: {data: {kind: shards, path: shards}, stats: {kind: stats}}")
-    missing = [f"data.path={tmp_path / 'nowhere'}"]
-    with pytest.raises(UserError, match="nowhere: no such folder; set the path of the data stage"):
-        run_recipe(path, tmp_path / "run", overrides=missing, dry_run=True, console=Console(quiet=True))
     synthesize(SynthConfig(clips=4), tmp_path / "shards", workers=1)
-    other = [f"data.path={tmp_path / 'shards'}", "data.layout=body133"]
-    with pytest.raises(UserError, match="layout wholebody363, but the recipe wants body133"):
-        run_recipe(path, tmp_path / "run", overrides=other, dry_run=True, console=Console(quiet=True))
+    for sets, says in (
+        ([f"data.path={tmp_path / 'nowhere'}"], "nowhere: no such folder; set the path of the data stage"),
+        (
+            [f"data.path={tmp_path / 'shards'}", "data.layout=body133"],
+            "layout wholebody363, but the recipe wants body133",
+        ),
+    ):
+        with pytest.raises(UserError, match=says):
+            run_recipe(path, tmp_path / "run", overrides=sets, dry_run=True, console=QUIET)
 
 
-LISTED = """
-name: two-faces
+BASE = """
+name: base
+defaults:
+  trained: {optim: {lr: 3.0e-4, warmup_steps: 7}, train: {steps: 50, precision: bf16-mixed}}
+  vq: {net: {width: 24, num_codes: 32}, train: {batch_size: 64}}
+  synth: {clips: 9}
 stages:
-  data: {kind: synth, clips: 8}
+  data: {kind: synth}
   stats: {kind: stats}
-  text: {kind: text}
-  face_vae: {kind: tma, part: face, net: {frame_stride: 1}, loss: {contrastive: 0}}
-  diffusion: {kind: diffusion}
-  tma: {kind: tma}
-  latents: {kind: aligned_text}
-  generate: {kind: generate, inputs: {generators: [face_vae, diffusion]}}
+  tokenizer: {kind: vq, net: {num_codes: 16}, train: {steps: 60}}
+  other: {kind: rvq}
 """
 
 
-def test_a_stage_of_the_base_can_be_left_out(tmp_path: Path) -> None:
-    (tmp_path / "base.yaml").write_text(LISTED)
-    child = (
-        "extends: base\nname: child\nstages: {face_vae: null, generate: {inputs: {generators: [diffusion]}}}"
+def test_a_stage_stands_on_its_kind_and_its_kind_on_trained(load: Any) -> None:
+    found = load(BASE)
+    tokenizer, other = config(found, "tokenizer"), config(found, "other")
+    assert (tokenizer.net.width, tokenizer.net.num_codes) == (24, 16)
+    assert (tokenizer.train.steps, tokenizer.train.batch_size) == (60, 64)
+    assert tokenizer.train.precision == other.train.precision == "bf16-mixed"
+    assert (tokenizer.optim.lr, tokenizer.optim.warmup_steps) == (3e-4, 7)
+    assert (other.train.steps, other.train.batch_size, other.net.width) == (50, 256, 512)
+    assert config(found, "data").clips == 9
+    assert "defaults" not in found.to_yaml() and load(found.to_yaml()) == found
+    found = load(BASE, "tokenizer.net.width=40", "defaults.trained.optim.lr=1e-3")
+    assert config(found, "tokenizer").net.width == 40
+    assert config(found, "tokenizer").optim.lr == config(found, "other").optim.lr == 1e-3
+    # Half of a default may need the stage: 7 heads do not divide the usual width, but the stage's own.
+    seven = (
+        BASE.replace("  synth:", "  dmd: {net: {heads: 7}}\n  synth:") + "  dmd: {kind: dmd, net: {dim: 70}}"
     )
-    names = [stage.name for stage in load_recipe(write(tmp_path, child)).stages]
-    assert names == ["data", "stats", "text", "diffusion", "tma", "latents", "generate"]
-    sets = ["face_vae=null", "generate.inputs.generators=[diffusion]"]
-    assert [stage.name for stage in load_recipe(tmp_path / "base.yaml", sets).stages] == names
+    assert config(load(seven), "dmd").net.heads == 7
+
+
+def test_what_extends_brings_its_own_defaults(load: Any, tmp_path: Path) -> None:
+    child = """
+extends: base
+name: child
+defaults: {trained: {optim: {lr: 5.0e-4}, train: {steps: 70}}, fsq: {net: {width: 8}}}
+stages: {more: {kind: fsq}, other: {kind: separate}, data: {clips: 11}}
+"""
+    found = load(child, base=BASE)
+    assert found.name == "child" and config(found, "data").clips == 11
+    assert (config(found, "tokenizer").train.steps, config(found, "other").train.steps) == (60, 70)
+    assert (config(found, "more").net.width, config(found, "more").optim.lr) == (8, 5e-4)
+    assert config(found, "more").optim.warmup_steps == 7, "the base's, which the child does not name"
+    # Those of a base may concern a stage that was replaced.
+    assert (
+        config(load("extends: base\nname: child\nstages: {tokenizer: {kind: fsq}}"), "tokenizer").net.width
+        == 512
+    )
+    assert load(BASE, "tokenizer={kind: fsq}").stage("tokenizer").kind.name == "fsq"
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "base.yaml").write_text(BASE)
+    assert len(load("extends: below/base.yaml\nname: child").stages) == 4
+    assert load("extends: humantomato/tiny\nname: child").stages == load_recipe("humantomato-tiny").stages
 
 
 @pytest.mark.parametrize(
-    ("child", "says"),
+    ("defaults", "says"),
     [
-        (
-            "{face_vae: null}",
-            r"generate.inputs.generators: 'face_vae' is no stage that gives a generator, as "
-            r"stages.face_vae: null in .*recipe.yaml leaves it out; valid names: diffusion",
-        ),
-        (
-            "{tma: null}",
-            r"stage 'latents' needs a stage 'tma' \(role 'tma'\), which stages.tma: null in .* leaves",
-        ),
-        ("{face_vea: null}", "there is no such stage to remove; did you mean 'face_vae'"),
+        ("{trainde: {optim: {}}}", "defaults.trainde: no stage kind 'trainde'; did you mean 'trained'"),
+        ("{trained: {trian: {steps: 3}}}", "defaults.trained: unknown key 'trian'; did you mean 'train'"),
+        ("{trained: {net: {width: 3}}}", "defaults.trained: unknown key 'net'"),
+        ("{vq: {net: {widht: 3}}}", "defaults.vq: unknown key 'net.widht'; did you mean 'width'"),
+        ("{vq: {train: {steps: many}}}", "defaults.vq: key 'train.steps' = 'many'"),
+        ("{vq: {kind: rvq}}", "defaults.vq: unknown key 'kind'"),
+        ("{fsq: {net: {width: 3}}}", "defaults.fsq concerns no stage: there is none of kind fsq"),
+        ("{vq: 3}", "defaults.vq"),
+        ("[vq]", "defaults"),
     ],
 )
-def test_what_names_a_stage_that_is_left_out(child: str, says: str, tmp_path: Path) -> None:
-    (tmp_path / "base.yaml").write_text(LISTED)
+def test_wrong_defaults_are_refused_by_name(defaults: str, says: str, load: Any) -> None:
+    text = BASE[: BASE.index("defaults:")] + f"defaults: {defaults}\n" + BASE[BASE.index("stages:") :]
     with pytest.raises(UserError, match=says):
-        load_recipe(write(tmp_path, f"extends: base\nname: child\nstages: {child}"))
+        load(text)
+
+
+def test_trained_without_a_stage_that_trains_is_refused(load: Any) -> None:
+    text = "name: x\ndefaults: {trained: {train: {steps: 3}}}\nstages: {data: {kind: synth}}"
+    with pytest.raises(UserError, match=r"defaults\.trained concerns no stage: there is none that trains"):
+        load(text)
+
+
+VALIDATOR = jsonschema.Draft202012Validator(recipe_schema())
+
+
+def test_schema_is_a_schema() -> None:
+    jsonschema.Draft202012Validator.check_schema(recipe_schema())
+
+
+@pytest.mark.parametrize("name", sorted(shipped_recipes()))
+def test_shipped_recipes_pass(name: str) -> None:
+    VALIDATOR.validate(read_yaml(shipped_recipes()[name]))
 
 
 @pytest.mark.parametrize(
-    ("sets", "says"),
+    "stage",
     [
-        (["tma=null"], r"needs a stage 'tma' \(role 'tma'\), which --set tma=null leaves out"),
-        (["face_vea=null"], "--set face_vea=null: no stage 'face_vea'; did you mean 'face_vae'"),
-        (
-            ["stages.tmaa=null"],
-            "--set stages.tmaa=null: there is no such stage to remove; did you mean 'tma'",
-        ),
-        (["diffusion=null", "diffusion.net.dim=8"], "no stage 'diffusion'; --set diffusion=null"),
-        (["sead=3"], "no stage 'sead'; did you mean 'seed'"),
-        (["diffusion.inputs.text=txt"], "needs a stage 'txt' .*; did you mean 'text'"),
-        (["generate.inputs.generators=[difusion]"], "'difusion' is no stage .*; did you mean 'diffusion'"),
+        {"kind": "tma", "optim": {"lrr": 1}},
+        {"kind": "tma", "optim": {"lr": -1}},
+        {"kind": "tma", "inputs": {"dat": "data"}},
+        {"kind": "nothing"},
+        {"kind": "gpt", "prior": "words"},
     ],
 )
-def test_names_on_the_command_line_that_are_no_stage(sets: list[str], says: str, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=says):
-        load_recipe(write(tmp_path, LISTED), sets)
+def test_mistakes_are_refused(stage: dict) -> None:
+    assert not VALIDATOR.is_valid({"name": "x", "stages": {"s": stage}})
+
+
+@pytest.mark.parametrize(
+    ("defaults", "right"),
+    [
+        ({"trained": {"train": {"steps": 3}}, "vq": {"net": {"width": 8}}, "bvh": {"fps": 20}}, True),
+        ({"trained": {"net": {"width": 8}}}, False),
+        ({"vq": {"kind": "vq"}}, False),
+        ({"vq": {"net": {"widht": 8}}}, False),
+        ({"vqq": {}}, False),
+    ],
+)
+def test_defaults_are_checked(defaults: dict, right: bool) -> None:
+    stages = {"data": {"kind": "bvh"}, "vq": {"kind": "vq"}, "removed": None}
+    assert VALIDATOR.is_valid({"name": "x", "defaults": defaults, "stages": stages}) == right
+
+
+def test_a_part_of_a_group_keeps_the_groups_own_defaults() -> None:
+    """UDE's schedule is linear (3.4); ude-tiny gives only what it predicts."""
+    dmd = load_recipe("ude-tiny").stage("dmd").config
+    assert (dmd.net.schedule.betas, dmd.net.schedule.predicts) == ("linear", "sample")
+    generate = load_recipe("ude-tiny").stage("generate").config
+    assert generate.sampling.sampler is None and generate.sampling.model_fields_set == {
+        "temperature",
+        "top_p",
+    }

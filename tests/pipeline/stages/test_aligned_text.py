@@ -11,10 +11,10 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import export_run, run_recipe
-from motionloom.pipeline.runs.graph import Selection
+from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import load_recipe
 
 pytestmark = pytest.mark.slow
@@ -41,8 +41,8 @@ def run(ude_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_caption_is_one_latent(run: Path) -> None:
-    stages, shelf = finished_stages(run), Shelf()
-    words, text, tma = (shelf.get(stages[name]) for name in ("words", "text", "tma"))
+    stages, stage_cache = finished_stages(run), StageCache()
+    words, text, tma = (stage_cache.get(stages[name]) for name in ("words", "text", "tma"))
     captions = sorted(words.cache.captions_by_key().values())
     assert captions == sorted(text.cache.captions_by_key().values()) and words.dim == words.cache.dim == 24
     tokens, mask = words.cache.tokens(captions)
@@ -57,8 +57,8 @@ def test_a_caption_is_one_latent(run: Path) -> None:
 
 
 def test_new_words_go_the_same_way(run: Path) -> None:
-    stages, shelf = finished_stages(run), Shelf()
-    words = shelf.get(stages["words"])
+    stages, stage_cache = finished_stages(run), StageCache()
+    words = stage_cache.get(stages["words"])
     captions = sorted(words.cache.captions_by_key().values())[:3]
     fresh, known = words.encoder.encode([*captions, "somebody sings"]), words.cache.tokens(captions)[0]
     assert fresh.tokens.shape == (4, 1, 24)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,22 +17,33 @@ from motionloom.datasets.audio.features import beats
 from motionloom.datasets.motion.canonical import resample
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.dance_plan import DanceConditions, DanceConfig, beats_of
+from motionloom.datasets.synth.dances import DanceConditions, DanceConfig, beats_of
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, synthesize
-from motionloom.pipeline.evaluation.dance_answers import mean_poses, nearest_dances, random_dances
-from motionloom.pipeline.evaluation.dance_figures import (
-    Matched,
-    alignment_of,
-    chances,
-    distribution_of,
-    features_of,
-    feet_of,
-    multimodality_of,
-    others,
-    recognition_of,
-    way,
+from motionloom.models.metrics.dance import dance_fid
+from motionloom.pipeline.evaluation.answers import mean_poses, nearest_dances, random_dances
+from motionloom.pipeline.evaluation.clip_metrics import DANCE_METRICS, Performance, measure_clip
+from motionloom.pipeline.evaluation.dances import (
+    DanceClip,
+    commonest,
+    dance_at,
+    dances_of,
+    digest_of_dances,
+    other_songs,
 )
-from motionloom.pipeline.evaluation.dances import DanceClip, dance_at, dances_of
+from motionloom.pipeline.evaluation.estimate import row_estimates
+from motionloom.pipeline.evaluation.figures import (
+    MODEL,
+    NEAREST,
+    NEAREST_MUSIC,
+    OTHER_MUSIC,
+    RANDOM_DANCE,
+    RECORDED,
+    STILL,
+    FigureFile,
+)
+from motionloom.pipeline.evaluation.movement import all_features, distances, movement_figures, multimodality
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generators.ude import UdeGenerator
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe
 
 FPS = 20.0
@@ -73,18 +86,13 @@ def test_clips_are_cut_with_their_music(data: Splits, clips: list[DanceClip]) ->
         assert clip.sound.seconds == pytest.approx(clip.seconds, abs=1 / clip.sound.rate)
         assert clip.beats.tolist() == beats_of(made.truth, clip.seconds)
         # What a model hears is what the data store: of the whole song, not of the clip alone.
-        assert clip.music is not None and np.array_equal(clip.music, data[1].audio(clip.index)[:frames])
+        assert clip.music is not None and np.array_equal(
+            clip.music, data[1].array(clip.index, "audio.npy")[:frames]
+        )
     short = dance_at(data[1], clips[0].index, seconds=2.0)
     assert short is not None and short.music is not None and len(short.music) == 40
     assert short is not None and short.seconds == 2.0 and short.sound.seconds == pytest.approx(2.0)
     assert (short.beats < 2.0).all() and len(short.beats) == (clips[0].beats < 2.0).sum()
-
-
-def test_different_songs_come_first(data: Splits) -> None:
-    songs = {clip.song for clip in dances_of(data[1], 100)}
-    chosen = dances_of(data[1], len(songs))
-    assert {clip.song for clip in chosen} == songs
-    assert [c.id for c in chosen] == [c.id for c in dances_of(data[1], len(songs))]
 
 
 def test_beats_without_a_truth_are_tracked(data: Splits, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,55 +104,85 @@ def test_beats_without_a_truth_are_tracked(data: Splits, monkeypatch: pytest.Mon
     assert clip.beats.tolist() == beats(clip.sound.samples, clip.sound.rate).tolist()
 
 
-def matched(motions: list[np.ndarray], clips: list[DanceClip]) -> list[Matched]:
-    return [Matched(joints, clip) for joints, clip in zip(motions, clips, strict=True)]
+def values(pairs: Iterable[tuple[np.ndarray, DanceClip]]) -> dict[str, float]:
+    """Means over motions, each held against a clip."""
+    rows = [
+        measure_clip(DANCE_METRICS, Performance(m, c.joints, c.fps, truth=c.truth, beats=c.beats))
+        for m, c in pairs
+    ]
+    return {name: found.value for name, found in row_estimates([rows]).items()}
 
 
 def test_figures_tell_the_truth_from_trivial_answers(data: Splits, clips: list[DanceClip]) -> None:
     real = [clip.joints for clip in clips]
-    apart = others(clips, 3, seed=1)
+    apart = other_songs(clips, 3, seed=1)
     assert all(clips[k].song != clip.song for clip, row in zip(clips, apart, strict=True) for k in row)
-    true = alignment_of(matched(real, clips))
-    crossed = alignment_of([Matched(m, clips[k]) for m, row in zip(real, apart, strict=True) for k in row])
+    true = values(zip(real, clips, strict=True))
+    crossed = values((m, clips[k]) for m, row in zip(real, apart, strict=True) for k in row)
     pool = dances_of(data[0], 50)
     still = mean_poses([c.joints for c in pool], pool[0].fps, map(len, real))
-    frozen = alignment_of(matched(still, clips))
+    frozen = values(zip(still, clips, strict=True))
     late = [np.concatenate([np.tile(j[:1], (4, 1, 1)), j[:-4]]) for j in real]  # a fifth of a second
-    delayed = alignment_of(matched(late, clips))
-    for name in ("bailando", "mint", "ude", "edge"):
+    delayed = values(zip(late, clips, strict=True))
+    for name in ("beat_align.bailando", "beat_align.mint", "beat_align.ude", "beat_align.edge"):
         assert true[name] > 0.7 > 0.5 > crossed[name] > frozen[name] == 0.0
         assert delayed[name] < 0.4
-    assert way(true, crossed, true) == pytest.approx(dict.fromkeys(true, 1.0))
-    assert way(crossed, crossed, true) == pytest.approx(dict.fromkeys(true, 0.0))
-    assert way(frozen, crossed, {name: value + 0.005 for name, value in crossed.items()}) == {}
-
-    found, guessed = recognition_of(matched(real, clips)), recognition_of(matched(still, clips))
-    assert found["genre"] == found["style"] == found["tempo"] == 1.0 and found["tempo_error"] < 0.02
-    assert guessed["genre"] <= chances(clips)["genre"] and guessed["tempo"] < 0.5
-
-    features = features_of(real, FPS, 60.0)
-    same, gone = distribution_of(features, features), distribution_of(features, features_of(still, FPS, 60.0))
-    assert same["fid_k"] == pytest.approx(0, abs=1e-3) and same["fid_m"] == pytest.approx(0, abs=1e-3)
-    assert gone["fid_m"] > 1 and max(gone["div_k"], gone["div_m"]) < 1e-9 < 1 < same["div_k"]
-    assert feet_of(still, FPS) == {"foot_skating": 0.0, "foot_contact": 0.0}
+    for name in ("genre", "style", "tempo"):
+        assert true[f"recognition.{name}"] == 1.0
+    assert true["recognition.tempo_error"] < 0.02 and frozen["recognition.tempo"] < 0.5
+    assert frozen["recognition.genre"] <= commonest(clips)["genre"]
+    assert frozen["feet.skating"] == frozen["feet.contact"] == 0.0
     slid = [joints + np.linspace(0, 10, len(joints))[:, None, None] * [1, 0, 0] for joints in real]
-    assert feet_of(slid, FPS)["foot_skating"] > 0.5 > feet_of(real, FPS)["foot_skating"]
+    assert values(zip(slid, clips, strict=True))["feet.skating"] > 0.5 > true["feet.skating"]
+
+    features = all_features(real, FPS)
+    same, gone = distances(features, features), distances(features, all_features(still, FPS))
+    assert max(same["movement.fid_k"], same["movement.fid_m"]) == pytest.approx(0, abs=1e-3)
+    assert gone["movement.fid_m"] > 1 and same["movement.div_k"] > 1
+    assert max(gone["movement.div_k"], gone["movement.div_m"]) < 1e-9
+
+
+def test_distances_are_to_all_dances_and_beside_them_to_the_test_clips(
+    data: Splits, clips: list[DanceClip]
+) -> None:
+    """As published: features, training and test, normalise and are the reference; few rows are said."""
+    real = all_features([clip.joints for clip in clips], FPS)
+    train = all_features([clip.joints for clip in dances_of(data[0], 50)], FPS)
+    whole = {kind: np.concatenate([train[kind], real[kind]]) for kind in real}
+    found = {(one.name, one.row): one for one in movement_figures(whole, real, {RECORDED: [real]}, {})}
+    for kind, width in (("k", 66), ("m", 32)):
+        published, ours = (found[f"movement.fid_{kind}{end}", RECORDED] for end in ("", "_test"))
+        assert published.value == pytest.approx(dance_fid(whole[kind], real[kind])) and published.value > 1
+        assert ours.value == pytest.approx(0, abs=1e-3)
+        assert (
+            published.note == ours.note == f"{len(clips)} motions for {width} columns, too few to be trusted"
+        )
+        assert found[f"movement.div_{kind}", RECORDED].note == ""
 
 
 def test_samples_of_a_song_vary_or_do_not(clips: list[DanceClip]) -> None:
-    real = features_of([clip.joints for clip in clips], FPS, 60.0)
-    other = features_of([clip.joints[::-1] * 1.5 for clip in clips], FPS, 60.0)
-    assert multimodality_of(real, [real]) == {}
-    for name, values in multimodality_of(real, [real, real]).items():
-        assert name in ("mm_k", "mm_m") and len(values) == len(clips) and not np.any(values)
-    assert min(multimodality_of(real, [real, other])["mm_k"]) > 0
+    real = all_features([clip.joints for clip in clips], FPS)
+    other = all_features([clip.joints[::-1] * 1.5 for clip in clips], FPS)
+    assert multimodality(real, [real]) == {}
+    assert {name: found.value for name, found in multimodality(real, [real, real]).items()} == {
+        "movement.mm_k": 0.0,
+        "movement.mm_m": 0.0,
+    }
+    assert multimodality(real, [real, other])["movement.mm_k"].value > 0
 
 
 def test_features_are_taken_at_the_published_rate(clips: list[DanceClip]) -> None:
     """A motion stored at 60 frames a second, and the same at 20, give features of one size."""
     fast = [resample(clip.joints, FPS, 60.0) for clip in clips]
-    for kind, rows in features_of(fast, 60.0, 60.0).items():
-        np.testing.assert_allclose(features_of([c.joints for c in clips], FPS, 60.0)[kind], rows, atol=1e-12)
+    for kind, rows in all_features(fast, 60.0).items():
+        np.testing.assert_allclose(all_features([c.joints for c in clips], FPS)[kind], rows, atol=1e-12)
+
+
+def test_the_digest_sees_motions_and_beats(clips: list[DanceClip]) -> None:
+    moved = replace(clips[0], joints=clips[0].joints + 1e-3)
+    later = replace(clips[0], beats=clips[0].beats + 0.1)
+    found = {digest_of_dances(some) for some in (clips, [moved, *clips[1:]], [later, *clips[1:]], clips[1:])}
+    assert len(found) == 4 and digest_of_dances([replace(clips[0], id="x"), *clips[1:]]) in found
 
 
 def test_trivial_answers_come_from_training_dances(data: Splits, clips: list[DanceClip]) -> None:
@@ -192,7 +230,7 @@ stages:
   ude: {denoising_steps: 2}
   generate: {count: 1, dances: 2, dance_seconds: 2, formats: [html, npz, mp4]}
   evaluate: {clips: 4}
-  evaluate_dances: {kind: evaluate_dances, clips: 4, repeats: 2}
+  evaluate_dances: {kind: evaluate_dances, clips: 4, repeats: 2, decodings: 2}
   report: {count: 1, dances: 2}
 """
 
@@ -215,29 +253,47 @@ def page_data(path: Path, name: str = "viewer-1-data") -> dict[str, Any]:
 
 def test_dances_of_a_run_are_evaluated(run: tuple[Path, str]) -> None:
     folder, said = run
-    figures = json.loads((folder / "stages/evaluate_dances/dances.json").read_text())
-    rows = figures["rows"]
-    assert (figures["clips"], figures["repeats"], figures["feature_fps"]) == (4, 2, 60.0)
-    assert set(rows) == {
-        "ground_truth", "generated", "shuffled_music", "nearest_music", "random_training_dance", "mean_pose"
-    }  # fmt: skip
-    made, true = rows["generated"], rows["ground_truth"]
-    assert set(made) == {
-        "beat_align", "recognition", "feet", "distribution", "multimodality", "positions", "way"
-    }  # fmt: skip
-    assert true["positions"]["ape_joints"]["mean"] == 0 < made["positions"]["ape_joints"]["mean"]
-    assert true["distribution"]["fid_k"]["mean"] == 0 and true["recognition"]["genre"]["mean"] == 1
-    for name in ("bailando", "mint", "ude", "edge"):
-        worse = (rows[other]["beat_align"][name]["mean"] for other in set(rows) - {"ground_truth"})
-        assert true["beat_align"][name]["mean"] > max(worse), "nothing was learned in two steps"
-        assert made["way"][name]["mean"] < 0.7
-    assert "generated from its music" in said and "test: " in said
+    file = FigureFile.read(folder / "stages/evaluate_dances/metrics.json")
+
+    def value(name: str, row: str = MODEL) -> float:
+        found = file.of(name, row)
+        assert found is not None, (name, row)
+        return found.value
+
+    facts = file.figures[0].protocol
+    assert (facts["clips"], facts["repeats"], facts["decodings"], facts["feature_fps"]) == (4, 2, 2, 60.0)
+    answers = {OTHER_MUSIC, NEAREST_MUSIC, RANDOM_DANCE, STILL}
+    assert answers | {MODEL, RECORDED} <= {one.row for one in file.figures}
+    assert value("position.ape_joints", RECORDED) == 0 < value("position.ape_joints")
+    assert value("recognition.genre", RECORDED) == 1 and value("movement.mm_k") >= 0
+    # To all dances, as published, and to the test clips, ours.
+    assert value("movement.fid_k", RECORDED) > 0 == value("movement.fid_k_test", RECORDED)
+    for name in ("bailando", "mint"):
+        key = f"beat_align.{name}"
+        worse = (value(key, row) for row in {*answers, MODEL})
+        assert value(key, RECORDED) > max(worse), "nothing was learned in two steps"
+        assert value(f"beat_way.{name}") < 0.7
+    assert OTHER_MUSIC in said and "test clips" in said
     # Captioned clips and dances without captions beside each other, no TMA in the run.
-    captions = json.loads((folder / "stages/evaluate/metrics.json").read_text())
-    assert captions["clips"] == 4 == captions["reconstructed_clips"] and "retrieval" not in captions
-    errors = captions["reconstruction_mm"]
-    assert {"mpjpe", "world", "mpjpe_nearest_train_clip", "pa_mpjpe"} <= errors.keys()
-    assert 0 < errors["mpjpe_nearest_train_clip"] < errors["mpjpe_mean_pose"]
+    captions = FigureFile.read(folder / "stages/evaluate/metrics.json")
+    assert not any(one.name.startswith("tma.") for one in captions.figures)
+    near, still, made = (captions.of("reconstruction.mpjpe", row) for row in (NEAREST, STILL, MODEL))
+    assert near is not None and still is not None and made is not None
+    assert 0 < near.value < still.value and made.protocol["clips"] == 4
+
+
+def test_the_same_tokens_are_decoded_with_other_noise(
+    run: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`decodings`: the draw of tokens stays, the diffusion decoder's noise changes."""
+    codes, decode = [], UdeGenerator.decode
+    monkeypatch.setattr(UdeGenerator, "decode", lambda *given: codes.append(given[1]) or decode(*given))
+    bundle = Bundle.open(run[0])
+    made = [bundle.generate(["a walk"], seconds=2.0, seed=3, noise_seed=noise) for noise in (1, 2, 1)]
+    motions = [one[0].joints for one in made]
+    assert len({code.codes[name].numpy().tobytes() for code in codes for name in code.codes}) == 1
+    np.testing.assert_array_equal(motions[0], motions[2])
+    assert np.abs(motions[0] - motions[1]).max() > 1e-3
 
 
 def test_the_page_plays_the_music(run: tuple[Path, str]) -> None:
@@ -274,11 +330,23 @@ def test_generated_files_have_their_music(run: tuple[Path, str]) -> None:
     assert [len(np.load(path)["joints"]) for path in sorted(folder.glob("*.npz"))][1:] == [40, 40]
 
 
+@pytest.mark.slow
+def test_evaluated_again_the_figures_are_the_same(run: tuple[Path, str]) -> None:
+    """By the run, and by `motionloom evaluate` twice after it, protocols included."""
+    stages = run[0] / "stages"
+    first = [FigureFile.read(stages / name / "metrics.json") for name in ("evaluate", "evaluate_dances")]
+    for _ in range(2):
+        out = evaluate_run(run[0], console=Console(quiet=True))
+        again = FigureFile.read(out / "metrics.json"), FigureFile.read(out / "evaluate_dances/metrics.json")
+        assert [one.figures for one in again] == [one.figures for one in first]
+
+
 def test_evaluate_runs_every_stage_of_figures(run: tuple[Path, str]) -> None:
     out = evaluate_run(run[0], clips=2, repeats=1, console=Console(quiet=True))
-    assert json.loads((out / "metrics.json").read_text())["clips"] == 2
-    figures = json.loads((out / "evaluate_dances/dances.json").read_text())
-    assert figures["clips"] == 2 and "multimodality" not in figures["rows"]["generated"]
+    for path in (out / "metrics.json", out / "evaluate_dances/metrics.json"):
+        file = FigureFile.read(path)
+        assert {one.protocol["clips"] for one in file.figures} == {2}
+        assert file.of("movement.mm_k") is None or path.parent.name == "evaluate_dances", "decoded twice"
 
 
 MUSIC_ONLY = """
@@ -321,9 +389,10 @@ def test_music_alone_is_enough(tmp_path: Path) -> None:
     (tmp_path / "music.yaml").write_text(MUSIC_ONLY)
     run_recipe(tmp_path / "music.yaml", tmp_path / "run", console=Console(quiet=True))
     stages = tmp_path / "run/stages"
-    figures = json.loads((stages / "evaluate/metrics.json").read_text())
-    assert figures["clips"] == 0 and figures["reconstructed_clips"] == 3
-    assert {"mpjpe_body", "mpjpe_hand"} <= figures["reconstruction_mm"].keys()
+    file = FigureFile.read(stages / "evaluate/metrics.json")
+    assert {one.protocol["clips"] for one in file.figures} == {3}, "of the reconstruction alone"
+    for part in ("body", "hand"):
+        assert file.of(f"reconstruction.mpjpe_{part}") is not None
     data = page_data(stages / "report/report.html")
     assert len(data["sounds"]) == 1 and all(motion["face"] for motion in data["motions"])
     faces = [motion["face"] for motion in data["motions"]]

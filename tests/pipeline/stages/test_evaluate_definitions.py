@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -17,13 +16,13 @@ from rich.console import Console
 
 from motionloom.datasets.motion.layout import WRISTS
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
-from motionloom.pipeline.evaluation.figure_rows import figure_rows
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, STILL, TRAINING, FigureFile
+from motionloom.pipeline.evaluation.latent_metrics import Latents, judged_figures
 from motionloom.pipeline.evaluation.reconstruction import FINGERS, published_errors
-from motionloom.pipeline.evaluation.text_motion import Latents, distribution
 from motionloom.pipeline.evaluation.truth import drawn, truth_of
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.store.latents import embed_motions
+from motionloom.pipeline.store.networks import embed_motions
 
 RECIPE = """
 extends: t2m-gpt-tiny
@@ -70,48 +69,38 @@ def test_tma_reads_captions_by_its_own_encoder(models: ModuleType, tmp_path: Pat
     recipe = RECIPE.replace("DISTILBERT", str(encoders[0])).replace("CLIP", str(encoders[1]))
     (tmp_path / "recipe.yaml").write_text(recipe)
     run_recipe(tmp_path / "recipe.yaml", tmp_path / "run", console=Console(quiet=True))
-    figures = json.loads((tmp_path / "run/stages/evaluate/metrics.json").read_text())
-    stages, shelf = finished_stages(tmp_path / "run"), Shelf()
-    dataset, tma = shelf.get(stages["data"]).split("test"), shelf.get(stages["tma"])
+    file = FigureFile.read(tmp_path / "run/stages/evaluate/metrics.json")
+    stages, stage_cache = finished_stages(tmp_path / "run"), StageCache()
+    dataset, tma = stage_cache.get(stages["data"]).split("test"), stage_cache.get(stages["tma"])
     truths = [truth_of(dataset, i) for i in sorted(drawn(dataset, 400))]
-    assert figures["clips"] == len(truths) == len(dataset)
+    assert len(truths) == len(dataset)
     motion = embed_motions(tma, [t.features for t in truths]).double()
     distance = {}
     for name in ("words", "text"):
-        latent = tma.embed_captions([t.caption for t in truths], shelf.get(stages[name]).cache).double()
+        latent = tma.embed_captions([t.caption for t in truths], stage_cache.get(stages[name]).cache).double()
         units = [x / x.norm(dim=-1, keepdim=True) for x in (latent, motion)]
         distance[name] = (units[0] - units[1]).norm(dim=-1).mean().item()
         plain = (latent - motion).norm(dim=-1).mean().item()
         if name == "words":
-            found = figures["retrieval"]["real"]
-            assert found["matching_score"]["mean"] == pytest.approx(distance["words"], rel=1e-5)
-            assert found["latent_distance"]["mean"] == pytest.approx(plain, rel=1e-5)
+            for key, wanted in (("matching_score", distance["words"]), ("latent_distance", plain)):
+                found = file.of(f"tma.{key}", RECORDED)
+                assert found is not None and found.value == pytest.approx(wanted, rel=1e-5)
     assert abs(distance["words"] - distance["text"]) > 1e-4, "ten times what the comparison above allows"
-    protocol = figures["protocol"]
+    made, apart = file.of("tma.t2m_r1"), file.of("tma.different.t2m_r1")
+    assert made is not None and apart is not None
     weights = (tmp_path / "run/stages/tma/model.safetensors").read_bytes()
-    assert protocol["evaluator"] == {"stage": "tma", "sha256": hashlib.sha256(weights).hexdigest()}
-    assert (protocol["repeats"], protocol["lengths"], protocol["generators"]) == (1, "free", ["gpt"])
+    assert made.protocol["judge"] == hashlib.sha256(weights).hexdigest()
+    assert file.about["judges"]["tma"]["stage"] == "tma" and file.about["made_by"] == {"generator": "gpt"}
+    assert (made.protocol["repeats"], made.protocol["lengths"]) == (1, "free")
     several = len({t.caption for t in truths})
     assert several < len(truths), "captions occur twice, as they do in the papers' splits"
-    assert figures["retrieval"]["different_captions"]["clips"] == several
-    assert figures["retrieval"]["clips"] == len(truths)
-    spread = figures["distribution"]
-    assert spread["clips"] == len(truths)
-    recorded, other, made, still = (
-        spread["rows"][name] for name in ("recorded", "training", "generated", "mean_pose")
-    )
-    assert set(recorded) == {"diversity"} and recorded["diversity"]["mean"] > 0
-    assert 0 < other["fid"]["mean"] < still["fid"]["mean"], "other recorded clips are nearer than a statue"
-    assert "multimodality" not in made, "one motion a caption has no variety"
-    titles = {title: (columns, rows) for title, columns, rows in figure_rows(figures)}
-    columns, rows = next(found for title, found in titles.items() if "as the papers count it" in title)
-    assert columns[1:4] == ["MPJPE", "body", "hands"] and len(columns) == 10
-    assert [row[0] for row in rows] == ["tokenizer", "nearest training clip", "mean pose"]
-    columns, rows = next(found for title, found in titles.items() if "TMA-R-Precision" in title)
-    assert [row[0] for row in rows] == [
-        "chance", "real motion", "generated motion", "real motion, different captions",
-        "generated motion, different captions",
-    ]  # fmt: skip
+    assert (made.protocol["clips"], apart.protocol["clips"]) == (len(truths), several)
+    other, still = file.of("tma.fid", TRAINING), file.of("tma.fid", STILL)
+    spread = file.of("tma.diversity", RECORDED)
+    assert other is not None and still is not None and spread is not None and spread.value > 0
+    assert 0 < other.value < still.value, "other recorded clips are nearer than a statue"
+    assert file.of("tma.fid", RECORDED) is None
+    assert file.of("tma.multimodality") is None, "one motion a caption has no variety"
 
 
 def test_errors_of_body_and_hands_by_hand() -> None:
@@ -147,7 +136,12 @@ def test_distribution_by_hand() -> None:
     shift = torch.linspace(0.5, 2, 6)
     made = [shift * torch.randn(400, 6, generator=generator) + 1 for _ in range(3)]
     latents = Latents(text=real, real=real, made=made, others=others, still=torch.ones(400, 6))
-    rows = distribution(latents, seed=0)["rows"]
+    words = [str(row) for row in range(400)]
+    figures = judged_figures("evaluator", "it", latents, words, {}, size=32, among=2, seed=0)
+    rows = {
+        row: {one.name.removeprefix("evaluator."): one for one in figures if one.row == row}
+        for row in (MODEL, TRAINING)
+    }
 
     def by_scipy(a: torch.Tensor, b: torch.Tensor) -> float:
         x, y = a.double().numpy(), b.double().numpy()
@@ -158,15 +152,15 @@ def test_distribution_by_hand() -> None:
     def unit(x: torch.Tensor) -> torch.Tensor:
         return x.double() / x.double().norm(dim=-1, keepdim=True)
 
-    found = rows["generated"]
-    assert found["fid"].mean == pytest.approx(np.mean([by_scipy(real, m) for m in made]), rel=1e-8)
-    assert found["fid_unit"].mean == pytest.approx(
+    found = rows[MODEL]
+    assert found["fid"].value == pytest.approx(np.mean([by_scipy(real, m) for m in made]), rel=1e-8)
+    assert found["fid_unit"].value == pytest.approx(
         np.mean([by_scipy(unit(real), unit(m)) for m in made]), rel=1e-8
     )
-    assert rows["training"]["fid"].mean == pytest.approx(by_scipy(real, others), rel=1e-8)
-    assert rows["training"]["fid"].mean < 0.1 < 5 < found["fid"].mean
+    assert rows[TRAINING]["fid"].value == pytest.approx(by_scipy(real, others), rel=1e-8)
+    assert rows[TRAINING]["fid"].value < 0.1 < 5 < found["fid"].value
     # Two draws of one Gaussian are sqrt(2) as far apart as it is wide: 300 pairs, five deviations.
     wide = float((2 * shift.square().sum()).sqrt())
-    assert found["diversity"].mean == pytest.approx(wide, rel=0.15)
+    assert found["diversity"].value == pytest.approx(wide, rel=0.15)
     apart = [float((made[a] - made[b]).norm(dim=-1).mean()) for a, b in ((0, 1), (0, 2), (1, 2))]
-    assert 0 < found["multimodality"].mean <= max(apart)
+    assert 0 < found["multimodality"].value <= max(apart)

@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from rich.console import Console
-from safetensors.numpy import load_file
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Given, Shelf
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.figures import CHANCE, MODEL, RECORDED, STILL, TRAINING, FigureFile
 from motionloom.pipeline.evaluation.judges import Judge
+from motionloom.pipeline.evaluation.latent_metrics import judged_figures
 from motionloom.pipeline.evaluation.retrieval import retrieve
-from motionloom.pipeline.evaluation.text_motion import matching
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.stages.evaluator import EvaluatorStage, EvaluatorStageConfig
+from motionloom.pipeline.stages.networks.evaluator import EvaluatorStage, EvaluatorStageConfig
 from motionloom.pipeline.store.evaluator import LoadedEvaluator, StageWords
 from motionloom.pipeline.store.weights import load_facts
 
@@ -56,15 +52,6 @@ stages:
     train: {steps: 240, batch_size: 32, checkpoint_every: 60, validate_every: 120}
 """
 
-SHORT = """
-extends: judge
-name: judge
-stages:
-  evaluator:
-    net: {dropout: DROPOUT, motion_hidden: 16, text_hidden: 16, movement: 16, movement_hidden: 16}
-    movement_steps: 6
-    train: {steps: 16, batch_size: 8, checkpoint_every: 4, validate_every: 8}
-"""
 
 JUDGED = """
 extends: judge
@@ -97,8 +84,8 @@ def judge(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def loaded(run: Path) -> tuple[Any, LoadedEvaluator]:
     """Data and evaluator of a run."""
-    stages, shelf = finished_stages(run), Shelf()
-    return shelf.get(stages["data"]), shelf.get(stages["evaluator"])
+    stages, stage_cache = finished_stages(run), StageCache()
+    return stage_cache.get(stages["data"]), stage_cache.get(stages["evaluator"])
 
 
 def metrics(run: Path) -> list[dict[str, float]]:
@@ -112,12 +99,15 @@ def test_it_finds_the_motion_of_a_caption(judge: Path) -> None:
     data, evaluator = loaded(judge / "run")
     test = data.split("test")
     truths = [truth_of(test, i) for i in range(len(test))]
-    latents = Judge.evaluator(evaluator).latents(truths, [], truths[:8])
-    found = matching(replace(latents, made=[latents.real]), size=32, repeats=20, seed=0)
-    assert found["chance"]["top-3"] == pytest.approx(3 / 32)
-    assert found["real"]["top-3"].mean > 0.6, found["real"]
-    assert found["mean_pose"]["top-3"].mean < 0.25
-    assert found["real"]["matching_score"].mean < 0.5 * found["mean_pose"]["matching_score"].mean
+    latents = Judge.evaluator(evaluator).latents(truths, [], truths[:8], {})
+    both = replace(latents, made=[latents.real])
+    words = [truth.caption for truth in truths]
+    figures = judged_figures("evaluator", "it", both, words, {}, size=32, among=2, seed=0)
+    found = {(one.name.removeprefix("evaluator."), one.row): one.value for one in figures}
+    assert found["top-3", CHANCE] == pytest.approx(3 / 32)
+    assert found["top-3", RECORDED] > 0.6, found
+    assert found["top-3", STILL] < 0.25
+    assert found["matching_score", RECORDED] < 0.5 * found["matching_score", STILL]
 
 
 @pytest.mark.slow
@@ -137,80 +127,26 @@ def test_movements_come_first_and_then_stay(judge: Path) -> None:
         assert torch.equal(value, weights[1][name]) == ("movement_encoder" in name or "decoder" in name), name
 
 
-def short(judge: Path, dropout: float) -> Path:
-    path = judge / f"short-{dropout:g}.yaml"
-    path.write_text(SHORT.replace("DROPOUT", str(dropout)))
-    return path
-
-
-@pytest.mark.slow
-def test_a_killed_training_ends_with_the_same_bytes(
-    judge: Path, start: Callable[..., Any], tmp_path: Path
-) -> None:
-    """Killed in the movements and in the pairs."""
-    recipe = short(judge, 0.2)
-    runs = [tmp_path / name for name in ("whole", "killed")]
-    for run in runs:
-        shutil.copytree(judge / "run", run)
-        shutil.rmtree(run / "stages/evaluator")
-    run_recipe(recipe, runs[0], console=Console(quiet=True))
-    folder = runs[1] / "stages/evaluator"
-    for checkpoint in ("step=00000004.ckpt", "step=00000012.ckpt"):
-        process = start("run", recipe, "--out", runs[1])
-        end = time.monotonic() + 120
-        while not (folder / "checkpoints" / checkpoint).is_file():
-            assert process.poll() is None and time.monotonic() < end, process.communicate()[0]
-            time.sleep(0.001)
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-        assert not (folder / "artifact.json").exists(), "it was over before the kill"
-    process = start("run", recipe, "--out", runs[1])
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode == 0 and "resuming evaluator at step 12 of 16" in output, output
-    found = [(run / "stages/evaluator/model.safetensors").read_bytes() for run in runs]
-    assert found[0] == found[1]
-
-
-@pytest.mark.slow
-def test_two_processes_train_as_one(judge: Path, start: Callable[..., Any], tmp_path: Path) -> None:
-    recipe = short(judge, 0.0)
-    runs = [tmp_path / name for name in ("one", "two")]
-    for run, devices in zip(runs, (1, 2), strict=True):
-        shutil.copytree(judge / "run", run)
-        shutil.rmtree(run / "stages/evaluator")
-        process = start("run", recipe, "--out", run, "--set", f"hardware.devices={devices}")
-        output, _ = process.communicate(timeout=150)
-        assert process.returncode == 0, output
-    weights = [load_file(run / "stages/evaluator/model.safetensors") for run in runs]
-    assert weights[0].keys() == weights[1].keys()
-    for name, value in weights[0].items():
-        assert np.abs(value.astype(np.float64) - weights[1][name]).max() < 1e-4, name
-    logged = [[row for row in metrics(run) if "val/matching_loss" in row] for run in runs]
-    assert len(logged[0]) == len(logged[1]) == 2
-    for first, second in zip(*logged, strict=True):
-        for name in ("val/matching_loss", "val/movement_loss"):
-            assert first[name] == pytest.approx(second[name], rel=1e-3)
-
-
 @pytest.mark.slow
 def test_an_evaluation_is_judged_by_it(judge: Path, call: Callable[..., Any], tmp_path: Path) -> None:
     (judge / "judged.yaml").write_text(JUDGED)
     shutil.copytree(judge / "run", tmp_path / "run")
     done = call("run", judge / "judged.yaml", "--out", tmp_path / "run", "--replace")
     assert done.code == 0, done.err
-    figures = json.loads((tmp_path / "run/stages/evaluate/metrics.json").read_text())
+    file = FigureFile.read(tmp_path / "run/stages/evaluate/metrics.json")
     weights = sha256_of(tmp_path / "run/stages/evaluator/model.safetensors")
-    assert figures["protocol"]["by_evaluator"] == {
-        "stage": "evaluator", "kind": "evaluator", "sha256": weights,
-    }  # fmt: skip
-    assert "retrieval" not in figures and "distribution" not in figures, "no TMA, no figures by it"
-    found = figures["by_evaluator"]
+    assert file.about["judges"] == {
+        "evaluator": {"stage": "evaluator", "kind": "evaluator", "sha256": weights}
+    }
+    assert not any(one.name.startswith("tma.") for one in file.figures), "no TMA, no figures by it"
+    top = file.of("evaluator.top-1")
     data, evaluator = loaded(tmp_path / "run")
-    assert found["matching"]["clips"] == 24 and found["matching"]["size"] == 8
-    rows = found["distribution"]["rows"]
-    assert 0 < rows["training"]["fid"]["mean"] < rows["mean_pose"]["fid"]["mean"]
-    assert rows["generated"]["fid"]["mean"] > 0 and data.layout == evaluator.layout
-    assert "R-Precision among 8 by the evaluator, 24 clips" in done.out
+    assert top is not None and top.protocol["judge"] == weights
+    assert (top.protocol["clips"], top.protocol["candidates"]) == (24, 8)
+    others, still, made = (file.of("evaluator.fid", row) for row in (TRAINING, STILL, MODEL))
+    assert others is not None and still is not None and made is not None
+    assert 0 < others.value < still.value and made.value > 0 and data.layout == evaluator.layout
+    assert "R-Precision by the evaluator" in done.out
     retrieved = retrieve(tmp_path / "run", "evaluator")
     truths = [t for t in (truth_of(data.split("test"), i) for i in range(60)) if t.caption]
     judge_ = Judge.evaluator(evaluator)
@@ -244,7 +180,7 @@ def test_other_layouts_and_words_are_refused(judge: Path) -> None:
         foreign.embed_captions(["a person walks"], [()])
     facts = load_facts(judge / "run/stages/evaluator")
     stats = replace(evaluator.stats, layout=MotionLayout.named("body133", fps=30))
-    given = Given({"stats": lambda: stats, "text": lambda: words.text})
+    given = EvaluatorStage.inputs({"stats": lambda: stats, "text": lambda: words.text})
     with pytest.raises(
         UserError, match="trained on layout body133 at 20 fps and is given statistics of body133"
     ):
@@ -263,9 +199,3 @@ def test_other_layouts_and_words_are_refused(judge: Path) -> None:
 def test_settings_that_cannot_work_are_refused(settings: dict[str, Any], sentence: str) -> None:
     with pytest.raises(UserError, match=sentence):
         EvaluatorStageConfig.parse(settings, "recipe")
-
-
-def test_defaults_are_the_published_ones() -> None:
-    config = EvaluatorStageConfig()
-    assert (config.optim.optimizer, config.optim.lr, config.optim.betas) == ("adam", 1e-4, (0.9, 0.999))
-    assert (config.train.batch_size, config.loss.margin, config.max_frames) == (32, 10.0, 196)

@@ -32,14 +32,14 @@ from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig
 from motionloom.models.training.stage_module import OptimConfig
-from motionloom.pipeline.contract.fingerprint import fingerprint_fields
-from motionloom.pipeline.contract.stage import Shelf, StageContext
+from motionloom.pipeline.contract.stage import StageCache, StageContext, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.gpt import GptStageConfig
-from motionloom.pipeline.stages.tma import TmaStageConfig
-from motionloom.pipeline.stages.tokenizer import H2VQStageConfig
-from motionloom.pipeline.stages.train_config import TrainConfig
-from motionloom.pipeline.stages.training import fit, read_metrics
+from motionloom.pipeline.stages.networks.gpt import GptStageConfig
+from motionloom.pipeline.stages.networks.tma import TmaStageConfig
+from motionloom.pipeline.stages.networks.tokenizer import H2VQStageConfig
+from motionloom.pipeline.store.training_log import read_training_log
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.trainer import fit
 
 STEPS, BATCH = 8, 8
 CLIP = 0.5  # below the norms met here
@@ -80,7 +80,7 @@ def train(folder: Path, **settings: Any) -> None:
     config = GptConfig(layers=2, dim=18, heads=2, ff=25, block_size=17, pkeep=0.8)
     net = InterleavedGPT(config, book.streams, book.pattern, text_dim=16)
     module = GptModule(
-        net, OptimConfig(lr=1e-2, warmup_steps=2), seed=0, max_steps=STEPS,
+        net, OptimConfig(lr=1e-2, warmup_steps=2, grad_clip=CLIP), seed=0, max_steps=STEPS,
         loss=GptLossConfig(), tokenizer=book, tma=tma,
     )  # fmt: skip
     given = {"steps": STEPS, "batch_size": BATCH, "checkpoint_every": 4, "validate_every": 4, **settings}
@@ -88,7 +88,7 @@ def train(folder: Path, **settings: Any) -> None:
     context = StageContext(
         name="gpt", recipe="test", config=None, folder=folder, inputs={}, seed=0,
         hardware=Hardware(accelerator="cpu", devices=2, threads=1), console=Console(quiet=True),
-        shelf=Shelf(),
+        stage_cache=StageCache(),
     )  # fmt: skip
     fit(
         context,
@@ -96,10 +96,9 @@ def train(folder: Path, **settings: Any) -> None:
         train_config,
         lambda batch, rank, world: Tokens(net, batch, rank, world),
         lambda: Tokens(net, 4, 0, 1, size=2),
-        CLIP,
     )
     assert module.net is net
-    if module.global_rank == 0:
+    if context.hardware.world() == 1 or torch.distributed.get_rank() == 0:
         save_file(net.state_dict(), folder / "weights.safetensors")
 
 
@@ -141,6 +140,7 @@ def weights(folder: Path) -> dict[str, Tensor]:
     return load_file(folder / "weights.safetensors")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize(
     ("one", "two", "tolerance"),
@@ -168,12 +168,13 @@ def test_same_weights_and_log(out: Path, one: str, two: str, tolerance: float) -
             assert max(query.abs().max(), values.abs().max()) < tolerance, name
         else:
             assert (second[name] - value).abs().max() < tolerance, name
-    rows = [read_metrics(out / folder) for folder in (one, two)]
+    rows = [read_training_log(out / folder) for folder in (one, two)]
     assert [row["step"] for row in rows[0]] == [row["step"] for row in rows[1]] == [4, 8]
     for before, after in zip(*rows, strict=True):
         assert after == pytest.approx(before, rel=max(tolerance, 1e-6) * 10), (one, two)
 
 
+@pytest.mark.slow
 def test_training_changed_something(out: Path) -> None:
     """Otherwise all of the above would be equal for nothing."""
     state = torch.load(next((out / "fsdp/checkpoints").glob("*0004.ckpt")), weights_only=True)["state_dict"]

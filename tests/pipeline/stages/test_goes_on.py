@@ -21,13 +21,13 @@ from tiny_players import Duel, train
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.fingerprint import fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import Interrupted
 from motionloom.pipeline.launch.team import lead_finds
-from motionloom.pipeline.stages.gpt import GptStageConfig
-from motionloom.pipeline.stages.train_config import TrainConfig
-from motionloom.pipeline.stages.training import Start, read_metrics, start_of
+from motionloom.pipeline.stages.networks.gpt import GptStageConfig
+from motionloom.pipeline.store.training_log import read_training_log
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.trainer import ResumePoint, resume_point
 
 # A constant schedule for both: a cosine would depend on the number of steps.
 CONSTANT: dict[str, Any] = {"critic": Duel(seed=0, max_steps=1).optim_config}
@@ -77,14 +77,9 @@ def test_the_average_is_that_of_the_weights(tmp_path: Path) -> None:
     assert torch.equal(trained, weights[-1])
     train(tmp_path / "watched", ema=0.9)
     assert_equal(newest(tmp_path / "watched")["state_dict"], plain.state_dict())
-    rows = [read_metrics(tmp_path / name) for name in ("plain", "watched")]
+    rows = [read_training_log(tmp_path / name) for name in ("plain", "watched")]
     for one, two in zip(*rows, strict=True):
         assert (one == two) == ("train/loss" in one)
-
-
-def test_draws_are_fingerprinted_where_they_are_not_what_they_always_were() -> None:
-    assert "draws" not in fingerprint_fields(TrainConfig())
-    assert fingerprint_fields(TrainConfig(draws="sample"))["draws"] == "sample"
 
 
 def test_draws_by_sample_are_not_repeated_by_a_compiled_graph() -> None:
@@ -107,10 +102,8 @@ def test_longer_equals_long(short: int, every: int, first: int, tmp_path: Path) 
     settings = {**FULL, "checkpoint_every": every, "validate_every": 6, "module": CONSTANT}
     long = train(tmp_path / "long", **settings)
     train(tmp_path / "longer", steps=short, **settings)
-    path, chunk, more = start_of(
-        tmp_path / "longer/checkpoints", TrainConfig(steps=24, checkpoint_every=every)
-    )
-    assert path is not None and path.stem == f"step={first:08d}" and chunk == every and more
+    path, more = resume_point(tmp_path / "longer/checkpoints", TrainConfig(steps=24, checkpoint_every=every))
+    assert path is not None and path.stem == f"step={first:08d}" and more
     with pytest.raises(ConnectionResetError):
         train(tmp_path / "longer", dies_at=20, **settings)
     longer = train(tmp_path / "longer", **settings)
@@ -137,17 +130,6 @@ def test_a_damaged_newest_checkpoint_changes_no_weight(
     said = capsys.readouterr().out
     assert f"{folder / names[1]}: the bytes are not those that were written" in said
     assert sorted(path.name for path in folder.iterdir()) == ["step=00000006.ckpt", "step=00000008.ckpt"]
-
-
-def test_longer_than_a_training_of_less_than_a_chunk(tmp_path: Path) -> None:
-    """Its length stays the interval, so the end is validated; the weights are those of the long one."""
-    settings = {**FULL, "checkpoint_every": 100, "validate_every": 24, "module": CONSTANT}
-    long = train(tmp_path / "long", **settings)
-    train(tmp_path / "longer", steps=8, **settings)
-    longer = train(tmp_path / "longer", **settings)
-    assert_equal(long.state_dict(), longer.state_dict())
-    steps = [row["step"] for row in read_metrics(tmp_path / "longer") if "val/loss" in row]
-    assert steps == [24]
 
 
 def test_workers_change_nothing(tmp_path: Path) -> None:
@@ -188,7 +170,7 @@ def worker(out: Path) -> None:
         torch.save(duel.state_dict(), out / f"{name}-{os.environ['RANK']}.pt")
     interrupt(out, int(os.environ["RANK"]), pair["hardware"])
     # Which checkpoint a training goes on from is found once, also where the ranks see different files.
-    assert lead_finds(lambda: Start(out / os.environ["RANK"], 6)) == Start(out / "0", 6)
+    assert lead_finds(lambda: ResumePoint(out / os.environ["RANK"])) == ResumePoint(out / "0")
     torch.distributed.barrier()
     os._exit(0)  # without destructors, as the program does
 
@@ -216,7 +198,7 @@ def test_two_ranks_equal_one_with_two_optimizers(name: str, pair: Path, tmp_path
     assert_equal(first, second)
     for key, value in one.state_dict().items():
         torch.testing.assert_close(first[key], value, rtol=BOUNDS[name], atol=BOUNDS[name])
-    rows = [read_metrics(folder) for folder in (tmp_path, pair / name)]
+    rows = [read_training_log(folder) for folder in (tmp_path, pair / name)]
     assert json.dumps([sorted(r) for r in rows[0]]) == json.dumps([sorted(r) for r in rows[1]])
     for row, other in zip(*rows, strict=True):
         assert other == pytest.approx(row, rel=1e-5, abs=1e-6)
@@ -229,7 +211,7 @@ def test_two_ranks_agree_on_the_step_of_a_signal(pair: Path) -> None:
     for step, signalled in zip(first, (2, 10, 18), strict=True):
         assert signalled <= step <= -(-signalled // 7) * 7  # at the latest where the chunk ends
     assert_equal(newest(pair / "whole"), newest(pair / "interrupted"))
-    assert read_metrics(pair / "whole") == read_metrics(pair / "interrupted")
+    assert read_training_log(pair / "whole") == read_training_log(pair / "interrupted")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +22,8 @@ from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import AnyTokenizerConfig, H2VQConfig, VqConfig
 from motionloom.pipeline.evaluation.truth import captioned, spread, truth_of
-from motionloom.pipeline.stages.gpt_data import GptClips, gpt_clips
-from motionloom.pipeline.stages.tokens import encode_split
-from motionloom.pipeline.store.tokens import TokenBatches, TokenStore
+from motionloom.pipeline.stages.networks.tokens import encode_split
+from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore, gpt_clips
 
 LAYOUT = MotionLayout.named("wholebody363")  # 30 fps
 FRAMES = 90
@@ -192,17 +191,3 @@ def test_a_tokenizer_without_a_hand_stream_needs_hands(tmp_path: Path) -> None:
     bare = dataset_of(tmp_path / "bare", Convert([[ALL]] * 2, present=(2, 2)))
     with pytest.raises(UserError, match="holds all that the tokenizer models"):
         clips_of(bare, config=VqConfig(width=8, depth=1, code_dim=8, num_codes=8, part="bodyhand"))
-
-
-def test_samples_say_which_groups_a_batch_holds(tmp_path: Path) -> None:
-    clips, store, net = clips_of(dataset_of(tmp_path, Convert([[WALKS, SITS], [ALL]])))
-    batches = replace(batches_of(clips, net, most=10), ids=clips.ids)
-    for k in range(4):
-        batch, samples = batches[k], batches.samples(k)
-        ends = {s.name: s.num_codes for s in net.streams}
-        read = deinterleave(batch["tokens"], net.pattern, ends=ends)
-        assert [sample.length for sample in samples] == read.groups.tolist()
-        for row, (clip, first, count) in enumerate(samples):
-            own = store.clip(clips.ids.index(clip), first, count)
-            for stream in net.streams:
-                assert torch.equal(read.codes[stream.name][row, : count * stream.per_group], own[stream.name])

@@ -12,7 +12,7 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from motionloom.pipeline.stages.training import read_metrics
+from motionloom.pipeline.store.training_log import read_training_log
 
 MORE: dict[str, Any] = {
     "kind": "gpt",
@@ -50,7 +50,7 @@ def test_a_stage_starts_from_anothers_weights(run: Callable[..., tuple[Any, Path
     before = load_file(folder.parent / "gpt/model.safetensors")
     after = load_file(folder / "model.safetensors")
     torch.testing.assert_close(after, before, rtol=0, atol=1e-9)
-    rows = [row for row in read_metrics(folder) if "val/align" in row]
+    rows = [row for row in read_training_log(folder) if "val/align" in row]
     assert [row["step"] for row in rows] == [2, 4]
     assert rows[0]["val/align"] == pytest.approx(rows[1]["val/align"], rel=1e-3)
     assert 0 < rows[0]["val/align"] < 20

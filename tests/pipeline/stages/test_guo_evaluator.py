@@ -23,13 +23,14 @@ from shard_samples import facts
 from slow_evaluator import SHAPES, slow_motion, slow_text
 
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.motion.h3d import encode_h3d
+from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.options import WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
-from motionloom.pipeline.store.latents import embed_motions
+from motionloom.pipeline.evaluation.figures import MODEL, FigureFile
+from motionloom.pipeline.store.networks import embed_motions
 from motionloom.pipeline.store.published_evaluator import load_published
 
 SCRIPT = Path(__file__).parents[3] / "docs" / "guo_evaluator.py"
@@ -304,23 +305,22 @@ def test_a_run_is_judged_by_it(
         (tmp_path / f"{name}.yaml").write_text(recipe.replace("SHARDS", str(tmp_path / name)))
     done = call("run", tmp_path / "tagged.yaml", "--out", tmp_path / "run")
     assert done.code == 0, done.err
-    figures = json.loads((tmp_path / "run/stages/evaluate/metrics.json").read_text())
+    file = FigureFile.read(tmp_path / "run/stages/evaluate/metrics.json")
     weights = sha256_of(folder / "model.safetensors")
-    assert figures["protocol"]["by_evaluator"] == {
+    assert file.about["judges"]["evaluator"] == {
         "stage": "guo", "kind": "guo_evaluator", "sha256": weights, "untagged": "refuse",
     }  # fmt: skip
-    found = figures["by_evaluator"]
-    assert found["matching"]["size"] == 4 and found["matching"]["clips"] == 10
-    assert set(found["matching"]["generated"]) == {"top-1", "top-2", "top-3", "matching_score"}
-    assert found["distribution"]["rows"]["generated"]["multimodality"]["mean"] > 0
-    assert "R-Precision among 4 by the evaluator, 10 clips" in done.out
-    assert "The evaluator's latents: FID to 10 recorded motions" in done.out
+    made = {one.name: one for one in file.figures if one.row == MODEL}
+    facts = made["evaluator.top-1"].protocol
+    assert (facts["clips"], facts["candidates"]) == (10, 4)
+    assert made["evaluator.matching_score"].value > 0 and made["evaluator.multimodality"].value > 0
     done = call("retrieval", tmp_path / "run", "--stage", "guo")
     assert done.code == 0 and "Retrieval of stage guo" in done.out, done.err
     record = json.loads((tmp_path / "run/retrieval-guo.json").read_text())
-    assert (record["kind"], record["sha256"], record["untagged"]) == ("guo_evaluator", weights, "refuse")
-    assert (record["split"], record["clips"], record["distance"]) == ("test", 10, "euclidean")
-    assert [row["protocol"] for row in record["protocols"]] == list("ABCD"), "the run has a text stage"
+    about, facts = record["about"], next(iter(record["protocol"].values()))
+    assert (about["kind"], about["sha256"], about["untagged"]) == ("guo_evaluator", weights, "refuse")
+    assert (facts["split"], facts["clips"], facts["distance"]) == ("test", 10, "euclidean")
+    assert {one["name"][0] for one in record["figures"]} == set("ABCD"), "the run has a text stage"
     done = call("run", tmp_path / "plain.yaml", "--out", tmp_path / "plain-run")
     assert done.code == 2 and "has no word/POS tags" in done.err
     other = ("--set", "guo.untagged=other")

@@ -12,19 +12,20 @@ import numpy as np
 import pytest
 import torch
 
-from motionloom.datasets.loading.statistics import FeatureStats, compute
+from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import FACE, HANDS
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
-from motionloom.pipeline.evaluation.reconstruction import face_figures, reconstruction_figures
-from motionloom.pipeline.evaluation.truth import reconstruct_truth, truth_of
-from motionloom.pipeline.stages.gpt_data import gpt_clips
-from motionloom.pipeline.stages.tokens import encode_split
+from motionloom.pipeline.evaluation.estimate import row_estimates
+from motionloom.pipeline.evaluation.reconstruction import face_errors, reconstruction_errors
+from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
+from motionloom.pipeline.stages.networks.tokens import encode_split
 from motionloom.pipeline.store.networks import TrainedTokenizer
-from motionloom.pipeline.store.tokens import TokenBatches, TokenStore
+from motionloom.pipeline.store.tokens import TokenBatches, TokenStore, gpt_clips
 
 TINY: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
 Data = list[tuple[ShardDataset, FeatureStats]]
@@ -109,9 +110,9 @@ def test_figures_do_not_depend_on_what_was_not_recorded(data: Data) -> None:
         truths = [truth_of(dataset, i) for i in range(len(dataset))]
         assert [t.face is None for t in truths] == ((dataset.present & FACE) == 0).tolist()
         trained = TrainedTokenizer(net, {"stats": stats})
-        figures.append(reconstruction_figures(trained, dataset, truths))
+        figures.append(reconstruction_errors(trained, dataset, truths))
         with_hands = [t for t in truths if t.present & HANDS]
-        alone = reconstruction_figures(trained, dataset, with_hands)
+        alone = reconstruction_errors(trained, dataset, with_hands)
         assert alone["mpjpe_hand"] == pytest.approx(figures[-1]["mpjpe_hand"])
         assert alone["mpjpe_body"] != pytest.approx(figures[-1]["mpjpe_body"])
     assert figures[0] == pytest.approx(figures[1], rel=1e-6)
@@ -130,8 +131,13 @@ def test_a_clip_through_a_tokenizer_of_any_part(data: Data, part: Part) -> None:
         modelled = part != "body" and truth.present & HANDS
         assert np.allclose(rebuilt[:, hand], mean[hand]) == (not modelled)
         assert not np.allclose(rebuilt[:, ~hand], mean[~hand])
-    figures = reconstruction_figures(trained, dataset, [truth_of(dataset, 0)])
+    figures = reconstruction_errors(trained, dataset, [truth_of(dataset, 0)])
     assert np.isfinite(list(figures.values())).all()
+
+
+def errors(trained: TrainedTokenizer, truths: list[Truth]) -> dict[str, float]:
+    rows = [face_errors(trained, truth) for truth in truths]
+    return {name: one.value for name, one in row_estimates([rows]).items()}
 
 
 def test_faces_count_where_there_are_any(data: Data) -> None:
@@ -140,11 +146,11 @@ def test_faces_count_where_there_are_any(data: Data) -> None:
     for dataset, stats in data:
         trained = TrainedTokenizer(net, {"stats": stats})
         truths = [truth_of(dataset, i) for i in range(len(dataset))]
-        found.append(face_figures(trained, truths))
+        found.append(errors(trained, truths))
         faces = [t.face for t in truths if t.face is not None]
         assert 0 < len(faces) < len(truths)
         columns = dataset.layout.slice("face")
         apart = np.concatenate([np.linalg.norm(face - stats.mean[columns], axis=1) for face in faces])
         assert found[-1]["expression_mean"] == pytest.approx(apart.mean(), rel=1e-5)
-        assert face_figures(trained, [t for t in truths if t.face is None]) == {}
+        assert errors(trained, [t for t in truths if t.face is None]) == {}
     assert found[0] == pytest.approx(found[1], rel=1e-6) and found[0]["expression"] > 0

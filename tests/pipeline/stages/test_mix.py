@@ -73,25 +73,6 @@ def test_training_draws_by_weight(run: Path) -> None:
     assert texts > len(dataset) / 2 and np.mean(drawn < texts) == 0.25
 
 
-def test_what_follows_reads_both(run: Path) -> None:
-    train = open_split(stage(run, "data"), "train")
-    assert train.has("texts.json").any() and train.has("audio.npy").any() and not train.has("audio.npy").all()
-    assert (stage(run, "stats") / "stats.safetensors").is_file()
-    assert (stage(run, "audio") / "audio.safetensors").is_file()
-
-
-def test_a_moved_run_still_works(run: Path, tmp_path: Path) -> None:
-    wanted = clips(open_split(stage(run, "data"), "train"))
-    moved = tmp_path / "elsewhere"
-    shutil.copytree(run, moved)
-    shutil.move(run / "stages", run / "away")
-    try:
-        found = clips(open_split(stage(moved, "data"), "train"))
-    finally:
-        shutil.move(run / "away", run / "stages")
-    assert all(np.array_equal(a, b) for a, b in zip(found, wanted, strict=True))
-
-
 def test_data_of_another_run(run: Path, tmp_path: Path) -> None:
     """It is named by its path, weighed by the name of both, and found again when both runs are moved."""
     text = f"""

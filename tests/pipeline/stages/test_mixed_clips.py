@@ -79,6 +79,6 @@ def test_every_stage_takes_a_mixed_data_set(tmp_path: Path, call: Callable[..., 
         assert f"{split}: {left} clips without a caption are left out" in done.out
     assert "train: 6 clips without a face caption are left out" in done.out
     figures = json.loads((tmp_path / "run/stages/evaluate/metrics.json").read_text())
-    assert figures["clips"] == captioned["test"]
+    assert {facts["clips"] for facts in figures["protocol"].values()} >= {captioned["test"]}
     log = (tmp_path / "run/stages/gpt/metrics.jsonl").read_text()
     assert "NaN" not in log

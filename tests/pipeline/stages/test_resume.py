@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from motionloom.pipeline.store.checkpoints import newest_checkpoint
+from motionloom.pipeline.training.checkpointing import readable
 
 pytestmark = pytest.mark.slow
 
@@ -50,7 +50,7 @@ def test_a_run_killed_four_times_equals_the_undisturbed_one(
             time.sleep(0.001)
         kill(process)
         assert not (folder / "artifact.json").exists(), f"{stage} was over before the kill"
-    newest = newest_checkpoint(run / "stages/gpt/checkpoints")
+    newest = next(readable(run / "stages/gpt/checkpoints"))[0]
     assert newest is not None
     newest.write_bytes(newest.read_bytes()[: newest.stat().st_size // 2])
     process = start("run", small_run.recipe, "--out", run)

@@ -10,9 +10,9 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.stages import rewordings
+from motionloom.pipeline.stages.data import rewordings
 
 RECIPE = """
 name: reworded
@@ -46,14 +46,14 @@ def test_tma_learns_from_rewordings_of_the_training_captions(tmp_path: Path) -> 
     recipe.write_text(RECIPE.replace("plain: {kind: tma}", "plain: {kind: tma, inputs: {rewordings: null}}"))
     run = tmp_path / "run"
     run_recipe(recipe, run, console=Console(quiet=True))
-    stages, shelf = finished_stages(run), Shelf()
-    made = shelf.get(stages["rewordings"])
-    data = shelf.get(stages["data"]).split("train")
+    stages, stage_cache = finished_stages(run), StageCache()
+    made = stage_cache.get(stages["rewordings"])
+    data = stage_cache.get(stages["data"]).split("train")
     captions = {c.text for i in range(len(data)) for c in data.texts(i)}
     said = json.loads((run / "stages/rewordings/rewordings.json").read_text())["captions"]
     assert captions <= set(said) and all(len(others) == 2 for others in said.values())
     assert sum(caption not in others for caption, others in said.items()) > len(said) / 4
-    assert made.cache.encoder == shelf.get(stages["text"]).cache.encoder
+    assert made.cache.encoder == stage_cache.get(stages["text"]).cache.encoder
     inputs = json.loads((run / "stages/tma/artifact.json").read_text())["inputs"]
     assert inputs["rewordings"]["stage"] == "rewordings"
     weights = [(run / "stages" / name / "model.safetensors").read_bytes() for name in ("plain", "tma")]

@@ -10,10 +10,10 @@ from rich.console import Console
 
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Shelf
+from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.retrieval import retrieve
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.graph import Selection
+from motionloom.pipeline.runs.plan import Selection
 
 pytestmark = pytest.mark.slow
 
@@ -52,7 +52,7 @@ def test_tma_tells_apart_what_the_sentence_encoder_does_not(tmp_path: Path) -> N
     recipe.write_text(RECIPE)
     run = tmp_path / "run"
     run_recipe(recipe, run, select=Selection(until="tma"), console=Console(quiet=True))
-    tma, encoder = Shelf().get(finished_stages(run)["tma"]), load_text_encoder("minilm")
+    tma, encoder = StageCache().get(finished_stages(run)["tma"]), load_text_encoder("minilm")
     for pair in PAIRS:
         encoded = encoder.encode(list(pair))
         sentence = cosine(torch.as_tensor(encoded.sentence))

@@ -10,22 +10,36 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-import yaml
 
-from motionloom.datasets.schema import Split
-from motionloom.datasets.shards import retry
-from motionloom.datasets.shards.index import SPLITS
+from motionloom.datasets.schema import SPLITS, Split
+from motionloom.datasets.shards import store as retry
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.models.training import stage_module
-from motionloom.pipeline.stages import progress
+from motionloom.pipeline.training import trainer
 
 pytestmark = pytest.mark.slow
 
 STEPS = 16
+RECIPE = f"""
+name: s3
+seed: 5
+hardware: {{accelerator: cpu, threads: 1}}
+stages:
+  stats: {{kind: stats}}
+  text: {{kind: text}}
+  tokenizer:
+    kind: vq
+    net: {{width: 16, depth: 1, code_dim: 8, num_codes: 16}}
+    train: {{steps: {STEPS}, batch_size: 8, checkpoint_every: 8, validate_every: 8}}
+  tma:
+    kind: tma
+    net: {{latent: 16, ff: 16, layers: 1, heads: 2}}
+    train: {{steps: 6, batch_size: 4, checkpoint_every: 8, validate_every: 8}}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -59,31 +73,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def recipe(folder: Path, name: str, data: dict[str, Any]) -> Path:
     path = folder / f"{name}.yaml"
-    train = {"checkpoint_every": 8, "validate_every": 8}
-    path.write_text(
-        yaml.safe_dump(
-            {
-                "name": "s3",
-                "seed": 5,
-                "hardware": {"accelerator": "cpu", "threads": 1},
-                "stages": {
-                    "data": {"kind": "shards", **data},
-                    "stats": {"kind": "stats"},
-                    "text": {"kind": "text"},
-                    "tokenizer": {
-                        "kind": "vq",
-                        "net": {"width": 16, "depth": 1, "code_dim": 8, "num_codes": 16},
-                        "train": {**train, "steps": STEPS, "batch_size": 8},
-                    },
-                    "tma": {
-                        "kind": "tma",
-                        "net": {"latent": 16, "ff": 16, "layers": 1, "heads": 2},
-                        "train": {**train, "steps": 6, "batch_size": 4},
-                    },
-                },
-            }
-        )
-    )
+    path.write_text(RECIPE + f"  data: {json.dumps({'kind': 'shards', **data})}\n")
     return path
 
 
@@ -111,7 +101,7 @@ def test_the_same_losses_from_s3_with_failing_requests(
     call: Callable[..., Any],
 ) -> None:
     monkeypatch.setattr(retry, "FIRST_PAUSE", 0.01)
-    for module in (stage_module, progress):
+    for module in (stage_module, trainer):
         monkeypatch.setattr(module, "LOG_EVERY", 1)
 
     def run(name: str, last: str | None, **data: Any) -> dict[str, Any]:

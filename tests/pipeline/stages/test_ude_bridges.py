@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.generators.ude import bridged
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import Script, ScriptSegment
-from motionloom.pipeline.stages.ude import bridged
 
 
 def shown(hidden: torch.Tensor) -> list[str]:

@@ -13,35 +13,12 @@ from typing import Any
 
 import pytest
 import torch
+from same_stage import assert_equal, newest
 from torch import Tensor
 from two_ranks import run_two_ranks
 from ude_training import NAMES, train
 
-from motionloom.pipeline.stages.training import read_metrics
-
-
-def newest(folder: Path) -> dict[str, Any]:
-    """What training goes on from, without the clock and the paths in it."""
-    path = max((folder / "checkpoints").iterdir())
-    checkpoint: dict[str, Any] = torch.load(path, weights_only=True)
-    return {name: checkpoint[name] for name in ("global_step", "epoch", "state_dict", "optimizer_states")}
-
-
-def flat(value: Any, where: str = "") -> dict[str, Any]:
-    """All levels as one."""
-    if isinstance(value, dict | list | tuple):
-        items = value.items() if isinstance(value, dict) else enumerate(value)
-        return {key: leaf for name, inner in items for key, leaf in flat(inner, f"{where}.{name}").items()}
-    return {where: value}
-
-
-def assert_equal(one: Any, two: Any) -> None:
-    """Bit for bit."""
-    first, second = flat(one), flat(two)
-    assert first.keys() == second.keys()
-    for name, value in first.items():
-        same = torch.equal(value, second[name]) if isinstance(value, Tensor) else value == second[name]
-        assert same, name
+from motionloom.pipeline.store.training_log import read_training_log
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -55,7 +32,7 @@ def test_killed_twice_equals_undisturbed(name: str, tmp_path: Path) -> None:
     again = train(name, tmp_path / "killed", dropout=0.2)
     assert_equal(again.state_dict(), whole.state_dict())
     assert_equal(newest(tmp_path / "killed"), newest(tmp_path / "whole"))
-    assert read_metrics(tmp_path / "killed") == read_metrics(tmp_path / "whole")
+    assert read_training_log(tmp_path / "killed") == read_training_log(tmp_path / "whole")
 
 
 def test_the_critic_and_its_spectral_norms_are_in_the_checkpoint(tmp_path: Path) -> None:
@@ -134,7 +111,7 @@ def test_two_ranks_equal_one(name: str, pair: Path, tmp_path: Path) -> None:
             *(meant(key, weight) for weight in (first[key], value)),
             rtol=BOUND, atol=BOUND, msg=lambda m, k=key: f"{k}: {m}",
         )  # fmt: skip
-    rows = [read_metrics(folder) for folder in (tmp_path, pair / name)]
+    rows = [read_training_log(folder) for folder in (tmp_path, pair / name)]
     assert [sorted(row) for row in rows[0]] == [sorted(row) for row in rows[1]]
     for row, other in zip(*rows, strict=True):
         assert other == pytest.approx(row, rel=1e-5, abs=1e-5)
@@ -148,7 +125,7 @@ def test_killed_and_gone_on_by_two_ranks_and_by_one_again(name: str, pair: Path,
     train(name, tmp_path, dtype=ELASTIC[name], **DRAWN)
     assert newest(pair / f"elastic-{name}")["global_step"] == 12
     train(name, pair / f"elastic-{name}", dtype=ELASTIC[name], **DRAWN)
-    rows = [read_metrics(folder) for folder in (tmp_path, pair / f"elastic-{name}")]
+    rows = [read_training_log(folder) for folder in (tmp_path, pair / f"elastic-{name}")]
     assert [row["step"] for row in rows[0]] == [8, 10, 16]
     bound = 1e-6 if ELASTIC[name] == torch.float64 else 1e-5
     for row, other in zip(*rows, strict=True):

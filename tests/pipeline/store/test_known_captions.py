@@ -11,7 +11,7 @@ import pytest
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import load_text_encoder
-from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.store.known_captions import (
     FAR,
     KNOWN_FILES,

@@ -11,13 +11,12 @@ import torch
 
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.encoder import EncodedText
-from motionloom.pipeline.contract.registry import stage_kind
-from motionloom.pipeline.contract.stage import Stage
-from motionloom.pipeline.stages.prepare import TextConfig
-from motionloom.pipeline.stages.same_text import same_encoder
+from motionloom.pipeline.contract.stage import Stage, stage_kind
+from motionloom.pipeline.stages.data.prepare import TextConfig
 from motionloom.pipeline.store import text
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.text import TextSource
+from motionloom.pipeline.training.warm_start import same_encoder
 
 CPU = torch.device("cpu")
 

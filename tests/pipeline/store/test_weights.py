@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 
-from motionloom.pipeline.inference.pretrained import MotionModel
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.store.weights import halve_weights
 
 

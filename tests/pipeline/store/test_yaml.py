@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.runs.shipped import shipped_recipes
+from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.store.yaml import dump_yaml, load_yaml, read_yaml
 
 CORE: list[tuple[str, Any]] = [

@@ -1,0 +1,169 @@
+"""One clip of SMPL parameters in an .npz file, as AMASS publishes them (SMPL-H `poses` [T, 156], SMPL-X
+[T, 165], also SMPL [T, 72]), or with the pose in parts (`root_orient`, `pose_body`, `pose_hand`).
+
+Only the named arrays are opened, so pickled extras of a file (marker lists) are never looked at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.motion.npz import NpzFile
+from motionloom.datasets.schema import UserError
+
+KINDS = {72: "SMPL", 156: "SMPL-H", 165: "SMPL-X"}
+"""Width of `poses` -> body model."""
+
+BODY = 3 * BODY_JOINTS
+HANDS = 90
+"""Columns of the finger rotations, always the last ones."""
+
+MAX_ANGLE = 100.0
+"""Radians. Fits may wind up a few turns; more than this is no rotation anybody meant."""
+
+MAX_METRES = 1e4
+
+_RATES = ("mocap_framerate", "mocap_frame_rate")
+_PARTS = {"root_orient": 3, "pose_body": BODY - 3, "pose_hand": HANDS}
+
+
+@dataclass(frozen=True)
+class MotionHeader:
+    """What a file states before its data are read."""
+
+    frames: int
+    fps: float | None
+    """None when the file has no frame rate."""
+    kind: str
+    """SMPL, SMPL-H or SMPL-X."""
+    gender: str
+    hands: bool
+    """Whether there are finger rotations."""
+
+
+@dataclass(frozen=True)
+class SmplMotion:
+    """Rotations [T, N, 3] (axis-angle, radians), translations [T, 3] (metres), one shape [B] or none."""
+
+    rotations: NDArray[np.float64]
+    trans: NDArray[np.float64]
+    betas: NDArray[np.float64] | None
+
+
+def read_motion_header(path: Path, label: str) -> MotionHeader:
+    """Length, frame rate and model of a clip without reading its motion; `UserError` when it is not one."""
+    with NpzFile(path, label) as file:
+        if "poses" in file.names:
+            frames, width = _matrix(file, "poses", None)
+            if width not in KINDS:
+                raise UserError(
+                    f"{label}: poses is [T, {width}]; SMPL has 72 columns, SMPL-H 156, SMPL-X 165"
+                )
+            kind, hands = KINDS[width], width > 72
+        else:
+            if "root_orient" not in file.names or "pose_body" not in file.names:
+                names = ", ".join(sorted(file.names)) or "nothing"
+                raise UserError(f"{label}: no array 'poses', nor root_orient and pose_body; there is {names}")
+            hands = "pose_hand" in file.names
+            kind = "SMPL-X" if "pose_jaw" in file.names else "SMPL-H" if hands else "SMPL"
+            frames = _matrix(file, "root_orient", 3)[0]
+            for part in ("pose_body", "pose_hand")[: 1 + hands]:
+                _same(label, part, _matrix(file, part, _PARTS[part])[0], frames)
+        _same(label, "trans", _matrix(file, "trans", 3)[0], frames)
+        if frames < 1:
+            raise UserError(f"{label}: no frames")
+        if "betas" in file.names and len(file.header("betas").shape) not in (1, 2):
+            raise UserError(f"{label}: betas is {list(file.header('betas').shape)}, not one shape [B]")
+        return MotionHeader(frames, _rate(file), kind, _gender(file), hands)
+
+
+def read_motion(
+    path: Path, label: str, *, hands: bool, palms: bool = False, frames: slice = slice(None)
+) -> SmplMotion:
+    """The 22 body joints, and the 30 finger joints with `hands`, of the given frames.
+
+    With `palms` SMPL's two hand joints follow the body's: SMPL-H and SMPL-X have none, theirs are at rest.
+
+    `UserError` for values that are not finite or absurd, naming frame and column.
+    """
+    with NpzFile(path, label) as file:
+        if "poses" in file.names:
+            poses = file.numbers("poses")[frames]
+            _check(label, "poses", poses, MAX_ANGLE, frames)
+            parts = [poses[:, :BODY], poses[:, -HANDS:]]
+            extra = poses[:, BODY:72] if poses.shape[1] == 72 else np.zeros((len(poses), 6))
+        else:
+            parts = []
+            for name in _PARTS if hands else ("root_orient", "pose_body"):
+                parts.append(file.numbers(name)[frames])
+                _check(label, name, parts[-1], MAX_ANGLE, frames)
+            parts = [np.concatenate(parts[:2], axis=1), *parts[2:]]
+            extra = np.zeros((len(parts[0]), 6))
+        trans = file.numbers("trans")[frames]
+        _check(label, "trans", trans, MAX_METRES, frames)
+        betas = _betas(file) if "betas" in file.names else None
+    rotations = np.concatenate(parts, axis=1) if hands else parts[0]
+    if palms:
+        rotations = np.concatenate([rotations, extra], axis=1)
+    return SmplMotion(rotations.reshape(len(rotations), -1, 3), trans, betas)
+
+
+def _matrix(file: NpzFile, name: str, width: int | None) -> tuple[int, int]:
+    header = file.header(name)
+    if len(header.shape) != 2 or (width is not None and header.shape[1] != width):
+        wanted = "D" if width is None else width
+        raise UserError(f"{file.label}: {name} is {list(header.shape)}, not [T, {wanted}]")
+    if header.dtype.kind != "f":
+        raise UserError(f"{file.label}: {name} holds {header.dtype}, not floats")
+    return header.shape[0], header.shape[1]
+
+
+def _same(label: str, name: str, found: int, frames: int) -> None:
+    if found != frames:
+        raise UserError(f"{label}: {found} frames of {name}, but {frames} frames of poses")
+
+
+def _rate(file: NpzFile) -> float | None:
+    for name in _RATES:
+        if name in file.names:
+            value = file.numbers(name, limit=4096)
+            fps = float(value.reshape(-1)[0]) if value.size == 1 else float("nan")
+            if not 0 < fps <= 10_000:
+                raise UserError(f"{file.label}: {name} is {value.tolist()}, not a number of frames a second")
+            return fps
+    return None
+
+
+def _gender(file: NpzFile) -> str:
+    """`female`, `male` or `neutral` (anything else, and none)."""
+    if "gender" not in file.names:
+        return "neutral"
+    stored: Any = file.array("gender", limit=4096)
+    value = stored.reshape(-1)[0] if stored.size == 1 else ""
+    text = value.decode("ascii", "replace") if isinstance(value, bytes) else str(value)
+    return text.lower() if text.lower() in ("female", "male") else "neutral"
+
+
+def _betas(file: NpzFile) -> NDArray[np.float64]:
+    """One shape [B]; a clip that changes its shape is two people."""
+    betas = np.atleast_2d(file.numbers("betas", limit=2**27))
+    _check(file.label, "betas", betas, 1e3, slice(None))
+    if not len(betas) or (betas != betas[0]).any():
+        raise UserError(f"{file.label}: betas change during the clip ({len(betas)} rows); give one shape")
+    return np.asarray(betas[0])
+
+
+def _check(label: str, name: str, values: NDArray[np.float64], limit: float, frames: slice) -> None:
+    good = np.abs(values) <= limit  # false for NaN
+    if not good.all():
+        frame, column = (int(index) for index in np.argwhere(~good)[0])
+        value = values[frame, column]
+        reason = f"at most {limit:g} is sensible" if np.isfinite(value) else "not a number"
+        at = frame + (frames.start or 0)
+        raise UserError(f"{label}: {name} is {value:.4g} at frame {at}, column {column}; {reason}")

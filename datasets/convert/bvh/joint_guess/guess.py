@@ -1,0 +1,208 @@
+"""Guess the joint map of any figure: names first, checked and completed by its tree.
+
+1. Legs and arms by the words of their names along a chain (`limbs.py`).
+2. Pelvis, spine, neck and head between and above them, fingers below the wrists.
+3. A joint that is missing between two others is a mean of its neighbours.
+
+What is not certain is not guessed: the row stays empty, with what it could be. All of it is [ours]. Whether
+the names tell the truth is seen when the clips are: a figure whose left is on its right has feet that point
+backwards (`datasets/motion/plausibility.py`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Literal
+
+from motionloom.datasets.convert.bvh.joint_guess.conventions import CONVENTIONS
+from motionloom.datasets.convert.bvh.joint_guess.figure import Figure
+from motionloom.datasets.convert.bvh.joint_guess.limbs import (
+    How,
+    Kind,
+    Limb,
+    LimbPair,
+    Rows,
+    fill_fingers,
+    fill_trunk,
+    named_pair,
+)
+from motionloom.datasets.motion.bvh.joint_map import JointMap, map_text
+from motionloom.datasets.motion.bvh.motion import BvhMotion
+from motionloom.datasets.motion.skeleton import Skeleton
+
+
+@dataclass(frozen=True)
+class GuessedJoint:
+    """One row: a joint of the target and what stands for it."""
+
+    joint: str
+    sources: tuple[str, ...]
+    """Source joints whose mean is taken, a repeated one weighing more; none in a row to be filled in."""
+    how: How | Literal["missing"]
+    candidates: tuple[str, ...] = ()
+    """Joints that it could be, where it is not certain."""
+
+
+@dataclass(frozen=True)
+class JointGuess:
+    """A guessed joint map."""
+
+    source: str
+    """The clip it was made from."""
+    target: Skeleton
+    rows: tuple[GuessedJoint, ...]
+    """One for every joint of the target."""
+    unmapped: tuple[str, ...]
+    """Source joints that stand for nothing."""
+    problems: tuple[str, ...]
+    """What contradicts the rows, each a clause."""
+
+    @property
+    def open_rows(self) -> tuple[GuessedJoint, ...]:
+        return tuple(row for row in self.rows if not row.sources)
+
+    @property
+    def certain(self) -> bool:
+        """Whether it may be used without anyone looking at it."""
+        return not self.open_rows and not self.problems
+
+    def joint_map(self, where: str) -> JointMap:
+        """The map, if it is certain; errors name it `where`."""
+        if not self.certain:
+            raise ValueError(f"{self.source}: the guess is not certain: {self.doubts()}")
+        return JointMap(where, self.target, tuple(row.sources for row in self.rows), self.unmapped)
+
+    def summary(self) -> str:
+        """How the joints were found, in one line."""
+        counts: Counter[str] = Counter(row.how for row in self.rows)
+        kinds = {"name": "by name", "hierarchy": "by hierarchy", "mean": "as means", "missing": "open"}
+        found = ", ".join(f"{counts[how]} {text}" for how, text in kinds.items() if counts[how])
+        return f"{found}; {len(self.unmapped)} of the source's joints stand for nothing"
+
+    def doubts(self) -> str:
+        """What is not certain, in one sentence without its full stop; empty when all is."""
+        rows = [
+            f"{row.joint} ({' or '.join(row.candidates[:4])}?)" if row.candidates else row.joint
+            for row in self.open_rows
+        ]
+        shown = ", ".join(rows[:8]) + (f" and {len(rows) - 8} more" if len(rows) > 8 else "")
+        return "; ".join([*self.problems, *([f"no certain joint for {shown}"] if rows else [])])
+
+    def text(self) -> str:
+        note = f"guessed from {self.source}: {self.summary()}"
+        if not self.certain:
+            todo = "Fill in the rows that say null" if self.open_rows else "Correct the rows"
+            note += f". NOT CERTAIN: {self.doubts()}. {todo}"
+        sources: list[tuple[str, ...] | None] = [row.sources or None for row in self.rows]
+        candidates = {row.joint: list(row.candidates) for row in self.open_rows if row.candidates}
+        more: dict[str, object] = {"candidates": candidates} if candidates else {}
+        return map_text(self.target, sources, note=note, unmapped=self.unmapped, **more)
+
+
+_SLOTS: dict[Kind, tuple[str, str, str, str]] = {
+    "leg": ("hip", "knee", "ankle", "foot"),
+    "arm": ("collar", "shoulder", "elbow", "wrist"),
+}
+
+
+def guess_joint_map(motion: BvhMotion, target: Skeleton) -> JointGuess:
+    """Guess which joints of a clip stand for those of `target` (`smpl22` or `smplx52`)."""
+    figure, rows = Figure.of(motion), Rows()
+    legs, arms = named_pair(figure, "leg"), named_pair(figure, "arm")
+    problems: list[str] = []
+    if legs is None or arms is None:
+        kinds = [kind for kind, pair in (("legs", legs), ("arms", arms)) if pair is None]
+        problems.append(f"found no {' and no '.join(kinds)} by name")
+        for pair in (legs, arms):
+            if pair is not None:
+                _fill_limbs(figure, pair, rows)
+        _fill_by_words(figure, rows)
+    else:
+        legs = _with_feet(figure, legs, rows)
+        fill_trunk(figure, legs, arms, rows)
+        for pair in (legs, arms):
+            _fill_limbs(figure, pair, rows)
+        _fill_collars(figure, arms, rows)
+        for side, arm in (("left", arms.left), ("right", arms.right)):
+            fill_fingers(figure, side, arm, rows)
+    return _guess(figure, motion.name, target, rows, problems)
+
+
+def _with_feet(figure: Figure, legs: LimbPair, rows: Rows) -> LimbPair:
+    """Legs whose fourth slot, where no name filled it, is the only joint that follows on the ankle."""
+    done: list[Limb] = []
+    for side, leg in (("left", legs.left), ("right", legs.right)):
+        ankle, toe = leg.slots[2], leg.slots[3]
+        assert ankle is not None
+        below = figure.children[ankle]
+        while toe is None and len(below) == 1:
+            toe = None if figure.coincide(below[0], ankle) else below[0]
+            below = figure.children[below[0]]
+        if toe is not None and leg.slots[3] is None:
+            rows.put(f"{side}_foot", [toe], "hierarchy")
+        elif toe is None:
+            rows.doubt(f"{side}_foot", below)
+        done.append(Limb((*leg.slots[:3], toe), leg.rivals))
+    return LimbPair("leg", done[0], done[1])
+
+
+def _fill_limbs(figure: Figure, pair: LimbPair, rows: Rows) -> None:
+    for side, limb in (("left", pair.left), ("right", pair.right)):
+        for word, joint, rivals in zip(_SLOTS[pair.kind], limb.slots, limb.rivals, strict=True):
+            name = f"{side}_{word}"
+            if rivals:
+                rows.doubt(name, rivals)
+            elif joint is not None and name not in rows.sources:
+                rows.put(name, [joint], "name")
+
+
+def _fill_by_words(figure: Figure, rows: Rows) -> None:
+    """What single names say where a figure makes no whole: for the one who completes the map."""
+    slots: list[tuple[str, str, set[str]]] = [
+        *(("", joint, {known.neck[i] for known in CONVENTIONS}) for i, joint in enumerate(("neck", "head"))),
+        ("", "pelvis", {known.trunk[0] for known in CONVENTIONS}),
+    ]
+    for kind, words in _SLOTS.items():
+        for i, word in enumerate(words):
+            fits = {getattr(known, kind)[i] for known in CONVENTIONS}
+            slots += [(side, f"{side}_{word}", fits) for side in ("left", "right")]
+    for side, joint, fits in slots:
+        if joint not in rows.sources:
+            found = [j for j, n in enumerate(figure.names) if n.word in fits - {""} and n.side == side]
+            if found:
+                rows.doubt(joint, found)
+
+
+def _fill_collars(figure: Figure, arms: LimbPair, rows: Rows) -> None:
+    """Collars without a name: the only joint between chest and shoulder, else the mean of what is around."""
+    chest = figure.common_ancestor(arms.roots)
+    for side, arm in (("left", arms.left), ("right", arms.right)):
+        shoulder, collar = arm.essential("arm")[0], f"{side}_collar"
+        if collar in rows.sources or collar in rows.candidates:
+            continue
+        between = figure.apart(chest, figure.path(chest, shoulder))[:-1]
+        if len(between) == 1:
+            rows.put(collar, between, "hierarchy")
+        elif between:
+            rows.doubt(collar, between)
+        else:  # our collar lies in the middle of these three to 2 cm
+            rows.put(collar, [chest, *rows.sources.get("neck", ())[:1], shoulder], "mean")
+
+
+def _guess(figure: Figure, source: str, target: Skeleton, rows: Rows, problems: list[str]) -> JointGuess:
+    def named(joints: tuple[int, ...]) -> tuple[str, ...]:
+        return tuple(figure.joints[joint] for joint in joints)
+
+    made = []
+    for joint in target.joints:
+        how = rows.how[joint] if joint in rows.sources else "missing"
+        candidates = named(rows.candidates.get(joint, ()))
+        made.append(GuessedJoint(joint, named(rows.sources.get(joint, ())), how, candidates))
+    used = {name for row in made for name in row.sources}
+    counts = Counter(figure.joints)
+    twice = sorted(name for name in used if counts[name] > 1)
+    if twice:
+        problems.append(f"{', '.join(twice)}: two joints of one name")
+    unmapped = tuple(name for name in dict.fromkeys(figure.joints) if name not in used)
+    return JointGuess(source, target, tuple(made), unmapped, tuple(problems))

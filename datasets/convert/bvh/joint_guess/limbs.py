@@ -1,0 +1,244 @@
+"""Joints of a figure: legs and arms by the words of their names along a chain, then the trunk between and
+above them and the fingers below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import pairwise, product
+from typing import Literal
+
+import numpy as np
+
+from motionloom.datasets.convert.bvh.joint_guess.conventions import CONVENTIONS, FINGERS
+from motionloom.datasets.convert.bvh.joint_guess.figure import Figure
+
+Kind = Literal["leg", "arm"]
+How = Literal["name", "hierarchy", "mean"]
+
+_ESSENTIAL: dict[Kind, tuple[int, int, int]] = {"leg": (0, 1, 2), "arm": (1, 2, 3)}
+"""Slots of the two long bones: hip, knee, ankle; shoulder, elbow, wrist. The fourth can be completed."""
+
+
+@dataclass(frozen=True)
+class Limb:
+    """One limb: the source joint of each of its four slots."""
+
+    slots: tuple[int | None, int | None, int | None, int | None]
+    rivals: tuple[tuple[int, ...], ...] = ((), (), (), ())
+    """Per slot the joints between which the names do not decide."""
+
+    def essential(self, kind: Kind) -> tuple[int, int, int]:
+        first, second, third = (self.slots[slot] for slot in _ESSENTIAL[kind])
+        assert first is not None and second is not None and third is not None
+        return first, second, third
+
+
+def named_limb(figure: Figure, kind: Kind, side: str) -> Limb | None:
+    """The limb whose joints carry the words of a convention, in order along one chain."""
+    words = [{getattr(known, kind)[slot] for known in CONVENTIONS} - {""} for slot in range(4)]
+    fits: list[list[int | None]] = [[None] for _ in range(4)]
+    for joint, name in enumerate(figure.names):
+        for slot in range(4):
+            if name.side == side and not name.spare and name.word in words[slot]:
+                fits[slot].append(joint)
+    best: list[tuple[int | None, ...]] = []
+    top = (0, 0)
+    for choice in product(*fits):
+        joints = [joint for joint in choice if joint is not None]
+        if any(choice[slot] is None for slot in _ESSENTIAL[kind]) or len(set(joints)) < len(joints):
+            continue
+        if any(a not in figure.ancestors(b) for a, b in pairwise(joints)):
+            continue
+        score = (len(joints), _agreement(figure, kind, choice))
+        if score >= top:
+            best = [*best, choice] if score == top else [choice]
+            top = score
+    if not best:
+        return None
+    fitting = [{one for fit in best if (one := fit[slot]) is not None} for slot in range(4)]
+    rivals = tuple(tuple(sorted(joints)) if len(joints) > 1 else () for joints in fitting)
+    a, b, c, d = best[0]
+    return Limb((a, b, c, d), rivals)
+
+
+def _agreement(figure: Figure, kind: Kind, choice: tuple[int | None, ...]) -> int:
+    """In how many slots one and the same convention has the words."""
+    words = ["" if joint is None else figure.names[joint].word for joint in choice]
+    rows: list[tuple[str, ...]] = [getattr(known, kind) for known in CONVENTIONS]
+    return max(sum(a == b for a, b in zip(words, row, strict=True)) for row in rows)
+
+
+@dataclass(frozen=True)
+class LimbPair:
+    """The two limbs of one kind."""
+
+    kind: Kind
+    left: Limb
+    right: Limb
+
+    @property
+    def roots(self) -> list[int]:
+        chains = [[joint for joint in limb.slots if joint is not None] for limb in (self.left, self.right)]
+        return [chain[0] for chain in chains]
+
+
+def named_pair(figure: Figure, kind: Kind) -> LimbPair | None:
+    """The legs or arms, where both sides have their names."""
+    left, right = (named_limb(figure, kind, side) for side in ("left", "right"))
+    return None if left is None or right is None else LimbPair(kind, left, right)
+
+
+_PELVIS_WORDS = frozenset(known.trunk[0] for known in CONVENTIONS)
+_SPINE_WORDS = frozenset(word for known in CONVENTIONS for word in known.trunk[1:])
+_NECK_WORDS = frozenset(known.neck[0] for known in CONVENTIONS)
+_HEAD_WORDS = tuple(dict.fromkeys(known.neck[1] for known in CONVENTIONS))
+"""Commonest first: the first that the figure has counts."""
+
+_NEAR_HIPS = 0.4
+"""The pelvis is within this share of a leg from the middle of the hips; a root on the floor is not [ours]."""
+
+
+@dataclass
+class Rows:
+    """Source joints of target joints, how they were found, and where several could be meant."""
+
+    sources: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    how: dict[str, How] = field(default_factory=dict)
+    candidates: dict[str, tuple[int, ...]] = field(default_factory=dict)
+
+    def put(self, joint: str, sources: Iterable[int], how: How) -> None:
+        """`joint` is the mean of these; a source that appears twice weighs twice."""
+        self.sources[joint], self.how[joint] = tuple(sources), how
+
+    def doubt(self, joint: str, candidates: Iterable[int]) -> None:
+        self.sources.pop(joint, None)
+        self.candidates[joint] = tuple(candidates)
+
+
+def fill_trunk(figure: Figure, legs: LimbPair, arms: LimbPair, rows: Rows) -> None:
+    """Add pelvis, spine1 to spine3, neck and head."""
+    pelvis = _pelvis(figure, legs, arms, rows)
+    chest = figure.common_ancestor(arms.roots)
+    spine = [j for j in figure.path(pelvis, chest) if not figure.names[j].spare]
+    above: int | None = None
+    if spine and "neck" in figure.names[chest].word:  # 3ds Max hangs the collars on the neck
+        above, spine = chest, spine[:-1]
+    _fill_spine(figure, pelvis, figure.apart(pelvis, tuple(spine)), rows)
+    _fill_head(figure, chest, above, set(arms.roots), rows)
+
+
+def _pelvis(figure: Figure, legs: LimbPair, arms: LimbPair, rows: Rows) -> int:
+    """Where legs and spine branch, if it lies between the hips; else the joint of that name that does."""
+    branch = figure.common_ancestor([*legs.roots, *arms.roots])
+    hips = figure.poses[:, [legs.left.essential("leg")[0], legs.right.essential("leg")[0]]].mean(axis=1)
+    hip, knee, ankle = legs.left.essential("leg")
+    reach = _NEAR_HIPS * (figure.length(hip, knee) + figure.length(knee, ankle))
+    named = [j for j, name in enumerate(figure.names) if name.word in _PELVIS_WORDS and not name.side]
+    fits = [
+        j
+        for j in dict.fromkeys([branch, *named])
+        if np.median(np.linalg.norm(figure.poses[:, j] - hips, axis=-1)) < reach
+    ]
+    if fits[:1] == [branch] or len(fits) == 1:
+        how: How = "name" if fits[0] in named else "hierarchy"
+        rows.put("pelvis", fits[:1], how)
+        return fits[0]
+    rows.doubt("pelvis", fits or [branch])
+    return branch
+
+
+def _fill_spine(figure: Figure, pelvis: int, spine: tuple[int, ...], rows: Rows) -> None:
+    """Three of any number [ours]: the lowest, the middle and that of the collars; means where fewer."""
+    if not spine:
+        return
+    middle = spine[(len(spine) - 1) // 2 : len(spine) // 2 + 1]
+    by_count = {
+        1: ((pelvis, pelvis, spine[0]), (pelvis, spine[0], spine[0]), spine),
+        2: ((pelvis, spine[0]), spine[:1], spine[1:]),
+    }
+    chosen = by_count.get(len(spine), (spine[:1], middle, spine[-1:]))
+    for joint, sources in zip(("spine1", "spine2", "spine3"), chosen, strict=True):
+        named = figure.names[sources[0]].word in _SPINE_WORDS
+        rows.put(joint, sources, "mean" if len(sources) > 1 else "name" if named else "hierarchy")
+
+
+def _fill_head(figure: Figure, chest: int, neck: int | None, arms: set[int], rows: Rows) -> None:
+    """Neck (unless known) and head, on the chest's branch that carries no arm."""
+    limbs = {figure.path(chest, arm)[0] for arm in arms if arm != chest}
+    branches = [child for child in figure.children[chest] if child not in limbs]
+    head = _named_head(figure, branches)
+    if head is not None:
+        chain = [j for j in figure.path(chest, head) if not figure.names[j].spare]
+        necks = [*figure.apart(chest, tuple(chain[:-1]))]
+        rows.put("head", [head], "name")
+    else:
+        chain = list(figure.apart(chest, _single_file(figure, branches)))
+        # A nameless neck and head are certain when they are all there is: of three, any two could be meant.
+        if len(chain) != (2 if neck is None else 1):
+            rows.doubt("head", chain or branches)
+            if neck is None:
+                rows.doubt("neck", chain or branches)
+            necks = []
+        else:
+            necks = chain[:-1]
+            rows.put("head", chain[-1:], "hierarchy")
+    if neck is not None:
+        rows.put("neck", [neck], "name")
+    elif necks:
+        named = [j for j in necks if figure.names[j].word in _NECK_WORDS]
+        rows.put("neck", (named or necks)[:1], "name" if named else "hierarchy")
+    elif head is not None:
+        rows.put("neck", [chest, head, head], "mean")
+
+
+def _named_head(figure: Figure, branches: list[int]) -> int | None:
+    above = [j for j in range(len(figure.joints)) if set(branches) & set(figure.ancestors(j))]
+    for word in _HEAD_WORDS:
+        fits = [j for j in above if figure.names[j].word == word and not figure.names[j].spare]
+        if fits:
+            return fits[0] if len(fits) == 1 else None
+    return None
+
+
+def _single_file(figure: Figure, branches: list[int]) -> tuple[int, ...]:
+    """The joints from the only branch on, up to the first that branches itself; none for several branches."""
+    out: list[int] = []
+    while len(branches) == 1:
+        out.append(branches[0])
+        branches = list(figure.children[branches[0]])
+    return tuple(out)
+
+
+def fill_fingers(figure: Figure, side: str, arm: Limb, rows: Rows) -> None:
+    """Add the three joints of each finger, by name alone: too many hands have four joints a finger."""
+    wrist = arm.essential("arm")[2]
+    below: dict[str, list[int]] = {}
+    for joint, name in enumerate(figure.names):
+        if name.side == side and not name.spare and wrist in figure.ancestors(joint):
+            below.setdefault(name.word, []).append(joint)
+    for finger in FINGERS:
+        chain = _knuckles(figure, wrist, finger, _chain(finger, below))
+        for number, joint in enumerate(chain, start=1):
+            rows.put(f"{side}_{finger}{number}", [joint], "name")
+
+
+def _chain(finger: str, below: dict[str, list[int]]) -> list[int]:
+    """The finger's joints outwards, in the words of the convention that has most of them."""
+    chains = [
+        [joint for word in known.fingers.chain(finger) for joint in below.get(word, [])]
+        for known in CONVENTIONS
+        if known.fingers is not None
+    ]
+    return max(chains, key=len)
+
+
+def _knuckles(figure: Figure, wrist: int, finger: str, chain: list[int]) -> list[int]:
+    """The knuckle and the two joints after it; none if the chain is no chain or too short."""
+    if len(chain) < 3 or any(a not in figure.ancestors(b) for a, b in pairwise(chain)):
+        return []
+    # Four joints begin in the palm (SOMA) or end at the tip (Mixamo). The bone in the palm is the longest.
+    in_palm = figure.length(chain[0], chain[1]) > figure.length(wrist, chain[0])
+    first = int(len(chain) > 3 and finger != "thumb" and in_palm)
+    return chain[first : first + 3]

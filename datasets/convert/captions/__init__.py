@@ -1,0 +1,1 @@
+"""Captions that people bring for their clips, in any of six forms."""

@@ -1,0 +1,136 @@
+"""`Converter`: what a source must answer; the same few questions for every kind of source.
+
+A new kind is a folder with a `convert.py` that holds one subclass. Command line, recipes and clusters find it
+there (`convert/registry.py`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.feature_step import FeatureStep
+from motionloom.datasets.convert.common.look import SourceJoints
+from motionloom.datasets.convert.common.plan import C, ConversionPlan
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import ClipMeta
+from motionloom.datasets.shards.sample import Sample
+
+if TYPE_CHECKING:
+    from motionloom.datasets.audio.features import AudioSettings
+
+Cfg = TypeVar("Cfg", bound=ConvertConfig)
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """How a source is looked through; changes no result."""
+
+    workers: int = 1
+    progress: bool = False
+    scan: Path | None = None
+    """A file that remembers what unchanged files hold."""
+    maps: Path | None = None
+    """Folder for the joint maps that are guessed."""
+
+
+class Converter(ABC, Generic[Cfg, C]):
+    """One kind of source, opened with its options. Picklable: workers convert with a copy."""
+
+    name: ClassVar[str]
+    """On the command line, as the kind of a stage, and in manifests."""
+    title: ClassVar[str]
+    """The source's own name."""
+    summary: ClassVar[str]
+    """One line for the help."""
+    example: ClassVar[str]
+    """What follows `motionloom data convert NAME` in the example of the help."""
+    config_class: ClassVar[type[ConvertConfig]]
+    version: ClassVar[int] = 1
+    """Raised when the same source gives other samples: finished shards are then made again."""
+    features_first: ClassVar[bool] = False
+    """Whether its clips are decoded in a step of their own before the first shard (`features`)."""
+
+    def __init__(self, config: Cfg) -> None:
+        self.config = config
+
+    @cached_property
+    def layout(self) -> MotionLayout:
+        return self.config.motion_layout()
+
+    @abstractmethod
+    def plan(self, settings: PlanSettings) -> ConversionPlan[C]:
+        """Look at the whole source and decide what becomes of every file, without converting anything."""
+
+    @abstractmethod
+    def convert(self, clip: C) -> Sample | list[Sample]:
+        """The sample of one clip. `UserError` or `DropClip` for what cannot be a person's motion."""
+
+    @abstractmethod
+    def joints(self, clip: C) -> SourceJoints:
+        """The joints of one clip as they are read, for the look at a source before it is converted."""
+
+    @abstractmethod
+    def depends_on(self, clip: C) -> list[object]:
+        """What the sample of a clip is made from, as plain JSON: its id, sizes or checksums of its files,
+        captions. When it changes, the shards are made again.
+        """
+
+    def licence(self, plan: ConversionPlan[C]) -> str:
+        """The licence of the whole data set."""
+        return self.config.licence or next(iter(plan.licences), "")
+
+    def options(self) -> dict[str, object]:
+        """What the samples depend on beside the source: options, and the facts of files that they name."""
+        return self.config.options()
+
+    def audio(self) -> AudioSettings | None:
+        """Settings of the audio features in the samples; None without any."""
+        return None
+
+    def subset(self, clip: C) -> str:
+        """The part of the source that a clip is in: some clips of each are looked at."""
+        return ""
+
+    def in_order(self, clip: C) -> bool:
+        """Whether the first clips of a clip's subset are the cheapest to read, as in an archive."""
+        return False
+
+    def features(self, plan: ConversionPlan[C], made_from: str) -> FeatureStep[C] | None:
+        """For sources whose clips cannot be read one by one: how they are decoded together.
+
+        `made_from` is the digest of what the samples depend on. The samples must be those of `convert`.
+        """
+        return None
+
+    def meta(
+        self,
+        clip: C,
+        motion: NDArray[np.float32],
+        *,
+        hands: bool = False,
+        face: bool = False,
+        source: str | None = None,
+        licence: str | None = None,
+        mirror_of: str | None = None,
+    ) -> ClipMeta:
+        return self.layout.clip_meta(
+            clip.id,
+            source=source or clip.label(),
+            split=clip.split,
+            frames=len(motion),
+            licence=licence or self.config.licence or "",
+            has_hands=hands,
+            has_face=face,
+            mirror_of=mirror_of,
+        )
+
+
+AnyConverter = Converter[Any, Any]

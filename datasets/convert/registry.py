@@ -1,0 +1,59 @@
+"""The converters by name: every folder here whose `convert.py` holds a `Converter`."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from pathlib import Path
+from typing import Any
+
+from motionloom.datasets import convert as _folder
+from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion
+from motionloom.datasets.convert.common.converter import AnyConverter, Converter, PlanSettings
+from motionloom.datasets.schema import UserError
+
+_HELPERS = ("captions", "common")
+
+
+def names() -> list[str]:
+    """Names of the converters, which are those of their folders."""
+    found = pkgutil.iter_modules(_folder.__path__)
+    return [entry.name for entry in found if entry.ispkg and entry.name not in _HELPERS]
+
+
+def converter_named(name: str) -> type[AnyConverter]:
+    """The converter of a folder, imported when it is asked for, so that `--help` stays quick."""
+    if name not in names():
+        raise UserError(f"unknown converter '{name}'; known: {', '.join(names())}")
+    module = importlib.import_module(f"{_folder.__name__}.{name}.convert")
+    return next(
+        kind
+        for kind in vars(module).values()
+        if isinstance(kind, type) and issubclass(kind, Converter) and kind.__module__ == module.__name__
+    )
+
+
+def converters() -> list[type[AnyConverter]]:
+    """All of them."""
+    return [converter_named(name) for name in names()]
+
+
+def prepare(
+    config: ConvertConfig,
+    *,
+    out: Path | None = None,
+    maps: Path | None = None,
+    workers: int = 1,
+    progress: bool = False,
+) -> Conversion[Any]:
+    """Look at the whole source and decide what becomes of every file; nothing is converted yet.
+
+    `config` is a converter's and decides which one. With `out`, the folder of the shards, a source whose
+    listing must read every file (archives) is read once and not again by the next run or by the other parts
+    of a conversion. Joint maps that are guessed are written into `maps`, by default `out`.
+    """
+    kind = next(kind for kind in converters() if isinstance(config, kind.config_class))
+    converter = kind(config)
+    scan = None if out is None else out / SCAN_FILE
+    return Conversion(converter, converter.plan(PlanSettings(workers, progress, scan, maps or out)))

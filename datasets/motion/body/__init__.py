@@ -1,0 +1,1 @@
+"""Bodies: SMPL files, rigid figures, feet, hands and faces."""

@@ -1,0 +1,190 @@
+"""Planted feet: where feet stand they stay, and the legs follow **[ours]**.
+
+A foot stands while its ball is low and slow, or, in features with contact columns, while these say so and it
+is low (published contacts hold at any height, h3d.py). For as long as it stands it is pinned above one point
+of the floor, its median there; before and after, the way to that point is blended in and out. Ankle and ball
+move by the same amount, so the foot keeps its angle, and `chain_solver` finds legs, and where they do not
+reach a little of everything else, that fit. This changes the motion: `FeetReport` says what it costs and
+what it gains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from motionloom.datasets.motion.body.chain_solver import solve_poses
+from motionloom.datasets.motion.body.rigid import FitError, RigidMotion
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import Config
+
+SIDES = ("left", "right")
+
+_PINNED = 1000.0
+"""Weight of ankles and balls against 1 of other joints: a pinned foot stays within a few millimetres even
+where the rest of the body has to give way."""
+_KNEES = 0.05
+"""Knees are where a leg may bend."""
+
+
+class FeetOptions(Config):
+    """When a foot stands, and how its correction comes and goes."""
+
+    height: float = Field(0.05, gt=0, allow_inf_nan=False)
+    """Metres above the floor below which a ball of the foot may stand; the floor is the balls' lowest place,
+    2 percent of the frames left out."""
+    speed: float = Field(0.8, gt=0, allow_inf_nan=False)
+    """Metres a second along the floor below which it may stand; sliding feet of small models reach 0.6."""
+    shortest: float = Field(0.1, ge=0, allow_inf_nan=False)
+    """Seconds: shorter contacts are none, and shorter gaps between two are closed."""
+    blend: float = Field(0.15, ge=0, allow_inf_nan=False)
+    """Seconds in which a correction comes and goes."""
+
+
+@dataclass(frozen=True)
+class FeetReport:
+    """What planting the feet changed. Slides are means over all steps in which a foot stands."""
+
+    slide_before: float
+    """Centimetres a second along the floor."""
+    slide_after: float
+    contact: float
+    """Share of the frames in which a foot stands, the mean of both feet."""
+    unplanted: FitError
+    """How far the figure was from the joints before its feet were planted."""
+
+    def __str__(self) -> str:
+        if not self.contact:
+            return "no foot stands in this motion, nothing was planted"
+        slide = f"feet slide {self.slide_after:.1f} cm/s where they slid {self.slide_before:.1f}"
+        return f"{slide}, at the cost of the way from {self.unplanted}"
+
+
+def foot_contacts(
+    joints: NDArray[np.floating],
+    skeleton: Skeleton,
+    fps: float,
+    options: FeetOptions | None = None,
+    features: NDArray[np.floating] | None = None,
+    layout: MotionLayout | None = None,
+) -> NDArray[np.bool_]:
+    """When the left and the right foot stand [T, 2], from joints [T, N, 3] in metres.
+
+    `features` [T, D] of a `layout` with contact columns take the place of the speed.
+    """
+    options = options or FeetOptions()
+    balls = np.asarray(joints, np.float64)[:, _balls(skeleton)]
+    low = balls[..., 1] - np.percentile(balls[..., 1], 2) < options.height
+    if features is not None and layout is not None and layout.has("foot_contacts"):
+        stated = np.asarray(features)[:, layout.slice("foot_contacts")] > 0.5
+        slow = stated[:, [1, 3]]  # ankle and ball of the left foot, then of the right one
+    else:
+        slow = _speeds(balls, fps) < options.speed
+    shortest = max(1, round(options.shortest * fps))
+    standing = low & slow
+    for foot in range(2):
+        standing[:, foot] = _without_short_runs(standing[:, foot], shortest, gaps=True)
+        standing[:, foot] = _without_short_runs(standing[:, foot], shortest, gaps=False)
+    return standing
+
+
+def plant_feet(
+    motion: RigidMotion,
+    unfitted: NDArray[np.floating],
+    contacts: NDArray[np.bool_],
+    fps: float,
+    options: FeetOptions | None = None,
+) -> tuple[RigidMotion, FeetReport]:
+    """The motion with its feet pinned while `contacts` [T, 2] say that they stand.
+
+    `unfitted` [T, N, 3] are the joints before any fit, which the result's error is measured against.
+    """
+    options = options or FeetOptions()
+    skeleton, balls = motion.skeleton, _balls(motion.skeleton)
+    before = _slide(motion.joints[:, balls], contacts, fps)
+    if not contacts.any():
+        return motion, FeetReport(before, before, 0.0, motion.error)
+    targets = motion.joints.copy()
+    weights = np.ones(len(skeleton))
+    blend = max(1, round(options.blend * fps))
+    for foot, side in enumerate(SIDES):
+        ankle = skeleton.index(f"{side}_ankle")
+        change = _correction(motion.joints[:, balls[foot]], contacts[:, foot], blend)
+        targets[:, [ankle, balls[foot]]] += change[:, None]
+        weights[[ankle, balls[foot]]] = _PINNED
+        weights[skeleton.index(f"{side}_knee")] = _KNEES
+    turned, root = solve_poses(
+        targets, skeleton.offsets, skeleton.parents, motion.rotations, motion.root, weights
+    )
+    planted = RigidMotion.posed(skeleton, turned, root, unfitted)
+    after = _slide(planted.joints[:, balls], contacts, fps)
+    return planted, FeetReport(before, after, float(contacts.mean()), motion.error)
+
+
+def _balls(skeleton: Skeleton) -> list[int]:
+    return [skeleton.index(f"{side}_foot") for side in SIDES]
+
+
+def _speeds(points: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
+    """Speed along the floor [T, ...] of points [T, ..., 3] in m/s, over two steps where possible."""
+    if len(points) < 2:
+        return np.zeros(points.shape[:-1])
+    way = np.gradient(points[..., [0, 2]], axis=0) * fps
+    return np.asarray(np.linalg.norm(way, axis=-1), dtype=np.float64)
+
+
+def _slide(balls: NDArray[np.float64], contacts: NDArray[np.bool_], fps: float) -> float:
+    """Mean speed along the floor in centimetres a second, over steps whose both frames are in contact."""
+    both = contacts[1:] & contacts[:-1]
+    if not both.any():
+        return 0.0
+    step = np.linalg.norm(np.diff(balls[..., [0, 2]], axis=0), axis=-1)
+    return float(step[both].mean() * fps * 100)
+
+
+def _correction(ball: NDArray[np.float64], standing: NDArray[np.bool_], blend: int) -> NDArray[np.float64]:
+    """Displacement [T, 3] along the floor that keeps a ball of the foot [T, 3] still while it stands."""
+    out = np.zeros_like(ball)
+    runs = _runs(standing)
+    for start, end in runs:
+        anchor = np.median(ball[start:end], axis=0)
+        out[start:end, [0, 2]] = (anchor - ball[start:end])[:, [0, 2]]
+    frames = np.arange(len(ball))
+    ends = [0, *(edge for run in runs for edge in run), len(ball)]
+    for free_start, free_end in zip(ends[::2], ends[1::2], strict=True):
+        free = frames[free_start:free_end]
+        if not len(free):
+            continue
+        # Within a gap shorter than two blends both corrections fade over the whole gap, so none is cut off.
+        span = min(blend, len(free) + 1)
+        if free_start > 0:
+            out[free] += out[free_start - 1] * _fade((free - free_start + 1) / span)[:, None]
+        if free_end < len(ball):
+            out[free] += out[free_end] * _fade((free_end - free) / span)[:, None]
+    return out
+
+
+def _fade(way: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 1 at 0 to 0 at 1 and beyond, level at both ends."""
+    x = np.clip(way, 0, 1)
+    return np.asarray(1 - x * x * (3 - 2 * x), dtype=np.float64)
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Start and end of every run of true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _without_short_runs(flags: NDArray[np.bool_], shortest: int, *, gaps: bool) -> NDArray[np.bool_]:
+    """Runs of true shorter than `shortest` frames removed; with `gaps` those of false between two of true."""
+    out = flags.copy()
+    for start, end in _runs(~flags if gaps else flags):
+        inside = start > 0 and end < len(flags)
+        if end - start < shortest and (inside or not gaps):
+            out[start:end] = gaps
+    return out

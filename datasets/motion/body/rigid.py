@@ -1,0 +1,218 @@
+"""One rigid skeleton for a whole motion: constant bones, a root and rotations, from joints that may stretch.
+
+Generated features hold positions, and nothing in them keeps bones at one length: within a clip of a small
+model a forearm changes by half. Tools that move skeletons (BVH, GLB, SMPL-X) cannot show that, and no body
+does it. So what is *shown* is a fitted figure, the same in every output; what is *measured* (evaluation,
+metrics) stays the features' own joints.
+
+The skeleton: each bone has the median length of the clip, and the fixed shapes of pelvis, chest and palms,
+whose joints carry several bones, are the clip's own too. Then `chain_solver` poses it: the frames' root and
+rotations with the least squared distance to the joints.
+
+Twist about a bone, which positions do not show, is as in the parent; of the twist that a palm shows, the
+forearm takes half, as forearms do **[ours]**. Rotations that are known (raw SMPL parameters) come in as the
+start and keep their twist. The `rotations_6d` of the h3d family know none: they are computed from positions
+by the smallest turn (h3d.py), so they would add nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.body.chain_solver import solve_poses
+from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+
+Floats = NDArray[np.float64]
+
+_NO_BONE = 1e-9
+_ROUNDS = 6
+"""Rounds of "turn to the bones, average the bones" for pelvis, chest and palms; a few settle it."""
+_MEASURED = 500
+"""Frames, at least, of longer motions that the shapes are measured on, spread evenly."""
+_FOREARM_SHARE = 0.5
+"""Share of a hand's twist that the forearm takes."""
+
+
+@dataclass(frozen=True)
+class FitError:
+    """Distances between the fitted joints and those they were fitted to, millimetres."""
+
+    mean_mm: float
+    max_mm: float
+
+    @staticmethod
+    def between(fitted: NDArray[np.floating], joints: NDArray[np.floating]) -> FitError:
+        """Over all frames and joints [T, N, 3], metres."""
+        away = np.linalg.norm(fitted - joints, axis=-1) * 1000
+        return FitError(float(away.mean()), float(away.max()))
+
+    def __str__(self) -> str:
+        return f"{self.mean_mm:.1f} mm on average, {self.max_mm:.0f} mm at most"
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """A motion of constant bones: T frames of N joints."""
+
+    skeleton: Skeleton
+    """Names, parents, and the motion's own rest offsets in metres: T-pose, +Z ahead, left at +X."""
+    rotations: Floats
+    """Local rotations [T, N, 3, 3] against the rest pose, child frame to parent frame."""
+    root: Floats
+    """Positions [T, 3] of joint 0 in metres."""
+    joints: Floats
+    """Positions [T, N, 3] in metres, by forward kinematics of the above."""
+    error: FitError
+    """Against the joints that came in."""
+
+    @staticmethod
+    def posed(
+        skeleton: Skeleton, rotations: Floats, root: Floats, joints: NDArray[np.floating]
+    ) -> RigidMotion:
+        """A motion of given rotations, compared with `joints` [T, N, 3]."""
+        shown, _ = forward_kinematics(rotations, root, skeleton.offsets, skeleton.parents)
+        return RigidMotion(skeleton, rotations, root, shown, FitError.between(shown, joints))
+
+
+def fit_rigid(
+    joints: NDArray[np.floating],
+    skeleton: Skeleton,
+    *,
+    rotations: NDArray[np.floating] | None = None,
+    symmetric: bool = False,
+) -> RigidMotion:
+    """The rigid motion nearest to joints [T, N, 3] in metres.
+
+    `skeleton` names the joints and gives the rest directions. With `symmetric`, left and right bones have one
+    length. `rotations` [T, N, 3, 3] are local rotations where they are known: the search starts there.
+    """
+    _check(joints, skeleton, rotations)
+    points = np.asarray(joints, dtype=np.float64)
+    if rotations is None:
+        own = measured_skeleton(points, skeleton, symmetric=symmetric)
+        start = joints_to_rotations(points, own)
+    else:
+        own = _lengths_only(points, skeleton, symmetric)
+        start = np.asarray(rotations, dtype=np.float64)
+    turned, root = solve_poses(points, own.offsets, own.parents, start, points[:, 0])
+    if rotations is None:
+        turned = share_twist(turned, own)
+    return RigidMotion.posed(own, turned, root, points)
+
+
+def measured_skeleton(
+    joints: NDArray[np.floating], skeleton: Skeleton, *, symmetric: bool = False
+) -> Skeleton:
+    """The skeleton with the bones of a motion [T, N, 3]: median lengths, and its own pelvis, chest and palms.
+
+    Bones of joints with one child keep the rest pose's direction, so that the rest stays a T-pose.
+    """
+    points = np.asarray(joints, dtype=np.float64)
+    parents = np.asarray(skeleton.parents)
+    own = _lengths_only(points, skeleton, symmetric)
+    # Medians settle long before that; motions of many minutes would take as long again as their poses.
+    points = points[:: max(1, len(points) // _MEASURED)]
+    lengths = np.linalg.norm(own.offsets, axis=-1, keepdims=True)
+    forks = [j for j in range(len(skeleton)) if (parents == j).sum() > 1]
+    bones = points.copy()
+    bones[:, 1:] -= points[:, parents[1:]]
+    offsets = own.offsets.copy()
+    for _ in range(_ROUNDS):
+        turned = joints_to_rotations(points, own)
+        _, world = forward_kinematics(turned, points[:, 0], own.offsets, own.parents)
+        for joint in forks:
+            ends = np.flatnonzero((parents == joint) & (lengths[:, 0] > _NO_BONE))
+            seen = np.einsum("tji,tcj->tci", world[:, joint], bones[:, ends])
+            middle = np.median(seen, axis=0)
+            offsets[ends] = _turned_back(middle, skeleton.offsets[ends])
+        size = np.linalg.norm(offsets, axis=-1, keepdims=True)
+        offsets *= lengths / np.where(size > _NO_BONE, size, 1.0)
+        if symmetric:
+            offsets = (offsets + offsets[skeleton.mirror] * [-1, 1, 1]) / 2
+        own = with_offsets(skeleton, offsets)
+    return own
+
+
+def share_twist(rotations: Floats, skeleton: Skeleton) -> Floats:
+    """Local rotations [T, N, 3, 3] of the same joints, with half of each hand's twist given to its forearm.
+
+    Turning a forearm about itself moves no joint, and the hand is turned back by as much.
+    """
+    from scipy.spatial.transform import Rotation
+
+    out = rotations.copy()
+    for side in ("left", "right"):
+        elbow, wrist = skeleton.index(f"{side}_elbow"), skeleton.index(f"{side}_wrist")
+        bone = skeleton.offsets[wrist]
+        if wrist not in skeleton.parents or not bone.any():
+            continue
+        axis = bone / np.linalg.norm(bone)
+        x, y, z, w = Rotation.from_matrix(out[:, wrist]).as_quat().T
+        twist = 2 * np.arctan2(np.stack([x, y, z], -1) @ axis, w)
+        # The angle is known but for whole turns: the nearest to the frame before, else forearms would spin.
+        twist = np.unwrap(np.remainder(twist + np.pi, 2 * np.pi) - np.pi)
+        twist -= 2 * np.pi * np.round(np.median(twist) / (2 * np.pi))
+        share = Rotation.from_rotvec(_FOREARM_SHARE * twist[:, None] * axis).as_matrix()
+        out[:, elbow] = out[:, elbow] @ share
+        out[:, wrist] = share.swapaxes(-1, -2) @ out[:, wrist]
+    return out
+
+
+def on_one_skeleton(motions: Sequence[RigidMotion]) -> list[RigidMotion]:
+    """The same motions on one skeleton of their mean bones; errors are against the given figures."""
+    own = [motion.skeleton for motion in motions]
+    if all(skeleton == own[0] for skeleton in own):
+        return list(motions)
+    if any(skeleton.joints != own[0].joints for skeleton in own):
+        raise UserError("motions of different joints have no skeleton in common; write one file for each")
+    mean = with_offsets(own[0], np.mean([skeleton.offsets for skeleton in own], axis=0))
+    out = []
+    for motion in motions:
+        turned, root = solve_poses(motion.joints, mean.offsets, mean.parents, motion.rotations, motion.root)
+        out.append(RigidMotion.posed(mean, turned, root, motion.joints))
+    return out
+
+
+def with_offsets(skeleton: Skeleton, offsets: NDArray[np.floating]) -> Skeleton:
+    """The skeleton with other rest offsets [N, 3]."""
+    return replace(skeleton, rest=tuple((float(x), float(y), float(z)) for x, y, z in offsets))
+
+
+def _lengths_only(points: Floats, skeleton: Skeleton, symmetric: bool) -> Skeleton:
+    own = skeleton.with_lengths_of(points)
+    if not symmetric:
+        return own
+    lengths = np.linalg.norm(own.offsets, axis=-1)
+    mean = (lengths + lengths[skeleton.mirror]) / 2
+    return with_offsets(own, own.offsets * (mean / np.where(lengths > _NO_BONE, lengths, 1.0))[:, None])
+
+
+def _turned_back(bones: Floats, rest: Floats) -> Floats:
+    """A joint's bones [C, 3] turned as a whole so that they lie over its rest offsets as well as they can."""
+    from scipy.spatial.transform import Rotation
+
+    if not len(bones):
+        return bones
+    turn, _ = Rotation.align_vectors(rest, bones)
+    return np.asarray(turn.apply(bones), dtype=np.float64)
+
+
+def _check(joints: NDArray[np.floating], skeleton: Skeleton, rotations: NDArray[np.floating] | None) -> None:
+    wanted = (len(skeleton), 3)
+    if joints.ndim != 3 or joints.shape[1:] != wanted or not len(joints):
+        raise UserError(
+            f"skeleton {skeleton.name} needs joints [T, {wanted[0]}, 3] with T > 0, not {list(joints.shape)}"
+        )
+    if not np.isfinite(joints).all():
+        raise UserError("joints hold NaN or infinite values: no skeleton can be fitted to them")
+    if rotations is not None and rotations.shape != (*joints.shape, 3):
+        raise UserError(
+            f"rotations {list(rotations.shape)} do not fit joints {list(joints.shape)}: "
+            f"expected {[*joints.shape, 3]}"
+        )

@@ -1,0 +1,134 @@
+"""Joint maps are data: which joints of a foreign skeleton stand for the joints of a named one.
+
+A map file is JSON: one key named after the target skeleton holds rows `[index, target joint, source]`, where
+`source` is a joint name or a list of names whose mean position is taken (a pair is the midpoint, a repeated
+name weighs more); `null` is a row still to be filled in. `note` and `unmapped` (joints left out on purpose)
+are optional. Only positions cross the map: rest poses and bone axes of the two skeletons differ.
+Guessed ones come from `convert/bvh/joint_guess`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from motionloom.datasets.motion.bvh.motion import BvhMotion
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+
+Unit = Literal["m", "cm", "mm", "inch"]
+Up = Literal["y", "z"]
+
+METRES: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+
+_ROWS = TypeAdapter(list[tuple[int, str, str | list[str] | None]])
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """Source joints of every joint of the target skeleton."""
+
+    where: str
+    target: Skeleton
+    sources: tuple[tuple[str, ...], ...]
+    """Per target joint the source names whose mean is taken."""
+    unmapped: tuple[str, ...] = ()
+
+    @staticmethod
+    def load(path: Path, *, target: str = "smpl22") -> JointMap:
+        """Read the rows of skeleton `target` from a map file; every target joint must have one row."""
+        try:
+            data = json.loads(path.read_text(encoding="utf-8-sig"))
+        except OSError as error:
+            raise UserError(f"{path}: cannot read the joint map ({error.strerror})") from None
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise UserError(f"{path}: not valid JSON ({error})") from None
+        if not isinstance(data, dict) or target not in data:
+            keys = ", ".join(data) if isinstance(data, dict) else "no keys"
+            raise UserError(
+                f"{path}: a joint map needs a key named after the skeleton '{target}'; found {keys}"
+            )
+        skeleton = Skeleton.named(target)
+        try:
+            rows = _ROWS.validate_python(data[target])
+        except ValidationError as error:
+            at = ".".join(str(part) for part in error.errors()[0]["loc"][:1])
+            raise UserError(
+                f"{path}: {target} row {at}: expected [index, target joint, source joint(s)]"
+            ) from None
+        sources: dict[int, tuple[str, ...]] = {}
+        empty = [name for _, name, source in rows if source is None]
+        if empty:
+            raise UserError(f"{path}: {target} rows still to be filled in (null): {', '.join(empty)}")
+        for index, name, source in rows:
+            assert source is not None
+            names = (source,) if isinstance(source, str) else tuple(source)
+            if skeleton.index(name) != index:
+                raise UserError(
+                    f"{path}: {target} row '{name}' has index {index}, not {skeleton.index(name)}"
+                )
+            if index in sources or not names:
+                problem = "appears twice" if index in sources else "has no source joint"
+                raise UserError(f"{path}: {target} row '{name}' {problem}")
+            sources[index] = names
+        missing = [name for i, name in enumerate(skeleton.joints) if i not in sources]
+        if missing:
+            raise UserError(f"{path}: {target} has no row for {', '.join(missing)}")
+        unmapped = tuple(str(name) for name in data.get("unmapped", []))
+        return JointMap(str(path), skeleton, tuple(sources[i] for i in range(len(skeleton))), unmapped)
+
+    def apply(self, motion: BvhMotion, *, unit: Unit = "cm", up: Up = "y") -> NDArray[np.float64]:
+        """World positions of the target's joints [T, N, 3] in metres, Y up.
+
+        `unit` and `up` describe the file, which does not say them itself.
+        """
+        counts = Counter(motion.joints)
+        for name in dict.fromkeys(name for names in self.sources for name in names):
+            if counts[name] == 0:
+                near = difflib.get_close_matches(name, motion.joints, n=1, cutoff=0.5)
+                hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(motion.joints[:30])}"
+                raise UserError(f"{motion.name}: no joint '{name}', which {self.where} names; {hint}")
+            if counts[name] > 1:
+                raise UserError(
+                    f"{motion.name}: joint '{name}' appears {counts[name]} times; the map is ambiguous"
+                )
+        world = motion.positions()
+        index = {name: i for i, name in enumerate(motion.joints)}
+        joints = world[:, [index[names[0]] for names in self.sources]]
+        for joint, names in enumerate(self.sources):
+            if len(names) > 1:
+                joints[:, joint] = world[:, [index[name] for name in names]].mean(axis=1)
+        joints *= METRES[unit]
+        if up == "z":
+            joints = np.stack([joints[..., 0], joints[..., 2], -joints[..., 1]], axis=-1)
+        return joints
+
+
+def map_text(
+    target: Skeleton,
+    sources: Sequence[tuple[str, ...] | None],
+    *,
+    note: str,
+    unmapped: Sequence[str] = (),
+    **more: Any,
+) -> str:
+    """A map file with one row a line, so that it can be corrected by hand; None is a row to be filled in."""
+
+    def row(index: int, names: tuple[str, ...] | None) -> str:
+        source = names[0] if names is not None and len(names) == 1 else names
+        return json.dumps([index, target.joints[index], source], ensure_ascii=False)
+
+    rows = ",\n  ".join(row(index, names) for index, names in enumerate(sources))
+    fields = {"note": note, **more, "unmapped": list(unmapped)}
+    rest = [f"{json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}" for key, value in fields.items()]
+    body = ",\n ".join([*rest[:-1], f'"{target.name}": [\n  {rows}]', rest[-1]])
+    return "{" + body + "}\n"

@@ -1,0 +1,295 @@
+"""The text of a BVH file: hierarchy line by line, motion block as one array.
+
+Every function names the file and the line in its `UserError`. `bvh.py` gives the numbers their meaning.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import dataclass, field
+from decimal import ROUND_DOWN, ROUND_HALF_UP, Decimal, InvalidOperation
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.schema import UserError
+
+Floats = NDArray[np.float64]
+
+CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
+_CANONICAL = {name.lower(): name for name in CHANNELS}
+_MOTION = re.compile(rb"^[ \t]*MOTION[ \t]*$", re.IGNORECASE | re.MULTILINE)
+_HEADER = re.compile(
+    rb"\s*Frames[ \t]*:[ \t]*(\S+)[ \t]*\n\s*Frame[ \t]+Time[ \t]*:[ \t]*(\S+)[ \t]*(?:\n|$)", re.IGNORECASE
+)
+_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+
+
+@dataclass(frozen=True)
+class MotionSection:
+    """Where the MOTION section lies in the bytes, and what its two header lines say."""
+
+    start: int
+    body: int
+    frames: int
+    frame_time: float
+    fps: float
+
+
+@dataclass
+class Hierarchy:
+    """Joints in file order; parents come before children (-1 = root)."""
+
+    names: list[str] = field(default_factory=list)
+    parents: list[int] = field(default_factory=list)
+    offsets: list[list[float]] = field(default_factory=list)
+    channels: list[tuple[str, ...]] = field(default_factory=list)
+    end_sites: list[tuple[int, list[float]]] = field(default_factory=list)
+
+
+def load_text(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
+    """The bytes with LF line ends and no BOM, and what errors call them."""
+    if isinstance(source, bytes):
+        data, where = source, name or "BVH data"
+    elif isinstance(source, str) and "\n" in source:
+        data, where = source.encode(), name or "BVH text"
+    else:
+        where = name or str(source)
+        try:
+            data = Path(source).read_bytes()
+        except OSError as error:
+            raise UserError(f"{where}: cannot read ({error.strerror})") from None
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    return data.removeprefix(b"\xef\xbb\xbf"), where
+
+
+def read_header(source: Path | str | bytes, *, name: str | None = None) -> MotionSection:
+    """Frame count and frame rate of a clip; the hierarchy and the values are not checked."""
+    data, where = load_text(source, name)
+    return find_motion(data, where)
+
+
+def find_motion(data: bytes, where: str) -> MotionSection:
+    """Locate the MOTION section and read its frame count and frame time."""
+    if not data.strip():
+        raise UserError(f"{where}: empty file")
+    marker = _MOTION.search(data)
+    if marker is None:
+        raise UserError(f"{where}: no MOTION section; the file has no frames")
+    header = _HEADER.match(data, marker.end())
+    if header is None:
+        line = data.count(b"\n", 0, marker.end()) + 2
+        raise UserError(
+            f"{where}: line {line}: expected 'Frames: <count>' and 'Frame Time: <seconds>' after MOTION"
+        )
+    frame_time, fps = _frame_time(header.group(2), where)
+    return MotionSection(marker.start(), header.end(), _frame_count(header.group(1), where), frame_time, fps)
+
+
+def _frame_count(text: bytes, where: str) -> int:
+    if not text.isdigit() or len(text) > 12:
+        raise UserError(f"{where}: 'Frames: {_shown(text)}' is not a whole number")
+    if int(text) == 0:
+        raise UserError(f"{where}: 'Frames: 0': the file has no frames")
+    return int(text)
+
+
+def _frame_time(text: bytes, where: str) -> tuple[float, float]:
+    """Seconds and fps. 0.0333 and 0.033333 both mean 30 fps; 0.033367 is 29.97."""
+    try:
+        exact = Decimal(text.decode("ascii", "replace"))
+    except InvalidOperation:
+        raise UserError(f"{where}: 'Frame Time: {_shown(text)}' is not a number") from None
+    if not exact.is_finite() or not Decimal("1e-5") < exact < 60:
+        raise UserError(
+            f"{where}: 'Frame Time: {_shown(text)}' must be seconds a frame, above 0.00001 and below 60; "
+            "the frame rate would be meaningless"
+        )
+    fps = 1 / float(exact)
+    whole = round(fps)
+    if whole:
+        digit = Decimal(1).scaleb(max(int(exact.as_tuple().exponent), -12))
+        near = {(Decimal(1) / whole).quantize(digit, mode) for mode in (ROUND_DOWN, ROUND_HALF_UP)}
+        fps = float(whole) if exact.quantize(digit) in near else fps
+    return float(exact), fps
+
+
+def read_values(data: bytes, start: int, frames: int, width: int, where: str) -> Floats:
+    """The motion block [frames, width] from byte `start` on; every row must hold `width` finite numbers."""
+    body = data[start:].rstrip()
+    if not body:
+        raise UserError(f"{where}: the header says {frames} frames, 0 found")
+    text = np.frombuffer(body, dtype=np.uint8)
+    visible = text > 32
+    starts = np.flatnonzero(visible & np.r_[True, ~visible[:-1]])
+    # A line's numbers are those that start before the next line does.
+    counts = np.diff(
+        np.searchsorted(starts, np.flatnonzero(text == ord("\n"))), prepend=0, append=len(starts)
+    )
+    lines = data.count(b"\n", 0, start) + 1 + np.flatnonzero(counts)
+    counts = counts[counts > 0]
+    wrong = np.flatnonzero(counts != width)
+    if len(wrong):
+        row = int(wrong[0])
+        raise UserError(
+            f"{where}: line {lines[row]}: frame {row} (from 0) has {counts[row]} numbers, "
+            f"the hierarchy declares {width} channels"
+        )
+    if len(counts) != frames:
+        raise UserError(f"{where}: the header says {frames} frames, {len(counts)} found")
+    values = _parse_numbers(body)
+    if len(values) != frames * width or not np.isfinite(values).all():
+        raise _bad_word(body, lines, width, where)
+    return values.reshape(frames, width)
+
+
+def _parse_numbers(body: bytes) -> Floats:
+    """Any numbers in text, by numpy's reader; fewer than there are when one is not a number."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # numpy only warns when it stops at a bad word
+        try:
+            return np.fromstring(body, dtype=np.float64, sep=" ")
+        except (ValueError, DeprecationWarning):
+            return np.empty(0)
+
+
+def _bad_word(body: bytes, lines: NDArray[np.int64], width: int, where: str) -> UserError:
+    for at, word in enumerate(body.split()):
+        if not _NUMBER.fullmatch(word) or not np.isfinite(float(word)):
+            row, column = divmod(at, width)
+            return UserError(
+                f"{where}: line {lines[row]}: frame {row}, channel {column} (from 0): "
+                f"'{_shown(word)}' is not a finite number"
+            )
+    return UserError(f"{where}: the motion block holds characters that are not numbers")
+
+
+def _shown(text: bytes) -> str:
+    return text[:40].decode("utf-8", "backslashreplace")
+
+
+def parse_hierarchy(text: bytes, where: str) -> Hierarchy:
+    """Parse everything before MOTION. The files of a collection mostly share one hierarchy, so it is kept."""
+    try:
+        return _parse_hierarchy(text)
+    except UserError:
+        return _HierarchyParser(where).parse(text)  # fails again, with the name of the file
+
+
+@lru_cache(maxsize=8)
+def _parse_hierarchy(text: bytes) -> Hierarchy:
+    return _HierarchyParser("").parse(text)
+
+
+class _HierarchyParser:
+    def __init__(self, where: str) -> None:
+        self.where = where
+        self.line = 0
+        self.out = Hierarchy()
+        self.offsets: dict[int, list[float]] = {}
+        self.channels: dict[int, tuple[str, ...]] = {}
+        self.open: list[int] = []
+        """Open blocks: a joint index, or -1 for an End Site."""
+        self.pending: int | None = None
+        """The block whose '{' must come next."""
+
+    def parse(self, text: bytes) -> Hierarchy:
+        started = False
+        for self.line, raw in enumerate(text.split(b"\n"), start=1):
+            for piece in re.findall(r"[{}]|[^{}]+", self._decode(raw)):
+                words = piece.split()
+                if not words:
+                    continue
+                if started:
+                    self._take(words[0].upper(), words, piece.strip())
+                elif words[0].upper() == "HIERARCHY":
+                    started = True
+                else:
+                    raise self._error("a BVH file must start with HIERARCHY")
+        missing = len(self.open) + (self.pending is not None)
+        if missing:
+            raise self._error(f"braces are not balanced: {missing} '}}' missing before MOTION")
+        if not self.out.names:
+            raise self._error("no ROOT joint")
+        for joint, name in enumerate(self.out.names):
+            if joint not in self.offsets or joint not in self.channels:
+                lacks = "CHANNELS" if joint in self.offsets else "OFFSET"
+                raise UserError(f"{self.where}: joint '{name}' has no {lacks} line")
+        self.out.offsets = [self.offsets[j] for j in range(len(self.out.names))]
+        self.out.channels = [self.channels[j] for j in range(len(self.out.names))]
+        return self.out
+
+    def _take(self, key: str, words: list[str], piece: str) -> None:
+        """One brace or one statement."""
+        block = self.open[-1] if self.open else None
+        in_joint = block is not None and block >= 0
+        if self.pending is not None:
+            if key != "{":
+                raise self._error(f"expected '{{' before '{piece[:60]}'")
+            self.open.append(self.pending)
+            self.pending = None
+        elif key == "}" and self.open:
+            self.open.pop()
+        elif key == "ROOT" and block is None and len(words) > 1:
+            if self.out.names:
+                raise self._error("a second ROOT; split the file, one character each")
+            self.pending = self._add(piece, -1)
+        elif key == "JOINT" and block is not None and in_joint and len(words) > 1:
+            self.pending = self._add(piece, block)
+        elif key == "END" and block is not None and in_joint:
+            self.out.end_sites.append((block, [0.0, 0.0, 0.0]))
+            self.pending = -1
+        elif key == "OFFSET" and block is not None:
+            if in_joint:
+                self.offsets[block] = self._offset(words)
+            else:
+                self.out.end_sites[-1] = (self.out.end_sites[-1][0], self._offset(words))
+        elif key == "CHANNELS" and block is not None and in_joint:
+            self.channels[block] = self._channel_names(words)
+        else:
+            raise self._error(f"'{piece[:60]}' is not expected here")
+
+    def _error(self, reason: str) -> UserError:
+        return UserError(f"{self.where}: line {self.line}: {reason}")
+
+    def _decode(self, raw: bytes) -> str:
+        try:
+            return raw.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise self._error(
+                f"'{_shown(raw.strip())}' is not UTF-8 text (byte {error.start + 1} of the line); "
+                "rename the joint or save the file as UTF-8"
+            ) from None
+
+    def _add(self, piece: str, parent: int) -> int:
+        self.out.names.append(piece.split(None, 1)[1].strip())  # a name may hold spaces
+        self.out.parents.append(parent)
+        return len(self.out.names) - 1
+
+    def _offset(self, words: list[str]) -> list[float]:
+        try:
+            values = [float(word) for word in words[1:]]
+        except ValueError:
+            values = []
+        if len(values) != 3 or not np.isfinite(values).all():
+            raise self._error(f"'{' '.join(words)[:60]}' must be OFFSET and three finite numbers")
+        return values
+
+    def _channel_names(self, words: list[str]) -> tuple[str, ...]:
+        joint = self.out.names[self.open[-1]]
+        names = [_CANONICAL.get(word.lower(), "") for word in words[2:]]
+        if len(words) < 2 or words[1] not in {str(n) for n in range(7)}:
+            raise self._error(f"joint '{joint}': CHANNELS must be followed by a count from 0 to 6")
+        if int(words[1]) != len(names):
+            raise self._error(
+                f"joint '{joint}' declares CHANNELS {words[1]} but lists {len(names)} channel names"
+            )
+        if "" in names:
+            raise self._error(f"unknown channel '{words[2 + names.index('')]}'; known: {', '.join(CHANNELS)}")
+        if len(set(names)) != len(names):
+            raise self._error(f"joint '{joint}' lists a channel twice")
+        return tuple(names)

@@ -1,0 +1,1 @@
+"""Motion features: joints to columns and back."""

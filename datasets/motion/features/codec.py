@@ -1,0 +1,99 @@
+"""Joints to features and back, for both families (HumanTOMATO section 4.2).
+
+`exact` (exact.py) is invertible and keeps the number of frames; `h3d` (h3d.py) equals the published HumanML3D
+and HumanTOMATO features, has one frame less than the joints, and retargets to the layout's skeleton first.
+The layout says which family an array holds. Both work on whole sequences and any leading dimensions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.features.exact import decode_exact, encode_exact
+from motionloom.datasets.motion.features.h3d import decode_h3d, encode_h3d
+from motionloom.datasets.motion.layout import FACE_DIMS, MotionLayout
+from motionloom.datasets.schema import UserError
+
+_GROUP_FRAMES = 800
+"""Clips are encoded in groups of about so many frames. Measured: larger groups leave the cache and run at
+half the speed, single clips of 200 frames pay as much for calls as for arithmetic."""
+
+
+def encode(
+    joints: NDArray[np.floating], layout: MotionLayout, face: NDArray[np.floating] | None = None
+) -> NDArray[np.float32]:
+    """Canonical joints [..., T, N, 3] in metres -> features [..., T', D]: T' = T (exact) or T - 1 (h3d).
+
+    `face` [..., T, 50] fills the layout's face columns; without it they are 0. Joints are not moved: call
+    `canonicalize` first (h3d does its own).
+    """
+    _check_family(layout)
+    _check_joints(joints, layout)
+    kernel = encode_h3d if layout.family == "h3d" else encode_exact
+    frames = joints.shape[-3] - (layout.family == "h3d")
+    clips = joints.reshape(-1, *joints.shape[-3:])
+    group = max(1, _GROUP_FRAMES // joints.shape[-3])
+    out = np.empty((len(clips), frames, layout.dim), dtype=np.float32)
+    for start in range(0, len(clips), group):
+        out[start : start + group] = kernel(clips[start : start + group], layout)
+    out = out.reshape(*joints.shape[:-3], frames, layout.dim)
+    if face is not None:
+        _check_face(face, joints, layout)
+        out[..., layout.slice("face")] = face[..., :frames, :]
+    return out
+
+
+def decode(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:
+    """Features [..., T, D] (not normalised) -> joints [..., T, N, 3] in metres, float64.
+
+    Frame 0 stands above the origin with heading +Z.
+    """
+    _check_family(layout)
+    if features.ndim < 2 or features.shape[-1] != layout.dim:
+        raise UserError(
+            f"layout {layout.name} has {layout.dim} columns, but these features are {list(features.shape)}"
+        )
+    return decode_h3d(features, layout) if layout.family == "h3d" else decode_exact(features, layout)
+
+
+def face_of(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.floating]:
+    """The expression columns [..., T, 50] of features [..., T, D]."""
+    return features[..., layout.slice("face")]
+
+
+def _check_family(layout: MotionLayout) -> None:
+    if not layout.has("root_yaw_velocity"):
+        raise UserError(
+            f"layout {layout.name} is raw parameters, not motion features; convert it to joints first"
+        )
+    if layout.family == "raw":
+        raise UserError(f"layout {layout.name} says family 'raw'; motion features are 'exact' or 'h3d'")
+    if layout.family == "exact" and layout.has("rotations_6d"):
+        raise UserError(f"layout {layout.name} holds rotations and contacts, which only the h3d family has")
+
+
+def _check_face(face: NDArray[np.floating], joints: NDArray[np.floating], layout: MotionLayout) -> None:
+    if not layout.has("face"):
+        raise UserError(f"layout {layout.name} has no face columns; use wholebody363 for clips with a face")
+    wanted = (*joints.shape[:-2], FACE_DIMS)
+    if face.shape != wanted:
+        raise UserError(
+            f"face of shape {list(face.shape)} does not fit joints {list(joints.shape)}: "
+            f"expected {list(wanted)}"
+        )
+
+
+def _check_joints(joints: NDArray[np.floating], layout: MotionLayout) -> None:
+    wanted = (layout.num_joints, 3)
+    least = 2 if layout.family == "h3d" else 1
+    if joints.ndim < 3 or joints.shape[-2:] != wanted:
+        raise UserError(
+            f"layout {layout.name} needs joints [..., T, {wanted[0]}, 3], but these are {list(joints.shape)}"
+        )
+    if joints.shape[-3] < least:
+        raise UserError(
+            f"a clip of {joints.shape[-3]} frames is too short: the {layout.family} family needs {least}"
+        )
+    if not np.isfinite(joints).all():
+        raise UserError("joints hold NaN or infinite values")

@@ -1,0 +1,284 @@
+"""Is this a person standing on a floor? One clip measured, many clips judged.
+
+A wrong length unit, a wrong upward axis or two rows of a joint map that were swapped give motion that is
+finite, smooth and trains without a complaint. What they do not give is people: so the plan of a conversion,
+the conversion itself and the check of a data set all measure the same few things here and judge them by the
+same bounds (docs/data.md gives each its reason).
+
+Single clips prove nothing, since people lie down, climb and walk backwards: every bound is about a *share* of
+the clips.
+"""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.canonical import facing, ground
+from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.motion.skeleton import Skeleton
+
+PERSON_METRES = (1.2, 2.2)
+"""Height of a figure: from a child of seven to the tallest people. Wrong units are 2.54 times off or more."""
+
+UPRIGHT = 0.5
+"""Cosine between the upward axis and the way from pelvis to head: 60 degrees, which sitting, squatting and
+bowing figures stay within for most of a clip."""
+
+FLOOR_METRES = 0.3
+"""How far the lowest joint may be from the floor in the median frame: jumps are shorter than half a clip, and
+joints of feet lie up to 0.1 m above their soles."""
+
+MOST = 0.5
+"""Share of the clips that must be people standing on a floor."""
+
+ODD = 0.2
+"""Share of the clips beyond which a few odd ones are worth a warning."""
+
+_RATE = 10.0
+"""Frames a second that are looked at."""
+_WALKS = 0.3
+"""Metres a second from which a figure goes somewhere."""
+_WALKS_SECONDS = 0.5
+_BACKWARDS = -0.5
+_LEAST_WALKS = 3
+"""Fewer clips of walking say nothing about the set."""
+
+_NAMED = Skeleton.named("smpl22")
+_PELVIS, _HEAD = _NAMED.index("pelvis"), _NAMED.index("head")
+_NECK = _NAMED.index("neck")
+_ANKLES = [_NAMED.index(f"{side}_ankle") for side in ("left", "right")]
+_FEET = [_NAMED.index(f"{side}_foot") for side in ("left", "right")]
+_NEUTRAL_HEIGHT = 1.7
+"""Metres: the adult behind the named skeleton (`skeletons/smpl22.json`)."""
+
+
+_STRETCHES = [
+    *((_NAMED.index(f"{side}_hip"), _NAMED.index(f"{side}_knee"), 0.5) for side in ("left", "right")),
+    *((_NAMED.index(f"{side}_knee"), _NAMED.index(f"{side}_ankle"), 0.5) for side in ("left", "right")),
+    (_PELVIS, _NECK, 1.0),
+    (_NECK, _HEAD, 1.0),
+]
+"""What a height is made of: (joint, joint, how often it counts). The trunk is one stretch: noise would make
+its five short bones longer, and bending hardly makes it shorter."""
+
+
+def _length(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Joints [..., 22, 3] -> length of a leg, the trunk and the neck [...]."""
+    return np.asarray(
+        sum(
+            weight * np.linalg.norm(joints[..., first, :] - joints[..., second, :], axis=-1)
+            for first, second, weight in _STRETCHES
+        )
+    )
+
+
+_HEIGHT_OF_LENGTH = _NEUTRAL_HEIGHT / float(_length(_NAMED.rest_joints))
+
+
+@dataclass(frozen=True)
+class FigureMeasure:
+    """One clip measured. Everything is a median over its frames, so that a bow or a jump does not count."""
+
+    height: float
+    """Metres, from the lengths of legs, trunk and neck: nearly the same in any pose."""
+    up: tuple[float, float, float]
+    """Unit vector from pelvis to head."""
+    floor: float
+    """Height of the lowest joint of all frames."""
+    above_floor: float
+    """Height of a frame's lowest joint above `floor`."""
+    forward: float | None
+    """Cosine between the way the figure goes and the way it faces; None where it stays in its place."""
+    toes: float
+    """How far the feet point to where the figure faces, -1 to 1: negative where left and right are
+    swapped."""
+
+    @property
+    def is_person_size(self) -> bool:
+        """Whether a person can be so tall."""
+        return PERSON_METRES[0] <= self.height <= PERSON_METRES[1]
+
+    @property
+    def is_upright(self) -> bool:
+        return self.up[1] > UPRIGHT
+
+    @property
+    def is_upside_down(self) -> bool:
+        return self.up[1] < -UPRIGHT
+
+    @property
+    def is_on_floor(self) -> bool:
+        """Whether some joint is near the clip's floor most of the time."""
+        return self.above_floor <= FLOOR_METRES
+
+
+def measure(joints: NDArray[np.floating], fps: float) -> FigureMeasure:
+    """Measure a clip of joints [T, N, 3], Y up, the first 22 those of the body skeleton."""
+    step = max(1, round(fps / _RATE))
+    body = np.asarray(joints[::step, :BODY_JOINTS], dtype=np.float64)
+    trunk = body[:, _HEAD] - body[:, _PELVIS]
+    up = np.median(trunk / np.maximum(np.linalg.norm(trunk, axis=-1, keepdims=True), 1e-9), axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-9)
+    lowest = body[..., 1].min(axis=-1)
+    floor = float(np.asarray(joints)[:, :BODY_JOINTS, 1].min())
+    heading = np.exp(1j * facing(body))
+    toes = ground(body[:, _FEET] - body[:, _ANKLES]) * heading.conj()[:, None]
+    return FigureMeasure(
+        height=float(np.median(_length(body))) * _HEIGHT_OF_LENGTH,
+        up=(float(up[0]), float(up[1]), float(up[2])),
+        floor=floor,
+        above_floor=float(np.median(lowest)) - floor,
+        forward=_forward(ground(body[:, _PELVIS]), heading, fps / step),
+        toes=float(np.median(toes.real / np.maximum(np.abs(toes), 1e-9))),
+    )
+
+
+def _forward(path: NDArray[np.complex128], heading: NDArray[np.complex128], fps: float) -> float | None:
+    """Mean cosine between steps and heading over the frames that go somewhere."""
+    steps = np.diff(path) * fps
+    speed = np.abs(steps)
+    walks = speed > _WALKS
+    if walks.sum() < _WALKS_SECONDS * fps:
+        return None
+    return float(np.mean((steps * heading[:-1].conj()).real[walks] / speed[walks]))
+
+
+Kind = Literal["size", "lying", "upside down", "floating", "below the floor", "left and right", "backwards"]
+
+
+@dataclass(frozen=True)
+class Oddity:
+    """What many clips have in common that people standing on a floor have not."""
+
+    kind: Kind
+    clips: int
+    of: int
+    """Clips that were measured for it."""
+    text: str
+    """One sentence."""
+
+    @property
+    def share(self) -> float:
+        """Of the clips that were measured."""
+        return self.clips / self.of
+
+    @property
+    def is_error(self) -> bool:
+        """Whether it is so in most clips; people do walk backwards, so that alone is none."""
+        return self.share > MOST and self.kind != "backwards"
+
+
+class PlausibilityStats:
+    """Many clips together, in 24 bytes each."""
+
+    def __init__(self) -> None:
+        self._height, self._up, self._floor = array("f"), array("f"), array("f")
+        self._above, self._forward, self._toes = array("f"), array("f"), array("f")
+
+    def __len__(self) -> int:
+        return len(self._height)
+
+    def add(self, clip: FigureMeasure) -> None:
+        self._height.append(clip.height)
+        self._up.append(clip.up[1])
+        self._floor.append(clip.floor)
+        self._above.append(clip.above_floor)
+        self._forward.append(float("nan") if clip.forward is None else clip.forward)
+        self._toes.append(clip.toes)
+
+    @property
+    def height(self) -> float:
+        """Median height of the figures in metres; NaN without any."""
+        return float(np.median(_values(self._height))) if len(self) else float("nan")
+
+    @property
+    def upright(self) -> float:
+        """Share of the clips whose head is above the pelvis; NaN without any."""
+        return float(np.mean(_values(self._up) > UPRIGHT)) if len(self) else float("nan")
+
+    @property
+    def above_floor(self) -> float:
+        """Median distance of a figure from the floor of its clip, metres; NaN without any."""
+        return float(np.median(_values(self._above))) if len(self) else float("nan")
+
+    @property
+    def walking(self) -> int:
+        """Clips in which the figure goes somewhere."""
+        return int(np.isfinite(_values(self._forward)).sum())
+
+    @property
+    def backwards(self) -> int:
+        """Of these, clips in which it goes backwards."""
+        return int((_values(self._forward) < _BACKWARDS).sum())
+
+    def oddities(self, *, least: float = ODD, floor_at_zero: bool = False) -> list[Oddity]:
+        """What more than the share `least` of the clips have, the most serious first.
+
+        `floor_at_zero` for canonical motion, whose floor must be at height 0.
+        """
+        if not len(self):
+            return []
+        height, up, above = _values(self._height), _values(self._up), _values(self._above)
+        small, tall = PERSON_METRES
+        found: list[Oddity] = []
+
+        def count(kind: Kind, odd: NDArray[np.bool_], text: str, of: int | None = None) -> None:
+            number, total = int(odd.sum()), of or len(self)
+            if number > least * total:
+                share = f"{number} of {total} clips ({number / total:.0%})"
+                found.append(Oddity(kind, number, total, f"{share} {text}"))
+
+        count(
+            "size",
+            ~((height >= small) & (height <= tall)),
+            f"show figures that are not {small:g} to {tall:g} m tall (median {self.height:.3g} m; "
+            f"a wrong length unit?)",
+        )
+        count(
+            "upside down", up < -UPRIGHT, "show figures whose head is below the pelvis (a wrong upward axis?)"
+        )
+        count(
+            "lying",
+            np.abs(up) <= UPRIGHT,
+            "show figures whose head is not above the pelvis (they lie: a wrong upward axis?)",
+        )
+        upright = up > UPRIGHT
+        standing = int(upright.sum())
+        if standing:  # the others have no floor and face nowhere
+            floor = _values(self._floor) if floor_at_zero else np.zeros(len(self))
+            low = floor < -FLOOR_METRES
+            count(
+                "floating",
+                upright & ~low & ~(above + floor <= FLOOR_METRES),
+                f"show figures that float more than {FLOOR_METRES:g} m above the floor",
+                standing,
+            )
+            count(
+                "below the floor",
+                upright & low,
+                f"show figures more than {FLOOR_METRES:g} m below the floor",
+                standing,
+            )
+            count(
+                "left and right",
+                upright & (_values(self._toes) < 0),
+                "show feet that point backwards (left and right swapped?)",
+                standing,
+            )
+        if self.walking >= _LEAST_WALKS and self.backwards > MOST * self.walking:
+            count(
+                "backwards",
+                _values(self._forward) < _BACKWARDS,
+                "in which somebody walks go backwards",
+                self.walking,
+            )
+        return sorted(found, key=lambda oddity: not oddity.is_error)
+
+
+def _values(stored: array[float]) -> NDArray[np.float64]:
+    return np.array(stored, dtype=np.float64)

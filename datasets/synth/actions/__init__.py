@@ -1,0 +1,1 @@
+"""What a clip does, and how a body does it: attributes, poses in animator's terms, actions."""

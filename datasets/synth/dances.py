@@ -1,0 +1,276 @@
+"""Dances to songs: which clips dance to which song, and how.
+
+Plan: everything is a pure function of (config, number). Clips of one song are all of one split, so that the
+songs, and with `hold_out_tempi` whole ranges of tempi, are new to whoever learned from the training split.
+
+Choreography: legs, arms, hands and face follow the genre, every pose on a beat of the music. Between two
+beats the body eases from pose to pose with a minimum-jerk curve, which has no speed at its ends: every beat
+is a minimum of the body's speed, which is what Beat Align looks for (UDE section 4.3). The first beat of a
+bar is always down and to the left, the section of the song picks the pair of arm poses, and hands and face
+are at their strongest on the first beat of a bar, so that all of it can be heard. Size, posture and whether
+the arms go together are the dancer's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from motionloom.datasets.schema import Config, Split
+from motionloom.datasets.synth.actions.arms import Hold, play
+from motionloom.datasets.synth.actions.maths import Array, keys
+from motionloom.datasets.synth.actions.pose import Track
+from motionloom.datasets.synth.actions.truth import Record, Span, Truth, require_known
+from motionloom.datasets.synth.face import express_with
+from motionloom.datasets.synth.genres import GENRES
+from motionloom.datasets.synth.hands import grip_hand
+from motionloom.datasets.synth.song import BEATS, Song, draw_song
+
+Ranges = TypeVar("Ranges", tuple[int, int], list[tuple[int, int]])
+Comes = Literal["text", "audio", "both", "none"]
+_GOLDEN = 0.6180339887498949
+
+
+class DanceConditions(Config):
+    """What dances come with, as weights: captions alone, music alone, both, or the motion alone."""
+
+    text: float = Field(0.0, ge=0)
+    audio: float = Field(0.0, ge=0)
+    both: float = Field(1.0, ge=0)
+    none: float = Field(0.0, ge=0)
+
+    @model_validator(mode="after")
+    def _some(self) -> DanceConditions:
+        if self.text + self.audio + self.both + self.none <= 0:
+            raise ValueError("at least one of text, audio, both and none needs a weight above 0")
+        return self
+
+    def of(self, number: int) -> Comes:
+        """What dance `number` comes with: exact shares, spread evenly (a low-discrepancy sequence)."""
+        weights = np.array([self.text, self.audio, self.both, self.none])
+        ends = np.cumsum(weights / weights.sum())
+        names: tuple[Comes, ...] = ("text", "audio", "both", "none")
+        place = int(np.searchsorted(ends, (number * _GOLDEN + 0.5) % 1.0, side="right"))
+        return names[min(place, int(np.flatnonzero(weights)[-1]))]
+
+
+class DanceConfig(Config):
+    """Dances to songs: several clips of each song of a pool, each with its own start in the song."""
+
+    songs: int = Field(24, ge=1)
+    """Songs in the pool."""
+    song_seconds: float = Field(40.0, ge=2, le=600)
+    """Length of a song."""
+    genres: list[str] | None = None
+    """None = all; otherwise names of `genres.GENRES`. A genre decides the style of its dances."""
+    tempo: tuple[int, int] = (80, 160)
+    """Slowest and fastest song, beats a minute."""
+    hold_out_songs: float | None = Field(None, ge=0, lt=1)
+    """Share of the songs that only test clips dance to; None = the config's `test_fraction`. Validation has
+    songs of its own too, `val_fraction` of them."""
+    hold_out_tempi: list[tuple[int, int]] = Field(default_factory=list)
+    """Ranges of beats a minute whose songs are kept for testing, for example `[[110, 119]]`."""
+    share: float | None = Field(None, gt=0, le=1)
+    """Share of dances among the clips; None = as much as any other action."""
+    conditions: DanceConditions = DanceConditions()
+    sound: bool = True
+    """Store the sound beside its features."""
+    sample_rate: int = Field(16_000, ge=8_000, le=48_000)
+    """Hz."""
+
+    @field_validator("genres")
+    @classmethod
+    def _known(cls, names: list[str] | None) -> list[str] | None:
+        return require_known(names, tuple(GENRES), "genre")
+
+    @field_validator("tempo", "hold_out_tempi")
+    @classmethod
+    def _ranges(cls, value: Ranges) -> Ranges:
+        for low, high in [value] if isinstance(value, tuple) else value:
+            if not 60 <= low <= high <= 170:
+                raise ValueError(f"tempi are [slowest, fastest] within 60 and 170, not {low}, {high}")
+        return value
+
+    def song(self, number: int, seed: int) -> Song:
+        names = tuple(self.genres or GENRES)
+        return draw_song(number, seed, genres=names, tempo=self.tempo, seconds=self.song_seconds)
+
+    def split(self, song: Song, test: float, val: float) -> Split:
+        """Split of all clips of a song. Songs come in rounds of all genres, so the first are balanced."""
+        if any(low <= song.bpm <= high for low, high in self.hold_out_tempi):
+            return "test"
+        tested = round(self.songs * (test if self.hold_out_songs is None else self.hold_out_songs))
+        if song.number < tested:
+            return "test"
+        return "val" if song.number < tested + round(self.songs * val) else "train"
+
+
+@dataclass(frozen=True)
+class DanceTruth(Truth):
+    """Attributes of a dance to a song."""
+
+    genre: str = ""
+    song: int = 0
+    """Number in the pool."""
+    key: int = 0
+    """Semitones of the song's key note above A."""
+    song_start: float = 0.0
+    """Where in the song the clip begins, seconds."""
+    first_beat: float = 0.0
+    """Seconds from the start of the clip to its first beat; the others follow each 60 / bpm seconds."""
+    bar_beat: int = 0
+    """Which beat of the bar that is, from 0."""
+
+
+@dataclass(frozen=True)
+class Dance:
+    """One dance before it is animated."""
+
+    truth: DanceTruth
+    song: Song
+    start: int
+    """First frame, counted from the start of the song."""
+    frames: int
+    comes: Comes
+
+    def seconds(self, fps: float) -> float:
+        """Where in the song the dance begins."""
+        return self.start / fps
+
+
+def song_of(number: int, dances: DanceConfig, seed: int) -> Song:
+    """The song of dance `number`: all songs of the pool once, in shuffled order, before any comes again."""
+    turn, place = divmod(number, dances.songs)
+    order = np.random.default_rng([seed, turn, 233]).permutation(dances.songs)
+    return dances.song(int(order[place]), seed)
+
+
+def plan_dance(number: int, index: int, dances: DanceConfig, seed: int, span: Span, fps: float) -> Dance:
+    """Dance `number`, which is clip `index`."""
+    rng = np.random.default_rng([seed, index, 0])
+    song = song_of(number, dances, seed)
+    whole = int(song.seconds * fps)
+    frames = min(max(8, round(span.pick(rng, at_least=min(4.0, span.high)) * fps)), whole)
+    start = int(rng.integers(whole - frames + 1))
+    first = song.beat_number(start / fps)
+    genre = song.style
+    truth = DanceTruth(
+        "dance",
+        left_hand=genre.hand,
+        right_hand=genre.hand,
+        face=genre.face,
+        bpm=song.bpm,
+        style=genre.style,
+        genre=song.genre,
+        song=song.number,
+        key=song.key,
+        song_start=round(start / fps, 9),
+        first_beat=round(first * song.beat - start / fps, 9),
+        bar_beat=first % BEATS,
+    )
+    return Dance(truth, song, start, frames, dances.conditions.of(number))
+
+
+def beats_of(truth: Record, seconds: float) -> list[float]:
+    """Times of the beats inside a clip of `seconds` by its truth record (`ClipMeta.truth`)."""
+    beat = 60.0 / truth["bpm"]
+    count = max(0, int(np.ceil((seconds - truth["first_beat"]) / beat - 1e-9)))
+    return [truth["first_beat"] + k * beat for k in range(count)]
+
+
+# ---- choreography
+
+_LEGS = {
+    # Metres aside and down, radians of the pelvis' roll and of the spine's twist.
+    "step": (0.0, 0.05, 0.05, 0.2),
+    "bounce": (0.0, 0.13, 0.0, 0.1),
+    "sway": (0.1, 0.045, 0.09, 0.25),
+}
+_STEP = 0.13
+"""Metres to either side."""
+
+
+def choreograph(song: Song, start: float, frames: int, fps: float, rng: np.random.Generator) -> Track:
+    """A dance of `frames` frames to the music from `start` seconds of a song on."""
+    genre = song.style
+    track = Track.standing(frames / fps, fps, rng, width=rng.uniform(0.0, 0.05))
+    first = song.beat_number(start)
+    numbers = np.arange(first - first % BEATS - BEATS, first + int(frames / fps / song.beat) + 3)
+    beats: Array = np.asarray(numbers * song.beat - start, dtype=np.float64)
+    amount = rng.uniform(0.85, 1.15)
+    aside, down, roll, twist = (amount * value for value in _LEGS[genre.style])
+    turns = np.where(numbers % 2 == 0, 1.0, -1.0)
+    side = keys(track.t, beats, turns)
+    if genre.style == "step":
+        _side_steps(track, beats, song.beat, _STEP * amount)
+    track.root[:, 0] += aside * side
+    track.root[:, 1] -= 0.03 + down * (0.5 + 0.5 * side)
+    track.pelvis[:, 2] += roll * side
+    track.spine[:, 2] -= 2.0 * roll * side
+    track.spine[:, 1] += twist * side
+    # The head nods deeper where a bar begins.
+    nods = np.where(numbers % BEATS == 0, 1.0, np.where(numbers % 2 == 0, 0.6, 0.0))
+    track.head[:, 0] += rng.uniform(0.12, 0.2) * keys(track.t, beats, nods)
+    track.knee_out += 0.1 * (0.5 + 0.5 * side)
+    together = rng.random() < 0.5
+    for hand in (0, 1):
+        holds: list[Hold] = []
+        for number, at in zip(numbers.tolist(), beats.tolist(), strict=True):
+            pair = genre.arms[song.section(number)]
+            even = (number % 2 == 0) != (hand == 1 and not together)
+            holds.append((at, *pair[1 if even else 0]))
+        play(track, hand, holds)
+    track.lower_to_reach(0.5 / fps)
+    return track
+
+
+def dance(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
+    """A dance without music of the tempo and style that `truth` has, by one of the style's genres."""
+    genres = [genre.name for genre in GENRES.values() if genre.style == truth.style]
+    seconds = span.pick(rng, at_least=min(4.0, span.high))
+    song = Song(0, 0, genres[int(rng.integers(len(genres)))], truth.bpm or 120, 0, seconds)
+    start = rng.uniform(0.0, 8 * BEATS * song.beat)  # within both kinds of section
+    return choreograph(song, start, round(seconds * fps), fps, rng)
+
+
+def dancing_hands(song: Song, start: float, t: Array, rng: np.random.Generator) -> Array:
+    """Finger rotations [2, T, 15, 3, 3]: the genre's hand shape, loosened in the second half of each bar."""
+    shape = song.style.hand
+    grip = _accents(song, start, t, 1.0, 0.7)
+    hands = [grip_hand(shape, t, grip, rng) for _ in (0, 1)]
+    return np.stack(hands)
+
+
+def dancing_face(song: Song, start: float, t: Array, rng: np.random.Generator) -> Array:
+    """Expression values [T, 50]: the genre's emotion, lighting up where a bar begins."""
+    return express_with(song.style.face, t, rng.uniform(0.9, 1.1) * _accents(song, start, t, 1.1, 0.5), rng)
+
+
+def _accents(song: Song, start: float, t: Array, high: float, low: float) -> Array:
+    """A curve [T]: `high` on the first beat of each bar, falling to `low` on the third, and back."""
+    end = start + float(t[-1])
+    bar = BEATS * song.beat
+    halves = np.arange(int(np.floor(start / bar)) * 2, int(np.ceil(end / bar)) * 2 + 2)
+    at = np.asarray(halves * (bar / 2), dtype=np.float64)
+    return keys(t + start, at, np.where(halves % 2 == 0, high, low))
+
+
+def _side_steps(track: Track, beats: Array, beat: float, far: float) -> None:
+    """Step out with one foot and bring the other to it, two beats each way; each foot lands on its beat."""
+    where = np.zeros((2, len(beats)))
+    for k in range(1, len(beats)):
+        where[:, k] = where[:, k - 1]
+        turn = k % 4
+        # Beats 0, 1 go left (left foot, then right foot closes), beats 2, 3 go right.
+        foot = 0 if turn in (0, 3) else 1
+        where[foot, k] = far if turn in (0, 1) else -far
+        mine = (track.t >= beats[k - 1]) & (track.t < beats[k])
+        phase = np.where(mine, (track.t - beats[k - 1]) / beat, 0.0)
+        track.ball[foot, :, 1] += 0.06 * np.sin(np.pi * phase) ** 2
+        track.foot_pitch[foot] += 0.35 * np.sin(np.pi * phase) ** 2
+    for foot in (0, 1):
+        track.ball[foot, :, 0] += keys(track.t, beats, where[foot])
+    track.root[:, 0] += keys(track.t, beats, where.mean(0))

@@ -1,1 +1,0 @@
-"""A recipe on a cluster that another engine schedules: SLURM, Kubernetes, SkyPilot."""

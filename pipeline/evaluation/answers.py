@@ -1,0 +1,158 @@
+"""Answers that need no model, to stand beside a model's: motions of the training set, and the mean pose.
+
+What a model would answer that only remembers is the training clip that comes nearest to a motion, or the
+training dance to the nearest music.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.schema import HANDS, PRESENT_ALL
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.pipeline.evaluation.dances import DanceClip
+
+Joints = NDArray[np.float64]
+
+KEY_FRAMES = 16
+"""Moments of a clip that the search compares."""
+
+
+def local_joints(features: NDArray[np.float32], layout: MotionLayout) -> NDArray[np.float64]:
+    """Joints [T, N, 3] relative to the root, turned into its heading: the pose without its path.
+
+    Layouts that hold such positions are read as they are, so that errors of the path play no part.
+    """
+    if not layout.has("positions"):
+        return local_joints_of(joints_of(features, layout), layout.fps)
+    positions = features[..., layout.slice("positions")].astype(np.float64)
+    positions = positions.reshape(*positions.shape[:-1], layout.num_joints - 1, 3)
+    height = features[..., layout.slice("root_height")].astype(np.float64)
+    positions[..., 1] -= height
+    return np.concatenate([np.zeros_like(positions[..., :1, :]), positions], axis=-2)
+
+
+class NearestClip:
+    """The training clip whose poses, stretched to the same length, come nearest.
+
+    Hands are compared where both clips have them. A motion with hands finds none without, if there are any.
+    """
+
+    def __init__(self, train: ClipDataset) -> None:
+        self.train = train
+        self.columns = train.layout.part("bodyhand")
+        keys = [self._key(np.asarray(train.motion(i))[:, self.columns]) for i in range(len(train))]
+        self.keys = [np.stack(part) for part in zip(*keys, strict=True)]
+        self.norms = [np.square(part).sum(1) for part in self.keys]
+        self.with_hands = (train.present & HANDS) > 0
+
+    def _key(self, features: NDArray[np.float32]) -> list[NDArray[np.float64]]:
+        """Positions of the body's joints and of the hands', each flat."""
+        layout = self.train.layout
+        if layout.has("positions"):
+            key = stretch(features[:, layout.slice("positions")], KEY_FRAMES)
+        else:
+            key = stretch(local_joints(features, layout)[:, 1:].reshape(len(features), -1), KEY_FRAMES)
+        return [part.ravel() for part in np.split(key, [3 * (BODY_JOINTS - 1)], axis=1)]
+
+    def motion(
+        self, features: NDArray[np.float32], present: int = PRESENT_ALL
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(pose, joints) of that clip, [T, N, 3] each, stretched to the T frames of `features`.
+
+        Features are stretched and their velocities scaled with time; where the layout has none, the joints
+        are stretched, since angles cannot be averaged. `present` says what `features` hold.
+        """
+        body, hands = (
+            norms - 2 * keys @ key
+            for norms, keys, key in zip(self.norms, self.keys, self._key(features), strict=True)
+        )
+        distance = body
+        if present & HANDS and self.with_hands.any():
+            distance = np.where(self.with_hands, body + hands, np.inf)
+        found = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
+        layout = self.train.layout
+        if not layout.has("positions"):
+            joints = joints_of(found, layout)
+            path = stretch(joints.reshape(len(joints), -1), len(features)).reshape(-1, *joints.shape[1:])
+            return local_joints_of(path, layout.fps), path
+        out = stretch(found, len(features))
+        for field in ("root_yaw_velocity", "root_xz_velocity", "velocities"):
+            out[:, layout.slice(field)] *= len(found) / len(features)
+        near = out.astype(np.float32)
+        return local_joints(near, layout), joints_of(near, layout)
+
+
+def stretch(values: NDArray[np.floating], frames: int) -> NDArray[np.float64]:
+    """Linear resampling of [T, D] to `frames` rows, first and last kept."""
+    at = np.linspace(0, len(values) - 1, frames)
+    low = np.floor(at).astype(int)
+    high = np.minimum(low + 1, len(values) - 1)
+    weight = (at - low)[:, None]
+    wide = values.astype(np.float64)
+    return np.asarray(wide[low] * (1 - weight) + wide[high] * weight)
+
+
+def mean_poses(pool: Sequence[Joints], fps: float, lengths: Iterable[int]) -> list[Joints]:
+    """The mean pose of training motions [T, N, 3], standing still for so many frames each."""
+    poses, heights = [], []
+    for joints in pool:
+        poses.append(local_joints_of(joints, fps).mean(0))
+        heights.append(joints[:, 0, 1].mean())
+    pose = np.mean(poses, axis=0)
+    pose[:, 1] += np.mean(heights)
+    return [np.tile(pose, (frames, 1, 1)) for frames in lengths]
+
+
+def random_dances(
+    pool: Sequence[DanceClip], clips: Sequence[DanceClip], rng: np.random.Generator
+) -> list[Joints]:
+    """For each clip a stretch of a training dance drawn at random, as long as the clip where one is."""
+    out = []
+    for clip in clips:
+        frames = len(clip.joints)
+        long = [other for other in pool if len(other.joints) >= frames] or list(pool)
+        joints = long[int(rng.integers(len(long)))].joints
+        start = int(rng.integers(max(0, len(joints) - frames) + 1))
+        out.append(joints[start : start + frames])
+    return out
+
+
+def nearest_dances(
+    train: ClipDataset, pool: Sequence[DanceClip], dataset: ClipDataset, clips: Sequence[DanceClip]
+) -> list[Joints] | None:
+    """For each clip the training dance to the most similar music, cut to its length.
+
+    Similar: the mean over time of the stored audio features, each in units of its deviation among the
+    training dances **[ours]**. Of equally long dances only where there are some. None where the data store
+    no audio features.
+    """
+    known, wanted = _music_means(train, pool), _music_means(dataset, clips)
+    if known is None or wanted is None:
+        return None
+    spread = known.std(0)
+    spread = np.where(spread > 1e-8, spread, np.inf)
+    lengths = np.array([len(other.joints) for other in pool])
+    out = []
+    for clip, music in zip(clips, wanted, strict=True):
+        away = (((known - music) / spread) ** 2).sum(1)
+        if (lengths >= len(clip.joints)).any():
+            away[lengths < len(clip.joints)] = np.inf
+        out.append(pool[int(away.argmin())].joints[: len(clip.joints)])
+    return out
+
+
+def _music_means(dataset: ClipDataset, clips: Sequence[DanceClip]) -> NDArray[np.float64] | None:
+    """Mean audio features [n, 438] of clips; None where one has none."""
+    rows = []
+    for clip in clips:
+        features = dataset.array(clip.index, "audio.npy")
+        if features is None or not len(features):
+            return None
+        rows.append(features.mean(0, dtype=np.float64))
+    return np.stack(rows)

@@ -1,0 +1,227 @@
+"""Metrics of single motions: a metric is a function of one `Performance`, and a line in a list here.
+
+Each is taken of what was generated and of every answer that needs no model, and is a mean over clips. A
+function returns values by the names of its columns, and leaves out what a motion does not show; a value may
+have a weight (`weighted`), such as its number of frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.synth.measure import agrees, measure_dance
+from motionloom.models.metrics.dance import SHORTEST, foot_contact_score, foot_skating, physics
+from motionloom.models.metrics.dance_beats import DEFINITIONS, beat_align
+from motionloom.models.metrics.position import KINDS, position_errors
+from motionloom.pipeline.contract.units import Row
+from motionloom.pipeline.evaluation.estimate import row_estimates, weighted
+from motionloom.pipeline.evaluation.figures import Estimate, Figure, Metric, Protocol, group_figures
+
+Joints = NDArray[np.float64]
+
+MIN_FRAMES = 4
+"""Shortest dance whose figures are taken."""
+
+
+@dataclass(frozen=True)
+class Performance:
+    """A motion, and what it is held against."""
+
+    joints: Joints
+    """[T, N, 3] in metres."""
+    recorded: Joints
+    """What was recorded for the same caption or song."""
+    fps: float
+    face: NDArray[np.float32] | None = None
+    """Expressions [T, 50]."""
+    truth: Mapping[str, Any] | None = None
+    """What a synthetic clip is known to do (`ClipMeta.truth`)."""
+    beats: NDArray[np.float64] | None = None
+    """Seconds of the beats of the music."""
+
+    @property
+    def frames(self) -> int:
+        """Frames that both motions last."""
+        return min(len(self.joints), len(self.recorded))
+
+
+@dataclass(frozen=True)
+class ClipMetric:
+    """A function of one motion, and the table and columns of its values."""
+
+    group: str
+    measure: Callable[[Performance], Row]
+    columns: tuple[Metric, ...]
+
+
+def agreement(performance: Performance) -> Row:
+    """1 or 0 for each attribute of a clip's caption that geometry can measure, and for all together; only
+    synthetic clips know what they do.
+    """
+    if performance.truth is None or "action" not in performance.truth:
+        return {}
+    found = agrees(performance.truth, performance.joints, performance.face, performance.fps)
+    found["everything"] = all(found.values())
+    return {f"agreement.{name}": float(value) for name, value in found.items()}
+
+
+def position(performance: Performance) -> Row:
+    """APE in m, weighted by frames, and AVE in m², over the frames that both motions last."""
+    frames = performance.frames
+    if frames < 2:
+        return {}
+    pair = (performance.joints, performance.recorded)
+    made, real = (torch.from_numpy(np.ascontiguousarray(x[:frames, :BODY_JOINTS])) for x in pair)
+    found, out = position_errors(made, real), Row()
+    for kind in KINDS:
+        out |= weighted(f"position.ape_{kind}", found.ape[kind] * frames, frames)
+        out[f"position.ave_{kind}"] = found.ave[kind]
+    return out
+
+
+def floor_and_jerk(performance: Performance) -> Row:
+    """Skating, floating, penetration and jitter; nothing of a motion too short for them."""
+    if len(performance.joints) < SHORTEST:
+        return {}
+    found = physics(performance.joints, performance.fps)._asdict()
+    return {f"physics.{name}": value for name, value in found.items()}
+
+
+def beat_alignment(performance: Performance) -> Row:
+    """Beat Align by every public definition; nothing of music without a beat."""
+    frames, fps = performance.frames, performance.fps
+    if performance.beats is None or frames < MIN_FRAMES:
+        return {}
+    # The last step has no place of its own in every definition.
+    inside = performance.beats[performance.beats < (frames - 1) / fps - 1e-6]
+    if not len(inside):
+        return {}
+    joints = performance.joints[:frames, :BODY_JOINTS]
+    return {f"beat_align.{name}": beat_align(joints, inside, fps, name) for name in DEFINITIONS}
+
+
+def recognition(performance: Performance) -> Row:
+    """Whether a dance has the genre, style and tempo (within 5 %) of its truth, and how far the tempo is off:
+    |tempo / true tempo - 1|.
+    """
+    truth = performance.truth or {}
+    if not truth.get("genre") or performance.frames < MIN_FRAMES:
+        return {}
+    found = measure_dance(performance.joints[: performance.frames], performance.fps)
+    off = abs(found.bpm / float(truth["bpm"]) - 1)
+    return {
+        "recognition.genre": float(found.genre == truth["genre"]),
+        "recognition.style": float(found.style == truth["style"]),
+        "recognition.tempo": float(off <= 0.05),
+        "recognition.tempo_error": off,
+    }
+
+
+def feet(performance: Performance) -> Row:
+    """Share of sliding steps, and EDGE's physical foot contact score."""
+    if len(performance.joints) < MIN_FRAMES:
+        return {}
+    return {
+        "feet.skating": foot_skating(performance.joints, performance.fps),
+        "feet.contact": foot_contact_score(performance.joints, performance.fps),
+    }
+
+
+def _definitions() -> dict[str, str]:
+    """Name of a definition of Beat Align -> the title of its column; equal definitions share one."""
+    shared: dict[Any, list[str]] = {}
+    for name, definition in DEFINITIONS.items():
+        shared.setdefault(definition, []).append(name)
+    return {names[0]: " = ".join(names) for names in shared.values()}
+
+
+_ASPECTS = (
+    "everything", "action", "direction", "side", "count", "speed", "left_hand", "right_hand", "face", "style",
+    "genre", "bpm",
+)  # fmt: skip
+_POSITION = ClipMetric(
+    "Distance to the motion recorded for the same caption or song (lower is better)",
+    position,
+    tuple(
+        Metric(f"position.{error}_{kind}", f"{error.upper()} {title}".strip(), "lower", unit)
+        for kind, title in (("joints", ""), ("root", "root"), ("path", "path"), ("pose", "pose"))
+        for error, unit in (("ape", "m"), ("ave", "m²"))
+    ),
+)
+
+CAPTION_METRICS: tuple[ClipMetric, ...] = (
+    _POSITION,
+    ClipMetric(
+        "Feet, floor and jerk (the nearer to recorded motion, the better)",
+        floor_and_jerk,
+        (
+            Metric("physics.skating", "foot skating"),
+            Metric("physics.floating", "floating", unit="mm"),
+            Metric("physics.penetration", "penetration", unit="mm"),
+            Metric("physics.jitter", "jitter, 100 m/s³"),
+        ),
+    ),
+    ClipMetric(
+        "Does the motion do what its caption says? (measured on the joints)",
+        agreement,
+        tuple(Metric(f"agreement.{name}", name.replace("_", " "), "higher", "share") for name in _ASPECTS),
+    ),
+)
+"""Of motions made for captions."""
+
+BEAT_ALIGN = ClipMetric(
+    "Beat Align (higher is better)",
+    beat_alignment,
+    tuple(Metric(f"beat_align.{name}", title, "higher") for name, title in _definitions().items()),
+)
+RECOGNITION = ClipMetric(
+    "What is danced, measured on the joints (higher is better; the error: lower)",
+    recognition,
+    (
+        Metric("recognition.genre", "genre", "higher"),
+        Metric("recognition.style", "style", "higher"),
+        Metric("recognition.tempo", "tempo within 5 %", "higher"),
+        Metric("recognition.tempo_error", "tempo error", "lower"),
+    ),
+)
+DANCE_METRICS: tuple[ClipMetric, ...] = (
+    BEAT_ALIGN,
+    RECOGNITION,
+    _POSITION,
+    ClipMetric(
+        "Feet (lower is better)",
+        feet,
+        (
+            Metric("feet.skating", "foot skating", "lower"),
+            Metric("feet.contact", "foot contact score", "lower"),
+        ),
+    ),
+)
+"""Of dances to music."""
+
+
+def measure_clip(metrics: Sequence[ClipMetric], performance: Performance) -> Row:
+    """All values of one motion."""
+    out = Row()
+    for metric in metrics:
+        out |= metric.measure(performance)
+    return out
+
+
+def clip_figures(
+    metrics: Sequence[ClipMetric], rows: Mapping[str, Sequence[Sequence[Row]]], protocol: Protocol
+) -> list[Figure]:
+    """Figures of what was measured clip by clip: row -> repeats -> clips (`measure_clip`)."""
+    found: dict[str, dict[str, Estimate]] = {row: row_estimates(repeats) for row, repeats in rows.items()}
+    return [
+        figure
+        for metric in metrics
+        for figure in group_figures(metric.group, metric.columns, found, protocol)
+    ]

@@ -1,0 +1,1 @@
+"""Generators: trained networks as makers of motion (`contract/generation.py`)."""

@@ -1,0 +1,202 @@
+"""Motion of text by a GPT over motion tokens (HumanTOMATO sections 3.3, 3.4 and B.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from motionloom.datasets.conditions import Conditions
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.drawing import Drawing, as_codes, sample_seeds
+from motionloom.models.gpt.sampling import generate
+from motionloom.models.gpt.streaming import TokenStream
+from motionloom.pipeline.contract.generation import FrameFlow, GenerationRequest, TokenFlow
+from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+from motionloom.pipeline.inference.generators.frames import Frames
+from motionloom.pipeline.store.networks import (
+    LoadedGpt,
+    LoadedTma,
+    MotionJudge,
+    TrainedTokenizer,
+    device_of,
+    embed_motions,
+)
+from motionloom.pipeline.store.text import TextSource
+
+T = TypeVar("T")
+
+_CANDIDATES_AT_ONCE = 64
+"""Motions sampled together where several are drawn for each text."""
+
+
+@dataclass(frozen=True)
+class GptGenerator:
+    """Tokens sampled from a GPT, then decoded: body and hands, or the face's residual codes (B.4)."""
+
+    gpt: LoadedGpt
+    given: Mapping[str, Any]
+    face: bool
+    method = "gpt"
+    modalities = frozenset({"text"})
+
+    @property
+    def tokenizer(self) -> TrainedTokenizer:
+        tokenizer: TrainedTokenizer = self.given["tokenizer"]
+        return tokenizer
+
+    @property
+    def layout(self) -> MotionLayout:
+        return self.tokenizer.layout
+
+    @property
+    def group_tokens(self) -> dict[str, int]:
+        return {stream.name: stream.per_group for stream in self.tokenizer.net.streams}
+
+    @property
+    def text(self) -> TextSource | None:
+        text: TextSource | None = self.given.get("text")
+        return text
+
+    @property
+    def part(self) -> Part:
+        return self.tokenizer.net.part
+
+    @property
+    def settings(self) -> frozenset[str]:
+        more = {"face_cfg_scale"} if self.face else set()
+        more |= {"candidates"} if self.reranker is not None else set()
+        return frozenset({"temperature", "top_k", "top_p", "cfg_scale"} | more)
+
+    @property
+    def reranker(self) -> LoadedTma | None:
+        """TMA used to rank candidates: the one behind the text prior, if it models the same body part."""
+        tma: LoadedTma | None = self.given.get("tma") if self.gpt.prior == "tma" else None
+        return tma if tma is not None and tma.part == self.part else None
+
+    @property
+    def unit_frames(self) -> int:
+        return self.tokenizer.net.group_frames
+
+    @property
+    def max_frames(self) -> int:
+        return self.gpt.net.max_groups * self.unit_frames
+
+    def prior(self, request: GenerationRequest) -> Tensor:
+        """First input of the GPT [B, E]: the TMA text latent or the sentence embedding."""
+        if self.gpt.prior == "sentence":
+            return request.pooled_text("this GPT").to(device_of(self.gpt.net))
+        if "tma" not in self.given:
+            raise UserError("this GPT needs the TMA text encoder, and no tma stage is here")
+        text = request.text("this GPT")
+        latent: Tensor = self.given["tma"].embed_text(text.features, text.mask)
+        return latent
+
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        """Lengths that are no whole groups are made of one group more, and cut. Of several candidates the
+        one nearest to its text is kept.
+        """
+        prior, reranker, count = self.prior(request), self.reranker, request.sampling.candidates
+        if reranker is None or count == 1:
+            return self._drawn(prior, request.frames, request.seeds, request.sampling)
+        out: list[NDArray[np.float32]] = []
+        at_once = max(1, _CANDIDATES_AT_ONCE // count)
+        for start in range(0, len(prior), at_once):
+            rows = slice(start, start + at_once)
+            frames = None if request.frames is None else repeated(request.frames[rows], count)
+            texts, seeds = prior[rows], candidate_seeds(request.seeds[rows], count)
+            drawn = self._drawn(texts.repeat_interleave(count, dim=0), frames, seeds, request.sampling)
+            out += nearest_candidates(reranker, texts, drawn)
+        return out
+
+    @torch.no_grad()
+    def _drawn(
+        self, prior: Tensor, frames: Sequence[int] | None, seeds: Sequence[int], sampling: SamplingConfig
+    ) -> list[NDArray[np.float32]]:
+        """One motion for each row of the prior [B, E]."""
+        unit = self.unit_frames
+        groups = None if frames is None else torch.tensor([-(-n // unit) for n in frames])
+        codes = generate(
+            self.gpt.net,
+            prior,
+            groups=groups,
+            temperature=sampling.temperature,
+            top_k=sampling.top_k or None,
+            top_p=sampling.top_p,
+            cfg_scale=sampling.face_guidance if self.face else sampling.cfg_scale,
+            seed=list(seeds),
+        )
+        motions = self.tokenizer.decode(codes.codes, codes.groups.tolist())
+        if frames is None:
+            return motions
+        return [motion[:count] for motion, count in zip(motions, frames, strict=True)]
+
+    def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
+        """Tokens as they come; a full block, or another text, goes on from the last frames."""
+        tokens = TokenStream(
+            self.gpt.net,
+            how=Drawing(sampling.temperature, sampling.top_k or None, sampling.top_p),
+            context=streaming.context_frames // self.unit_frames,
+            cfg_scale=sampling.face_guidance if self.face else sampling.cfg_scale,
+            seed=seed,
+        )
+        return GptFlow(tokens, lambda conditions: self.prior(GenerationRequest(conditions, None, [seed])))
+
+    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> FrameFlow:
+        if streaming.decoder == "diffusion":
+            raise UserError("this model has no diffusion decoder; leave streaming's decoder out")
+        return Frames.of_tokenizer(self.tokenizer, streaming)
+
+
+class GptFlow:
+    """One motion's tokens, one group at a time.
+
+    Args:
+        tokens: The network's side.
+        prior: First input of the GPT [1, E] of conditions of one row.
+    """
+
+    def __init__(self, tokens: TokenStream, prior: Callable[[Conditions], Tensor]) -> None:
+        self._tokens, self._prior = tokens, prior
+
+    def condition(self, conditions: Conditions) -> None:
+        self._tokens.condition(self._prior(conditions))
+
+    def draw(self, left: int | None) -> Mapping[str, Tensor]:
+        group = self._tokens.draw()
+        return as_codes(self._tokens.gpt, group[:, None], group.new_ones(1)).codes
+
+
+def candidate_seeds(seeds: Sequence[int], count: int) -> list[int]:
+    """Seeds of `count` draws for each of `seeds`, grouped by motion: its own seed first, so that a
+    single draw is the first of several.
+    """
+    return [one for seed in seeds for one in (seed, *sample_seeds(seed, count - 1))]
+
+
+def repeated(values: Sequence[T], count: int) -> list[T]:
+    """Each value `count` times in a row."""
+    return [value for value in values for _ in range(count)]
+
+
+def nearest_candidates(
+    reranker: MotionJudge, text: Tensor, motions: Sequence[NDArray[np.float32]]
+) -> list[NDArray[np.float32]]:
+    """Each text's motion whose latent has the greatest cosine to the text's; [T, C] each.
+
+    Args:
+        reranker: What embeds motions [T, C] of its part, in their own units.
+        text: The texts' latents, float [B, Z].
+        motions: B * K motions, a text's K draws next to each other.
+    """
+    count = len(motions) // len(text)
+    latents = F.normalize(embed_motions(reranker, motions).double(), dim=-1).view(len(text), count, -1)
+    near = (latents * F.normalize(text.cpu().double(), dim=-1)[:, None]).sum(-1)
+    return [motions[row * count + draw] for row, draw in enumerate(near.argmax(1).tolist())]

@@ -1,0 +1,259 @@
+"""Motion tokens along a time line whose conditions may change: windows that go on from one another.
+
+A model of tokens is trained on windows of some frames. A longer stretch, such as a song, is made window by
+window: each window begins with the last groups of the one before (`context`), and the music of a
+window begins and ends where its groups do, as in training. Where a stretch begins, music from before it is
+masked. Noise z is drawn once a motion.
+
+Legend: B rows, G groups of four frames, L positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from motionloom.datasets.conditions import Condition, Conditions
+from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.tokens import Codes
+from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.models.utt.continuing import join
+from motionloom.models.utt.network import ConditionedUtt
+from motionloom.models.utt.sampling import draw_z, generate
+from motionloom.pipeline.contract.generation import Stretch
+from motionloom.pipeline.contract.sampling import SamplingConfig
+
+
+class TokenTimeline:
+    """Makes tokens for stretches of conditions.
+
+    Args:
+        net: MATE and UTT.
+        window: Groups of a training window.
+        context: Groups that a window sees of what came before.
+        prepared: What the stages of the modalities give, by name, such as the statistics of music.
+        inject_z: Draw z.
+    """
+
+    def __init__(
+        self,
+        net: ConditionedUtt,
+        *,
+        window: int,
+        context: int,
+        prepared: Mapping[str, object],
+        inject_z: bool,
+    ) -> None:
+        self.net, self.window_groups, self.context = net, window, context
+        self.prepared, self.inject_z = prepared, inject_z
+
+    @torch.no_grad()
+    def tokens(self, stretches: Sequence[Stretch], seeds: Sequence[int], sampling: SamplingConfig) -> Codes:
+        """Codes of all stretches, one after another; B rows, a seed each."""
+        utt, count = self.net.utt, len(seeds)
+        device = next(self.net.parameters()).device
+        empty = torch.zeros(count, 0, dtype=torch.int64, device=device)
+        made = Codes(dict.fromkeys(utt.names, empty), torch.zeros(count, dtype=torch.int64, device=device))
+        z = draw_z(seeds, utt.config.z_dim).to(device) if self.inject_z and utt.config.z_dim else None
+        for number, stretch in enumerate(stretches):
+            conditions = self.normalised(stretch.conditions)
+            if stretch.frames is None:
+                if len(stretches) > 1:
+                    raise UserError(
+                        "a stretch without a length stands alone; give the length of each in seconds"
+                    )
+                return self.window(conditions, made, z, None, window_seeds(seeds, 0, 0), sampling)
+            wanted = torch.tensor([-(-n // GROUP_FRAMES) for n in stretch.frames], device=device)
+            made = self._stretch(conditions, made, z, wanted, seeds, number, sampling)
+        return made
+
+    def _stretch(
+        self,
+        conditions: Conditions,
+        before: Codes,
+        z: Tensor | None,
+        wanted: Tensor,
+        seeds: Sequence[int],
+        number: int,
+        sampling: SamplingConfig,
+    ) -> Codes:
+        """What is there with `wanted` [B] groups more."""
+        made, done, turn = before, torch.zeros_like(wanted), 0
+        while bool((done < wanted).any()):
+            rows = torch.nonzero(done < wanted)[:, 0]
+            here = _rows(made, rows)
+            seen = here.groups.clamp(max=self.context)
+            new = torch.minimum(wanted[rows] - done[rows], self.window_groups - seen)
+            first = (done[rows] - seen) * GROUP_FRAMES
+            frames = (seen + new) * GROUP_FRAMES
+            part = {
+                name: cut(_rows_of(condition, rows), first, frames)
+                if name in self.net.mate.timed
+                else _rows_of(condition, rows)
+                for name, condition in conditions.items()
+            }
+            own = [seeds[row] for row in rows.tolist()]
+            noise = None if z is None else z[rows]
+            more = self.window(part, here, noise, new, window_seeds(own, number, turn), sampling)
+            made = _with(made, rows, join(here, more, self.net.utt.pattern))
+            done[rows] += more.groups
+            turn += 1
+        return made
+
+    def window(
+        self,
+        conditions: Conditions,
+        before: Codes,
+        z: Tensor | None,
+        groups: Tensor | None,
+        seeds: Sequence[int],
+        sampling: SamplingConfig,
+        drawn: int = 0,
+    ) -> Codes:
+        """New codes that follow `before`, whose last `drawn` groups are of this window already."""
+        count = len(seeds)
+        encoded = self.net.mate(conditions, count)
+        present = {name: condition.present.tolist() for name, condition in conditions.items()}
+        scales = [sampling.scale({name: rows[row] for name, rows in present.items()}) for row in range(count)]
+        guided = any(scale != 1 for scale in scales)
+        return generate(
+            self.net.utt,
+            encoded,
+            null=self.net.mate.unconditional(count) if guided else None,
+            inject_z=self.inject_z,
+            z=z,
+            start=before,
+            context=self.context + drawn,
+            max_groups=min(self.window_groups, self.net.utt.max_groups) if groups is None else None,
+            groups=groups,
+            temperature=sampling.temperature,
+            top_k=sampling.top_k or None,
+            top_p=sampling.top_p,
+            cfg_scale=scales,
+            seed=list(seeds),
+            drawn=drawn,
+        )
+
+    def normalised(self, conditions: Conditions) -> dict[str, Condition]:
+        """Encoded conditions as training saw them."""
+        return {
+            name: MODALITIES[name].normalise(self.prepared.get(name), condition)
+            for name, condition in conditions.items()
+        }
+
+
+def window_seeds(seeds: Sequence[int], stretch: int, turn: int) -> list[int]:
+    """Seeds of one window's draws; those of the first window are the motions' own."""
+    if stretch == turn == 0:
+        return list(seeds)
+    return [
+        int(np.random.SeedSequence([seed, stretch, turn]).generate_state(1, np.uint64)[0]) for seed in seeds
+    ]
+
+
+def _rows_of(condition: Condition, rows: Tensor) -> Condition:
+    features, mask, pooled = condition
+    return Condition(features[rows], mask[rows], None if pooled is None else pooled[rows])
+
+
+def cut(condition: Condition, first: Tensor, frames: Tensor) -> Condition:
+    """Positions first [B] .. first + frames [B] of a timed modality; those outside of it are masked."""
+    features, mask, pooled = condition
+    order = torch.arange(int(frames.max()), device=first.device)
+    at = first[:, None] + order
+    inside = (at >= 0) & (at < mask.shape[1]) & (order < frames[:, None])
+    index = at.clamp(0, mask.shape[1] - 1)
+    cut_mask = mask.gather(1, index) & inside
+    cut = features.gather(1, index[..., None].expand(-1, -1, features.shape[2]))
+    return Condition(cut.masked_fill(~cut_mask[..., None], 0.0), cut_mask, pooled)
+
+
+def _rows(codes: Codes, rows: Tensor) -> Codes:
+    return Codes({name: values[rows] for name, values in codes.codes.items()}, codes.groups[rows])
+
+
+def _with(codes: Codes, rows: Tensor, new: Codes) -> Codes:
+    """`codes` with some rows replaced, padded to the longest."""
+    groups = codes.groups.clone()
+    groups[rows] = new.groups
+    out = {}
+    for name, values in codes.codes.items():
+        width = max(values.shape[1], new.codes[name].shape[1])
+        whole = torch.nn.functional.pad(values, (0, width - values.shape[1]))
+        whole[rows] = torch.nn.functional.pad(new.codes[name], (0, width - new.codes[name].shape[1]))
+        out[name] = whole
+    return Codes(out, groups)
+
+
+class TimelineFlow:
+    """One motion's tokens as they come, for streams.
+
+    The windows, their seeds and what they see are those of `TokenTimeline.tokens`; of what came before
+    only the last groups are kept, so a script gives the same tokens and memory does not grow.
+
+    Args:
+        timeline: What makes a window.
+        seed: Of the motion.
+        sampling: How tokens are drawn.
+        hop: Groups that are drawn at a time; also a window's length while that of its stretch is not known.
+    """
+
+    def __init__(self, timeline: TokenTimeline, seed: int, sampling: SamplingConfig, hop: int) -> None:
+        self._line, self._seed, self._sampling, self._hop = timeline, seed, sampling, hop
+        utt = timeline.net.utt
+        self._device = next(timeline.net.parameters()).device
+        empty = torch.zeros(1, 0, dtype=torch.int64, device=self._device)
+        self._before = Codes(dict.fromkeys(utt.names, empty), self._count(0))
+        drawn = timeline.inject_z and utt.config.z_dim
+        self._z = draw_z([seed], utt.config.z_dim).to(self._device) if drawn else None
+        self._conditions: Conditions = {}
+        self._number, self._turn, self._done = -1, 0, 0
+        """Which stretch this is, and the windows and groups of it that there are."""
+        self._inside: Conditions = {}
+        self._open = self._drawn = 0
+        """Groups that this window has yet to come, and those that it has; its conditions are `_inside`."""
+
+    def condition(self, conditions: Conditions) -> None:
+        self._conditions = self._line.normalised(conditions)
+        self._number, self._turn, self._done, self._open = self._number + 1, -1, 0, 0
+
+    @torch.no_grad()
+    def draw(self, left: int | None) -> Mapping[str, Tensor]:
+        if not self._open:
+            self._begin(left)
+        new = min(self._hop, self._open)
+        seeds = window_seeds([self._seed], self._number, self._turn)
+        more = self._line.window(
+            self._inside, self._before, self._z, self._count(new), seeds, self._sampling, self._drawn
+        )
+        self._before = join(self._before, more, self._line.net.utt.pattern)
+        self._open, self._drawn, self._done = self._open - new, self._drawn + new, self._done + new
+        return more.codes
+
+    def _begin(self, left: int | None) -> None:
+        """Start the next window and cut the conditions to it."""
+        self._before, self._turn, self._drawn = self._last(self._before), self._turn + 1, 0
+        seen = int(self._before.groups[0])
+        self._open = min(self._hop if left is None else left, self._line.window_groups - seen)
+        first, frames = (self._done - seen) * GROUP_FRAMES, (seen + self._open) * GROUP_FRAMES
+        self._inside = {
+            name: cut(condition, self._count(first), self._count(frames))
+            if name in self._line.net.mate.timed
+            else condition
+            for name, condition in self._conditions.items()
+        }
+
+    def _last(self, codes: Codes) -> Codes:
+        kept = min(int(codes.groups[0]), self._line.context)
+        pattern = self._line.net.utt.pattern
+        return Codes(
+            {name: v[:, v.shape[1] - kept * pattern.count(name) :] for name, v in codes.codes.items()},
+            self._count(kept),
+        )
+
+    def _count(self, groups: int) -> Tensor:
+        return torch.tensor([groups], device=self._device)

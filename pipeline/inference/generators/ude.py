@@ -1,0 +1,190 @@
+"""The UDE engine: tokens of text, music or both in turn, decoded to one motion (UDE section 3.5, 4.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor
+
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.dmd_sampling import decode_motions
+from motionloom.models.diffusion.dmd_streaming import DmdStream
+from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.gpt.tokens import Codes
+from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.pipeline.contract.generation import FrameFlow, GenerationRequest, Stretch, TokenFlow
+from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+from motionloom.pipeline.contract.stage import StageConfig
+from motionloom.pipeline.inference.generators.frames import Frames
+from motionloom.pipeline.inference.generators.timeline import TimelineFlow, TokenTimeline
+from motionloom.pipeline.store.networks import LoadedDmd, LoadedUtt, TrainedTokenizer
+from motionloom.pipeline.store.text import TextSource
+
+
+class UdeConfig(StageConfig):
+    """How tokens are carried on and decoded."""
+
+    inject_z: bool = True
+    """Draw z; without it a model trained with z is conditioned on its inputs alone (Tables 3 and 5)."""
+    context_frames: int = Field(40, ge=0, multiple_of=4)
+    """Frames of motion that a new stretch, or the next window of a long one, sees of what came before."""
+    sampler: Sampler = "dpm++"
+    """Sampler of the diffusion decoder, unless a request sets another."""
+    denoising_steps: int = Field(20, ge=1)
+    overlap_frames: int = Field(32, ge=0, multiple_of=4)
+    """Frames that neighbouring windows of the diffusion decoder share."""
+    bridge_frames: int = Field(0, ge=0, multiple_of=4)
+    """Frames around a change of conditions whose tokens the diffusion decoder is not shown: it bridges them
+    [ours]. It must be trained for that (`net.hide` of its stage); 0 decodes every token."""
+
+
+@dataclass(frozen=True)
+class UdeGenerator:
+    """Motion of text, music or both, of any length."""
+
+    utt: LoadedUtt
+    dmd: LoadedDmd | None
+    config: UdeConfig
+    method = "ude"
+    max_frames = None
+
+    @property
+    def tokenizer(self) -> TrainedTokenizer:
+        tokenizer: TrainedTokenizer = self.utt.given["tokenizer"]
+        return tokenizer
+
+    @property
+    def layout(self) -> MotionLayout:
+        return self.tokenizer.layout
+
+    @property
+    def group_tokens(self) -> dict[str, int]:
+        return {stream.name: stream.per_group for stream in self.tokenizer.net.streams}
+
+    @property
+    def part(self) -> Part:
+        return self.tokenizer.net.part
+
+    @property
+    def text(self) -> TextSource | None:
+        return self.utt.given.get("text")
+
+    @property
+    def modalities(self) -> frozenset[str]:
+        return self.utt.modalities
+
+    @property
+    def settings(self) -> frozenset[str]:
+        more = {"sampler", "denoising_steps"} if self.dmd is not None else set()
+        return frozenset({"temperature", "top_k", "top_p", "cfg_scale", "guidance"} | more)
+
+    @property
+    def unit_frames(self) -> int:
+        return GROUP_FRAMES
+
+    @cached_property
+    def timeline(self) -> TokenTimeline:
+        return TokenTimeline(
+            self.utt.net,
+            window=self.utt.max_frames // GROUP_FRAMES,
+            context=self.config.context_frames // GROUP_FRAMES,
+            prepared={name: self.utt.given.get(name) for name in self.modalities},
+            inject_z=self.config.inject_z,
+        )
+
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        stretch = Stretch(request.conditions, request.frames)
+        return self.drive([stretch], request.seeds, request.sampling, request.noise_seeds)
+
+    def drive(
+        self,
+        stretches: Sequence[Stretch],
+        seeds: Sequence[int],
+        sampling: SamplingConfig,
+        noise_seeds: Sequence[int] | None = None,
+    ) -> list[NDArray[np.float32]]:
+        """Tokens that go on from stretch to stretch, then all of them decoded at once."""
+        codes = self.timeline.tokens(stretches, seeds, sampling)
+        noise = seeds if noise_seeds is None else noise_seeds
+        given = [stretch.frames for stretch in stretches if stretch.frames is not None]
+        if len(given) < len(stretches):
+            return self.decode(codes, noise, sampling)
+        lengths = torch.tensor([list(frames) for frames in given], device=codes.groups.device)
+        hidden = None
+        if self.config.bridge_frames and len(stretches) > 1:
+            groups = (lengths + GROUP_FRAMES - 1) // GROUP_FRAMES
+            hidden = bridged(groups, self.config.bridge_frames // GROUP_FRAMES)
+        motions = self.decode(codes, noise, sampling, hidden)
+        totals = lengths.sum(0).tolist()
+        return [motion[:count] for motion, count in zip(motions, totals, strict=True)]
+
+    def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
+        """Tokens as they come, those of `drive` where the lengths of all stretches are known."""
+        return TimelineFlow(self.timeline, seed, sampling, hop=max(1, streaming.hop_frames // GROUP_FRAMES))
+
+    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> FrameFlow:
+        """The tokenizer's own decoder, or windows of the diffusion decoder."""
+        if self.dmd is None and streaming.decoder == "diffusion":
+            raise UserError("this model has no diffusion decoder; leave streaming's decoder out")
+        if self.dmd is None or streaming.decoder == "tokenizer":
+            return Frames.of_tokenizer(self.tokenizer, streaming)
+        sampler, steps = self.denoising(sampling)
+        decoder = DmdStream(
+            self.dmd.net,
+            self.group_tokens,
+            seed=seed,
+            sampler=sampler,
+            steps=steps,
+            window=self.dmd.window,
+            overlap=self.config.overlap_frames,
+        )
+        return Frames(decoder, self.tokenizer.of_coordinates)
+
+    def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
+        return (
+            sampling.sampler or self.config.sampler,
+            sampling.denoising_steps or self.config.denoising_steps,
+        )
+
+    def decode(
+        self, codes: Codes, seeds: Sequence[int], sampling: SamplingConfig, hidden: Tensor | None = None
+    ) -> list[NDArray[np.float32]]:
+        """Features in their own units, [T, C] a row; `hidden` as `decode_motions` takes it."""
+        if self.dmd is None:
+            return self.tokenizer.decode(codes.codes, codes.groups.tolist())
+        sampler, steps = self.denoising(sampling)
+        made = decode_motions(
+            self.dmd.net,
+            codes,
+            seeds=seeds,
+            sampler=sampler,
+            steps=steps,
+            window=self.dmd.window,
+            overlap=min(self.config.overlap_frames, self.dmd.window - GROUP_FRAMES),
+            hidden=hidden,
+        )
+        return [self.tokenizer.of_coordinates(motion) for motion in made]
+
+
+def bridged(groups: Tensor, count: int) -> Tensor:
+    """Which groups of motions lie in the `count` around a border, bool [B, G].
+
+    Args:
+        groups: int64 [N, B], groups of each of N stretches. Never more than half of a stretch is bridged.
+        count: Half of them before the border, the others after it.
+    """
+    ends = groups.cumsum(0)
+    at = torch.arange(int(ends[-1].max()), device=groups.device)
+    hidden = torch.zeros(groups.shape[1], len(at), dtype=torch.bool, device=groups.device)
+    for number, end in enumerate(ends[:-1]):
+        before = (groups[number] // 2).clamp(max=count // 2)
+        after = (groups[number + 1] // 2).clamp(max=count - count // 2)
+        hidden |= (at >= (end - before)[:, None]) & (at < (end + after)[:, None])
+    return hidden

@@ -1,0 +1,208 @@
+"""`MotionModel`: a trained model in one folder, saved, loaded and shared through the hub.
+
+    model = MotionModel.from_pretrained("synthetic")       # a model of the package, a folder, or a hub's name
+    motions = model.generate(["a person waves"], seed=1)
+    motions[0].joints                                      # [T, N, 3] metres
+
+The folder holds weights (safetensors), configs, statistics, the skeleton and, where it does not come with the
+installation, the text encoder: nothing else is needed, and nothing in it is ever unpickled or run.
+"""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from huggingface_hub import ModelHubMixin, snapshot_download
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+
+from motionloom.datasets.base.places import hub_is_away, require_hub_name
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
+from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
+from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.requests import caption_list
+from motionloom.pipeline.inference.script import Script
+from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
+from motionloom.pipeline.inference.stream import MotionStream, stream_of
+from motionloom.pipeline.launch.hardware import choose_device
+from motionloom.pipeline.store.known_captions import Unknown
+from motionloom.pipeline.store.run_folder import BUNDLE_FILE
+
+if TYPE_CHECKING:
+    from motionloom.datasets.audio.sound import Sound
+
+
+class MotionModel(
+    ModelHubMixin,
+    library_name="motionloom",
+    pipeline_tag="text-to-3d",
+    tags=["human-motion", "text-to-motion", "whole-body"],
+):
+    """Captions, music or both to whole-body motions."""
+
+    def __init__(self, folder: Path | str, device: str | torch.device = "auto") -> None:
+        self.folder = model_folder(folder)
+        self.bundle = Bundle.open(self.folder, choose_device(device))
+        # The mixin would write our argument, a local path, into the config.json that the hub wants.
+        self._hub_mixin_config = dict(HUB_CONFIG)
+
+    @classmethod
+    def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> MotionModel:
+        """A folder, a model that comes with the package, or a name on the hub (`owner/name`).
+
+        `options` are `device` (auto: a GPU if there is one; cpu, cuda, cuda:N) and the hub's (revision,
+        token, local_files_only).
+        """
+        name = pretrained_model_name_or_path
+        if model_folder(
+            name
+        ).is_dir():  # the hub's own way in warns of a run folder, which has no config.json
+            return cls(name, options.get("device", "auto"))
+        if isinstance(name, Path) or "/" not in name:
+            raise UserError(no_such_model(name))
+        require_hub_name(name)
+        away = hub_is_away()
+        if away:
+            options["local_files_only"] = True
+        try:
+            return super().from_pretrained(name, **options)
+        except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            if away:
+                reason = "it cannot be reached from here, and its cache does not hold it"
+            raise UserError(f"{name}: no such folder, and the hub does not give it ({reason})") from None
+
+    def generate(
+        self,
+        captions: Sequence[str] | None = None,
+        *,
+        face: Sequence[str] | None = None,
+        sounds: Sequence[Sound | None] | None = None,
+        seconds: float | Sequence[float] | None = None,
+        seed: int = 0,
+        sampling: SamplingConfig | Mapping[str, object] | None = None,
+    ) -> list[GeneratedMotion]:
+        """Motions for captions, sounds or both, in order; equal arguments give equal motions.
+
+        A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
+        a motion is as long as its sound, or else the model decides. `sampling` is a `SamplingConfig` or a
+        mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused; of a caption
+        that is far from all it was trained on, it warns. What `sampling` leaves out is as the model's export
+        recommends, or the default.
+        """
+        for unknown in self.unknown(caption_list(captions or ()), caption_list(face or ())):
+            warnings.warn(str(unknown), stacklevel=2)
+        return self.bundle.generate(
+            captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
+            sampling=SamplingConfig.of(sampling), strict=True,
+        )  # fmt: skip
+
+    def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
+        """Captions that are far from all that it was trained on, and what it knows nearest to each."""
+        return unknown_captions(self.bundle, captions, face)
+
+    def perform(
+        self,
+        script: Path | str | Script,
+        *,
+        samples: int = 1,
+        seed: int = 0,
+        sampling: SamplingConfig | Mapping[str, object] | None = None,
+    ) -> list[GeneratedMotion]:
+        """One motion driven by a script of text and music in turn, and `samples` - 1 others of it.
+
+        `script` is a file, or a `Script` whose sound files are seen from the current folder.
+        """
+        if isinstance(script, Script):
+            segments = script.open(Path())
+        else:
+            segments = Script.read(Path(script)).open(Path(script).parent, str(script))
+        return self.bundle.perform(segments, samples=samples, seed=seed, sampling=SamplingConfig.of(sampling))
+
+    def stream(
+        self,
+        captions: str | Iterable[str | tuple[str, float]] | Script | None = None,
+        *,
+        face: str = "",
+        sound: Sound | None = None,
+        seconds: float | None = None,
+        seed: int = 0,
+        sampling: SamplingConfig | Mapping[str, object] | None = None,
+        streaming: StreamConfig | Mapping[str, object] | None = None,
+    ) -> MotionStream:
+        """One motion as an iterator of chunks, each there as soon as its frames are final.
+
+        Args:
+            captions: One caption; or several, one after another, each as (caption, seconds) or all `seconds`
+                long, which may be made while the stream runs; or a `Script`. `say` of the stream changes the
+                caption on the way.
+            face: What the face does, while one caption lasts.
+            sound: Music to move to, beside one caption or alone.
+            seconds: Length of one caption, or of each that does not come with its own. Without it one caption
+                goes on until `say` or `close`, and music to its end.
+            seed: Equal arguments give equal motions. The frames of one caption are those of `generate` with
+                the same seed and length, as far as the network's block goes.
+            sampling: As of `generate`.
+            streaming: How much at a time: a `StreamConfig` or a mapping like `{"chunk_frames": 4}`.
+
+        As `generate`, it warns of a caption that the model does not know, when its turn has come.
+        """
+        return stream_of(
+            self.bundle, captions, face=face, sound=sound, seconds=seconds, seed=seed,
+            sampling=SamplingConfig.of(sampling), streaming=streaming, notice=_warn,
+        )  # fmt: skip
+
+    @property
+    def fps(self) -> float:
+        return self.bundle.layout.fps
+
+    @property
+    def modalities(self) -> frozenset[str]:
+        """What it can be conditioned on: "text", "audio" or both."""
+        return self.bundle.generator.modalities
+
+    @property
+    def max_seconds(self) -> float:
+        """Its longest motion; infinite where there is no limit. Streams have none."""
+        return self.bundle.max_seconds
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        """Copy all that `generate` needs into the folder."""
+        if (self.folder / BUNDLE_FILE).is_file():
+            shutil.copytree(self.folder, save_directory, dirs_exist_ok=True)
+        else:
+            write_bundle(self.folder, save_directory)
+
+    @classmethod
+    def _from_pretrained(
+        cls,
+        *,
+        model_id: str,
+        revision: str | None = None,
+        cache_dir: str | Path | None = None,
+        force_download: bool = False,
+        local_files_only: bool = False,
+        token: str | bool | None = None,
+        device: str | torch.device = "auto",
+        **kwargs: Any,
+    ) -> MotionModel:
+        """Open a folder, or fetch one from the hub first."""
+        if Path(model_id).is_dir():
+            return cls(model_id, device)
+        folder = snapshot_download(
+            model_id, revision=revision, cache_dir=cache_dir, force_download=force_download,
+            local_files_only=local_files_only, token=token,
+            allow_patterns=["*.json", "*.safetensors", "*.txt", "*.model"],
+        )  # fmt: skip
+        return cls(folder, device)
+
+
+def _warn(unknown: Unknown) -> None:
+    """Warn of a stream's caption, at the loop that takes the chunks."""
+    warnings.warn(str(unknown), stacklevel=6)

@@ -1,0 +1,361 @@
+"""`MotionStream`: motion that is watched while it is made, under captions that may change on the way.
+
+Tokens are drawn group by group and decoded as soon as the groups that a frame's decoding looks at are known
+(`models/tokenizer/streaming.py`); the root goes on from chunk to chunk (`JointFlow`). So every
+frame is final: it is the one that decoding all tokens at once would give. What is kept is one block of the
+networks and the decoder's window, whatever the length of the motion.
+
+A UDE's diffusion decoder denoises all windows of a motion together. A stream has a choice: the tokenizer's
+own decoder, which answers at once, or windows that are denoised one after another
+(`models/diffusion/dmd_streaming.py`) [ours].
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.features.flow import JointFlow
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.drawing import sample_seeds
+from motionloom.pipeline.contract.generation import Prompt, StreamingGenerator
+from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.inference.bundle import Bundle, split_columns, unknown_captions
+from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.requests import require_driven, require_seed, require_used
+from motionloom.pipeline.inference.script import DrivenSegment, Script, segment_frames
+from motionloom.pipeline.render.score import Driver, Segment
+from motionloom.pipeline.store.known_captions import Unknown
+
+if TYPE_CHECKING:
+    from motionloom.datasets.audio.sound import Sound
+
+
+@dataclass(frozen=True)
+class MotionChunk:
+    """Some frames of a stream, final, all driven by one caption."""
+
+    start: int
+    """Number of its first frame, counted from the stream's."""
+    prompt: Prompt
+    features: NDArray[np.float32]
+    """Body-hand features [T, D]."""
+    joints: NDArray[np.float64]
+    """Positions [T, N, 3] in metres; they go on where the chunk before ends."""
+    face: NDArray[np.float32] | None
+    """Expression [T, 50], or None where the model makes no face."""
+    layout: MotionLayout
+
+    @property
+    def caption(self) -> str:
+        return self.prompt.text
+
+    @property
+    def fps(self) -> float:
+        return self.layout.fps
+
+
+def joined(chunks: Sequence[MotionChunk], seed: int | None = None) -> GeneratedMotion:
+    """Chunks that follow each other as one motion."""
+    if not chunks:
+        raise UserError("no chunks to join; take at least one from the stream")
+    spans: list[Segment] = []
+    begin = chunks[0].start
+    for chunk in chunks:
+        at = (chunk.start - begin) / chunk.fps
+        end = at + len(chunk.joints) / chunk.fps
+        kind: Driver = "text" if chunk.prompt.sound is None else "music"
+        if spans and spans[-1].label == chunk.caption:
+            spans[-1] = Segment(spans[-1].start, end, chunk.caption, kind)
+        else:
+            spans.append(Segment(at, end, chunk.caption, kind))
+    several = len(spans) > 1
+    faces = [chunk.face for chunk in chunks if chunk.face is not None]
+    return GeneratedMotion(
+        Prompt("; ".join(span.label for span in spans)) if several else chunks[0].prompt,
+        np.concatenate([chunk.features for chunk in chunks]),
+        np.concatenate([chunk.joints for chunk in chunks]),
+        np.concatenate(faces) if len(faces) == len(chunks) else None,
+        chunks[0].layout,
+        tuple(spans) if several else (),
+        seed=seed,
+    )
+
+
+class MotionStream(Iterator[MotionChunk]):
+    """Chunks of one motion, made as they are asked for.
+
+    `say` may be called at any time, also from another thread; the rest belongs to one thread.
+
+    Args:
+        bundle: The model.
+        segments: What drives the motion, one after another; taken when its time comes, so it may be endless
+            itself. A segment of infinite length goes on until `say`.
+        seed: Equal seeds, segments and settings give equal motions.
+        sampling: How tokens are drawn.
+        config: How much at a time.
+        notice: Is given each caption that the model does not know, once, when its segment begins.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        segments: Iterator[DrivenSegment],
+        *,
+        seed: int,
+        sampling: SamplingConfig,
+        config: StreamConfig,
+        notice: Callable[[Unknown], object] | None = None,
+    ) -> None:
+        require_seed(seed)
+        self.layout, self.seed = bundle.layout, seed
+        seeds = sample_seeds(seed, 2)
+        self._segments, self._said = segments, deque[DrivenSegment]()
+        sampling = bundle.drawing(sampling)
+        self._bundle, self._face_model = bundle, sampling.face_model
+        self._notice, self._noticed = notice, set[str]()
+        self._body = _Maker(bundle, bundle.main, seeds[0], sampling, config)
+        face = _streaming_face(bundle, sampling)
+        self._face = None if face is None else _Maker(bundle, face, seeds[1], sampling, config)
+        self._joints = JointFlow(bundle.layout)
+        self._least = config.chunk_frames
+        self._bounds: deque[tuple[int, Prompt]] = deque()
+        """First frames of segments that were begun, and what drives them."""
+        self._left: int | None = 0
+        """Groups that are left of the segment; None = without an end."""
+        self._given = self._number = 0
+        """Frames given, segments begun."""
+        self._ended = False
+
+    def say(self, caption: str, *, seconds: float | None = None, face: str = "") -> None:
+        """Go on with another caption from the next tokens on; what is left of the present one is left out.
+
+        It lasts `seconds`, then the next segment comes; without them, until `say`. Frames that are drawn
+        already still come: those that the decoder looks ahead, and of a UDE at most `hop_frames` more.
+        """
+        if not caption.strip():
+            raise UserError("the caption is empty; say what the person does")
+        length = math.inf if seconds is None else seconds
+        segment = DrivenSegment(Prompt(caption, face), length, caption)
+        self._check(segment, self._number)
+        self._said.append(segment)
+
+    def close(self) -> None:
+        """No more tokens are drawn; what is drawn already still comes."""
+        self._segments, self._left = iter(()), 0
+        self._said.clear()
+
+    def __iter__(self) -> MotionStream:
+        return self
+
+    def __next__(self) -> MotionChunk:
+        """The next frames; raises `StopIteration` after the last ones."""
+        while not self._ended and self._ready() < self._least:
+            self._draw()
+        count = self._ready()
+        if not count:
+            raise StopIteration
+        while len(self._bounds) > 1 and self._bounds[1][0] <= self._given:
+            self._bounds.popleft()
+        if len(self._bounds) > 1:
+            count = min(count, self._bounds[1][0] - self._given)
+        body = self._body.take(count)
+        features, with_it = split_columns(body, self._body.generator, self.layout)
+        face = with_it if self._face is None else self._face.take(count)
+        chunk = MotionChunk(
+            self._given, self._bounds[0][1], features, self._joints(features), face, self.layout
+        )
+        self._given += count
+        return chunk
+
+    def _ready(self) -> int:
+        makers = [self._body, *filter(None, [self._face])]
+        return min(maker.ready for maker in makers)
+
+    def _draw(self) -> None:
+        """More tokens, of the next segment where this one is over or another one is called for."""
+        if self._said or self._left == 0:
+            segment = self._said.popleft() if self._said else next(self._segments, None)
+            if segment is None:
+                self._ended = True
+                self._body.finish()
+                if self._face is not None:
+                    self._face.finish()
+                return
+            self._begin(segment)
+        before = self._body.groups
+        self._body.draw(self._left)
+        if self._face is not None:
+            while self._face.groups < self._body.groups:
+                self._face.draw(self._body.groups - self._face.groups)
+        if self._left is not None:
+            self._left -= self._body.groups - before
+
+    def _begin(self, segment: DrivenSegment) -> None:
+        frames = self._check(segment, self._number)
+        unit = self._body.generator.unit_frames
+        self._left = None if frames is None else frames // unit
+        self._number += 1
+        self._bounds.append((self._body.groups * unit, segment.prompt))
+        self._look(segment.prompt)
+        self._body.condition(segment.prompt, segment.prompt.text)
+        if self._face is not None:
+            self._face.condition(segment.prompt, segment.prompt.words)
+
+    def _look(self, prompt: Prompt) -> None:
+        """Give notice of words that the model does not know."""
+        if self._notice is None:
+            return
+        for unknown in unknown_captions(self._bundle, [prompt.text], [prompt.face_text], self._face_model):
+            if unknown.caption not in self._noticed:
+                self._noticed.add(unknown.caption)
+                self._notice(unknown)
+
+    def _check(self, segment: DrivenSegment, number: int) -> int | None:
+        require_driven(self._body.generator, [segment.prompt])
+        if segment.seconds == math.inf:
+            return None
+        if not segment.seconds > 0:
+            raise UserError(f"segments.{number} lasts {segment.seconds:g} s; give a length above 0")
+        return segment_frames(self._body.generator, segment, number)
+
+
+class _Maker:
+    """One generator's side of a stream: its conditions, its tokens, its frames."""
+
+    def __init__(
+        self, bundle: Bundle, stage: Finished, seed: int, sampling: SamplingConfig, config: StreamConfig
+    ) -> None:
+        generator = bundle.of(stage)
+        if not isinstance(generator, StreamingGenerator):
+            raise UserError(
+                f"this model ({generator.method}) makes a motion as a whole; streams need a GPT or a UDE"
+            )
+        self.generator = generator
+        self._encoder, self._fps = bundle.encoder(stage), bundle.layout.fps
+        self._flow = generator.flow(seed, sampling, config)
+        self._decoder = generator.decoding(seed, sampling, config)
+        self._frames: NDArray[np.float32] = np.zeros(
+            (0, len(generator.layout.part(generator.part))), np.float32
+        )
+        self.groups = 0
+        """Groups drawn."""
+
+    @property
+    def ready(self) -> int:
+        """Frames that are final and not taken."""
+        return len(self._frames)
+
+    def condition(self, prompt: Prompt, words: str) -> None:
+        self._flow.condition(self._encoder.encode([prompt], [words], self.generator.modalities, self._fps))
+
+    def draw(self, left: int | None) -> None:
+        codes = self._flow.draw(left)
+        stream, per_group = next(iter(self.generator.group_tokens.items()))
+        self.groups += codes[stream].shape[1] // per_group
+        made = self._decoder.push(codes)
+        if made is not None:
+            self._add(made)
+
+    def finish(self) -> None:
+        made = self._decoder.finish()
+        if made is not None:
+            self._add(made)
+
+    def take(self, count: int) -> NDArray[np.float32]:
+        out, self._frames = self._frames[:count], self._frames[count:].copy()
+        return out
+
+    def _add(self, frames: NDArray[np.float32]) -> None:
+        self._frames = np.concatenate([self._frames, frames])
+
+
+def _streaming_face(bundle: Bundle, sampling: SamplingConfig) -> Finished | None:
+    """The face generator that was asked for, or the first that can stream; None where there is none."""
+    if sampling.face_model is not None:
+        return bundle.choose_face(sampling.face_model)
+    found = (stage for stage in bundle.faces.values() if isinstance(bundle.of(stage), StreamingGenerator))
+    return next(found, None)
+
+
+Captions = str | Iterable[str | tuple[str, float]] | Script | None
+
+
+def stream_of(
+    bundle: Bundle,
+    captions: Captions,
+    *,
+    face: str = "",
+    sound: Sound | None = None,
+    seconds: float | None = None,
+    seed: int = 0,
+    sampling: SamplingConfig | None = None,
+    streaming: StreamConfig | Mapping[str, object] | None = None,
+    notice: Callable[[Unknown], object] | None = None,
+) -> MotionStream:
+    """A stream of `MotionModel.stream`'s arguments; `notice` is given captions that are unknown."""
+    sampling = sampling or SamplingConfig()
+    require_used(bundle, [face] if face else None, sampling)
+    if sampling.candidates > 1:
+        raise UserError(
+            "a stream shows its motion as it is drawn, so there is none to choose: leave candidates out"
+        )
+    segments = segments_of(bundle, captions, face=face, sound=sound, seconds=seconds)
+    config = StreamConfig.parse({} if streaming is None else streaming, "streaming")
+    return MotionStream(bundle, segments, seed=seed, sampling=sampling, config=config, notice=notice)
+
+
+def segments_of(
+    bundle: Bundle,
+    captions: Captions,
+    *,
+    face: str = "",
+    sound: Sound | None = None,
+    seconds: float | None = None,
+) -> Iterator[DrivenSegment]:
+    """What drives the motion, one segment after another."""
+    if seconds is not None and not 0 < seconds < math.inf:
+        raise UserError(f"{seconds:g} s: give a length above 0, or none for a stream without an end")
+    if isinstance(captions, Script):
+        if face or sound is not None or seconds is not None:
+            raise UserError("a script says everything: leave face, sound and seconds out")
+        opened = captions.open(Path())
+        require_driven(bundle.generator, [segment.prompt for segment in opened])
+        return iter(opened)
+    if captions is None or isinstance(captions, str):
+        prompt = Prompt(captions or "", face, sound)
+        if captions is not None or sound is None:
+            _require_text(captions or "", 0)
+        require_driven(bundle.generator, [prompt])
+        longest = math.inf if sound is None else sound.seconds
+        length = longest if seconds is None else min(seconds, longest)
+        return iter([DrivenSegment(prompt, length, prompt.text or "music")])
+    if face or sound is not None:
+        raise UserError("face and sound go with one caption; of several give a Script")
+    return _several(captions, seconds)
+
+
+def _several(captions: Iterable[str | tuple[str, float]], seconds: float | None) -> Iterator[DrivenSegment]:
+    for number, given in enumerate(captions):
+        text, length = (given, seconds) if isinstance(given, str) else given
+        _require_text(text, number)
+        if length is None:
+            raise UserError(
+                f"captions[{number}] ('{text}') says not how long it lasts; give (caption, seconds), or "
+                f"seconds for all"
+            )
+        yield DrivenSegment(Prompt(text), float(length), text)
+
+
+def _require_text(text: str, number: int) -> None:
+    if not isinstance(text, str) or not text.strip():
+        raise UserError(f"captions[{number}] is empty; say what the person does")

@@ -1,0 +1,268 @@
+"""The files that motions can be written as: one `Writer` a format, all of them in `WRITERS`.
+
+A new format is one function here and one line in the table: `generate --format`, the `generate` stage,
+`GeneratedMotion.save`, the help of the command line and the server take it from there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import AfterValidator
+
+from motionloom.datasets.schema import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from motionloom.pipeline.inference.shown import FigureOptions, ShownMotion
+    from motionloom.pipeline.render.body.glb import GlbClip
+    from motionloom.pipeline.render.score import Score
+    from motionloom.pipeline.render.viewer import ViewerMotion
+
+
+@dataclass(frozen=True)
+class OutputClip:
+    """One motion to write."""
+
+    shown: ShownMotion
+    score: Score
+    options: FigureOptions
+    seed: int | None = None
+    arkit: bool = False
+    """Whether GLB files carry ARKit's 52 shapes of the face, instead of the synthetic source's own."""
+
+    @cached_property
+    def face(self) -> NDArray[np.float32] | None:
+        """Expression values [T, 50]."""
+        return self.shown.motion.face
+
+    @cached_property
+    def controls(self) -> NDArray[np.float64] | None:
+        """Controls of the drawn face [T, 5]."""
+        from motionloom.pipeline.render.body.face import synthetic_face_controls
+
+        return None if self.face is None else synthetic_face_controls(self.face)
+
+    def arkit_weights(self) -> NDArray[np.float64]:
+        """Weights of ARKit's shapes [T, 52], by the user's bases where there are any."""
+        from motionloom.datasets.motion.body.arkit import ArkitBases
+        from motionloom.pipeline.render.body.face import synthetic_arkit
+
+        if self.face is None:
+            raise UserError("this model makes no face: leave the format arkit out")
+        if self.options.arkit_bases is None:
+            return synthetic_arkit(self.face)
+        return ArkitBases.read(self.options.arkit_bases).weights(self.face)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Motions that are written together, and what their page is called."""
+
+    clips: Sequence[OutputClip]
+    title: str = ""
+    note: str = ""
+    progress: Callable[[int, int], None] | None = None
+    """Called with frames done and all frames while a film is made."""
+
+
+@dataclass(frozen=True)
+class Writer:
+    """One format."""
+
+    suffix: str
+    """What follows the name of a motion: `.npz`, `_smplx.npz`."""
+    mime: str
+    help: str
+    write: Callable[[Path, Outputs], object] = field(repr=False)
+    """Writes the clips to the path; a single one, unless `together` is set."""
+    together: str = ""
+    """Name of the file that holds all motions."""
+    alone: bool = True
+    """Whether each motion has a file of its own."""
+    default: bool = False
+    slow: bool = False
+    """Takes seconds or minutes, so that a server does not offer it."""
+    needs_face: bool = False
+
+
+def write_npz(path: Path, outputs: Outputs) -> None:
+    """Joints [T, N, 3] in metres, features, expression, bones, and the facts as one JSON text (no pickle)."""
+    import numpy as np
+
+    from motionloom.datasets.base.files import atomic_file
+
+    [clip] = outputs.clips
+    figure, motion = clip.shown, clip.shown.motion
+    facts = {
+        "caption": motion.caption,
+        "face_caption": motion.face_caption,
+        "fps": motion.layout.fps,
+        "layout": motion.layout.name,
+        "family": motion.layout.family,
+        "skeleton": motion.layout.skeleton_name,
+        "joint_names": list(motion.layout.skeleton.joints),
+        "up": "y",
+        "unit": "m",
+        "seed": clip.seed,
+        "figure": figure.facts(),
+    }
+    arrays: dict[str, Any] = {
+        "joints": figure.joints.astype(np.float32),
+        "features": motion.features,
+        "rotations": figure.figure.rotations.astype(np.float32),
+        "offsets": figure.figure.skeleton.offsets.astype(np.float32),
+        "root": figure.figure.root.astype(np.float32),
+    }
+    if motion.face is not None:
+        arrays["face"] = motion.face
+    with atomic_file(path) as file:
+        np.savez_compressed(file, metadata=np.array(json.dumps(facts)), **arrays)
+
+
+def write_bvh(path: Path, outputs: Outputs) -> None:
+    """The figure's bones and rotations."""
+    from motionloom.datasets.motion.bvh.motion import write_bvh as write
+
+    [clip] = outputs.clips
+    figure = clip.shown.figure
+    write(path, figure.skeleton, figure.rotations, figure.root, clip.shown.fps)
+
+
+def write_html(path: Path, outputs: Outputs) -> None:
+    """The viewer page with all motions."""
+    from motionloom.pipeline.render.viewer import write_viewer
+
+    write_viewer(path, [cell_of(clip) for clip in outputs.clips], outputs.title, outputs.note)
+
+
+def write_mp4(path: Path, outputs: Outputs) -> None:
+    """A film with the face, and with the sound where there is any."""
+    from motionloom.pipeline.render.film import write_mp4 as write
+
+    [clip] = outputs.clips
+    write(
+        path,
+        clip.shown.joints,
+        clip.shown.motion.layout.skeleton,
+        clip.shown.fps,
+        clip.shown.motion.caption,
+        sound=clip.score.sound,
+        figure=clip.shown.rigid,
+        face_controls=clip.controls,
+        progress=outputs.progress,
+    )
+
+
+def write_glb(path: Path, outputs: Outputs) -> None:
+    """The skinned body, each motion an animation of it, with its face."""
+    from motionloom.pipeline.render.body.glb import write_glb as write
+
+    arkit = outputs.clips[0].arkit
+    write(path, [_animation(clip) for clip in outputs.clips], "arkit" if arkit else "expressions")
+
+
+def _animation(clip: OutputClip) -> GlbClip:
+    from motionloom.pipeline.render.body.face import expression_weights
+    from motionloom.pipeline.render.body.glb import GlbClip
+
+    face = None
+    if clip.face is not None:
+        face = clip.arkit_weights() if clip.arkit else expression_weights(clip.face)
+    name = clip.shown.motion.caption or "motion"
+    return GlbClip(name, clip.shown.figure, clip.shown.fps, face, clip.shown.facts())
+
+
+def write_smplx(path: Path, outputs: Outputs) -> None:
+    """Parameters of SMPL-X, made for the user's body model where there is one."""
+    from motionloom.datasets.motion.body.smpl import BodyModel
+    from motionloom.datasets.motion.body.smplx_file import write_smplx as write
+
+    [clip] = outputs.clips
+    model = clip.options.body_model
+    write(
+        path, clip.shown.figure, clip.shown.fps, None if model is None else BodyModel.load(model, "smplx52")
+    )
+
+
+def write_arkit(path: Path, outputs: Outputs) -> None:
+    """ARKit's 52 weights of each frame."""
+    from motionloom.datasets.motion.body.arkit import write_arkit_csv
+
+    [clip] = outputs.clips
+    write_arkit_csv(path, clip.arkit_weights(), clip.shown.fps)
+
+
+def cell_of(clip: OutputClip, label: str = "generated") -> ViewerMotion:
+    """The motion as the viewer takes it, with its sound, beats and segments."""
+    from motionloom.pipeline.render.viewer import ViewerMotion
+
+    motion = clip.shown.motion
+    return ViewerMotion(
+        joints=clip.shown.joints,
+        fps=clip.shown.fps,
+        parents=motion.layout.skeleton.parents,
+        label=label,
+        caption=motion.caption,
+        face_controls=clip.controls,
+        sound=clip.score.sound,
+        beats=clip.score.beats,
+        segments=clip.score.segments,
+        figure=clip.shown.rigid,
+    )
+
+
+_BYTES = "application/octet-stream"
+WRITERS: dict[str, Writer] = {
+    "npz": Writer(".npz", _BYTES, "joints and features as numpy arrays", write_npz, default=True),
+    "bvh": Writer(".bvh", "text/plain; charset=utf-8", "bones for animation tools", write_bvh, default=True),
+    "mp4": Writer(".mp4", "video/mp4", "a film", write_mp4, slow=True),
+    "glb": Writer(".glb", "model/gltf-binary", "the skinned body for 3-D tools", write_glb, "motions.glb"),
+    "smplx": Writer("_smplx.npz", _BYTES, "SMPL-X parameters", write_smplx),
+    "arkit": Writer(
+        "_arkit.csv", "text/csv; charset=utf-8", "the face for ARKit", write_arkit, needs_face=True
+    ),
+    "html": Writer(
+        ".html", "text/html; charset=utf-8", "a page to watch", write_html, "index.html", False, default=True
+    ),
+}
+"""By the names that `--format` knows."""
+
+
+def default_formats() -> list[str]:
+    """What is written unless other formats are asked for."""
+    return [name for name, writer in WRITERS.items() if writer.default]
+
+
+def formats_help() -> str:
+    """The formats in one sentence of a command's help."""
+    names = [f"{name} ({writer.help})" for name, writer in WRITERS.items()]
+    return f"Comma-separated, default {','.join(default_formats())}: {', '.join(names)}."
+
+
+def known_format(name: str) -> str:
+    """The name; ValueError where there is no such format."""
+    if name not in WRITERS:
+        raise ValueError(f"no format '{name}'; known: {', '.join(WRITERS)}")
+    return name
+
+
+Format = Annotated[str, AfterValidator(known_format)]
+"""A name of `WRITERS`, in a config."""
+
+
+def writer_for(path: Path) -> Writer:
+    """The format of a file's ending; `UserError` where there is none."""
+    fitting = [writer for writer in WRITERS.values() if path.name.lower().endswith(writer.suffix)]
+    if not fitting:
+        known = ", ".join(writer.suffix for writer in WRITERS.values())
+        ending = f"'{path.suffix}'" if path.suffix else "no ending"
+        raise UserError(f"{path}: a motion cannot be saved with {ending}; name a file that ends in {known}")
+    return max(fitting, key=lambda writer: len(writer.suffix))

@@ -1,0 +1,183 @@
+"""MP4 of one motion: the body is drawn here, imageio-ffmpeg's ffmpeg encodes (H.264 and AAC)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from motionloom.datasets.base.files import atomic_path
+from motionloom.datasets.motion.body.rigid import RigidMotion
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of, smooth_path
+from motionloom.pipeline.render.scene import SOLE, Actor, Ground, detail_for, draw_figure
+from motionloom.pipeline.render.sound import RATE, Soundtrack, film_sound
+
+Progress = Callable[[int, int], None]
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
+
+
+def write_mp4(
+    path: Path,
+    joints: NDArray[np.floating],
+    skeleton: Skeleton,
+    fps: float,
+    caption: str = "",
+    *,
+    size: tuple[int, int] = (512, 512),
+    sound: Soundtrack | None = None,
+    figure: RigidMotion | None = None,
+    face_controls: NDArray[np.floating] | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Film joints [T, N, 3] (metres, Y up); `progress(done, total)` is called after every frame.
+
+    `sound` starts with the first frame; it is cut, or filled up with silence, to the T / fps seconds of the
+    film. `figure` is the rigid figure whose joints these are, where there is one; `face_controls` [T, 5] are
+    the viewer's. The file appears under its name only when it is whole. `size` is rounded up to even numbers
+    for H.264.
+    """
+    try:
+        import imageio_ffmpeg  # the binary is looked up on import: only for those who film
+    except ModuleNotFoundError:
+        raise UserError(f"{path}: films need imageio-ffmpeg; pip install 'motionloom[film]'") from None
+    width, height = (side + side % 2 for side in size)
+    actor = _actor(joints, skeleton, figure, face_controls)
+    frames = _frames(actor, fps, _subtitle(caption, (width, height)), (width, height))
+    # Named, because the temporary file's ending does not say it.
+    form = ["-f", "mp4", "-movflags", "+faststart"]
+    with atomic_path(path) as temporary:
+        wav = temporary.with_suffix(".wav")
+        writer = imageio_ffmpeg.write_frames(
+            str(temporary),
+            (width, height),
+            fps=fps,
+            codec="libx264",
+            pix_fmt_out="yuv420p",
+            macro_block_size=2,
+            output_params=["-preset", "veryfast", "-crf", "20", *form]
+            + ([] if sound is None else ["-ar", str(RATE), "-b:a", "128k"]),
+            audio_path=None if sound is None else str(wav),
+            audio_codec=None if sound is None else "aac",
+            ffmpeg_log_level="error",
+        )
+        try:
+            if sound is not None:
+                wav.write_bytes(film_sound(sound, len(joints) / fps))
+            with closing(writer):
+                writer.send(None)  # starts ffmpeg, which opens the WAV
+                for done, frame in enumerate(frames, start=1):
+                    writer.send(frame)
+                    if progress is not None:
+                        progress(done, len(joints))
+        except OSError as error:
+            if error.errno is not None:
+                raise
+            raise UserError(_unfinished(path, str(error))) from None  # ffmpeg has ended before us
+        finally:
+            wav.unlink(missing_ok=True)
+        if not _is_whole(temporary):
+            raise UserError(_unfinished(path, "its file is cut short"))
+
+
+def _unfinished(path: Path, why: str) -> str:
+    reason = (why.strip().splitlines() or ["no reason given"])[0]
+    return f"{path}: ffmpeg could not write the film ({reason}); is the disk full? No film is left there"
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether the boxes of an MP4 file, its index among them, fill it to the end; ffmpeg's own exit code is
+    not passed on to us.
+    """
+    names, at, size = set(), 0, path.stat().st_size
+    with path.open("rb") as file:
+        while at + 8 <= size:
+            file.seek(at)
+            length, name = struct.unpack(">I4s", file.read(8))
+            if length == 1:
+                length = struct.unpack(">Q", file.read(8))[0]
+            if length < 8:
+                return False
+            names.add(name)
+            at += length
+    return at == size and {b"moov", b"mdat"} <= names
+
+
+def _actor(
+    joints: NDArray[np.floating],
+    skeleton: Skeleton,
+    figure: RigidMotion | None,
+    face_controls: NDArray[np.floating] | None,
+) -> Actor:
+    exact = np.asarray(joints, np.float64)
+    if exact.ndim != 3 or exact.shape[1:] != (len(skeleton), 3) or not len(exact):
+        raise UserError(
+            f"joints must be [T, {len(skeleton)}, 3] for {skeleton.name}, got {list(exact.shape)}"
+        )
+    if not np.isfinite(exact).all():
+        raise UserError("joints hold NaN or infinity; nothing sensible can be filmed")
+    return Actor.of(exact, skeleton, figure, face_controls)
+
+
+def _frames(
+    actor: Actor, fps: float, subtitle: Image.Image, size: tuple[int, int]
+) -> Iterator[NDArray[np.uint8]]:
+    """One RGB picture [height, width, 3] of each frame, by a camera that follows the figure."""
+    joints = actor.posing.joints
+    floor = floor_of(joints)
+    target = smooth_path(joints[:, 0], fps)
+    spread = np.linalg.norm(joints[..., [0, 2]] - target[:, None][..., [0, 2]], axis=-1).max(axis=1)
+    height = float(np.clip(np.percentile(joints[..., 1].max(axis=1), 98) - floor + 0.2, 0.3, 5))
+    radius = float(np.clip(np.percentile(spread, 90) + 0.06, 0.2, 4))
+    target[:, 1] = floor + 0.455 * height
+    camera = Camera(*VIEWS["3/4"], fit_distance(height, radius, *size), *size)
+    ground = Ground(camera, floor + 0.455 * height, floor - SOLE)
+    detail = detail_for(camera)
+    for frame, middle in enumerate(target):
+        image = ground.draw(middle)
+        ground.draw_trail(image, middle, joints[:, 0])
+        ground.cast_shadow(image, middle, actor, frame)
+        draw_figure(image, camera, middle, actor, frame, detail)
+        if subtitle.height:
+            picture = Image.fromarray(image)
+            picture.paste((36, 42, 56), (12, size[1] - subtitle.height - 10), subtitle)
+            image = np.asarray(picture)
+        yield image
+
+
+def _subtitle(caption: str, size: tuple[int, int]) -> Image.Image:
+    """The caption in at most two lines, as a mask; of no height where there is none."""
+    face = ImageFont.load_default(max(11, size[1] // 30))
+    step = round(size[1] / 30 * 1.35)
+    lines = _wrap(caption, size[0] - 24, face, 2) if caption else []
+    out = Image.new("L", (size[0] - 24, step * len(lines)))
+    for row, line in enumerate(lines):
+        ImageDraw.Draw(out).text((0, row * step), line, fill=255, font=face)
+    return out
+
+
+def _wrap(
+    text: str, width: float, face: ImageFont.FreeTypeFont | ImageFont.ImageFont, lines: int
+) -> list[str]:
+    """Break text into at most `lines` lines of `width` pixels; what does not fit ends in an ellipsis."""
+    out = [""]
+    for word in text.split():
+        longer = f"{out[-1]} {word}".strip()
+        if face.getlength(longer) <= width or not out[-1]:
+            out[-1] = longer
+        else:
+            out.append(word)
+    if len(out) > lines:
+        out = [*out[: lines - 1], f"{out[lines - 1]} …"]
+    for row, line in enumerate(out):
+        kept = line
+        while face.getlength(out[row]) > width and kept:
+            kept = kept[:-1]
+            out[row] = kept.rstrip(" …") + "…"
+    return out

@@ -1,0 +1,205 @@
+"""The comparison as one self-contained page: who is compared, what differs, curves, figures.
+
+Every run keeps one colour throughout. Names come from folders and recipes and are escaped like all text of a
+`Page`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from motionloom.datasets.base.progress import duration
+from motionloom.pipeline.evaluation.figures import heading
+from motionloom.pipeline.render.charts import Line
+from motionloom.pipeline.render.labels import curve_label
+from motionloom.pipeline.render.page import Cell, Page, Value
+from motionloom.pipeline.results.compare.curves import CurveChart, curve_charts
+from motionloom.pipeline.results.compare.runs import (
+    ABSENT,
+    ComparedRun,
+    StageDifferences,
+    setting_differences,
+)
+from motionloom.pipeline.results.compare.tables import ComparedTable, compared_tables
+from motionloom.pipeline.store.yaml import setting_text
+
+NO_PAGES = ("report",)
+"""Kinds of stages that nothing compared here comes from."""
+LETTERS = "ABCDEFGH"
+NAMED = 3
+"""So many runs are named in the page's title, more are counted."""
+
+
+def comparison_page(runs: Sequence[ComparedRun]) -> Page:
+    """The page of `runs`."""
+    names = " and ".join((", ".join(run.label for run in runs[:-1]), runs[-1].label))
+    what = "settings that differ, figures on held-out clips, training curves"
+    if len(runs) <= NAMED:
+        page = Page(f"{names} compared", what.capitalize())
+    else:
+        page = Page(f"{len(runs)} runs compared", f"{names}: {what}")
+    _who(page, runs)
+    _settings(page, runs, setting_differences(runs))
+    charts, tables = curve_charts(runs), compared_tables(runs)
+    _figures(page, runs, tables)
+    _curves(page, runs, charts)
+    return page
+
+
+def missing_lines(run: ComparedRun) -> list[str]:
+    """What a run does not have yet, a line for each stage."""
+    return [f"{s.name}: {s.say()}" for s in run.state.unfinished if s.kind not in NO_PAGES]
+
+
+def _who(page: Page, runs: Sequence[ComparedRun]) -> None:
+    page.add_heading("Runs")
+    rows: list[list[Value]] = []
+    for run in runs:
+        state = run.state
+        known = [stage.seconds for stage in state.stages if stage.seconds is not None]
+        places = dict.fromkeys(stage.hardware for stage in state.stages if stage.hardware)
+        done = sum(stage.usable for stage in state.stages)
+        rows.append(
+            [
+                _chip(run),
+                state.recipe,
+                "–" if state.seed is None else str(state.seed),
+                f"{done} of {len(state.stages)}",
+                duration(sum(known)) if known else None,
+                "; ".join(places) or None,
+            ]
+        )
+    columns = ["run", "recipe", "seed", "stages finished", "time of these", "ran on"]
+    page.add_table(columns, rows, "The runs, each with its colour", pinned=True)
+    missing = {run.label: missing_lines(run) for run in runs}
+    if any(missing.values()):
+        page.add_text("Not all is there yet; the page shows what there is. Missing:")
+        page.add_list([f"{label} – {'; '.join(lines)}" for label, lines in missing.items() if lines])
+
+
+def _settings(page: Page, runs: Sequence[ComparedRun], differences: Sequence[StageDifferences]) -> None:
+    page.add_heading("Settings that differ")
+    if not differences:
+        page.add_text("All settings are equal.")
+    for stage in differences:
+        title = f"Stage {stage.stage}" if stage.stage else "The recipe"
+        if stage.missing:
+            absent = f"{title}: not in {', '.join(stage.missing)}"
+            page.add_text(f"{absent}." if stage.differences else f"{absent}; equal where it is.")
+        if stage.differences:
+            rows = [
+                [one.key, *(None if value is ABSENT else setting_text(value) for value in one.values)]
+                for one in stage.differences
+            ]
+            page.add_table(["setting", *(_chip(run) for run in runs)], rows, title, pinned=True)
+
+
+def _figures(page: Page, runs: Sequence[ComparedRun], tables: Sequence[ComparedTable]) -> None:
+    page.add_heading("Figures on held-out clips")
+    without = [run.label for run in runs if not run.evaluations]
+    if not tables:
+        page.add_text("No run has figures yet: their stages that evaluate are not finished.")
+        return
+    page.add_text(
+        "★ is the best of the runs that were measured alike, ☆ the best mean where its 95 % interval still "
+        "overlaps another's, so that the difference may be chance; figures without ± were measured once. "
+        "Intervals are over clips or, of figures of whole sets, over repeats. "
+        "Grey rows are what figures are compared with, and are not ranked."
+    )
+    sources = [f"{run.label}: {path}" for run in runs for path in run.files.values()]
+    several = len({table.stage for table in tables}) > 1
+    if without:
+        page.add_text(f"Without any figures yet: {', '.join(without)}.")
+    for table in tables:
+        _figure_table(page, table, several, without)
+    with page.folded("Files that the figures were read from"):
+        page.add_list(sources)
+
+
+def _figure_table(page: Page, table: ComparedTable, several: bool, silent: Sequence[str]) -> None:
+    lettered = len({row.protocol for row in table.rows}) > 1
+    columns = ["", *(["measured"] if lettered else []), *(heading(column) for column in table.columns)]
+    rows: list[list[Value]] = []
+    for row in table.rows:
+        cells: list[Value] = [_chip(row.run)]
+        if lettered:
+            cells.append(f"as {LETTERS[row.protocol]}")
+        for column in table.columns:
+            figure = row.figures.get(column.name)
+            sure = row.best.get(column.name)
+            text = None if figure is None else figure.text()
+            cells.append(text if text is None or sure is None else Cell(text, best=sure, maybe=not sure))
+        rows.append(cells)
+    for reference in table.references:
+        name = f"{reference.title} ({', '.join(reference.runs)})" if reference.runs else reference.title
+        found = [reference.figures.get(column.name) for column in table.columns]
+        soft = [None if f is None else Cell(f.text(), soft=True) for f in found]
+        rows.append([Cell(name, soft=True), *([None] if lettered else []), *soft])
+    title = f"{table.title} – stage {table.stage}" if several else table.title
+    page.add_table(columns, rows, title, pinned=True)
+    if table.difference:
+        page.add_text(table.difference)
+    without = [label for label in table.missing if label not in silent]
+    if without:
+        page.add_text(f"No such figures of: {', '.join(without)}.")
+
+
+def _curves(page: Page, runs: Sequence[ComparedRun], charts: Sequence[CurveChart]) -> None:
+    page.add_heading("Training curves")
+    if not charts:
+        page.add_text("No run has logged a training yet.")
+        return
+    page.add_text(
+        "One colour a run; whole lines are training, dashed ones validation. A loss says something only "
+        "between trainings whose losses and data are set alike."
+    )
+    stages = dict.fromkeys(chart.stage for chart in charts)
+    for stage in stages:
+        own = [chart for chart in charts if chart.stage == stage]
+        page.add_subheading(stage)
+        for line in _remarks(runs, stage):
+            page.add_text(line)
+        for chart in own:
+            if chart.open:
+                _chart(page, chart)
+        rest = [chart for chart in own if not chart.open]
+        if rest:
+            with page.folded(f"{len(rest)} more curves of {stage}"):
+                for chart in rest:
+                    _chart(page, chart)
+
+
+def _remarks(runs: Sequence[ComparedRun], stage: str) -> list[str]:
+    """What to know before comparing a stage's curves."""
+    states = {run.label: run.state.stage(stage) for run in runs}
+    kinds: Mapping[str, list[str]] = {}
+    for label, state in states.items():
+        if state is not None:
+            kinds = {**kinds, state.kind: [*kinds.get(state.kind, []), label]}
+    out = []
+    if len(kinds) > 1:
+        listed = "; ".join(f"{kind}: {', '.join(labels)}" for kind, labels in kinds.items())
+        out.append(f"Stages of different kinds, so other losses: {listed}.")
+    without = [run.label for run in runs if stage not in run.logs]
+    going = [
+        f"{label} ({state.say()})"
+        for label, state in states.items()
+        if state is not None and state.progress == "started"
+    ]
+    if without:
+        out.append(f"No curves of: {', '.join(without)}.")
+    if going:
+        out.append(f"Not finished: {', '.join(going)}.")
+    return out
+
+
+def _chart(page: Page, chart: CurveChart) -> None:
+    lines = [
+        Line(f"{c.run.label} ({c.split})", c.steps, c.values, dashed=c.split == "val", colour=c.run.colour)
+        for c in chart.curves
+    ]
+    page.add_plot(lines, f"{chart.stage}: {curve_label(chart.figure)}")
+
+
+def _chip(run: ComparedRun) -> Cell:
+    return Cell(run.label, colour=run.colour)

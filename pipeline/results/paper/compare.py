@@ -1,0 +1,96 @@
+"""Runs beside the numbers of the papers: what `motionloom evaluate --table` does."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from motionloom.datasets.base.files import write_text
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.results.paper.fill import fill
+from motionloom.pipeline.results.paper.filled import FilledTable
+from motionloom.pipeline.results.paper.schema import PaperTable
+from motionloom.pipeline.results.paper.writers import SUFFIXES, WRITERS, print_text
+from motionloom.pipeline.store.files import require_file_place
+from motionloom.pipeline.store.yaml import read_yaml
+
+
+def compare_with_paper(
+    table: str,
+    runs: Sequence[Path] = (),
+    *,
+    format: str | None = None,
+    out: Path | None = None,
+    console: Console | None = None,
+) -> FilledTable:
+    """Print a table of a paper with the rows of finished runs, or write it to the file `out`.
+
+    Nothing is measured and no model is loaded: the figures are those of the runs' finished evaluations.
+
+    Args:
+        table: Its name, such as `humantomato/7`, or a YAML file of the same form.
+        runs: Run folders; without any, the paper's numbers stand alone.
+        format: text, markdown, csv, latex or json; by default what the suffix of `out` says, else text.
+        out: File to write in place of printing.
+        console: Where to print; standard output by default.
+    """
+    console = console or make_console()
+    form = _format(format, out)
+    if out is not None:
+        require_file_place(out)
+    filled = fill(table, paper_table(table), runs)
+    if out is not None:
+        write_text(out, WRITERS[form](filled))
+        console.print(str(out), soft_wrap=True)
+    elif form == "text":
+        print_text(filled, console)
+    else:
+        console.print(WRITERS[form](filled), soft_wrap=True, markup=False, emoji=False, end="")
+    return filled
+
+
+def list_tables(console: Console | None = None) -> None:
+    """Print the names of all tables, with what each compares and how many of its rows have a model."""
+    grid = Table("table", "what it compares", "section", "rows", "of which we can have", title_justify="left")
+    grid.title = "tables of the papers (motionloom evaluate --table NAME RUN...)"
+    for name in shipped_tables():
+        table = paper_table(name)
+        ours = sum(row.ours is not None or row.recorded for row in table.rows)
+        grid.add_row(name, table.title, table.section, str(len(table.rows)), str(ours))
+    (console or make_console()).print(grid)
+
+
+def _format(given: str | None, out: Path | None) -> str:
+    if given is None:
+        return SUFFIXES.get(out.suffix.lower(), "text") if out is not None else "text"
+    if given not in WRITERS:
+        near = difflib.get_close_matches(given, WRITERS, n=1, cutoff=0.5)
+        hint = f"did you mean '{near[0]}'?" if near else f"choose {', '.join(WRITERS)}"
+        raise UserError(f"--format {given}: no such format; {hint}")
+    return given
+
+
+def shipped_tables() -> dict[str, Path]:
+    """The tables that come with the package: `PAPER/NUMBER` -> its file, in the papers' order."""
+    folder = Path(str(resources.files("motionloom.configs"))) / "tables"
+    found = [(path.relative_to(folder).parts[0], int(path.stem), path) for path in folder.rglob("*.yaml")]
+    return {f"{paper}/{number}": path for paper, number, path in sorted(found)}
+
+
+def paper_table(name: str) -> PaperTable:
+    """A table by its name, such as `humantomato/7`, or from a file of one's own, such as `mine.yaml`."""
+    if name.endswith((".yaml", ".yml")):
+        return PaperTable.parse(read_yaml(Path(name)), name)
+    shipped = shipped_tables()
+    if name not in shipped:
+        near = difflib.get_close_matches(name.lower(), shipped, n=1, cutoff=0.5)
+        hint = f"did you mean '{near[0]}'?" if near else "motionloom evaluate --tables lists them"
+        raise UserError(f"--table {name}: no such table; {hint}")
+    path = shipped[name]
+    return PaperTable.parse(read_yaml(path), str(path))

@@ -1,0 +1,298 @@
+"""The rows of runs in a table of a paper: which of their stages each row is, and what they measured."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, ROWS, Figure, Protocol, say_difference
+from motionloom.pipeline.results.paper.conditions import config_fits, may_fill, value_at
+from motionloom.pipeline.results.paper.evaluations import Evaluation, evaluations_of
+from motionloom.pipeline.results.paper.filled import Cell, FilledRow, FilledTable, Head
+from motionloom.pipeline.results.paper.notes import data_set_of, differences, notes_of
+from motionloom.pipeline.results.paper.schema import Column, PaperTable, Row
+from motionloom.pipeline.store.run_state import StageRecord
+
+_MISSING, _NO_MODEL = "missing in these runs", "missing: no model of ours"
+
+_ANSWERS = tuple(row for row in ROWS if row != MODEL)
+_PAPERS = {"humantomato": "HumanTOMATO", "ude": "UDE"}
+
+
+def fill(name: str, table: PaperTable, runs: Sequence[Path] = ()) -> FilledTable:
+    """The table with the rows of `runs`, each under the paper's row that it is; without any, the paper's."""
+    return _Filling(name, table, runs).filled()
+
+
+class _Filling:
+    """A table being filled in."""
+
+    def __init__(self, name: str, table: PaperTable, runs: Sequence[Path]) -> None:
+        self.name, self.table = name, table
+        runs = list(dict.fromkeys(runs))
+        self.evaluations = {run: evaluations_of(run, table.measures) for run in runs if table.measures}
+        names = [run.resolve().name for run in runs]
+        self.labels = {
+            run: str(run) if names.count(short) > 1 else short for run, short in zip(runs, names, strict=True)
+        }
+        self.folders = {label: run for run, label in self.labels.items()}
+        self.decimals = [self._decimals(at) for at in range(len(table.columns))]
+        self.used: dict[tuple[Path, str], Evaluation] = {}
+        self.shown: dict[tuple[Path, str], list[tuple[Column, Figure]]] = {}
+        self.settings: dict[str, None] = {}
+        self.doubts: dict[str, None] = {}
+        self.seen: set[tuple[object, ...]] = set()
+
+    def filled(self) -> FilledTable:
+        """The paper's rows, ours below each, and the answers that need no model."""
+        heads = tuple(Head(c.group, c.name, c.unit, c.better, c.printed) for c in self.table.columns)
+        models = [self._models(row) for row in self.table.rows]
+        rows: list[FilledRow] = []
+        for row, ours in zip(self.table.rows, models, strict=True):
+            rows += [self._paper(row), *ours]
+            if row.recorded:
+                rows += self._references({}, (RECORDED,))
+            if row.values:
+                rows += self._references(row.values, _ANSWERS)
+        if not any(row.values for row in self.table.rows):
+            rows += self._references({}, _ANSWERS)
+        found = [
+            difference
+            for (run, name), evaluation in self.used.items()
+            for difference in differences(
+                evaluation, self.labels[run], self.table, self.shown.get((run, name), [])
+            )
+        ]
+        paper, _, number = self.name.partition("/")
+        title = f"{_PAPERS.get(paper, paper)} Table {number}" if number else self.name
+        said = {key: str(value) for key, value in self.table.measured.dump().items() if value}
+        marked = mark_best(rows, heads)
+        doubts = [*self._unlike(), *self.doubts]
+        notes = notes_of(self.table, marked, list(self.settings), doubts, with_runs=bool(self.evaluations))
+        return FilledTable(
+            self.name, title, self.table.title, self.table.section, said, heads, marked, tuple(found), notes
+        )
+
+    def _unlike(self) -> list[str]:
+        """How our figures of a column were measured differently from each other."""
+        columns: dict[str, dict[str, Protocol]] = {}
+        for (run, name), found in self.shown.items():
+            for column, figure in found:
+                columns.setdefault(column.title, {})[f"{self.labels[run]} {name}"] = figure.protocol
+        said = dict.fromkeys(say_difference(protocols) for protocols in columns.values())
+        return [sentence.removesuffix(".") for sentence in said if sentence]
+
+    def _decimals(self, at: int) -> int:
+        """Of our figures: as many as the paper prints in that column."""
+        column = self.table.columns[at]
+        if not column.printed:
+            return 1 if column.unit == "mm" else 3
+        place = sum(one.printed for one in self.table.columns[:at])
+        cells = [row.printed()[place] for row in self.table.rows]
+        return max((cell.decimals for cell in cells if cell is not None), default=3)
+
+    def _paper(self, row: Row) -> FilledRow:
+        printed = iter(row.printed())
+        cells = [next(printed) if column.printed else None for column in self.table.columns]
+        shown = tuple(None if cell is None else Cell(cell.text, cell.mean, cell.spread) for cell in cells)
+        return FilledRow("paper", row.method, row.method, shown)
+
+    def _models(self, row: Row) -> list[FilledRow]:
+        """Our rows of one of the paper's; one that says so where there are none."""
+        if row.recorded or not self.evaluations:
+            return []
+        found = [
+            one
+            for run in self.evaluations
+            for one in named_apart(without_repetitions(self._of_run(run, row)))
+        ]
+        for one in found:
+            for evaluation in self.evaluations[self.folders[one.run]]:
+                if evaluation.name in one.evaluations:
+                    self.used[evaluation.run, evaluation.name] = evaluation
+        label = _NO_MODEL if row.ours is None else _MISSING
+        return found or [FilledRow("missing", row.method, label, (None,) * len(self.table.columns))]
+
+    def _of_run(self, run: Path, row: Row) -> list[FilledRow]:
+        """One row for each model of a run, or for each set of models where the columns are settings."""
+        if row.ours is None:
+            return []
+        role, conditions = row.ours.role, row.ours.conditions()
+        fitting = [
+            (evaluation, evaluation.about[role])
+            for evaluation in self.evaluations[run]
+            if role in evaluation.about
+            and all(may_fill(match, evaluation.about.get(name)) for name, match in conditions.items())
+        ]
+        by_setting = any(column.where for column in self.table.columns)
+        names = [""] if by_setting else list(dict.fromkeys(model.name for _, model in fitting))
+        out = []
+        for name in names:
+            lists = [
+                [
+                    (evaluation, model)
+                    for evaluation, model in fitting
+                    if column.figure is not None
+                    and evaluation.measure == column.of
+                    and (by_setting or model.name == name)
+                    and config_fits(column.where, model.config)
+                    and self._about(column, evaluation)
+                ]
+                for column in self.table.columns
+            ]
+            for turn in range(max(map(len, lists), default=0)):
+                chosen = [found[turn] if turn < len(found) else None for found in lists]
+                out.append(self._ours(run, row, chosen))
+            if (
+                not any(lists) and fitting and not by_setting
+            ):  # a model whose figures this table has no column for
+                out.append(self._ours(run, row, [None] * len(lists), name))
+        return out
+
+    def _about(self, column: Column, evaluation: Evaluation) -> bool:
+        """Whether an evaluation is of the column's data set."""
+        return not column.data or data_set_of(evaluation, self.table.data) == column.data
+
+    def _ours(
+        self, run: Path, row: Row, chosen: Sequence[tuple[Evaluation, StageRecord] | None], name: str = ""
+    ) -> FilledRow:
+        assert row.ours is not None
+        cells: list[Cell | None] = []
+        alike: list[str | None] = []
+        models, evaluations = dict.fromkeys([name] if name else []), dict[str, None]()
+        for at, found in enumerate(chosen):
+            column = self.table.columns[at]
+            if found is None or column.figure is None:
+                cells.append(None)
+                alike.append(None)
+                continue
+            evaluation, model = found
+            models[model.name] = None
+            evaluations[evaluation.name] = None
+            figure = evaluation.figure(column.figure.format(**row.values))
+            cells.append(None if figure is None else self._cell(evaluation, figure, at))
+            alike.append(None if figure is None else figure.protocol_key)
+            self._settings(run, model, {**row.ours.setting, **column.setting})
+        label = " ".join([self.labels[run], ", ".join(models)])
+        return FilledRow(
+            "ours",
+            row.method,
+            label,
+            tuple(cells),
+            self.labels[run],
+            tuple(models),
+            tuple(evaluations),
+            tuple(alike),
+        )
+
+    def _settings(self, run: Path, model: StageRecord, paper: Mapping[str, object]) -> None:
+        """Note where a model of ours has another setting than the paper's."""
+        wrong = []
+        for key, theirs in paper.items():
+            ours = value_at(model.config, key, None)
+            if ours != theirs:
+                wrong.append(f"{key} {ours} (paper: {theirs})")
+        if wrong:
+            self.settings[f"{self.labels[run]} {model.name}: {', '.join(wrong)}"] = None
+
+    def _cell(self, evaluation: Evaluation, figure: Figure, at: int) -> Cell:
+        column, digits = self.table.columns[at], self.decimals[at]
+        self.shown.setdefault((evaluation.run, evaluation.name), []).append((column, figure))
+        if figure.note:
+            self.doubts[f"{column.title} of {self.labels[evaluation.run]}, {figure.note}"] = None
+        mean = figure.value * column.scale
+        spread = None if figure.interval is None else figure.interval * column.scale
+        text = f"{mean:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
+        return Cell(text, mean, spread)
+
+    def _references(self, values: Mapping[str, str], titles: Iterable[str]) -> list[FilledRow]:
+        """Answers that need no model, of the evaluations that the table uses; equal ones of a run once."""
+        out = []
+        for title in titles:
+            for run, all_of_run in self.evaluations.items():
+                used = [one for one in all_of_run if (run, one.name) in self.used] or all_of_run
+                for evaluation in used:
+                    row = self._reference(run, evaluation, title, values)
+                    key = (run, title, tuple(cell and cell.text for cell in row.cells), *values.items())
+                    if any(row.cells) and key not in self.seen:
+                        self.seen.add(key)
+                        self.used.setdefault((run, evaluation.name), evaluation)
+                        out.append(row)
+        return out
+
+    def _reference(
+        self, run: Path, evaluation: Evaluation, title: str, values: Mapping[str, str]
+    ) -> FilledRow:
+        cells = []
+        for at, column in enumerate(self.table.columns):
+            fits = evaluation.measure == column.of and self._about(column, evaluation)
+            name = column.figure.format(**values) if fits and column.figure is not None else ""
+            figure = evaluation.figure(name, title)
+            cells.append(None if figure is None else self._cell(evaluation, figure, at))
+        label = f"{title} ({self.labels[run]} {evaluation.name})"
+        return FilledRow("reference", "", label, tuple(cells), self.labels[run], (), (evaluation.name,))
+
+
+# Which rows are shown, and which figures are the best of those measured alike.
+
+
+def mark_best(rows: Sequence[FilledRow], heads: Sequence[Head]) -> tuple[FilledRow, ...]:
+    """The rows with the best figures marked: of models of ours, two or more of them measured alike.
+
+    The paper's rows, recorded motion and other answers that need no model are never ranked. Equal figures
+    are marked together; the figure as it is printed decides.
+    """
+    best: dict[int, set[int]] = defaultdict(set)
+    for at, head in enumerate(heads):
+        if head.better is None:
+            continue
+        for group in _measured_alike(rows, at).values():
+            if len(group) < 2:
+                continue
+            values = {number: float(cell.text.split(" ")[0]) for number, cell in group}
+            wanted = min(values.values()) if head.better == "lower" else max(values.values())
+            for number, value in values.items():
+                if value == wanted and len(set(values.values())) > 1:
+                    best[number].add(at)
+    return tuple(row.marked(best[number]) for number, row in enumerate(rows))
+
+
+def _measured_alike(rows: Sequence[FilledRow], at: int) -> dict[str, list[tuple[int, Cell]]]:
+    """Numbers and cells of our rows in column `at`, by how they were measured."""
+    groups: dict[str, list[tuple[int, Cell]]] = defaultdict(list)
+    for number, row in enumerate(rows):
+        if row.source != "ours" or not row.alike:
+            continue
+        cell, alike = row.cells[at], row.alike[at]
+        if cell is not None and alike is not None:
+            groups[alike].append((number, cell))
+    return groups
+
+
+def without_repetitions(rows: Sequence[FilledRow]) -> list[FilledRow]:
+    """Rows of one run, without those that say no more of their model than another one does."""
+    out: list[FilledRow] = []
+    for row in rows:
+        if any(_covers(other, row) for other in out):
+            continue
+        out = [other for other in out if not _covers(row, other)]
+        out.append(row)
+    return out
+
+
+def _covers(one: FilledRow, other: FilledRow) -> bool:
+    """Whether every figure of `other` stands in `one`, of the same models."""
+    same = one.run == other.run and set(other.stages) <= set(one.stages)
+    pairs = zip(one.cells, other.cells, strict=True)
+    return same and all(b is None or (a is not None and a.text == b.text) for a, b in pairs)
+
+
+def named_apart(rows: Sequence[FilledRow]) -> list[FilledRow]:
+    """Rows whose labels are equal, with the evaluation's name behind."""
+    often = Counter(row.label for row in rows)
+    return [
+        replace(row, label=f"{row.label} ({', '.join(row.evaluations)})") if often[row.label] > 1 else row
+        for row in rows
+    ]

@@ -1,0 +1,224 @@
+"""A table of a paper as a file: its columns, its numbers as printed, and which model of ours each row is.
+
+title: Reconstruction by different quantization methods (MPJPE)
+section: "4.4"
+measured: {data: Motion-X, split: test}
+columns:
+  - {name: All, unit: mm, better: lower, figure: reconstruction.mpjpe}
+rows:
+  - {method: Vanilla VQ (512), paper: "140.66", ours: {tokenizer: {kind: vq}}}
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from motionloom.datasets.schema import Config
+from motionloom.pipeline.results.paper.conditions import Condition, Scalar, StageMatch
+
+Measure = Literal["evaluate", "evaluate_dances", "retrieval"]
+"""What took a figure: a stage of one of the first two kinds, or the command `retrieval`."""
+
+ROLES: dict[str, tuple[Measure, ...]] = {
+    "tokenizer": ("evaluate",),
+    "face_tokenizer": ("evaluate",),
+    "generator": ("evaluate", "evaluate_dances"),
+    "face_generator": ("evaluate",),
+    "alignment": ("retrieval",),
+}
+"""What an evaluation measures, and which kinds of evaluation do."""
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)"
+_PRINTED = re.compile(rf"({_NUMBER})(?: ± ({_NUMBER}))?")
+
+
+class Printed(Config):
+    """A number as the paper prints it, trailing zeros included."""
+
+    text: str
+    mean: float
+    spread: float | None = None
+
+    @staticmethod
+    def of(text: str) -> Printed | None:
+        """From "0.559 ± .007"; None for "-"."""
+        text = text.strip()
+        if text == "-":
+            return None
+        match = _PRINTED.fullmatch(text)
+        if match is None:
+            raise ValueError(f"'{text}' is no number; write 1.5, 1.5 ± 0.2, or - for none")
+        mean, spread = match.groups()
+        return Printed(text=text, mean=float(mean), spread=None if spread is None else float(spread))
+
+    @property
+    def decimals(self) -> int:
+        return len(self.text.split(" ")[0].partition(".")[2])
+
+
+class Column(Config):
+    """One column."""
+
+    name: str = Field(min_length=1)
+    group: str = ""
+    """Heading above several columns."""
+    unit: str = ""
+    better: Literal["lower", "higher"] | None = None
+    figure: str | None = None
+    """Name of our figure, such as `reconstruction.mpjpe`; `{protocol}` stands for a row's value. None: there
+    is no such figure of ours, and `why` says why."""
+    of: Measure = "evaluate"
+    why: str = ""
+    scale: float = 1.0
+    """The paper's number is our figure times this: 100 where it prints percent."""
+    differs: str = ""
+    """How our figure differs in kind from the paper's."""
+    candidates: int | None = Field(None, ge=2)
+    """Of how many answers the paper's retrieval chooses; ours is the evaluation's own."""
+    data: str = ""
+    """The data set, where columns of one table differ in it."""
+    where: dict[str, Condition] = Field(default_factory=dict)
+    """What the config of a row's model must be besides, where the columns are settings of it."""
+    setting: dict[str, Scalar] = Field(default_factory=dict)
+    """The paper's settings of this column's model; another one of ours is named below the table."""
+    printed: bool = True
+    """Whether the paper has this column; else it holds our figures alone."""
+
+    @property
+    def title(self) -> str:
+        return f"{self.group} {self.name}".strip()
+
+    @model_validator(mode="after")
+    def _says_why(self) -> Self:
+        if (self.figure is None) != bool(self.why):
+            raise ValueError("give either figure (the key of ours) or why (there is none)")
+        if not self.printed and self.figure is None:
+            raise ValueError("a column that the paper does not have needs a figure of ours")
+        return self
+
+
+class Ours(Config):
+    """Which models of a run are this row: conditions on what an evaluation measures, by role."""
+
+    tokenizer: StageMatch | None = None
+    face_tokenizer: StageMatch | None = None
+    generator: StageMatch | None = None
+    face_generator: StageMatch | None = None
+    alignment: StageMatch | None = None
+    setting: dict[str, Scalar] = Field(default_factory=dict)
+    """The paper's settings of the model; a stage of another one is this row all the same, and the difference
+    is named below the table."""
+
+    def conditions(self) -> dict[str, StageMatch | None]:
+        """Role -> condition, as far as the file has them: None is one too."""
+        return {role: getattr(self, role) for role in ROLES if role in self.model_fields_set}
+
+    @property
+    def role(self) -> str:
+        """The role of the model that the row is about."""
+        return next(role for role, match in self.conditions().items() if match is not None)
+
+    @model_validator(mode="after")
+    def _about_something(self) -> Self:
+        if not any(self.conditions().values()):
+            raise ValueError(f"needs a condition on one of {', '.join(ROLES)}")
+        return self
+
+
+def _cells(text: str) -> str:
+    for cell in text.split("|"):
+        Printed.of(cell)
+    return text
+
+
+class Row(Config):
+    """One row of the paper."""
+
+    method: str = Field(min_length=1)
+    """As the paper prints it."""
+    paper: Annotated[str, AfterValidator(_cells)]
+    """Its numbers, separated by |; - where the paper has none."""
+    recorded: bool = False
+    """Ground truth: ours are the recorded motions of the evaluations."""
+    ours: Ours | None = None
+    why: str = ""
+    """Why no model of ours is this row."""
+    values: dict[str, str] = Field(default_factory=dict)
+    """What `{...}` in a column's figure stands for in this row."""
+    note: str = ""
+
+    def printed(self) -> tuple[Printed | None, ...]:
+        return tuple(Printed.of(cell) for cell in self.paper.split("|"))
+
+    @model_validator(mode="after")
+    def _one_of_three(self) -> Self:
+        if self.recorded + (self.ours is not None) + bool(self.why) != 1:
+            raise ValueError("give one of ours (the model), recorded: true, and why (there is no model)")
+        return self
+
+
+class Measured(Config):
+    """How the paper's numbers were measured; None where it does not say."""
+
+    data: str
+    split: str | None = "test"
+    clips: int | None = None
+    evaluator: str | None = None
+    """What embeds motions and captions, in our figures' place."""
+    repeats: str | None = None
+    sampling: str | None = None
+    """How its motions were drawn."""
+    spread: str | None = None
+    """What its ± is."""
+    note: str = ""
+
+
+class DataSet(Config):
+    """A data set of several that one table has columns of."""
+
+    name: str
+    hands: bool = True
+    """Whether its motions have hands: our run on other data fills the columns of the first data set that is
+    like its own."""
+
+
+class PaperTable(Config):
+    """A table of a paper."""
+
+    title: str
+    """What it compares."""
+    section: str
+    """Where the paper speaks of it."""
+    measured: Measured
+    data: list[DataSet] = Field(default_factory=list)
+    """Where columns name theirs."""
+    columns: list[Column] = Field(min_length=1)
+    rows: list[Row] = Field(min_length=1)
+
+    @field_validator("columns")
+    @classmethod
+    def _different_names(cls, columns: list[Column]) -> list[Column]:
+        titles = [column.title for column in columns]
+        if twice := next((title for title in titles if titles.count(title) > 1), None):
+            raise ValueError(f"two columns are called '{twice}'")
+        return columns
+
+    @model_validator(mode="after")
+    def _as_wide_as_its_columns(self) -> Self:
+        wanted = sum(column.printed for column in self.columns)
+        for row in self.rows:
+            if len(row.printed()) != wanted:
+                raise ValueError(f"row '{row.method}' has {len(row.printed())} numbers for {wanted} columns")
+        known = {data.name for data in self.data}
+        for column in self.columns:
+            if column.data and column.data not in known:
+                raise ValueError(f"column '{column.title}': no data set '{column.data}' under data")
+        return self
+
+    @property
+    def measures(self) -> tuple[Measure, ...]:
+        """Where its figures come from."""
+        return tuple(dict.fromkeys(column.of for column in self.columns if column.figure is not None))

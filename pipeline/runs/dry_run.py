@@ -1,0 +1,230 @@
+"""What a run would do and what its trainings take, before anything runs: tables for people, a record for
+programs (`motionloom run --dry-run`, with `--json`).
+
+Nothing that took long is replaced unless the user asks for it. Guarded are trainings, whatever they took, and
+every other stage that took an hour or more, such as a long conversion **[ours]**. The rest (statistics,
+tokens, figures, pages) is cheap and runs again without asking. `--from` and `--force` ask for the stages that
+they run again; `--replace` asks for all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from motionloom.datasets.base.progress import duration
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.lookup import preview_of, previews
+from motionloom.pipeline.contract.showing import ModelCard
+from motionloom.pipeline.contract.stage import Stage
+from motionloom.pipeline.runs.plan import PlannedStage, Selection, make_plan, require_fit
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.files import read_record
+from motionloom.pipeline.store.run_folder import stage_folder
+from motionloom.pipeline.store.yaml import read_yaml
+
+
+def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
+    """The plan as a table for people."""
+    table = Table(title=escape(f"{recipe.name}: {len(plan)} stages"), title_justify="left")
+    for column in ("stage", "kind", "action", "why", "from"):
+        table.add_column(column, overflow="fold")
+    colours = {"run": "yellow", "resume": "cyan", "skip": "green", "leave": "dim"}
+    for row in plan:
+        colour = colours[row.action]
+        inputs = ", ".join(dict.fromkeys(row.stage.inputs.values()))
+        cells = (row.stage.name, row.stage.kind.name, f"[{colour}]{row.action}[/]")
+        table.add_row(*cells, escape(row.reason), escape(inputs))
+    return table
+
+
+def estimate(recipe: Recipe, names: Collection[str] | None = None) -> dict[str, ModelCard]:
+    """A card for each stage that trains, of `names` or of all; `UserError` when the layout of the data is not
+    known.
+    """
+    stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
+    cards = {}
+    for stage in recipe.stages:
+        if names is not None and stage.name not in names:
+            continue
+        try:
+            card = stage.kind.estimate(stage.config, previews(stage, stages), recipe.hardware)
+        except UserError as error:
+            raise UserError(f"stage {stage.name}: {error}") from None
+        if card is not None:
+            cards[stage.name] = card
+    return cards
+
+
+def estimate_table(cards: dict[str, ModelCard]) -> Table:
+    """For a terminal."""
+    table = Table(title="what the trainings take (one process)", title_justify="left")
+    for column in ("stage", "parameters", "batch", "memory", "tokens"):
+        table.add_column(column, overflow="fold")
+    for name, card in cards.items():
+        parameters = _count(card.parameters)
+        if card.codebook:
+            parameters += f" + {_count(card.codebook)} codebook"
+        table.add_row(name, parameters, str(card.local_batch), _size(card.memory_bytes), card.note)
+    return table
+
+
+def _count(number: int) -> str:
+    return f"{number / 1e6:.1f} M" if number >= 1e5 else f"{number / 1e3:.1f} k"
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 / 10 else f"{count / 2**20:.1f} MiB"
+
+
+def say_estimate(recipe: Recipe, console: Console, todo: Sequence[Stage] | None = None) -> None:
+    """Print what the trainings of the stages `todo` (None = all) take, where the recipe says enough."""
+    todo = recipe.stages if todo is None else todo
+    if not any(stage.kind.trains for stage in todo):
+        return
+    stages = {stage.name: stage for stage in recipe.stages}
+    for stage in recipe.stages:
+        if "data" not in stage.kind.gives(stage.config):
+            continue
+        try:
+            preview_of(stage, {**stages, **recipe.outside})
+        except UserError as error:
+            console.print(str(error), markup=False)
+            return
+    console.print(estimate_table(estimate(recipe, {stage.name for stage in todo})))
+
+
+def plan_record(
+    recipe: str | Path,
+    out: Path | None = None,
+    *,
+    overrides: Sequence[str] = (),
+    select: Selection | None = None,
+) -> dict[str, object]:
+    """The stages in order, each with what happens to it and why, and what its training takes.
+
+    `replaces` are stages that the run would delete, which it refuses without `--replace`, and trainings that
+    it would start over. Refuses what the run would refuse.
+    """
+    loaded = load_recipe(recipe, overrides)
+    run = out or Path("runs") / loaded.name
+    plan = make_plan(loaded, run, select)
+    todo = [row for row in plan if row.action in {"run", "resume"}]
+    require_fit(todo, loaded.hardware)
+    cards = estimate(loaded, {row.stage.name for row in todo})
+    return {
+        "recipe": loaded.name,
+        "folder": run,
+        "hardware": loaded.hardware,
+        "stages": [_row(row, cards) for row in plan],
+        "replaces": {
+            "finished": [one.stage for one in replaced_stages(run, plan)],
+            "started": started_trainings(run, plan),
+        },
+    }
+
+
+def _row(row: PlannedStage, cards: dict[str, ModelCard]) -> dict[str, object]:
+    stage = row.stage
+    return {
+        "stage": stage.name,
+        "kind": stage.kind.name,
+        "action": row.action,
+        "reason": row.reason,
+        "inputs": stage.inputs,
+        "fingerprint": row.fingerprint,
+        "training": cards.get(stage.name),
+    }
+
+
+# What a run would replace.
+
+LONG_SECONDS = 3600.0
+"""A stage that trains nothing is guarded from this time on."""
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """A finished stage that a plan would run again although the user did not name it."""
+
+    stage: str
+    why: str
+    trained: bool
+    seconds: float | None
+    """What it took, as its `timing.json` says; None where that was not noted."""
+
+    def say(self) -> str:
+        work = "training" if self.trained else "work"
+        took = f"{work} of unknown time" if self.seconds is None else f"{duration(self.seconds)} of {work}"
+        return f"  {self.stage}: {self.why} ({took})"
+
+
+def replaced_stages(run: Path, plan: Sequence[PlannedStage]) -> list[Replaced]:
+    """Finished stages that are guarded and that the plan would replace."""
+    out = []
+    for row in plan:
+        folder = stage_folder(run, row.stage.name)
+        if row.action != "run" or row.asked or Artifact.find(folder) is None:
+            continue
+        trained, seconds = row.stage.kind.trains, _seconds(folder)
+        if trained or (seconds or 0.0) >= LONG_SECONDS:
+            out.append(Replaced(row.stage.name, row.reason, trained, seconds))
+    return out
+
+
+def started_trainings(run: Path, plan: Sequence[PlannedStage]) -> list[str]:
+    """Trainings with checkpoints that the plan starts over although the user did not name them."""
+    return [
+        row.stage.name
+        for row in plan
+        if row.action == "run"
+        and row.stage.kind.trains
+        and not row.asked
+        and Artifact.find(stage_folder(run, row.stage.name)) is None
+        and (stage_folder(run, row.stage.name) / "checkpoints").is_dir()
+    ]
+
+
+def explain_replacements(run: Path, recipe: str, stages: Sequence[Replaced]) -> str | None:
+    """Why a run is refused without `--replace`; None where it replaces nothing that is guarded."""
+    other = _recipe_in(run, recipe)
+    if other is None and not stages:
+        return None
+    lines = [f"{run}: holds a run of recipe '{other}', not '{recipe}'"] if other is not None else [f"{run}:"]
+    if stages:
+        known = [stage.seconds for stage in stages if stage.seconds is not None]
+        total = f", {duration(sum(known))} of work" if known else ""
+        joint = "; to go on here would" if other is not None else " this would"
+        lines[0] += f"{joint} replace {len(stages)} finished stage{'s' * (len(stages) > 1)}{total}:"
+        lines += [stage.say() for stage in stages]
+    end = f"-o {_free(run)} keeps both, --replace goes on here: what fits is kept, the rest is made again"
+    return "\n".join([*lines, end]) if stages else f"{lines[0]}; {end}"
+
+
+def _recipe_in(run: Path, name: str) -> str | None:
+    """The recipe that a run folder holds, where it is another one."""
+    path = run / "recipe.yaml"
+    try:
+        found = read_yaml(path) if path.is_file() else None
+    except UserError:
+        return None  # it is about to be written again
+    there = found.get("name", name) if isinstance(found, dict) else name
+    return None if there == name else str(there)
+
+
+def _free(run: Path) -> Path:
+    """A free name for another run folder."""
+    return next(place for number in count(2) if not (place := Path(f"{run}-{number}")).exists())
+
+
+def _seconds(folder: Path) -> float | None:
+    path = folder / "timing.json"
+    seconds = read_record(path).get("seconds") if path.is_file() else None
+    return float(seconds) if isinstance(seconds, int | float) else None

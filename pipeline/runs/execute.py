@@ -1,0 +1,189 @@
+"""Running a plan: each stage in order, by all processes that take part in it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+
+from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.lock import file_lock
+from motionloom.datasets.schema import UserError
+from motionloom.models.training.distributed import alone
+from motionloom.pipeline.contract.stage import Finished, Stage, StageCache, StageContext, StageKind
+from motionloom.pipeline.launch.process import process_rank
+from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, Started, require_fit
+from motionloom.pipeline.runs.recipe import Recipe
+from motionloom.pipeline.runs.verify_shards import verify_shards
+from motionloom.pipeline.store.artifact import Artifact, InputStage
+from motionloom.pipeline.store.files import remove_tree, write_json
+from motionloom.pipeline.store.run_folder import identity_of, place_from, stage_folder
+
+
+def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
+    """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment.
+
+    With several processes each calls this with the same plan: the lead runs and writes everything, the others
+    only take part in trainings and in stages that share their work, and return after the last one.
+    """
+    todo = [row for row in plan if row.action in {"run", "resume"}]
+    joint = [row for row in todo if row.stage.kind.trains or row.stage.kind.shares]
+    require_fit(todo, recipe.hardware)
+    if joint:
+        recipe.hardware.require_devices()
+    leads = process_rank() == 0
+    if not leads:
+        todo = joint
+    with _lock(run, needed=leads):
+        team = Team.start(recipe.hardware) if joint else Team()
+        if leads:
+            write_text(run / "recipe.yaml", recipe.to_yaml(run))
+            request = next((row.request for row in todo if row.request is not None), None)
+            if request is None:
+                (run / REQUEST_FILE).unlink(missing_ok=True)
+            else:
+                write_json(run / REQUEST_FILE, request.dump())
+            for row in plan:
+                if row.action == "skip":
+                    row.stage.kind.settle(row.stage.config, stage_folder(run, row.stage.name))
+        for row in todo:
+            stage, folder = row.stage, stage_folder(run, row.stage.name)
+            begin = time.perf_counter()
+            if leads:
+                place = f"{plan.index(row) + 1}/{len(plan)}"
+                console.print(f"[bold]\\[{place}] {stage.name}[/] ({stage.kind.summary})")
+                _prepare(folder, row)
+            perform(stage.kind, context_of(recipe, run, stage, folder, console, team), team, run)
+            if leads:
+                seconds = time.perf_counter() - begin
+                took = {"seconds": round(seconds, 2), "hardware": recipe.hardware.describe()}
+                write_json(folder / "timing.json", took)
+                _artifact(recipe, run, row, plan).finish(folder)
+                console.print(f"    finished in {seconds:.1f} s")
+        if leads:
+            (run / REQUEST_FILE).unlink(missing_ok=True)
+    return [row.stage.name for row in todo]
+
+
+def perform(kind: StageKind, context: StageContext, team: Team, run: Path) -> None:
+    """One stage of `run`, by all processes that take part in its kind."""
+    if kind.trains:
+        verify_shards(context, team, run)
+        kind.run(context)
+        return
+    with alone():
+        if kind.shares:
+            verify_shards(context, team, run)
+            kind.share(context)
+            team.meet()
+        elif team.leads:
+            verify_shards(context, Team(), run)
+        if team.leads:
+            kind.run(context)
+
+
+def context_of(
+    recipe: Recipe,
+    run: Path,
+    stage: Stage,
+    folder: Path,
+    console: Console,
+    team: Team,
+    stage_cache: StageCache | None = None,
+) -> StageContext:
+    """What a stage works with in `folder`."""
+    return StageContext(
+        name=stage.name,
+        recipe=recipe.name,
+        config=stage.config,
+        folder=folder,
+        inputs=stage_inputs(recipe, run, stage),
+        seed=recipe.seed_of(stage),
+        hardware=recipe.hardware,
+        console=console,
+        stage_cache=StageCache(recipe.hardware.device()) if stage_cache is None else stage_cache,
+        rank=team.rank,
+        world=team.world,
+    )
+
+
+def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]:
+    """The stages that feed one of a recipe, by role."""
+    made: dict[str, Finished] = dict(recipe.outside)
+
+    def finished(name: str) -> Finished:
+        if name not in made:
+            source = recipe.stage(name)
+            inputs = {role: finished(above) for role, above in source.inputs.items()}
+            gone = {role: said for (needing, role), said in recipe.gone.items() if needing == name}
+            folder = stage_folder(run, name)
+            made[name] = Finished(name, source.kind, source.config, folder, inputs, gone=gone)
+        return made[name]
+
+    return {role: finished(name) for role, name in stage.inputs.items()}
+
+
+def begin(run: Path, row: PlannedStage) -> None:
+    """Mark a stage of a plan as begun, so that parts of it can be made before it is run."""
+    with _lock(run, needed=True):
+        _prepare(stage_folder(run, row.stage.name), row)
+
+
+def _prepare(folder: Path, row: PlannedStage) -> None:
+    request = None if row.request is None else row.request.id
+    started = Started(fingerprint=row.fingerprint, extendable=row.extendable, request=request)
+    if row.action == "run":
+        remove_tree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "started.json", started.dump())
+    # A training that is made longer is not finished any more.
+    (folder / "artifact.json").unlink(missing_ok=True)
+
+
+def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[PlannedStage]) -> Artifact:
+    stage, rows = row.stage, {planned.stage.name: planned for planned in plan}
+    return Artifact(
+        stage=stage.name,
+        kind=stage.kind.name,
+        version=stage.kind.version,
+        fingerprint=row.fingerprint,
+        seed=recipe.seed_of(stage),
+        config=stage.config.dump(),
+        inputs={role: _input(recipe, run, row, rows, name) for role, name in stage.inputs.items()},
+    )
+
+
+def _input(
+    recipe: Recipe, run: Path, row: PlannedStage, rows: Mapping[str, PlannedStage], name: str
+) -> InputStage:
+    """What an artifact says of an input; refuses one from outside that has changed since the plan."""
+    if name in rows:
+        return InputStage(stage=name, fingerprint=rows[name].fingerprint)
+    folder = recipe.outside[name].folder
+    now = identity_of(folder)
+    if now != row.identities[name]:
+        raise UserError(
+            f"stage '{row.stage.name}': {folder} was made again while this stage ran; run the recipe again"
+        )
+    return InputStage(stage=folder.name, fingerprint=now, folder=place_from(run, folder))
+
+
+@contextmanager
+def _lock(run: Path, needed: bool) -> Iterator[None]:
+    """One writer per run folder. The lock ends with its process, even a killed one."""
+    if not needed:
+        yield
+        return
+    run.mkdir(parents=True, exist_ok=True)
+    with file_lock(run / ".lock", wait=False) as mine:
+        if not mine:
+            raise UserError(
+                f"{run}: another motionloom process is working on this run; wait for it or stop it"
+            )
+        (run / ".lock").write_text(str(os.getpid()))
+        yield

@@ -1,0 +1,329 @@
+"""What a recipe needs of a cluster: its stages in groups, one after the other, each with its own machines.
+
+SLURM schedules (`slurm.py`); this only describes. A group is one command, `motionloom run RECIPE -o OUT
+--until LAST`, whose selection covers exactly the stages of the group: the groups before have made what they
+need. The run graph decides what is done: a group that is started twice, after a kill or by mistake, skips
+what is finished and resumes what is not.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+from rich.table import Table
+
+from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.registry import converter_named
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.contract.stage import Stage
+from motionloom.pipeline.runs.recipe import Recipe
+
+Need = Literal["cpu", "gpu", "all"]
+"""One process without a GPU; one process with one; as many processes on all nodes as there are GPUs."""
+
+PARTS_MODULE = "motionloom.pipeline.runs.convert_part"
+
+
+def _one_line(text: str) -> str:
+    if not text or not text.isprintable():
+        raise ValueError("write one line of printable characters")
+    return text
+
+
+Line = Annotated[str, AfterValidator(_one_line)]
+"""Text of one line: a batch script must not get another."""
+
+
+class SlurmOptions(Config):
+    """What to ask SLURM for: `motionloom launch --cluster KEY=VALUE`."""
+
+    name: str | None = Field(None, pattern=r"^[a-z]([a-z0-9-]{0,28}[a-z0-9])?$")
+    """Name of the jobs; by default made from the recipe's."""
+    partition: Line | None = None
+    """Partition of the groups with GPUs, and of the others if `light_partition` is not given; default the
+    cluster's."""
+    light_partition: Line | None = None
+    """Partition of the groups without GPUs."""
+    account: Line | None = None
+    """Account to charge."""
+    qos: Line | None = None
+    """Quality of service."""
+    time_minutes: int = Field(1440, ge=1)
+    """Time limit of a group that takes all machines."""
+    light_minutes: int = Field(240, ge=1)
+    """Time limit of the other groups."""
+    cpus_per_gpu: int = Field(8, ge=1)
+    """CPU cores for each process that trains."""
+    memory_gb_per_gpu: float = Field(64, gt=0)
+    """Memory for each process that trains."""
+    light_cpus: int = Field(8, ge=1)
+    """CPU cores, and processes of a conversion, in a group of one process."""
+    light_memory_gb: float = Field(32, gt=0)
+    """Memory of a group of one process."""
+    parts: int = Field(8, ge=1)
+    """Tasks of the array that a conversion at the beginning is cut into; 1 for a plain job."""
+    warn_seconds: int = Field(120, ge=60)
+    """How long before its time limit a job is queued again."""
+    requeues: int = Field(100, ge=0)
+    """How often one job may be queued again at its time limit; 0 lets it end there."""
+    extra: dict[str, Line] = Field(default_factory=dict)
+    """More options of sbatch: `extra.constraint=h100`."""
+
+    @field_validator("extra")
+    @classmethod
+    def _are_options(cls, extra: dict[str, str]) -> dict[str, str]:
+        for name in extra:
+            if not re.fullmatch(r"[a-z][a-z0-9-]*", name):
+                raise ValueError(f"'{name}': an sbatch option is a word such as 'mail-type'")
+        return extra
+
+    @model_validator(mode="after")
+    def _warned_in_time(self) -> Self:
+        if 2 * self.warn_seconds > 60 * min(self.time_minutes, self.light_minutes):
+            raise ValueError(
+                f"warn_seconds {self.warn_seconds} is more than half of a time limit: jobs would be "
+                f"queued again before they have done anything; raise time_minutes and light_minutes"
+            )
+        return self
+
+    @classmethod
+    def from_words(cls, words: Sequence[str]) -> Self:
+        """From `KEY=VALUE` words; `extra.KEY=VALUE` is an option of sbatch."""
+        fields: dict[str, object] = {}
+        extra: dict[str, str] = {}
+        for word in words:
+            key, equals, value = word.partition("=")
+            if not equals:
+                raise UserError(f"--cluster '{word}': write KEY=VALUE, for example partition=gpu")
+            if key.startswith("extra."):
+                extra[key.removeprefix("extra.")] = value
+            else:
+                fields[key] = value
+        return cls.parse({**fields, "extra": extra} if extra else fields, "--cluster")
+
+
+@dataclass(frozen=True)
+class Machines:
+    """What a group runs on."""
+
+    nodes: int
+    processes: int
+    """On each node, as `gpus`, `cpus` and `memory_gb` are."""
+    gpus: int
+    cpus: int
+    memory_gb: float
+    minutes: int
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A conversion's step that several machines make at once."""
+
+    stage: str
+    step: Literal["features", "shards"]
+    count: int
+
+
+@dataclass(frozen=True)
+class Group:
+    """Stages that run as one job, after the group before."""
+
+    name: str
+    """A word of lower-case letters, digits and dashes; the first character is a digit."""
+    need: Need
+    stages: tuple[str, ...]
+    last: tuple[str, ...]
+    """Those of the stages that no other of the group needs."""
+    machines: Machines
+    settings: tuple[str, ...]
+    """Settings of `hardware`, as `--set` takes them."""
+    after: str | None = None
+    """Name of the group that must be done before."""
+    parts: Parts | None = None
+
+
+@dataclass(frozen=True)
+class LaunchPlan:
+    """A recipe as groups."""
+
+    name: str
+    """Name of the jobs: lower-case letters, digits and dashes, a letter first."""
+    recipe: Recipe
+    given: str | None
+    """A shipped recipe's name; None for a recipe of the user's own, which travels in its resolved form."""
+    overrides: tuple[str, ...]
+    out: str
+    groups: tuple[Group, ...]
+
+    def job(self, group: Group) -> str:
+        """What a group's job is called."""
+        return f"{self.name}-{group.name}"
+
+    def command(self, group: Group, recipe: str, program: Sequence[str]) -> list[str]:
+        """The words that run a group: `program` is `motionloom`, `recipe` the file of an own recipe."""
+        sets = [word for setting in (*self._overrides, *group.settings) for word in ("--set", setting)]
+        return [*program, "run", self.given or recipe, "-o", self.out, "--until", ",".join(group.last), *sets]
+
+    def part_command(self, parts: Parts, recipe: str, python: Sequence[str]) -> list[str]:
+        """The words that make one part of a conversion, whose number is in SLURM's variable."""
+        where = [self.given or recipe, self.out, parts.stage, parts.step, str(parts.count)]
+        return [*python, "-m", PARTS_MODULE, *where, *self._overrides]
+
+    @property
+    def _overrides(self) -> tuple[str, ...]:
+        return self.overrides if self.given else ()  # a resolved recipe has them
+
+    def table(self) -> Table:
+        table = Table(title=f"{self.recipe.name}: {len(self.groups)} groups", title_justify="left")
+        for column in ("group", "stages", "machines", "limit", "after"):
+            table.add_column(column, overflow="fold")
+        for group in self.groups:
+            stages = ", ".join(group.stages)
+            if group.parts is not None:
+                stages += f" ({group.parts.step} in {group.parts.count} parts)"
+            limit = f"{group.machines.minutes} min"
+            table.add_row(group.name, stages, _say_machines(group), limit, group.after or "")
+        return table
+
+
+def make_launch_plan(
+    recipe: Recipe,
+    options: SlurmOptions,
+    *,
+    given: str | None,
+    overrides: Sequence[str],
+    out: Path,
+    nodes: int,
+    gpus_per_node: int,
+) -> LaunchPlan:
+    """Cut a recipe into groups, and conversions at its beginning into parts."""
+    if nodes < 1 or gpus_per_node < 0:
+        raise UserError(
+            f"--nodes {nodes} --gpus-per-node {gpus_per_node}: take 1 node or more and no negative count"
+        )
+    settings = _Settings(options, nodes, gpus_per_node)
+    groups: list[Group] = []
+    for need, stages in _cut(recipe, gpus_per_node):
+        for one in [] if groups else _parts_of(stages, options.parts):
+            name = f"{len(groups) + 1}-{_word(one.stage, 12)}-{one.step}"
+            groups.append(settings.group(name, "cpu", (one.stage,), groups, one))
+        names = tuple(stage.name for stage in stages)
+        read = {name for stage in stages for name in stage.inputs.values()}
+        last = tuple(name for name in names if name not in read)
+        label = "train" if any(stage.kind.trains for stage in stages) else _word(names[0], 12)
+        groups.append(settings.group(f"{len(groups) + 1}-{label}", need, names, groups, last=last))
+    _require_fit(recipe, groups)
+    word = options.name or _word(recipe.name, 30)
+    name = word if word[:1].isalpha() else f"run-{word}"
+    return LaunchPlan(name, recipe, given, tuple(overrides), str(out), tuple(groups))
+
+
+@dataclass(frozen=True)
+class _Settings:
+    options: SlurmOptions
+    nodes: int
+    gpus: int
+
+    def group(
+        self,
+        name: str,
+        need: Need,
+        stages: tuple[str, ...],
+        before: Sequence[Group],
+        parts: Parts | None = None,
+        last: tuple[str, ...] = (),
+    ) -> Group:
+        options, each = self.options, max(self.gpus, 1)
+        if need == "all":
+            cpus, memory = options.cpus_per_gpu * each, options.memory_gb_per_gpu * each
+            machines = Machines(self.nodes, each, self.gpus, cpus, memory, options.time_minutes)
+        else:
+            machines = Machines(
+                1, 1, int(need == "gpu"), options.light_cpus, options.light_memory_gb, options.light_minutes
+            )
+        fields = [f"nodes={machines.nodes}", f"devices={machines.processes}"]
+        if need != "all":
+            fields.append(f"convert_workers={options.light_cpus}")
+        # A node whose driver is broken must not do a GPU's work on its CPU.
+        fields.append("accelerator=cpu" if need == "cpu" or self.gpus == 0 else "accelerator=gpu")
+        hardware = tuple(f"hardware.{field}" for field in fields)
+        return Group(name, need, stages, last, machines, hardware, before[-1].name if before else None, parts)
+
+
+def _cut(recipe: Recipe, gpus: int) -> list[tuple[Need, list[Stage]]]:
+    """Runs of stages that need the same, in an order that can run.
+
+    A stage is put forward into an earlier group where all that it reads is there: every group waits in the
+    queue once.
+    """
+    needs = _needs(recipe, gpus)
+    waiting = list(recipe.stages)
+    done: set[str] = set()
+    out: list[tuple[Need, list[Stage]]] = []
+    while waiting:
+        ready = [stage for stage in waiting if done.issuperset(stage.inputs.values())]
+        same = [stage for stage in ready if out and needs[stage.name] == out[-1][0]]
+        if not same:
+            out.append((needs[ready[0].name], []))
+            same = [ready[0]]
+        out[-1][1].append(same[0])
+        done.add(same[0].name)
+        waiting.remove(same[0])
+    return out
+
+
+def _needs(recipe: Recipe, gpus: int) -> dict[str, Need]:
+    """By stage: what trains, or divides its work, takes all; what reads a trained network takes one GPU."""
+    needs: dict[str, Need] = {}
+    for stage in recipe.stages:
+        if stage.kind.trains or stage.kind.shares:
+            needs[stage.name] = "all"
+        elif gpus and any(needs[name] != "cpu" for name in stage.inputs.values()):
+            needs[stage.name] = "gpu"
+        else:
+            needs[stage.name] = "cpu"
+    return needs
+
+
+def _parts_of(stages: Sequence[Stage], count: int) -> list[Parts]:
+    """The conversions among the stages as parts: the steps of all that come first, then the shards."""
+    if count == 1:
+        return []
+    found = [stage for stage in stages if isinstance(stage.config, ConvertConfig)]
+    first = [stage for stage in found if converter_named(stage.kind.name).features_first]
+    return [
+        *(Parts(stage.name, "features", count) for stage in first),
+        *(Parts(stage.name, "shards", count) for stage in found),
+    ]
+
+
+def _require_fit(recipe: Recipe, groups: Sequence[Group]) -> None:
+    """Refuse before anything waits in a queue what its group's processes could not run."""
+    for group in groups:
+        hardware = recipe.hardware.model_copy(
+            # What is installed here says nothing of the cluster, so loggers are not asked after.
+            update={"nodes": group.machines.nodes, "devices": group.machines.processes, "loggers": ()}
+        )
+        for name in group.stages:
+            try:
+                recipe.stage(name).config.require_fit(hardware)
+            except UserError as error:
+                raise UserError(f"stage {name}: {error}") from None
+
+
+def _word(text: str, longest: int) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:longest].strip("-")
+
+
+def _say_machines(group: Group) -> str:
+    machines = group.machines
+    if group.need == "all" and machines.gpus:
+        return f"{machines.nodes} x {machines.gpus} GPUs"
+    if group.need == "all":
+        return f"{machines.nodes} x 1 process"
+    return f"{machines.cpus} cores" + (", 1 GPU" if machines.gpus else "")

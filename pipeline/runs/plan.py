@@ -1,0 +1,318 @@
+"""What happens to each stage of a recipe in a run folder, and why.
+
+A stage's fingerprint covers its kind and version, its full resolved config, the seed, facts about outside
+files and the fingerprints of its inputs. A stage is finished when its folder holds an `artifact.json` with
+that fingerprint and every output it lists. Anything else runs, and whatever is below it has another
+fingerprint and runs too.
+
+A training of which only `train.steps` was raised goes on from its last checkpoint: `started.json` holds,
+next to the fingerprint, a digest of all that the fingerprint covers except the number of steps. Where that
+is the same and no learning-rate schedule ends with the training, what has been trained is the beginning of
+what is wanted.
+
+`--from` and `--force` run stages again. Until all of them are done the run folder keeps a note of that
+request, and each stage a note that it was begun for it, so the same command after a kill goes on instead of
+beginning again.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.contract.stage import Every, Stage, fingerprint_fields
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.runs.inputs import require_elsewhere
+from motionloom.pipeline.runs.recipe import Recipe
+from motionloom.pipeline.runs.resolve import Tree
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.files import fingerprint_of
+from motionloom.pipeline.store.run_folder import identity_of, stage_folder
+from motionloom.pipeline.training.config import TrainedStageConfig
+
+REQUEST_FILE = ".again.json"
+"""In the run folder, while stages are run again by request."""
+
+Action = Literal["skip", "run", "resume", "leave"]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which part of the graph to run."""
+
+    first: str | None = None
+    """Run this stage and all below it again."""
+    until: str | None = None
+    """Stop after this stage: only it and what it needs. Several with commas between them."""
+    only: str | None = None
+    """Just this stage; its inputs must be finished."""
+    force: bool = False
+    """Run the selected stages even if they are finished."""
+
+
+class Request(Config):
+    """`.again.json`: which command asked for stages to be run again."""
+
+    id: str
+    select: dict[str, str | bool | None]
+
+
+class Started(Config):
+    """`started.json`: what is being made in a stage's folder."""
+
+    fingerprint: str
+    extendable: dict[str, int | str] | None = None
+    """A training's steps, and the digest of everything else."""
+    request: str | None = None
+    """The request for which the stage is run again."""
+
+    @staticmethod
+    def find(folder: Path) -> Started | None:
+        """What was begun last in a stage's folder."""
+        path = folder / "started.json"
+        return Started.load_json(path) if path.is_file() else None
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """One row of the plan."""
+
+    stage: Stage
+    fingerprint: str
+    action: Action
+    reason: str
+    asked: bool = False
+    """The selection names it to run again (`--from`, `--force`)."""
+    extendable: dict[str, int | str] | None = None
+    """What a longer training would be compared with."""
+    request: Request | None = None
+    """The request for which the stage is run again."""
+    identities: Mapping[str, str] = field(default_factory=dict)
+    """What its inputs from outside were when the plan was made."""
+
+
+def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
+    """Decide for every stage, in order, what happens to it."""
+    select = select or Selection()
+    wanted = selected(recipe, select)
+    forced = _descendants(recipe, select.first) if select.first else set()
+    if select.force:
+        forced |= wanted
+    request, done = _request(run, select, forced) if forced else (None, set())
+    plan: list[PlannedStage] = []
+    rows: dict[str, PlannedStage] = {}
+    for stage in recipe.stages:
+        require_elsewhere(run, stage, recipe.outside)
+        facts = _facts(recipe, stage, rows)
+        fingerprint, others = fingerprint_of(facts), extendable(stage, facts)
+        again = request if stage.name in forced else None
+        if again is not None and stage.name not in done:
+            action, reason = _decide_again(stage, fingerprint, run, again, select)
+        else:
+            action, reason = _decide(recipe, stage, fingerprint, run, rows, forced)
+        if action == "run" and again is None:
+            longer = extension(stage, others, stage_folder(run, stage.name))
+            if longer is not None:
+                action, reason = ("resume" if longer[0] else "run"), longer[1]
+        if stage.name not in wanted and action != "skip":
+            action, reason = "leave", "not selected"
+        identities = {n: _fingerprint(recipe, n, rows) for n in stage.inputs.values() if n in recipe.outside}
+        rows[stage.name] = PlannedStage(
+            stage, fingerprint, action, reason, again is not None, others, again, identities
+        )
+        plan.append(rows[stage.name])
+    if select.only:
+        for role, name in recipe.stage(select.only).inputs.items():
+            if name in rows and rows[name].action != "skip":
+                raise UserError(
+                    f"--only {select.only}: its input '{role}' ({name}) is not finished; run it first"
+                )
+    return plan
+
+
+def require_fit(rows: Sequence[PlannedStage], hardware: Hardware) -> None:
+    """Refuse, before anything runs, stages whose settings cannot run on this hardware."""
+    for row in rows:
+        try:
+            row.stage.config.require_fit(hardware)
+        except UserError as error:
+            raise UserError(f"stage {row.stage.name}: {error}") from None
+
+
+def selected(recipe: Recipe, select: Selection) -> set[str]:
+    """Names of the stages that may run; refuses selections that contradict each other."""
+    first, until, only = select.first, select.until, select.only
+    last = [name.strip() for name in until.split(",")] if until is not None else []
+    named = [("--from", first), *(("--until", name) for name in last), ("--only", only)]
+    for option, name in named:
+        if name is not None:
+            recipe.stage(name, option)
+    for option, name in (("--from", first), ("--until", until)):
+        if only and name and name != only:
+            raise UserError(f"--only {only} runs that stage alone: leave {option} {name} out")
+    needed = _ancestors(recipe, *last)
+    if first and until and first not in needed:
+        raise UserError(
+            f"--from {first} --until {until}: '{until}' does not need '{first}', so there is nothing between "
+            f"them; leave one out"
+        )
+    if first and select.force and not only:
+        raise UserError(
+            f"--from {first} runs that stage and those below it again, --force all that are selected: leave "
+            f"one out"
+        )
+    if only:
+        return {only}
+    return needed if until is not None else {stage.name for stage in recipe.stages}
+
+
+def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> Tree:
+    """What a stage's fingerprint is the digest of."""
+    facts = {
+        "kind": stage.kind.name,
+        "version": stage.kind.version,
+        "seed": recipe.seed_of(stage),
+        "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
+        "external": stage.kind.external(stage.config),
+        "inputs": {role: _fingerprint(recipe, name, rows) for role, name in stage.inputs.items()},
+    }
+    if any(isinstance(role, Every) for role in stage.kind.roles()):
+        facts["order"] = list(stage.inputs)  # the first of several generators is the default
+    return facts
+
+
+def _fingerprint(recipe: Recipe, name: str, rows: Mapping[str, PlannedStage]) -> str:
+    """An input's fingerprint, or its identity where it comes from outside."""
+    if name in rows:
+        return rows[name].fingerprint
+    return str(identity_of(recipe.outside[name].folder))
+
+
+def _request(run: Path, select: Selection, forced: set[str]) -> tuple[Request, set[str]]:
+    """The request of this command, begun before or now, and the stages that are done for it."""
+    path, asked = run / REQUEST_FILE, asdict(select)
+    if path.is_file():
+        found = Request.load_json(path)
+        if found.select == asked:
+            done = {name for name in forced if _done(stage_folder(run, name), found)}
+            if done != forced:
+                return found, done
+    return Request(id=secrets.token_hex(8), select=asked), set()
+
+
+def _done(folder: Path, request: Request) -> bool:
+    started = Started.find(folder)
+    return started is not None and started.request == request.id and Artifact.find(folder) is not None
+
+
+def _decide_again(
+    stage: Stage, fingerprint: str, run: Path, request: Request, select: Selection
+) -> tuple[Action, str]:
+    """The action of a stage that must run again and has not yet."""
+    reason = "forced" if select.force else f"from {select.first}"
+    started = Started.find(stage_folder(run, stage.name))
+    if started is not None and started.request == request.id and started.fingerprint == fingerprint:
+        return "resume", f"{reason}; started earlier, not finished"
+    return "run", reason
+
+
+def _decide(
+    recipe: Recipe,
+    stage: Stage,
+    fingerprint: str,
+    run: Path,
+    rows: dict[str, PlannedStage],
+    forced: set[str],
+) -> tuple[Action, str]:
+    folder = stage_folder(run, stage.name)
+    artifact, started = Artifact.find(folder), Started.find(folder)
+    resumes = started is not None and started.fingerprint == fingerprint
+    if artifact is None or artifact.fingerprint != fingerprint:
+        if resumes:
+            return "resume", "started earlier, not finished"
+        if artifact is not None:
+            return "run", _difference(recipe, artifact, stage, rows)
+        return "run", "never run" if started is None else "settings changed before it finished"
+    gone = artifact.missing(folder)
+    if gone:
+        return "run", f"output {gone} is gone or has another size"
+    above = [n for n in stage.inputs.values() if n in forced and rows[n].action in {"run", "resume"}]
+    if above:
+        return "run", f"below {above[0]}"
+    return "skip", "finished"
+
+
+def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[str, PlannedStage]) -> str:
+    if artifact.kind != stage.kind.name or artifact.version != stage.kind.version:
+        return f"{artifact.kind} v{artifact.version} is now {stage.kind.name} v{stage.kind.version}"
+    changes = list(_changed_fields(artifact.config, stage.config.dump()))
+    if changes:
+        more = f" (+{len(changes) - 1} more)" if len(changes) > 1 else ""
+        return f"changed: {changes[0]}{more}"
+    for role, name in stage.inputs.items():
+        old = artifact.inputs.get(role)
+        if old is None or old.fingerprint != _fingerprint(recipe, name, rows):
+            return f"input {name} changed"
+    return "seed, source files or the order of inputs changed"
+
+
+def _changed_fields(old: object, new: object, prefix: str = "") -> Iterator[str]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            yield from _changed_fields(old.get(key), new.get(key), f"{prefix}.{key}" if prefix else key)
+    elif old != new:
+        yield f"{prefix} {old} -> {new}"
+
+
+def _ancestors(recipe: Recipe, *names: str) -> set[str]:
+    """These stages and all that they need."""
+    out: set[str] = set()
+    todo = list(names)
+    while todo:
+        current = todo.pop()
+        out.add(current)
+        todo += [stage.name for stage in recipe.above(recipe.stage(current))]
+    return out
+
+
+def _descendants(recipe: Recipe, name: str) -> set[str]:
+    out = {name}
+    for stage in recipe.stages:
+        if out & set(stage.inputs.values()):
+            out.add(stage.name)
+    return out
+
+
+def extendable(stage: Stage, facts: Tree) -> dict[str, int | str] | None:
+    """What `started.json` keeps of a stage that trains: its steps, and a digest of the other facts."""
+    if not isinstance(stage.config, TrainedStageConfig):
+        return None
+    fields = dict(facts["config"])
+    fields["train"] = {name: value for name, value in fields["train"].items() if name != "steps"}
+    return {"steps": stage.config.train.steps, "others": fingerprint_of({**facts, "config": fields})}
+
+
+def extension(stage: Stage, wanted: Mapping[str, int | str] | None, folder: Path) -> tuple[bool, str] | None:
+    """Whether a stage whose fingerprint has changed goes on from its checkpoints, and why (not).
+
+    None where more than its steps has changed, or they became fewer, or nothing is there to go on from.
+    """
+    started = Started.find(folder)
+    before = None if started is None else started.extendable
+    if wanted is None or before is None or before["others"] != wanted["others"]:
+        return None
+    if int(before["steps"]) >= int(wanted["steps"]):
+        return None
+    steps = f"train.steps {before['steps']} -> {wanted['steps']}"
+    assert isinstance(stage.config, TrainedStageConfig)
+    schedule = stage.config.schedule_of_length()
+    if schedule is not None:
+        return False, f"changed: {steps}, and {schedule} depends on it"
+    if not any((folder / "checkpoints").glob("*.ckpt")):
+        return None
+    return True, f"{steps}: goes on from its last checkpoint"

@@ -1,0 +1,391 @@
+"""A recipe as plain data, from all that says something about it: one walk, `resolve`.
+
+    extends: humantomato-tiny     # another recipe: a file next to this one, or a shipped one
+    name: mine
+    start: synthetic              # a trained model to go on from: of the package, an export or a run
+    defaults:
+      trained: {optim: {schedule: cosine}, train: {precision: bf16-mixed, batch_size: 256}}
+      vq: {net: {width: 256}}
+    stages:
+      data: {kind: bvh, source: mocap, captions: mocap/captions.jsonl, licence: unknown}
+      tokenizer: {train: {steps: 300}}
+      face_gpt: null
+
+The later layer wins: what is extended, the file itself, `--set`. Mappings merge key by key, lists are
+replaced whole; a stage of another kind replaces the old one whole, and `null` removes it. Then each stage's
+entry goes over what the `start` model says of it and over the `defaults` of its kind, and those over
+`trained`, which concerns all stages that train.
+
+With `start`, a stage without a `kind` is trained on from the model's stage of that name: same kind, same
+settings but for `optim` and `train`. What the recipe does not train is the model's own: its statistics, its
+tokenizer, its TMA. Data come in the model's layout and frame rate, and `generate` takes along its faces.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError, explain
+from motionloom.pipeline.contract.stage import Every, Finished, StageConfig, stage_kinds
+from motionloom.pipeline.store.run_folder import BUNDLE_FILE, is_place
+from motionloom.pipeline.store.weights import load_facts
+from motionloom.pipeline.store.yaml import load_yaml, read_yaml
+from motionloom.pipeline.training.config import TrainedStageConfig
+
+Tree = dict[str, Any]
+"""Plain data of a recipe: what YAML and JSON know."""
+
+START = "start"
+"""Key of a recipe, and the role in which a stage takes the network that it goes on from."""
+TRAINED = "trained"
+"""The defaults of every stage that trains."""
+
+_DEEPEST = 4
+_TOP = ("name", "description", "seed", "data_seed", "hardware", START, "defaults", "stages")
+_OWN = ("optim", "train")
+"""Settings that a training does not take over from the model it starts from."""
+_COMPLETED_LATER = {"missing", "value_error"}
+"""What may be wrong with defaults, since a stage's own entry completes them."""
+
+
+@dataclass
+class Resolved:
+    """A recipe with every layer applied; `stages` says all of each stage but the defaults of its config."""
+
+    data: Tree
+    where: str
+    """For messages."""
+    removed: dict[str, str] = field(default_factory=dict)
+    """Stages that a layer has left out, and the file or option that did."""
+
+
+def shipped_recipes() -> dict[str, Path]:
+    """Recipes that come with the package, by name: `FOLDER/SIZE.yaml` is called `FOLDER-SIZE`, `NAME.yaml` at
+    the top `NAME`.
+    """
+    folder = Path(str(resources.files("motionloom.configs")))
+    found = {f"{path.parent.name}-{path.stem}": path for path in folder.glob("*/*.yaml")}
+    found |= {path.stem: path for path in folder.glob("*.yaml")}
+    return dict(sorted(found.items()))
+
+
+def find_recipe(name_or_path: str) -> Path:
+    """A recipe file by path, or a shipped recipe by name; `FOLDER/SIZE` is a name too."""
+    path = Path(name_or_path)
+    if path.suffix in {".yaml", ".yml"}:
+        if not path.is_file():
+            raise UserError(f"{path}: no such recipe file")
+        return path
+    shipped, name = shipped_recipes(), name_or_path.replace("/", "-")
+    if name not in shipped:
+        raise UserError(f"no recipe '{name_or_path}'{nearest(name, list(shipped))} (or give a .yaml file)")
+    return shipped[name]
+
+
+def nearest(name: str, valid: Sequence[str], shown: Sequence[str] | None = None) -> str:
+    """A hint to append: did you mean 'x'?, or the list of valid names, or else of those `shown`."""
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    names = valid if shown is None else shown
+    return f"; did you mean '{near[0]}'?" if near else f"; valid names: {', '.join(names)}"
+
+
+def resolve(path: Path, overrides: Sequence[str] = ()) -> Resolved:
+    """Read a recipe and all that it builds on, apply `--set`, and write out what its stages share."""
+    where = f"{path} with --set" if overrides else str(path)
+    out = Resolved({}, where)
+    _read(path, out)
+    # Defaults of what is extended may concern stages that this recipe has replaced; its own may not.
+    _require_used(read_file(path).get("defaults"), out.data.get("stages"), str(path))
+    known = set(out.data.get("defaults") or ())
+    for text in overrides:
+        _override(out, text)
+    data = out.data
+    name, stages, defaults = data.pop(START, None), data.get("stages"), data.pop("defaults", None) or {}
+    if not isinstance(defaults, dict):
+        raise UserError(f"{where}: defaults must map kinds of stages to settings")
+    for key, fields in defaults.items():
+        _require_default(key, fields, where)
+    if not isinstance(stages, dict):
+        return out
+    model = None if name is None else StartingModel.open(name, where)
+    missing = {} if model is None else {r: one for r, one in model.stages.items() if r not in stages}
+    for key, entry in stages.items():
+        if not isinstance(entry, dict):
+            continue  # refused as the recipe is parsed
+        if model is not None:
+            entry = model.entry(key, entry, missing, where)
+        elif "kind" not in entry:
+            others = [other for other, its in stages.items() if isinstance(its, dict) and "kind" in its]
+            hint = f", nor has a recipe that it extends{nearest(key, others)}" if others else ""
+            raise UserError(f"{where}: stages.{key} says no kind{hint}")
+        shared: Tree = {}
+        for concerning in _defaults_of(entry):
+            shared = merge(shared, defaults.get(concerning, {}))
+        stages[key] = merge(shared, entry)
+    _require_used(defaults.keys() - known, stages, where)
+    return out
+
+
+def merge(base: Tree, change: Tree) -> Tree:
+    """`change` over `base`, mappings key by key; neither is altered."""
+    out = dict(base)
+    for key, value in change.items():
+        old = out.get(key)
+        out[key] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return out
+
+
+# Files and what they extend.
+
+
+def read_file(path: Path) -> Tree:
+    """One recipe file alone; places in it are as seen from here."""
+    data = read_yaml(path)
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: a recipe is a mapping with 'name' and 'stages'")
+    start = data.get(START)
+    if isinstance(start, str) and (path.parent / Path(start).expanduser()).is_dir():
+        data[START] = str(path.parent / Path(start).expanduser())
+    if isinstance(data.get("stages"), dict):
+        data["stages"] = {name: _placed(entry, path.parent) for name, entry in data["stages"].items()}
+    return data
+
+
+def _read(path: Path, out: Resolved, depth: int = 0) -> None:
+    data = read_file(path)
+    base = data.pop("extends", None)
+    if base is None:
+        out.data = data
+        return
+    if depth > _DEEPEST:
+        raise UserError(f"{path}: 'extends' goes in a circle or more than four files deep")
+    beside = path.parent / (str(base) if str(base).endswith((".yaml", ".yml")) else f"{base}.yaml")
+    _read(beside if beside.is_file() else find_recipe(str(base)), out, depth + 1)
+    old, new = out.data.get("stages"), data.get("stages")
+    out.data = merge(out.data, {key: value for key, value in data.items() if key != "stages"})
+    if not isinstance(old, dict) or not isinstance(new, dict):
+        out.data["stages"] = new if "stages" in data else old
+        return
+    stages = dict(old)
+    for name, entry in new.items():
+        before = old.get(name)
+        if entry is None:
+            _require_there(str(name), old, f"{path}: stages.{name} is null and")
+            del stages[name]
+            out.removed[str(name)] = f"stages.{name}: null in {path}"
+            continue
+        out.removed.pop(name, None)
+        if isinstance(before, dict) and isinstance(entry, dict):
+            same = entry.get("kind", before.get("kind")) == before.get("kind")
+            stages[name] = merge(before, entry) if same else entry
+        else:
+            stages[name] = entry
+    out.data["stages"] = stages
+
+
+def _require_there(name: str, stages: Iterable[str], where: str) -> None:
+    if name not in stages:
+        raise UserError(f"{where} there is no such stage to remove{nearest(name, list(stages))}")
+
+
+# `--set`.
+
+
+def _override(out: Resolved, text: str) -> None:
+    """Apply one `--set`: `stage.field=value`, `seed=8`, or `stage=null`, which leaves the stage out."""
+    key, equals, value = text.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise UserError(f"--set {text}: write it as stage.field=value")
+    new, stages = load_yaml(value, f"--set {text}"), out.data.get("stages") or {}
+    if parts[0] not in _TOP:
+        if parts[0] not in stages:
+            hint = nearest(parts[0], [*stages, *_TOP], list(stages))
+            by = out.removed.get(parts[0])
+            raise UserError(f"--set {text}: no stage '{parts[0]}'{hint if by is None else f'; {by}'}")
+        parts = ["stages", *parts]
+    if parts[0] == "stages" and len(parts) == 2 and new is None:
+        _require_there(parts[1], stages, f"--set {text}:")
+        del stages[parts[1]]
+        out.removed[parts[1]] = f"--set {text}"
+        return
+    # A value replaces what is there, a mapping too.
+    out.data = _put(out.data, parts, new)
+    if parts[0] == "stages" and len(parts) > 2:
+        out.data["stages"][parts[1]] = _placed(out.data["stages"][parts[1]], None)
+
+
+def _put(data: object, parts: Sequence[str], value: object) -> Any:
+    if not parts:
+        return value
+    old = data if isinstance(data, dict) else {}
+    return {**old, parts[0]: _put(old.get(parts[0]), parts[1:], value)}
+
+
+# Stages of other runs, as `inputs` name them.
+
+
+def place_name(folder: Path) -> str:
+    """A stage outside the run as a loaded recipe names it: from the current folder if it is below it."""
+    place, here = folder.resolve(), Path.cwd()
+    name = str(place.relative_to(here)) if place.is_relative_to(here) else str(place)
+    return name if is_place(name) else f"./{name}"
+
+
+def _placed(entry: Any, folder: Path | None) -> Any:
+    """A stage's entry with its inputs' paths seen from here; `folder` is where the recipe is."""
+
+    def seen(value: Any) -> Any:
+        if isinstance(value, list):
+            return [seen(one) for one in value]
+        if not isinstance(value, str) or not is_place(value):
+            return value
+        written = Path(value).expanduser()
+        if folder is not None and ((folder / written).exists() or value.startswith("../")):
+            return place_name(folder / written)
+        return place_name(written)
+
+    if not isinstance(entry, dict) or not isinstance(entry.get("inputs"), dict):
+        return entry
+    return {**entry, "inputs": {role: seen(value) for role, value in entry["inputs"].items()}}
+
+
+# `defaults:`.
+
+
+def _defaults_of(entry: Mapping[str, object]) -> list[str]:
+    """The keys of `defaults` that concern an entry, the most general first."""
+    kind = stage_kinds().get(str(entry.get("kind")))
+    if kind is None:
+        return []
+    return [TRAINED, kind.name] if issubclass(kind.config, TrainedStageConfig) else [kind.name]
+
+
+def _require_used(keys: Iterable[str] | None, stages: object, where: str) -> None:
+    """Refuse defaults that concern no stage."""
+    entries = [one for one in stages.values() if isinstance(one, dict)] if isinstance(stages, dict) else []
+    if any("kind" not in entry for entry in entries):
+        return  # of the kinds of the model that the recipe starts from
+    concerned = {key for entry in entries for key in _defaults_of(entry)}
+    for key in keys or ():
+        if key not in concerned and (key == TRAINED or key in stage_kinds()):
+            whom = "that trains" if key == TRAINED else f"of kind {key}"
+            raise UserError(f"{where}: defaults.{key} concerns no stage: there is none {whom}; leave it out")
+
+
+def _require_default(key: str, fields: object, where: str) -> None:
+    """Refuse keys that no such stage has, and values that cannot be right in any."""
+    kinds = stage_kinds()
+    if key != TRAINED and key not in kinds:
+        raise UserError(f"{where}: defaults.{key}: no stage kind '{key}'{nearest(key, [TRAINED, *kinds])}")
+    config: type[StageConfig] = TrainedStageConfig if key == TRAINED else kinds[key].config
+    try:
+        config.model_validate(fields)
+    except ValidationError as error:
+        lines = explain(error, config, f"{where}: defaults.{key}").splitlines()
+        pairs = zip(error.errors(), lines, strict=False)
+        wrong = [line for item, line in pairs if item["type"] not in _COMPLETED_LATER]
+        if wrong:
+            raise UserError("\n".join(wrong)) from None
+
+
+# `start:`.
+
+
+@dataclass(frozen=True)
+class StartingModel:
+    """A trained GPT and what it was trained with."""
+
+    name: str
+    stages: Mapping[str, Finished]
+    """By role: gpt, tokenizer, stats, and tma where it has one."""
+    faces: tuple[Finished, ...]
+    """Its generators of faces."""
+    layout: MotionLayout
+    """Layout and frame rate of its motion."""
+
+    @staticmethod
+    def open(name: object, where: str) -> StartingModel:
+        """The model in a folder, or of the package; `where` is what names it, for messages."""
+        if not isinstance(name, str):
+            raise UserError(f"{where}: {START} must be the name or the folder of a trained model")
+        made = _generators(name, f"{where}: {START} = '{name}'")
+        gpts = [stage for stage in made if stage.kind.name == "gpt" and not stage.config.face]
+        if not gpts:
+            kinds = ", ".join(dict.fromkeys(stage.kind.name for stage in made)) or "nothing"
+            raise UserError(
+                f"{where}: {START} = '{name}': trainings start from a model whose body is made by a stage of "
+                f"kind gpt; this one has {kinds}"
+            )
+        gpt, tokenizer = gpts[0], gpts[0].inputs["tokenizer"]
+        stages = {"gpt": gpt, "tokenizer": tokenizer, "stats": tokenizer.inputs["stats"]}
+        if "tma" in gpt.inputs:
+            stages["tma"] = gpt.inputs["tma"]
+        faces = tuple(stage for stage in made if stage not in gpts and _of_face(stage))
+        return StartingModel(name, stages, faces, load_facts(tokenizer.folder).layout.layout())
+
+    def entry(self, key: str, entry: Tree, missing: Mapping[str, Finished], where: str) -> Tree:
+        """A stage's entry with what the model says of it."""
+        inputs: Tree = dict(entry.get("inputs") or {})
+        if "kind" not in entry:
+            stage = self.stages.get(key)
+            if stage is None or not stage.kind.trains:
+                known = [role for role, found in self.stages.items() if found.kind.trains]
+                raise UserError(
+                    f"{where}: stages.{key} has no kind, and {START} '{self.name}' has no '{key}' to go on "
+                    f"from{nearest(key, known)}"
+                )
+            settings = {name: value for name, value in stage.config.dump().items() if name not in _OWN}
+            entry = merge({"kind": stage.kind.name, **settings}, entry)
+            inputs.setdefault(START, place_name(stage.folder))
+        kind = stage_kinds().get(str(entry["kind"]))
+        if kind is None:
+            return entry  # refused by its name later
+        roles = {role.name: role for role in kind.roles()}
+        for role, stage in missing.items():
+            if role in roles and not isinstance(roles[role], Every):
+                inputs.setdefault(role, place_name(stage.folder))
+        if kind.name == "generate" and self.faces and "gpt" not in missing:
+            # Faces are none of what is trained here, and go with the model.
+            inputs.setdefault("generators", ["gpt", *(place_name(stage.folder) for stage in self.faces)])
+        entry = entry | self._layout(key, entry, kind.config, where)
+        return {**entry, "inputs": inputs} if inputs else entry
+
+    def _layout(self, key: str, entry: Tree, config: type[StageConfig], where: str) -> Tree:
+        """Layout and frame rate of an entry that brings data: the model's."""
+        wanted = {"layout": self.layout.name, "fps": self.layout.fps}
+        out = {name: value for name, value in wanted.items() if name in config.model_fields}
+        for name, value in out.items():
+            if entry.get(name, value) != value:
+                raise UserError(
+                    f"{where}: stages.{key}.{name} = {entry[name]}, but {START} '{self.name}' was trained on "
+                    f"{name} {value}; leave it out"
+                )
+        return out
+
+
+def _generators(name: str, where: str) -> list[Finished]:
+    # What opens models is imported where a recipe starts from one.
+    from motionloom.pipeline.contract.lookup import generators_of, open_exported
+    from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
+
+    folder = model_folder(Path(name).expanduser())
+    if (folder / BUNDLE_FILE).is_file():
+        return open_exported(folder)
+    if (folder / "recipe.yaml").is_file():
+        return generators_of(folder)
+    if not folder.exists():
+        raise UserError(f"{where}: {no_such_model(name)}")
+    raise UserError(f"{where}: neither an export nor a run; name the folder of one")
+
+
+def _of_face(stage: Finished) -> bool:
+    return bool(getattr(stage.config, "face", False)) or getattr(stage.config, "part", "") == "face"

@@ -1,0 +1,269 @@
+"""`motionloom launch`: a recipe on SLURM, one batch script a group, each waiting for the one before.
+
+- `--dependency=afterok` with `--kill-on-invalid-dep`: a group starts when the one before has succeeded, and
+  is cancelled when that can no longer happen. A job that is queued again keeps its id, so what waits for it
+  goes on waiting.
+- Preemption and broken nodes queue a job again (`--requeue`). A time limit would not: the batch script is
+  warned before it, passes the warning on, and queues itself again once the command has ended. A training
+  saves the step that it is at, so none is made twice. A node that breaks costs at most
+  `train.checkpoint_every` steps.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from motionloom.datasets.base.files import write_text
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch.process import SAVED
+from motionloom.pipeline.runs.dry_run import explain_replacements, replaced_stages
+from motionloom.pipeline.runs.launch_plan import Group, LaunchPlan, SlurmOptions, make_launch_plan
+from motionloom.pipeline.runs.plan import make_plan
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.store.files import require_folder
+
+LOG_FOLDER = ".slurm"
+"""Inside the run folder: scripts and logs of the jobs. May be deleted when all is over."""
+
+PYTHON = (sys.executable, "-P")
+"""This Python, which must lie under the same path on every node."""
+
+PROGRAM = (*PYTHON, "-m", "motionloom.pipeline.cli.main")
+
+RECIPE_FILE = "recipe.yaml"
+"""The resolved recipe of a launch, next to its scripts."""
+
+_SIGNALS = """\
+child= warned= came= early=
+pass_on() {{  # to the command: a training saves the step it is at, and ends
+  came=1
+  if [ -n "$child" ]; then kill -s "$1" "$child" 2> /dev/null || true; else early=$1; fi
+}}
+warn() {{
+  came=1
+  [ "${{SLURM_RESTART_COUNT:-0}}" -lt {requeues} ] || return 0  # it may still finish
+  warned=1
+  pass_on USR1
+}}
+trap warn USR1
+trap 'pass_on TERM' TERM
+"""
+"""SLURM warns the script with USR1, and ends all with TERM: a preemption, a time limit or a scancel.
+
+A preemption with a grace time begins with TERM to what srun has started. Once that has saved and ended, the
+job would be over, and failed, before SLURM queues it again: the script does so itself.
+"""
+
+_WAIT = """\
+child=$!
+[ -z "$early" ] || pass_on "$early"
+code=0
+wait "$child" || code=$?
+while [ -n "$came" ]; do  # a signal ended the wait, not the command
+  came=
+  ended=0
+  wait "$child" || ended=$?
+  [ "$ended" -eq 127 ] || code=$ended
+done
+# {saved}: a training is saved. 138: the warning ended a command that has nothing to save.
+# A job that was cancelled is not RUNNING any more; queued again it would come back.
+again=
+state=$(squeue --noheader --jobs={job} --format=%T 2> /dev/null) || state=
+if [ -n "$warned" ] && [ "${{state:-RUNNING}}" = RUNNING ]; then
+  if [ "$code" -eq {saved} ] || [ "$code" -eq 138 ]; then again="the time limit is near"; fi
+elif [ "$code" -eq {saved} ] && [ "$state" = RUNNING ]; then
+  again="asked to end"  # the grace time of a preemption
+fi
+if [ -n "$again" ] && scontrol requeue {job}; then
+  echo "$again: queued again, goes on from there"
+  trap - TERM
+  sleep 3600  # SLURM ends this try
+fi
+exit "$code"
+"""
+
+
+@dataclass(frozen=True)
+class Script:
+    """A group as sbatch takes it."""
+
+    group: Group
+    path: Path
+    text: str
+
+    def submit(self, after: str | None) -> list[str]:
+        """The command that submits it to start after the job `after`."""
+        waiting = [f"--dependency=afterok:{after}"] if after else []
+        return ["sbatch", "--parsable", *waiting, str(self.path)]
+
+
+def launch_recipe(
+    recipe: str | Path,
+    *,
+    nodes: int = 1,
+    gpus_per_node: int = 8,
+    out: Path | None = None,
+    overrides: Sequence[str] = (),
+    options: Sequence[str] = (),
+    dry_run: bool = False,
+    console: Console,
+) -> LaunchPlan:
+    """Submit a recipe to SLURM; with `dry_run` the plan and the scripts are printed and nothing is written.
+
+    `options` are `KEY=VALUE` words of `SlurmOptions`.
+    """
+    loaded, asked = load_recipe(recipe, overrides), SlurmOptions.from_words(options)
+    run = out or Path("runs") / loaded.name
+    require_folder(run)
+    if (run / "recipe.yaml").is_file():
+        refusal = explain_replacements(run, loaded.name, replaced_stages(run, make_plan(loaded, run)))
+        if refusal is not None:
+            raise UserError(refusal)
+    plan = make_launch_plan(
+        loaded,
+        asked,
+        given=None if Path(recipe).suffix in {".yaml", ".yml"} else str(recipe),
+        overrides=overrides,
+        out=run.absolute(),
+        nodes=nodes,
+        gpus_per_node=gpus_per_node,
+    )
+    console.print(plan.table())
+    if dry_run:
+        _show_scripts(plan, asked, console)
+    else:
+        submit_run(plan, asked, console)
+    return plan
+
+
+def _show_scripts(plan: LaunchPlan, options: SlurmOptions, console: Console) -> None:
+    folder = Path(plan.out) / LOG_FOLDER / "DATE-TIME"
+    if plan.given is None:
+        line = f"would write {folder / RECIPE_FILE}: the resolved recipe"
+        console.print(line, soft_wrap=True, markup=False)
+    before: str | None = None
+    for script in slurm_scripts(plan, options, folder, Path.cwd()):
+        console.print(f"\n{script.path}:\n{script.text}", soft_wrap=True, markup=False)
+        console.print(" ".join(script.submit(before)), soft_wrap=True, markup=False)
+        before = f"ID-OF-{script.group.name}"
+
+
+def slurm_scripts(plan: LaunchPlan, options: SlurmOptions, folder: Path, cwd: Path) -> list[Script]:
+    """The batch scripts of a plan, to be written into `folder`; jobs run in `cwd`."""
+    return [
+        Script(group, folder / f"{group.name}.sbatch", _text(plan, group, options, folder, cwd))
+        for group in plan.groups
+    ]
+
+
+def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> list[str]:
+    """Write the scripts into the run folder and submit them; the job ids."""
+    if shutil.which("sbatch") is None:
+        raise UserError("no sbatch here: start this where jobs are submitted, or look with --dry-run")
+    folder = _new_folder(Path(plan.out) / LOG_FOLDER)
+    if plan.given is None:
+        write_text(folder / RECIPE_FILE, plan.recipe.to_yaml())
+    scripts = slurm_scripts(plan, options, folder, Path.cwd())
+    for script in scripts:
+        write_text(script.path, script.text)
+    ids: list[str] = []
+    for script in scripts:
+        asked = subprocess.run(script.submit(ids[-1] if ids else None), capture_output=True, text=True)
+        if asked.returncode != 0:
+            if ids:
+                subprocess.run(["scancel", *ids], capture_output=True)
+            raise UserError(f"sbatch refused {script.path}: {asked.stderr.strip()}")
+        ids.append(asked.stdout.strip().partition(";")[0])
+        after = f", after job {ids[-2]}" if len(ids) > 1 else ""
+        console.print(f"{script.group.name}: job {ids[-1]}{after}")
+    console.print(
+        f"watch: squeue --jobs {','.join(ids)}; stop: scancel {' '.join(ids)}; logs: {folder}",
+        soft_wrap=True,
+        markup=False,
+    )
+    return ids
+
+
+def _new_folder(parent: Path) -> Path:
+    """A folder of its own for every submission."""
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    for number in range(1000):
+        folder = parent / (f"{stamp}-{number}" if number else stamp)
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            continue
+    raise UserError(f"{parent}: too many submissions in one second")
+
+
+def _text(plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, cwd: Path) -> str:
+    lines = ["#!/bin/bash", *(_directive(*one) for one in _options(plan, group, options, folder, cwd))]
+    job = '"$SLURM_JOB_ID"'
+    if group.parts is not None:
+        job = '"${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"'
+    lines += [_SIGNALS.format(requeues=options.requeues).rstrip()]
+    lines += [f"{shlex.join(_command(plan, group, folder))} &"]
+    lines += [_WAIT.format(job=job, saved=SAVED).rstrip()]
+    return "\n".join(lines) + "\n"
+
+
+def _options(
+    plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, cwd: Path
+) -> list[tuple[str, str | None]]:
+    machines, parts = group.machines, group.parts
+    partition = options.partition if machines.gpus else options.light_partition or options.partition
+    log = f"{str(folder / group.name).replace('%', '%%')}-{'%A_%a' if parts else '%j'}.log"
+    asked: list[tuple[str, str | None]] = [
+        ("job-name", plan.job(group)),
+        ("partition", partition),
+        ("account", options.account),
+        ("qos", options.qos),
+        ("nodes", str(machines.nodes)),
+        ("ntasks-per-node", str(machines.processes)),
+        ("cpus-per-task", str(machines.cpus // machines.processes)),
+        ("gpus-per-node", str(machines.gpus) if machines.gpus else None),
+        ("mem", f"{max(1, round(machines.memory_gb * 1024))}M"),
+        ("time", str(machines.minutes)),
+        ("array", f"0-{parts.count - 1}" if parts else None),
+        ("chdir", str(cwd)),
+        ("output", log),
+        ("open-mode", "append"),
+        ("signal", f"B:USR1@{options.warn_seconds}"),
+        ("kill-on-invalid-dep", "yes"),
+        *options.extra.items(),
+    ]
+    return [("requeue", None), *((name, value) for name, value in asked if value is not None)]
+
+
+def _directive(name: str, value: str | None) -> str:
+    """A line for sbatch, which splits it at blanks and knows quotes and backslashes, but is no shell."""
+    if value is None:
+        return f"#SBATCH --{name}"
+    if not all(character.isalnum() or character in "-_./:,@%=+" for character in value):
+        value = '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return f"#SBATCH --{name}={value}"
+
+
+def _command(plan: LaunchPlan, group: Group, folder: Path) -> Sequence[str]:
+    recipe = str(folder / RECIPE_FILE)
+    if group.parts is not None:
+        return plan.part_command(group.parts, recipe, PYTHON)
+    command, machines = plan.command(group, recipe, PROGRAM), group.machines
+    if machines.nodes * machines.processes == 1:
+        return command
+    asked = [f"--nodes={machines.nodes}", f"--ntasks-per-node={machines.processes}"]
+    asked += [f"--cpus-per-task={machines.cpus // machines.processes}"]
+    if machines.gpus:
+        # All GPUs of a node for each of its processes, which choose theirs.
+        asked.append(f"--gpus-per-node={machines.gpus}")
+    return ["srun", *asked, "--kill-on-bad-exit=1", *command]

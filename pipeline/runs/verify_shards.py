@@ -1,0 +1,129 @@
+"""Before a stage reads shards: each is compared with its sha256, once as long as the file does not change.
+
+What has been compared is noted in `.compared.json` of the run folder, so the next stage, and the same command
+after a kill, only looks whether the files are as they were. Processes that see the same files (those of one
+machine, or all of them on a shared file system) compare a share each; a machine with a copy of its own
+compares all of it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from motionloom.datasets.base.progress import Meter, duration
+from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.shards.checksums import LocalShard, problems
+from motionloom.pipeline.contract.stage import StageContext
+from motionloom.pipeline.launch.hardware import usable_cores
+from motionloom.pipeline.launch.process import JointError
+from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.store.data import local_shards
+from motionloom.pipeline.store.files import write_json
+
+FILE_NAME = ".compared.json"
+_THREADS = 4
+"""At most, in a process: more read no disk faster."""
+_WORTH_A_LINE = 5.0
+"""Seconds."""
+
+State = list[int]
+
+
+class ComparedFile(Config):
+    """A file that had its sha256 when it was compared."""
+
+    sha256: str
+    states: list[State]
+    """What it was like (`LocalShard.state`): one on a shared file system, else one for each machine."""
+
+
+class Compared(Config):
+    """`.compared.json`: files by their path."""
+
+    files: dict[str, ComparedFile]
+
+    @staticmethod
+    def read(path: Path) -> Compared:
+        """What is noted; nothing where there is no such note, or none that can be read."""
+        try:
+            return Compared.load_json(path)
+        except UserError:
+            return Compared(files={})
+
+    def knows(self, shard: LocalShard, state: State) -> bool:
+        """Whether the file has been compared as it is."""
+        known = self.files.get(str(shard.path))
+        return known is not None and known.sha256 == shard.info.sha256 and state in known.states
+
+
+def verify_shards(context: StageContext, team: Team, run: Path) -> None:
+    """Refuse shards among the stage's inputs that are not those of their manifest.
+
+    Every process of `team` calls this; it returns when all are here, and an error is raised in all.
+    """
+    team.meet()  # before: the lead may still be making what is to be compared
+    how = context.hardware.verify_shards
+    shards: list[LocalShard] = []
+    if how != "never" and context.again is None:
+        for stage in context.inputs.values():
+            if stage.gives("data") and not stage.exported:
+                shards += local_shards(stage.folder)
+    shards = list({shard.path: shard for shard in shards}.values())
+    if not shards:
+        return
+    begin = time.monotonic()
+    size = compare_shards(shards, run / FILE_NAME, team, context.console, again=how == "always")
+    seconds = time.monotonic() - begin
+    if size and seconds > _WORTH_A_LINE:
+        context.console.print(
+            f"    {len(shards)} shards have the sha256 of their manifest ({size / 1e6:,.0f} MB compared in "
+            f"{duration(seconds)})"
+        )
+
+
+def compare_shards(
+    shards: Sequence[LocalShard], record: Path, team: Team, console: Console, *, again: bool = False
+) -> int:
+    """Compare what `record` does not know, with `again` all; how many bytes this process has read.
+
+    Raises:
+        JointError: A shard is not the manifest's; the first one is named.
+    """
+    states = [shard.state() for shard in shards]
+    known = Compared.read(record) if team.leads and not again else Compared(files={})
+    # The lead's note counts for all: another machine may see an older one.
+    seen_by = team.gather((states, known.dump() if team.leads else None))
+    known = Compared.parse(seen_by[0][1], str(record))
+    todo: list[LocalShard] = []
+    missing = 0
+    for seen in {str(seen): seen for seen, _ in seen_by}.values():
+        alike = [rank for rank, (theirs, _) in enumerate(seen_by) if theirs == seen]
+        pending = [shard for shard, state in zip(shards, seen, strict=True) if not known.knows(shard, state)]
+        missing += len(pending)
+        if team.rank in alike:
+            todo = pending[alike.index(team.rank) :: len(alike)]
+    if not missing:
+        return 0
+    size = sum(shard.info.bytes for shard in todo)
+    with Meter("comparing shards", len(todo), console=console) as meter:
+        found = problems(todo, min(_THREADS, usable_cores()), meter.advance)
+    wrong = [said for own in team.gather(found) for said in own]
+    if wrong:
+        more = f" ({len(wrong)} such shards; motionloom data check lists them)" if len(wrong) > 1 else ""
+        raise JointError(f"{wrong[0]}{more}")
+    if team.leads:
+        _note(record, known, shards, [seen for seen, _ in seen_by])
+    return size
+
+
+def _note(record: Path, known: Compared, shards: Sequence[LocalShard], seen: Sequence[list[State]]) -> None:
+    """Write down what the files of all machines are like now that they have been compared."""
+    files = dict(known.files)
+    for place, shard in enumerate(shards):
+        states = list({str(own[place]): own[place] for own in seen}.values())
+        files[str(shard.path)] = ComparedFile(sha256=shard.info.sha256, states=states)
+    write_json(record, Compared(files=files).dump())

@@ -1,0 +1,77 @@
+"""Stages that convert a real source: one kind per converter, its options those of the converter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.convert.captions.options import digest_of
+from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.common.converter import AnyConverter
+from motionloom.datasets.convert.registry import converters, prepare
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.stage import StageConfig, StageContext, register
+from motionloom.pipeline.stages.data.data import DataStage, say_shards
+from motionloom.pipeline.store.data import SHARDS
+
+
+def _stage_config(kind: type[AnyConverter]) -> type[StageConfig]:
+    """A class that stands in this module, so that worker processes of a conversion can unpickle it."""
+    name, bases = f"{kind.__name__}StageConfig", (kind.config_class, StageConfig)
+    made = type(name, bases, {"__doc__": kind.summary, "__module__": __name__})
+    globals()[name] = made
+    return made
+
+
+class ConvertStage(DataStage):
+    """Shards converted from a source."""
+
+    def external(self, config: ConvertConfig) -> dict[str, Any]:
+        return source_facts(config)
+
+
+def run_convert(context: StageContext) -> None:
+    """Convert the source into the stage's folder."""
+    out = context.folder / SHARDS
+    workers = context.hardware.convert_workers
+    shown = not context.console.quiet
+    conversion = prepare(context.config, out=out, workers=workers, progress=shown)
+    manifest = run_conversion(
+        conversion,
+        out,
+        workers=workers,
+        progress=shown,
+        say=lambda line: context.console.print(f"    {line}", markup=False, soft_wrap=True),
+    )
+    say_shards(context, manifest)
+    if conversion.plan.captions:
+        context.console.print(
+            f"    {conversion.plan.captions}", markup=False, highlight=False, soft_wrap=True
+        )
+
+
+def source_facts(config: ConvertConfig) -> dict[str, Any]:
+    """Names and sizes of the source's files; checksums of the files, and folders of text files, that options
+    name."""
+    source = Path(config.source).expanduser()
+    if not source.exists():
+        raise UserError(f"{source}: no such folder (the source; set it with --set data.source=FOLDER)")
+    listed = sorted(source.rglob("*")) if source.is_dir() else [source]
+    files = {p.relative_to(source).as_posix(): p.stat().st_size for p in listed if p.is_file()}
+    steering = {}
+    for name in type(config).model_fields:
+        path = getattr(config, name)
+        if name == "source" or not isinstance(path, Path):
+            continue
+        path = path.expanduser()
+        if path.is_file():
+            steering[name] = sha256_of(path)
+        elif path.is_dir() and any(path.rglob("*.txt")):  # captions and split files
+            steering[name] = digest_of(path)["sha256"]
+    return {"files": files, "steering": steering}
+
+
+for _kind in converters():
+    register(ConvertStage(_kind.name, f"shards from {_kind.title}", _stage_config(_kind), run_convert))

@@ -1,0 +1,130 @@
+"""Statistics and text conditions: what every training stage reads beside the motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import compute
+from motionloom.datasets.shards.clips import in_order
+from motionloom.datasets.text.build import build_text_cache
+from motionloom.pipeline.contract.stage import (
+    CPU,
+    Finished,
+    Inputs,
+    StageConfig,
+    StageContext,
+    StageKind,
+    register,
+)
+from motionloom.pipeline.store.data import captions_of
+from motionloom.pipeline.store.files import copy_files
+from motionloom.pipeline.store.known_captions import representatives, save_known
+from motionloom.pipeline.store.text import BUILT_IN, TextPreview, TextSource, keep_place
+
+_STATS = "stats.safetensors"
+
+
+class StatsConfig(StageConfig):
+    """Mean and standard deviation per feature dimension, from the training split only."""
+
+    group: bool = False
+    """Average the deviation over each kind of feature, as HumanML3D does."""
+
+
+class TextConfig(StageConfig):
+    """Sentence and token embeddings of every caption, computed once."""
+
+    encoder: str = "minilm"
+    """`minilm` (comes with the installation), a folder with a sentence-transformers, BERT-like or CLIP model,
+    or a name on the Hugging Face hub."""
+    similarity: str = "minilm"
+    """The encoder, named likewise, that says which captions mean the same: the paper's sBERT (D.1, D.2), for
+    the filter of negatives and retrieval protocol B, whatever `encoder` is."""
+
+
+class StatsStage(StageKind[StatsConfig]):
+    """Mean and deviation of every feature."""
+
+    name = "stats"
+    summary = "mean and deviation"
+    config = StatsConfig
+    takes = ("data",)
+
+    def run(self, context: StageContext) -> None:
+        dataset = context.given["data"].split("train")
+        compute(dataset, group=context.config.group).save(context.folder / _STATS)
+        context.console.print(
+            f"    {len(dataset)} clips, {int(dataset.frames.sum())} frames, {dataset.layout.dim} dimensions"
+        )
+
+    def load(self, stage: Finished, given: Inputs, device: torch.device) -> FeatureStats:
+        return FeatureStats.load(stage.folder / _STATS)
+
+    def export(self, stage: Finished, target: Path) -> None:
+        copy_files(stage.folder, target, (_STATS,))
+
+
+class TextStage(StageKind[TextConfig]):
+    """Embeddings of every caption."""
+
+    name = "text"
+    summary = "caption embeddings"
+    config = TextConfig
+    takes = ("data",)
+
+    def run(self, context: StageContext) -> None:
+        keep_place(context.config.encoder, context.folder)
+        data, captions, trained = context.given["data"], set[str](), {False: set[str](), True: set[str]()}
+        for split in data.splits:
+            dataset = data.split(split)
+            for index in in_order(dataset, "texts.json", "face_texts.json"):
+                for face in (False, True):
+                    said = {caption.text for caption in captions_of(dataset, index, face=face)}
+                    captions |= said
+                    trained[face] |= said if split == "train" else set()
+        cache = build_text_cache(
+            context.folder / "cache",
+            captions,
+            context.config.encoder,
+            workers=context.hardware.convert_workers,
+            progress=context.console.is_terminal,
+            device=str(context.device),
+            similarity=context.config.similarity,
+        )
+        context.console.print(
+            f"    {len(captions)} different captions, {cache.dim}-d embeddings by {cache.encoder}"
+        )
+        if context.config.similarity == BUILT_IN:
+            body, face_captions = (sorted(trained[face]) for face in (False, True))
+            save_known(
+                context.folder,
+                representatives(body, cache.similarity(body)),
+                representatives(face_captions, cache.similarity(face_captions)),
+            )
+
+    def preview(self, config: TextConfig, given: Inputs) -> TextPreview:
+        return TextPreview.of(config.encoder)
+
+    def load(self, stage: Finished, given: Inputs, device: torch.device) -> TextSource:
+        return _source(stage, device)
+
+    def exported_config(self, config: TextConfig) -> TextConfig:
+        """Without the places on this machine: an export brings its encoder along."""
+        return TextConfig()
+
+    def export(self, stage: Finished, target: Path) -> None:
+        _source(stage, CPU).export(target)
+
+
+def _source(stage: Finished, device: torch.device) -> TextSource:
+    source = TextSource(stage.folder, stage.config.encoder, device, stage.exported)
+    if stage.exported:
+        _ = source.known  # read at once: what is broken in an export is found before anything is made
+    return source
+
+
+register(StatsStage())
+register(TextStage())

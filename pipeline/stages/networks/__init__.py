@@ -1,0 +1,1 @@
+"""Stages that train, and what they make of their networks."""

@@ -1,0 +1,99 @@
+"""Motion diffusion stage, of the face: the paper's second facial baseline (HumanTOMATO B.5.2)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from pydantic import Field, field_validator
+
+from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.inference.generators.diffusion import DiffusionFace
+from motionloom.pipeline.stages.networks.tma import CaptionInputs, caption_batches, part_columns
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage, caption_example
+
+if TYPE_CHECKING:
+    from motionloom.models.diffusion.module import DiffusionModule
+
+
+class DiffusionStageConfig(TrainedStageConfig):
+    """A denoiser of motions, conditioned on a sentence embedding."""
+
+    net: DiffusionConfig = DiffusionConfig()
+    train: TrainConfig = TrainConfig(steps=200_000, batch_size=64)
+    part: Literal["face"] = "face"
+    """What is denoised: the face, conditioned on the face captions."""
+    max_frames: int = Field(196, ge=8)
+    """Longer clips are cropped at random."""
+    min_frames: int = Field(16, ge=1)
+    """Shorter clips are left out."""
+
+    @field_validator("part", mode="before")
+    @classmethod
+    def _faces_only(cls, part: str) -> str:
+        if part != "face":
+            raise ValueError(f"a diffusion stage makes faces only, not {part}: leave `part` out")
+        return part
+
+
+class DiffusionStage(TrainedStage[DiffusionStageConfig, CaptionInputs, MotionDiffusion]):
+    """A denoiser, trained on whole clips and their captions."""
+
+    name = "diffusion"
+    summary = "motion diffusion"
+    config = DiffusionStageConfig
+    inputs = CaptionInputs
+
+    def gives(self, config: DiffusionStageConfig) -> frozenset[str]:
+        return super().gives(config) | {GENERATOR}
+
+    def facts(self, config: DiffusionStageConfig, inputs: CaptionInputs) -> ModelFacts:
+        layout = inputs.data.layout
+        width = len(part_columns(layout, config.part))
+        extra = {"motion_dim": width, "text_dim": inputs.text.dim, "part": config.part}
+        return ModelFacts(
+            kind="diffusion", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra
+        )
+
+    def network(self, facts: ModelFacts, inputs: CaptionInputs) -> MotionDiffusion:
+        config = DiffusionConfig.parse(facts.config, facts.where)
+        dims = (facts.fact(key, int) for key in ("motion_dim", "text_dim"))
+        return MotionDiffusion(config, *dims)
+
+    def module(
+        self, config: DiffusionStageConfig, net: MotionDiffusion, inputs: CaptionInputs, seed: int
+    ) -> DiffusionModule:
+        from motionloom.models.diffusion.module import DiffusionModule
+
+        return DiffusionModule(net, config.optim, seed=seed, max_steps=config.train.steps)
+
+    def batches(
+        self, config: DiffusionStageConfig, net: MotionDiffusion, inputs: CaptionInputs, seed: int, log: Log
+    ) -> Batches:
+        return caption_batches(
+            inputs, seed, part=config.part, max_frames=config.max_frames, min_frames=config.min_frames
+        )
+
+    def example(
+        self, config: DiffusionStageConfig, net: MotionDiffusion, inputs: CaptionInputs, batch: int
+    ) -> Example:
+        width = len(part_columns(inputs.data.layout, config.part))
+        return caption_example(batch, config.max_frames, width, inputs.text.dim)
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        layout = given["stats"].layout
+        return DiffusionFace(self.load(stage, given, device), layout, given)
+
+    def exported(self, config: DiffusionStageConfig) -> tuple[str, ...]:
+        return ("stats", "text")
+
+    def curves(self, config: DiffusionStageConfig) -> tuple[Curve, ...]:
+        return (Curve("loss"),)
+
+
+register(DiffusionStage())

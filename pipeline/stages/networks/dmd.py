@@ -1,0 +1,104 @@
+"""DMD stage: the diffusion decoder of motion tokens (UDE section 3.4)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from pydantic import Field
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.dmd import Dmd, DmdConfig
+from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import register
+from motionloom.pipeline.stages.networks.tokenizer import WindowInputs, window_batches
+from motionloom.pipeline.store.networks import LoadedDmd, TrainedTokenizer, require_streams, stream_facts
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+
+if TYPE_CHECKING:
+    from motionloom.models.diffusion.dmd_module import DmdModule
+
+
+class DmdStageConfig(TrainedStageConfig):
+    """A diffusion decoder of the tokens of one tokenizer."""
+
+    net: DmdConfig = DmdConfig()
+    optim: OptimConfig = OptimConfig(optimizer="adam")
+    train: TrainConfig = TrainConfig(steps=200_000, batch_size=64)
+    window: int = Field(160, ge=8, multiple_of=4)
+    """Frames of a training window; longer motions are decoded in overlapping windows of this size."""
+    windows_per_clip: int = Field(1, ge=1)
+    """Windows cut from one read of a clip."""
+
+
+class DmdInputs(WindowInputs):
+    """What it takes."""
+
+    tokenizer: TrainedTokenizer
+
+
+class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
+    """Tokens to varied motion."""
+
+    name = "dmd"
+    summary = "diffusion decoder of motion tokens"
+    config = DmdStageConfig
+    inputs = DmdInputs
+
+    def gives(self, config: DmdStageConfig) -> frozenset[str]:
+        return super().gives(config) | {"decoder"}
+
+    def facts(self, config: DmdStageConfig, inputs: DmdInputs) -> ModelFacts:
+        tokenizer = inputs.tokenizer.net
+        if config.net.schedule.predicts == "epsilon" and config.net.dim < tokenizer.dim:
+            raise UserError(
+                f"net.dim {config.net.dim} cannot carry the noise of {tokenizer.dim} columns, and a network "
+                f"that predicts the noise has to give back: raise net.dim to {tokenizer.dim} or more, or set "
+                f"net.schedule.predicts: sample"
+            )
+        extra = {**stream_facts(tokenizer), "window": config.window}
+        layout = LayoutFacts.of(inputs.data.layout)
+        return ModelFacts(kind="dmd", config=config.net.dump(), layout=layout, extra=extra)
+
+    def network(self, facts: ModelFacts, inputs: DmdInputs) -> Dmd:
+        tokenizer = inputs.tokenizer.net
+        require_streams(facts, tokenizer, "decoder")
+        config = DmdConfig.parse(facts.config, facts.where)
+        return Dmd(config, tokenizer.streams, tokenizer.pattern, tokenizer.dim)
+
+    def module(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs, seed: int) -> DmdModule:
+        from motionloom.models.diffusion.dmd_module import DmdModule
+
+        return DmdModule(
+            net, config.optim, seed=seed, max_steps=config.train.steps, tokenizer=inputs.tokenizer.net
+        )
+
+    def batches(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs, seed: int, log: Log) -> Batches:
+        columns, window = inputs.tokenizer.columns, config.window
+        return window_batches(
+            config, inputs, columns, seed, batch_size=32, max_frames=window, min_frames=GROUP_FRAMES
+        )
+
+    def example(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs, batch: int) -> Example:
+        return Example(
+            {
+                "motion": torch.empty(batch, config.window, net.motion_dim),
+                "length": torch.full((batch,), config.window),
+            }
+        )
+
+    def loaded(self, net: Dmd, facts: ModelFacts, inputs: DmdInputs) -> LoadedDmd:
+        return LoadedDmd(net, facts.fact("window", int), inputs)
+
+    def exported(self, config: DmdStageConfig) -> tuple[str, ...]:
+        return ("tokenizer",)
+
+    def curves(self, config: DmdStageConfig) -> tuple[Curve, ...]:
+        return (Curve("loss"),)
+
+
+register(DmdStage())

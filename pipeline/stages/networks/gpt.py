@@ -1,0 +1,302 @@
+"""GPT stages: Hierarchical-GPT over body and hand tokens, and the face GPT (HumanTOMATO sections 3.3-3.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from pydantic import Field
+from torch.utils.data import Dataset
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.training.lora import LoraConfig, add_lora, merge_lora, require_peft
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, Stage, filled_by, register
+from motionloom.pipeline.inference.generators.gpt import GptGenerator
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.networks.tokens import Tokens
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.networks import (
+    LoadedGpt,
+    LoadedTma,
+    TrainedTokenizer,
+    require_streams,
+    stream_facts,
+)
+from motionloom.pipeline.store.run_folder import is_place
+from motionloom.pipeline.store.text import TextSource
+from motionloom.pipeline.store.tokens import GptClips, TokenBatches, gpt_clips
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+from motionloom.pipeline.training.warm_start import START, require_start_layout, same_encoder, starts_from
+
+if TYPE_CHECKING:
+    from motionloom.models.gpt.module import GptModule
+
+Prior = Literal["tma", "sentence"]
+
+
+class GptStageConfig(TrainedStageConfig):
+    """A GPT over the tokens of one tokenizer."""
+
+    shardable = True
+
+    net: GptConfig = GptConfig()
+    loss: GptLossConfig = GptLossConfig()
+    train: TrainConfig = TrainConfig(steps=300_000, batch_size=256)
+    prior: Prior = "tma"
+    """First input of the GPT: the TMA text latent (section 3.5) or the plain sentence embedding."""
+    face: bool = False
+    """Train on the face captions."""
+    min_frames: int = Field(16, ge=1)
+    """Captions about fewer frames are left out where the clip has a longer one."""
+    lora: LoraConfig | None = None
+    """Train adapters beside the weights that `inputs.start` brings; null trains all. What is saved is one
+    network of plain weights either way."""
+
+    def require_fit(self, hardware: Hardware) -> None:
+        """A model that samples as it trains is neither one graph nor cut over ranks, nor are adapters."""
+        super().require_fit(hardware)
+        if self.lora is not None:
+            require_peft()
+            if self.train.compile or self.train.strategy == "fsdp":
+                raise UserError(
+                    "lora trains adapters, which train.compile and train.strategy fsdp do not know; set "
+                    "compile: false and strategy: ddp, or lora: null"
+                )
+        if self.aligned_on_samples and (self.train.compile or self.train.strategy == "fsdp"):
+            raise UserError(
+                "loss.align_on samples draws motions token by token, which train.compile and train.strategy "
+                "fsdp cannot do; set compile: false and strategy: ddp, or align_on: predictions"
+            )
+
+    @property
+    def aligned(self) -> bool:
+        return self.loss.align_weight > 0
+
+    @property
+    def aligned_on_samples(self) -> bool:
+        return self.aligned and self.loss.align_on == "samples"
+
+
+class GptInputs(Inputs):
+    """What it takes."""
+
+    data: Data
+    text: TextSource
+    tokenizer: TrainedTokenizer
+    tokens: Tokens
+    tma: LoadedTma | None
+    start: LoadedGpt | None = filled_by("gpt")
+
+
+class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
+    """A GPT, trained on exported tokens."""
+
+    name = "gpt"
+    summary = "GPT over motion tokens"
+    config = GptStageConfig
+    inputs = GptInputs
+
+    def gives(self, config: GptStageConfig) -> frozenset[str]:
+        return super().gives(config) | {GENERATOR}
+
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
+        """Its TMA must read captions as it does, and a GPT that it starts from must be the same network."""
+        require_own_text(stage, others)
+        require_start(stage, others)
+
+    def facts(self, config: GptStageConfig, inputs: GptInputs) -> ModelFacts:
+        if (config.prior == "tma" or config.aligned) and inputs.tma is None:
+            raise UserError("prior 'tma' and align_weight > 0 need a tma stage before it")
+        tokenizer: TrainedTokenizer = inputs.tokenizer
+        prior_tma = inputs.tma if config.prior == "tma" else None
+        text_dim = inputs.text.dim if prior_tma is None else prior_tma.net.config.latent
+        extra = {
+            "text_dim": text_dim,
+            "prior": config.prior,
+            **stream_facts(tokenizer.net),
+        }
+        if inputs.start is not None:
+            require_start_layout(inputs.data.layout, tokenizer.layout)
+        layout = LayoutFacts.of(inputs.data.layout)
+        return ModelFacts(kind="gpt", config=config.net.dump(), layout=layout, extra=extra)
+
+    def network(self, facts: ModelFacts, inputs: GptInputs) -> InterleavedGPT:
+        tokenizer = inputs.tokenizer.net
+        require_streams(facts, tokenizer, "GPT")
+        config = GptConfig.parse(facts.config, facts.where)
+        return InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, facts.fact("text_dim", int))
+
+    def prepare(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs) -> None:
+        """Go on from another GPT's weights, where the recipe names one."""
+        if inputs.start is not None:
+            net.load_state_dict(inputs.start.net.state_dict())
+
+    def module(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int) -> GptModule:
+        """Cross-entropy, and L_align on what the frozen tokenizer and TMA make of its tokens."""
+        from motionloom.models.gpt.module import GptModule
+
+        if config.lora is not None:
+            add_lora(net, config.lora)
+        return GptModule(
+            net,
+            config.optim,
+            seed=seed,
+            max_steps=config.train.steps,
+            loss=config.loss,
+            tokenizer=inputs.tokenizer.net if config.aligned else None,
+            tma=inputs.tma.net if config.aligned and inputs.tma is not None else None,
+        )
+
+    def trained(self, config: GptStageConfig, net: InterleavedGPT) -> None:
+        if config.lora is not None:
+            merge_lora(net)
+
+    def batches(
+        self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int, log: Log
+    ) -> Batches:
+        data, text, tokenizer = inputs.data, inputs.text.cache, inputs.tokenizer.net
+        tma = inputs.tma if config.prior == "tma" or config.aligned else None
+
+        @cache
+        def clips_of(split: str) -> GptClips:
+            store = inputs.tokens.open(split)
+            dataset = data.split(split)
+            clips = gpt_clips(dataset, store, tokenizer, face=config.face, min_frames=config.min_frames)
+            if clips.uncaptioned:
+                kind = "face caption" if config.face else "caption"
+                log(f"{split}: {clips.uncaptioned} clips without a {kind} are left out")
+            return clips
+
+        def batches(split: str, batch: int, rank: int = 0, world: int = 1, *, training: bool) -> TokenBatches:
+            clips = clips_of(split)
+            latents = tma.embed_captions(clips.texts, text) if tma is not None else None
+            if config.prior == "tma" and latents is not None:
+                prior = latents
+            else:
+                prior = torch.as_tensor(text.sentence(clips.texts))
+            return TokenBatches(
+                clips.store,
+                clips.captions,
+                prior,
+                torch.as_tensor(text.similarity(clips.texts)),
+                net.pattern,
+                net.num_codes,
+                net.max_groups,
+                batch,
+                seed,
+                rank,
+                world,
+                training,
+                clips.sources,
+                latents=latents if config.aligned and config.prior != "tma" else None,
+                present=clips.present,
+            )
+
+        def train(batch: int, rank: int, world: int) -> Dataset[object]:
+            return batches("train", batch, rank, world, training=True)
+
+        def validation() -> Dataset[object]:
+            return batches(data.held_out().split, 32, training=False)
+
+        return Batches(train, validation)
+
+    def dry_module(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs) -> GptModule:
+        """Without the judge of sampled motions, which keeps nothing for the backward pass, and without
+        adapters, which peft cannot make of tensors without values: a bound from above.
+        """
+        module = self.module(config.model_copy(update={"lora": None}), net, inputs, seed=0)
+        if config.aligned_on_samples:
+            module.tokenizer = None
+        return module
+
+    def example(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, batch: int) -> Example:
+        """The longest sequences; samples that are judged are so many more rows."""
+        if config.aligned_on_samples:
+            batch *= 1 + config.loss.samples
+        tokenizer, groups, ends = inputs.tokenizer.net, net.max_groups, len(net.names)
+        length = groups * len(net.pattern) + ends
+        order = torch.tensor([net.names.index(name) for name in (net.pattern * groups + net.names)])
+        tensors = {
+            "tokens": torch.zeros(batch, length, dtype=torch.int64),
+            "kinds": order.expand(batch, -1),
+            "text": torch.empty(batch, net.text_dim),
+            "similarity": torch.empty(batch, inputs.text.dim),
+        }
+        if config.aligned and inputs.tma is not None:
+            tensors["tma_text"] = torch.empty(batch, inputs.tma.net.config.latent)
+        parts = " + ".join(f"{groups * s.per_group} {s.name}" for s in tokenizer.streams)
+        frames = groups * tokenizer.group_frames
+        return Example(tensors, f"{parts} + {ends} End = {length} for {frames} frames")
+
+    def loaded(self, net: InterleavedGPT, facts: ModelFacts, inputs: GptInputs) -> LoadedGpt:
+        return LoadedGpt(net, facts.fact("prior", str))
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        return GptGenerator(self.load(stage, given, device), given, stage.config.face)
+
+    def exported(self, config: GptStageConfig) -> tuple[str, ...]:
+        return ("tokenizer", "text", "tma") if config.prior == "tma" else ("tokenizer", "text")
+
+    def curves(self, config: GptStageConfig) -> tuple[Curve, ...]:
+        return (Curve("ce"), Curve("accuracy"), Curve("align"))
+
+
+_SIZES = ("layers", "dim", "heads", "ff", "block_size")
+"""Of the network; a GPT goes on from another only where these are equal."""
+
+
+def require_own_text(stage: Stage, others: Mapping[str, Stage]) -> None:
+    """A TMA must be given captions by the encoder that it was trained on."""
+    tma, own = others.get(stage.inputs.get("tma", "")), stage.inputs.get("text", "")
+    other = tma.inputs.get("text", "") if tma is not None else own
+    if not same_encoder(own, other, others):
+        raise UserError(
+            f"stage '{stage.name}' reads captions as '{own}' encodes them, but its TMA "
+            f"'{stage.inputs['tma']}' was trained on those of '{other}'; name one text stage for both, "
+            f"or leave the TMA out (inputs: {{tma: null}})"
+        )
+
+
+def _its_own(start: Stage, wrong: list[str]) -> str:
+    """Where the inputs of a GPT outside the run lie, for the message."""
+    roles = [name.removeprefix("inputs.") for name in wrong if name.startswith("inputs.")]
+    there = [f"{role}: {start.inputs[role]}" for role in roles if is_place(start.inputs.get(role, ""))]
+    return f", like inputs: {{{', '.join(there)}}}" if there else ""
+
+
+def require_start(stage: Stage, others: Mapping[str, Stage]) -> None:
+    """A GPT can go on from another's weights where both are one network that reads and writes the same."""
+    if stage.config.lora is not None and START not in stage.inputs:
+        raise UserError(
+            f"stage '{stage.name}' has lora and no trained GPT to add adapters to; name one in "
+            f"stages.{stage.name}.inputs.{START}, or set lora: null"
+        )
+    start = others.get(stage.inputs.get(START, ""))
+    if start is None:
+        return
+    ours, theirs = stage.config, start.config
+    wrong = [f"net.{size}" for size in _SIZES if getattr(ours.net, size) != getattr(theirs.net, size)]
+    wrong += ["prior"] if ours.prior != theirs.prior else []
+    roles = ("tokenizer",) + (("tma",) if ours.prior == "tma" else ())
+    if not same_encoder(start.inputs.get("text", ""), stage.inputs.get("text", ""), others):
+        wrong.append("inputs.text")
+    for role in roles:
+        # A tokenizer or TMA that was itself trained on from the start's speaks nearly the same language.
+        own, theirs_is = stage.inputs.get(role, ""), start.inputs.get(role, "")
+        wrong += [] if starts_from(own, theirs_is, others) else [f"inputs.{role}"]
+    if wrong:
+        raise UserError(
+            f"stage '{stage.name}' starts from '{start.name}', which differs in {', '.join(wrong)}; give "
+            f"both the same{_its_own(start, wrong)}"
+        )
+
+
+register(GptStage())

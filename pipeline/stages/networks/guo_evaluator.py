@@ -1,0 +1,64 @@
+"""The published evaluator of Guo et al. (CVPR 2022), from a folder that its user made of the release."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from motionloom.pipeline.contract.stage import (
+    Finished,
+    Inputs,
+    StageConfig,
+    StageContext,
+    StageKind,
+    register,
+)
+from motionloom.pipeline.store.evaluator import LoadedEvaluator
+from motionloom.pipeline.store.files import copy_files
+from motionloom.pipeline.store.published_evaluator import (
+    FACTS,
+    FILES,
+    Untagged,
+    check_published,
+    load_published,
+)
+
+
+class GuoEvaluatorConfig(StageConfig):
+    """Where the published evaluator lies, and what it makes of captions without tags."""
+
+    folder: Path
+    """What `docs/guo_evaluator.py` has made: weights, statistics and word vectors."""
+    untagged: Untagged = "refuse"
+    """A caption without the `word/POS` tags that the evaluator reads is refused; `other` reads its words as
+    they stand, without their classes [ours], and its figures cannot be compared with the papers'."""
+
+
+class GuoEvaluatorStage(StageKind[GuoEvaluatorConfig]):
+    """The evaluator that the papers' figures are of; it judges HumanML3D's 263 features."""
+
+    name = "guo_evaluator"
+    summary = "the published text-motion evaluator"
+    config = GuoEvaluatorConfig
+
+    def gives(self, config: GuoEvaluatorConfig) -> frozenset[str]:
+        return frozenset({"evaluator"})
+
+    def external(self, config: GuoEvaluatorConfig) -> dict[str, str]:
+        return check_published(config.folder.expanduser()).sha256
+
+    def run(self, context: StageContext) -> None:
+        """Check all of the folder and copy it, so that the run says for good what judged it."""
+        source = context.config.folder.expanduser()
+        load_published(source)
+        copy_files(source, context.folder, (*FILES, FACTS))
+
+    def load(self, stage: Finished, given: Inputs, device: torch.device) -> LoadedEvaluator:
+        return load_published(stage.folder, untagged=stage.config.untagged, device=device)
+
+    def export(self, stage: Finished, target: Path) -> None:
+        copy_files(stage.folder, target, (*FILES, FACTS))
+
+
+register(GuoEvaluatorStage())

@@ -1,0 +1,222 @@
+"""Text-motion alignment stage; without InfoNCE it is TEMOS, of the face the facial cVAE (HumanTOMATO 3.5,
+B.5.1, D).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from torch.utils.data import Dataset
+
+from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
+from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.text.reword import Rewordings
+from motionloom.models.tma.losses import TmaLossConfig
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import (
+    ALIGNMENT,
+    FACE_ALIGNMENT,
+    GENERATOR,
+    Finished,
+    Inputs,
+    Stage,
+    filled_by,
+    register,
+)
+from motionloom.pipeline.inference.generators.vae import VaeMotion
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.networks import LoadedTma
+from motionloom.pipeline.store.text import TextSource
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage, caption_example
+from motionloom.pipeline.training.warm_start import (
+    START,
+    require_same_start,
+    require_start_layout,
+    same_encoder,
+)
+
+if TYPE_CHECKING:
+    from motionloom.models.tma.module import TmaModule
+
+_FREE = frozenset({"dropout", "attention_dropout", "text_dropout", "text_noise"})
+"""Settings that are of the training and not of the network: another one may go on with others."""
+
+
+class TmaStageConfig(TrainedStageConfig):
+    """Motion and text encoders in one latent space."""
+
+    net: TmaConfig = TmaConfig()
+    loss: TmaLossConfig = TmaLossConfig()
+    train: TrainConfig = TrainConfig(steps=50_000, batch_size=256)
+    max_frames: int = Field(196, ge=8)
+    """Longer clips are cropped at random."""
+    min_frames: int = Field(16, ge=1)
+    """Shorter clips are left out."""
+    part: Literal["bodyhand", "face"] = "bodyhand"
+    """What is aligned; `face` takes the face captions. Without InfoNCE (`loss.contrastive: 0`) it is TEMOS,
+    or, of the face, the paper's facial cVAE (B.5.1)."""
+
+    @model_validator(mode="after")
+    def _faces_have_every_frame(self) -> TmaStageConfig:
+        if self.part == "face" and self.net.frame_stride != 1:
+            raise ValueError("a face is generated frame by frame: net.frame_stride must be 1 with part: face")
+        return self
+
+
+def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:
+    """Columns of one part of a layout, which must have it."""
+    if not layout.has_part(part):
+        raise UserError(f"layout {layout.name} has no {part} columns; choose another part or data set")
+    return layout.part(part)
+
+
+class CaptionInputs(Inputs):
+    """What a stage takes that trains on whole clips with captions."""
+
+    data: Data
+    stats: FeatureStats
+    text: TextSource
+
+
+class TmaInputs(CaptionInputs):
+    """What it takes."""
+
+    rewordings: Rewordings | None
+    start: LoadedTma | None = filled_by("tma")
+
+
+class TmaStage(TrainedStage[TmaStageConfig, TmaInputs, Tma]):
+    """Motion and text encoders, trained on whole clips and their captions."""
+
+    name = "tma"
+    summary = "text-motion alignment"
+    config = TmaStageConfig
+    inputs = TmaInputs
+
+    def gives(self, config: TmaStageConfig) -> frozenset[str]:
+        """One space for text and motion, or for text and faces; without InfoNCE motion of text: the facial
+        cVAE (B.5.1), and TEMOS (4.1.2), whose latents are compared with TMA's.
+        """
+        names = super().gives(config)
+        if config.loss.contrastive == 0:
+            names |= {GENERATOR}
+        if config.part != "face":
+            return names | {ALIGNMENT}
+        return names if config.loss.contrastive == 0 else names | {FACE_ALIGNMENT}
+
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
+        """A TMA that it starts from must be the same network, over the same text and statistics."""
+        require_same_start(stage, others, _FREE)
+        start = others.get(stage.inputs.get(START, ""))
+        if start is not None and not same_encoder(start.inputs.get("text", ""), stage.inputs["text"], others):
+            raise UserError(
+                f"stage '{stage.name}' starts from '{start.name}', which reads captions of another text "
+                f"encoder; give '{stage.inputs['text']}' the encoder of '{start.inputs['text']}'"
+            )
+
+    def facts(self, config: TmaStageConfig, inputs: TmaInputs) -> ModelFacts:
+        layout = inputs.data.layout
+        if inputs.start is not None:
+            require_start_layout(layout, inputs.start.layout)
+        part_columns(layout, config.part)
+        extra = {"text_dim": inputs.text.dim, "max_frames": config.max_frames, "part": config.part}
+        return ModelFacts(kind="tma", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra)
+
+    def network(self, facts: ModelFacts, inputs: TmaInputs) -> Tma:
+        layout, part = facts.layout.layout(), _part(facts)
+        if not layout.has_part(part):
+            raise UserError(f"{facts.where}: layout {layout.name} has no {part} columns; run the stage again")
+        config = TmaConfig.parse(facts.config, facts.where)
+        return Tma.of_layout(config, layout, part, facts.fact("text_dim", int))
+
+    def prepare(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs) -> None:
+        """The coordinates it reads depend on how features are normalised; or all comes from a start."""
+        if inputs.start is not None:
+            net.load_state_dict(inputs.start.net.state_dict())
+        elif net.basis is not None:
+            columns, stats = part_columns(inputs.data.layout, config.part), inputs.stats
+            net.basis.learn(stats.mean[columns], stats.std[columns])
+
+    def module(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs, seed: int) -> TmaModule:
+        from motionloom.models.tma.module import TmaModule
+
+        return TmaModule(net, config.optim, seed=seed, max_steps=config.train.steps, loss=config.loss)
+
+    def batches(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs, seed: int, log: Log) -> Batches:
+        return caption_batches(
+            inputs,
+            seed,
+            part=config.part,
+            max_frames=config.max_frames,
+            min_frames=config.min_frames,
+            rewordings=inputs.rewordings,
+        )
+
+    def example(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs, batch: int) -> Example:
+        return caption_example(batch, config.max_frames, net.motion_dim, net.text_dim)
+
+    def loaded(self, net: Tma, facts: ModelFacts, inputs: TmaInputs) -> LoadedTma:
+        frames, part = facts.fact("max_frames", int), _part(facts)
+        return LoadedTma(net, facts.layout.layout(), frames, part, inputs)
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        return VaeMotion(self.load(stage, given, device))
+
+    def exported(self, config: TmaStageConfig) -> tuple[str, ...]:
+        return ("stats", "text")
+
+    def curves(self, config: TmaStageConfig) -> tuple[Curve, ...]:
+        return (Curve("contrastive"), Curve("loss"))
+
+
+def _part(facts: ModelFacts) -> Part:
+    part = facts.fact("part", str)
+    if part not in get_args(Part):
+        raise UserError(
+            f"{facts.where}: key 'extra.part' = {part!r} is no part; run or export the stage again"
+        )
+    return cast(Part, part)
+
+
+def caption_batches(
+    inputs: CaptionInputs,
+    seed: int,
+    *,
+    part: Part,
+    max_frames: int,
+    min_frames: int,
+    rewordings: Rewordings | None = None,
+) -> Batches:
+    """Captioned clips of one part."""
+    data, stats, readers = inputs.data, inputs.stats, {"text": inputs.text.cache}
+    dataset = data.split("train", training=True)
+    clips: dict[str, Any] = {"max_frames": max_frames, "min_frames": min_frames}
+    clips |= {
+        "columns": part_columns(dataset.layout, part),
+        "captioned": "face" if part == "face" else "body",
+    }
+
+    def train(batch: int, rank: int, world: int) -> Dataset[object]:
+        return ConditionBatches(
+            dataset, stats, readers, batch_size=batch, seed=seed, rank=rank, world=world,
+            rewordings=rewordings, **clips,
+        )  # fmt: skip
+
+    def validation() -> Dataset[object]:
+        return EvalBatches(data.held_out(), stats, readers, batch_size=32, **clips)
+
+    return Batches(train, validation)
+
+
+register(TmaStage())

@@ -1,0 +1,239 @@
+"""Tokenizer stages: H2VQ, VQ, RVQ, FSQ; body-hand, body only or face (HumanTOMATO section 3.2, B.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch.utils.data import Dataset
+
+from motionloom.datasets.loading.batches import WindowBatches
+from motionloom.datasets.loading.condition_batches import EvalBatches
+from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.schema import UserError
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import (
+    AnyTokenizerConfig,
+    EmaTokenizerConfig,
+    FsqConfig,
+    H2VQConfig,
+    MqConfig,
+    RvqConfig,
+    SeparateConfig,
+    VqConfig,
+    parse_tokenizer,
+)
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import Inputs, Stage, filled_by, register
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.networks import TrainedTokenizer
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+from motionloom.pipeline.training.warm_start import require_same_start, require_start_layout
+
+if TYPE_CHECKING:
+    from motionloom.models.tokenizer.module import TokenizerModule
+
+_FREE = frozenset(
+    {
+        "recon", "velocity_weight", "alpha", "decay", "reset_below",
+        "codebook_weight", "commitment_weight", "start",
+    }
+)  # fmt: skip
+"""Settings that are of the training and not of the network: another one may go on with others."""
+
+
+class TokenizerStageConfig(TrainedStageConfig):
+    """What every tokenizer stage has."""
+
+    train: TrainConfig = TrainConfig(steps=100_000, batch_size=256)
+    window: int = Field(64, ge=4, multiple_of=4)
+    """Frames of a training window."""
+    windows_per_clip: int = Field(1, ge=1)
+    """Windows cut from one read of a clip."""
+    net: AnyTokenizerConfig
+
+    def require_fit(self, hardware: Hardware) -> None:
+        """A codebook must get several times the vectors that it resets codes below."""
+        super().require_fit(hardware)
+        net = self.net
+        if not isinstance(net, EmaTokenizerConfig | MqConfig):
+            return
+        if isinstance(net, MqConfig) and net.quantizer != "ema":
+            return  # codes learnt by gradient are never reset
+        vectors = self.train.batch_size // self.train.accumulate * self.window // GROUP_FRAMES
+        needed = 2 * net.num_codes * net.reset_below
+        if vectors < needed:
+            raise UserError(
+                f"a codebook of {net.num_codes} codes gets {vectors} vectors an update and resets codes "
+                f"used less than {net.reset_below:g} times: it would replace codes for ever. Set "
+                f"net.reset_below to {vectors / net.num_codes / 4:.2g} or less, or raise "
+                "train.batch_size"
+            )
+
+
+class H2VQStageConfig(TokenizerStageConfig):
+    """Body and hand codebooks with their hierarchy."""
+
+    net: H2VQConfig = H2VQConfig()
+
+
+class VqStageConfig(TokenizerStageConfig):
+    """One codebook."""
+
+    net: VqConfig = VqConfig()
+
+
+class RvqStageConfig(TokenizerStageConfig):
+    """Residual codebooks (body-only data, face)."""
+
+    net: RvqConfig = RvqConfig()
+
+
+class SeparateStageConfig(TokenizerStageConfig):
+    """Body and hands apart, the ablation of H2VQ."""
+
+    net: SeparateConfig = SeparateConfig()
+
+
+class FsqStageConfig(TokenizerStageConfig):
+    """Finite scalar quantization."""
+
+    net: FsqConfig = FsqConfig()
+
+
+class MqStageConfig(TokenizerStageConfig):
+    """UDE's motion quantization."""
+
+    net: MqConfig = MqConfig()
+
+
+class WindowConfig(Protocol):
+    """Settings of a stage that trains on windows."""
+
+    @property
+    def window(self) -> int: ...
+
+    @property
+    def windows_per_clip(self) -> int: ...
+
+
+class WindowInputs(Inputs):
+    """What a stage takes that trains on windows."""
+
+    data: Data
+    stats: FeatureStats
+
+
+class TokenizerInputs(WindowInputs):
+    """What it takes."""
+
+    start: TrainedTokenizer | None = filled_by("tokenizer")
+
+
+class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokenizer]):
+    """A tokenizer, trained on windows of the training split."""
+
+    inputs = TokenizerInputs
+
+    def __init__(self, name: str, summary: str, config: type[TokenizerStageConfig]) -> None:
+        self.name, self.summary, self.config = name, summary, config
+
+    def gives(self, config: TokenizerStageConfig) -> frozenset[str]:
+        return super().gives(config) | {"tokenizer"}
+
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
+        """A tokenizer that it starts from must be the same network over equally normalised motion."""
+        require_same_start(stage, others, _FREE)
+
+    def facts(self, config: TokenizerStageConfig, inputs: TokenizerInputs) -> ModelFacts:
+        if inputs.start is not None:
+            require_start_layout(inputs.data.layout, inputs.start.layout)
+        layout = LayoutFacts.of(inputs.data.layout)
+        return ModelFacts(kind=config.net.kind, config=config.net.dump(), layout=layout)
+
+    def network(self, facts: ModelFacts, inputs: TokenizerInputs) -> Tokenizer:
+        config = parse_tokenizer(facts.config, f"{facts.where}: config")
+        return build_tokenizer(config, facts.layout.layout())
+
+    def prepare(self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs) -> None:
+        """The coordinates it learns in depend on how features are normalised; or all comes from a start."""
+        if inputs.start is not None:
+            net.load_state_dict(inputs.start.net.state_dict())
+            return
+        columns, stats = net.columns.numpy(), inputs.stats
+        net.basis.learn(stats.mean[columns], stats.std[columns])
+
+    def module(
+        self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs, seed: int
+    ) -> TokenizerModule:
+        from motionloom.models.tokenizer.module import TokenizerModule
+
+        steps = config.train.steps
+        return TokenizerModule(net, config.optim, seed=seed, max_steps=steps, **config.net.loss_terms())
+
+    def batches(
+        self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs, seed: int, log: Log
+    ) -> Batches:
+        # Validation has enough tokens in a batch that its perplexity compares with training's.
+        columns = net.columns.numpy()
+        return window_batches(config, inputs, columns, seed, batch_size=64, max_frames=4 * config.window)
+
+    def example(
+        self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs, batch: int
+    ) -> Example:
+        per_group = " + ".join(f"{s.per_group} {s.name}" for s in net.streams)
+        return Example(
+            {
+                "motion": torch.empty(batch, config.window, net.dim),
+                "length": torch.full((batch,), config.window),
+            },
+            f"{per_group} per {GROUP_FRAMES} frames, {net.bits_per_second:.0f} bit/s",
+        )
+
+    def loaded(self, net: Tokenizer, facts: ModelFacts, inputs: TokenizerInputs) -> TrainedTokenizer:
+        return TrainedTokenizer(net.freeze(), inputs)
+
+    def exported(self, config: TokenizerStageConfig) -> tuple[str, ...]:
+        return ("stats",)
+
+    def curves(self, config: TokenizerStageConfig) -> tuple[Curve, ...]:
+        return tuple(Curve(name) for name in ("recon", "perplexity", "usage", "dead", "resets"))
+
+
+def window_batches(
+    config: WindowConfig, inputs: WindowInputs, columns: NDArray[np.int64], seed: int, **validation: Any
+) -> Batches:
+    """Windows of the training split; validation on held-out clips, as `EvalBatches` takes it."""
+    data, stats = inputs.data, inputs.stats
+    dataset = data.split("train", training=True)
+
+    def train(batch: int, rank: int, world: int) -> Dataset[object]:
+        return WindowBatches(
+            dataset,
+            stats,
+            window=config.window,
+            batch_size=batch,
+            windows_per_clip=config.windows_per_clip,
+            seed=seed,
+            rank=rank,
+            world=world,
+            columns=columns,
+        )
+
+    return Batches(train, lambda: EvalBatches(data.held_out(), stats, columns=columns, **validation))
+
+
+register(TokenizerStage("h2vq", "H2VQ tokenizer", H2VQStageConfig))
+register(TokenizerStage("vq", "VQ tokenizer", VqStageConfig))
+register(TokenizerStage("rvq", "RVQ tokenizer", RvqStageConfig))
+register(TokenizerStage("separate", "body and hands apart", SeparateStageConfig))
+register(TokenizerStage("fsq", "FSQ tokenizer", FsqStageConfig))
+register(TokenizerStage("mq", "UDE's motion quantization", MqStageConfig))

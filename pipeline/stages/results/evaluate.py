@@ -1,0 +1,250 @@
+"""Evaluation: reconstruction, retrieval, generation on the test split, each beside its trivial answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.stage import FACE_ALIGNMENT, GENERATOR, Every, StageContext, register
+from motionloom.pipeline.contract.units import Arrays, Row, as_rows
+from motionloom.pipeline.evaluation.answers import mean_poses
+from motionloom.pipeline.evaluation.clip_metrics import (
+    CAPTION_METRICS,
+    Performance,
+    clip_figures,
+    measure_clip,
+)
+from motionloom.pipeline.evaluation.details import write_cases
+from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, STILL, TRAINING, Fact, Figure, FigureFile
+from motionloom.pipeline.evaluation.judges import Judge
+from motionloom.pipeline.evaluation.latent_metrics import GUO_BATCH, judged_figures, reconstructed_figures
+from motionloom.pipeline.evaluation.lookup import LOOKUPS
+from motionloom.pipeline.evaluation.movement import Features, all_features, movement_figures
+from motionloom.pipeline.evaluation.reconstruction import clip_error_figures, face_figures
+from motionloom.pipeline.evaluation.truth import Truth, digest_of, spread_any, truth_of
+from motionloom.pipeline.stages.results.evaluate_units import (
+    CAPTIONS,
+    CLIP,
+    FACE,
+    JOINTS,
+    LATENT,
+    MOTION,
+    MOVEMENT,
+    EvaluateConfig,
+    EvaluationUnits,
+)
+from motionloom.pipeline.stages.results.evaluation import EvaluationStage
+
+_NAMES = {"tma": "TMA", "evaluator": "the evaluator", "face_evaluator": "the face evaluator"}
+
+
+class EvaluateStage(EvaluationStage):
+    """Reconstruction, retrieval and generation on the test split."""
+
+    name = "evaluate"
+    summary = "figures on the test split"
+    config = EvaluateConfig
+    takes = (
+        "data", "tokenizer?", "face_tokenizer?: tokenizer", "tma?", "evaluator?",
+        f"face_evaluator?: {FACE_ALIGNMENT}",
+        Every("generators", GENERATOR),
+    )  # fmt: skip
+
+    def external(self, config: Any) -> dict[str, str]:
+        """Checksum of the head whose vertices are measured."""
+        path = config.face_basis
+        if path is None:
+            return {}
+        if not path.is_file():
+            raise UserError(f"evaluate: face_basis {path}: no such file")
+        return {path.name: sha256_of(path)}
+
+    def evaluation(self, context: StageContext) -> _Evaluation:
+        return _Evaluation(context)
+
+
+class _Evaluation(EvaluationUnits):
+    """What is read from what all processes have made."""
+
+    def measured(self) -> FigureFile:
+        """All figures, each beside its trivial answers; `cases.safetensors` is written beside them."""
+        context, split = self.context, self.dataset.split
+        figures = self.reconstruction()
+        if not self.truths and not figures:
+            raise UserError(
+                f"{self.dataset.where}: no captioned clip of split '{split}' is long enough for one group of "
+                f"tokens"
+            )
+        if left := int((~self.said).sum()):
+            rest = "are left out" if self.tokenizer is None else "are left out, except of the reconstruction"
+            context.console.print(f"    {split}: {left} clips without a caption {rest}")
+        if self.performs:
+            made = list(context.units.read("generated", len(self.performances)))
+            figures += self.by_judges(made) + self.clip_by_clip(made) + self.movement(made)
+            if any(t.truth for t in self.truths):
+                self.details.performed(self.truths, self._first(made))
+        write_cases(context.folder, self.details.cases)
+        about = self.about(self.bundle) | {"judges": self._judged_by()}
+        return FigureFile("evaluate", tuple(figures), about, self.details.record())
+
+    def _judged_by(self) -> dict[str, dict[str, Any]]:
+        """Stage, kind and checksum of each judge."""
+        out = {}
+        for role in self.judges:
+            stage = self.context.inputs[role]
+            named = {"stage": stage.name, "kind": stage.kind.name, "sha256": self._weights(role)}
+            out[role] = named | (self.context.given[role].facts if role == "evaluator" else {})
+        return out
+
+    def _weights(self, role: str) -> str:
+        return sha256_of(self.context.input(role) / "model.safetensors")
+
+    @cached_property
+    def protocol(self) -> dict[str, Fact]:
+        """What one has to know to get the figures of generated motion again, but for the seed."""
+        config = self.config
+        assert self.bundle is not None
+        return {
+            "split": self.dataset.split,
+            "clips": len(self.truths),
+            "clips_sha256": digest_of(self.truths),
+            "caption": "the first about the whole clip, else the first",
+            "lengths": config.lengths,
+            **self.drawn_as(self.bundle),
+        }
+
+    def reconstruction(self) -> list[Figure]:
+        if self.tokenizer is None:
+            return []
+        found = list(self.context.units.read("reconstructed", len(self.slices)))
+        if not found:
+            return []
+        protocol: dict[str, Fact] = {
+            "split": self.dataset.split, "clips": len(self.shown), "clips_sha256": digest_of(self.shown)
+        }  # fmt: skip
+        rows = [row for table in found for row in as_rows(table, JOINTS)]
+        out = clip_error_figures(rows, self.tokenizer.net.bits_per_second, protocol)
+        out += face_figures([row for table in found for row in as_rows(table, FACE)], protocol)
+        for role, judge in self.judges.items():
+            latents = [table[LATENT[role]] for table in found if LATENT[role] in table]
+            shown = self.judged(judge, self.shown)
+            if latents:
+                out += reconstructed_figures(
+                    role,
+                    _NAMES[role],
+                    judge.recorded(shown),
+                    torch.from_numpy(np.concatenate(latents)),
+                    judge.recorded(self.judged(judge, self.others)[: len(shown)]),
+                    judge.texts(shown) if self.shown is self.truths else None,
+                    {**protocol, "judge": self._weights(role)},
+                    size=min(self.config.size, GUO_BATCH),
+                    repeats=self.config.repeats,
+                    seed=self.context.seed,
+                )
+        self.details.reconstructed(self.tokenizer, self.shown)
+        return out
+
+    def by_judges(self, made: Sequence[Arrays]) -> list[Figure]:
+        """Figures by the latents of each judge."""
+        config, out = self.config, list[Figure]()
+        for role, judge in self.performed_by.items():
+            truths = self.judged(judge, self.truths)
+            others = self.judged(judge, self.others)
+            nearest = {} if judge.motions.part == "face" else self._nearest_captions
+            latents = judge.latents(truths, self._latents(made, role), others, nearest)
+            if role == "tma":
+                self.details.judged(latents, truths, self._first(made))
+            out += judged_figures(
+                role,
+                _NAMES[role],
+                latents,
+                _captions(judge, truths),
+                {**self.protocol, "clips": len(truths), "judge": self._weights(role)},
+                size=config.size if role == "tma" else min(config.size, GUO_BATCH),
+                among=config.among,
+                seed=self.context.seed,
+            )
+        return out
+
+    def clip_by_clip(self, made: Sequence[Arrays]) -> list[Figure]:
+        """Figures of single motions, beside recorded motion, as many training clips and the mean pose."""
+        fps = self.dataset.layout.fps
+        clips = {RECORDED: self.truths, **self._nearest_captions}
+        answers = {row: [(t.joints, t.face) for t in found] for row, found in clips.items()}
+        answers[STILL] = [(joints, None) for joints in self._still]
+        if len(self.others) >= len(self.truths):
+            answers[TRAINING] = [(t.joints, None) for t in self.others[: len(self.truths)]]
+        rows = {MODEL: [self._rows(some) for some in self._repeats(made)]}
+        for row, motions in answers.items():
+            performances = [
+                Performance(joints, t.joints, fps, face, t.truth)
+                for (joints, face), t in zip(motions, self.truths, strict=True)
+            ]
+            rows[row] = [[measure_clip(CAPTION_METRICS, one) for one in performances]]
+        return clip_figures(CAPTION_METRICS, rows, self.protocol)
+
+    def movement(self, made: Sequence[Arrays]) -> list[Figure]:
+        """Figures of kinetic and geometric features."""
+        fps = self.dataset.layout.fps
+        real = all_features((t.joints for t in self.truths), fps)
+        others = all_features((t.joints for t in self.others[: len(self.truths)]), fps)
+        drawn: list[Features] = [
+            {kind: np.concatenate([table[MOVEMENT + kind] for table in some]) for kind in ("k", "m")}
+            for some in self._repeats(made)
+        ]
+        rows = {MODEL: drawn, RECORDED: [real], TRAINING: [others], STILL: [all_features(self._still, fps)]}
+        for row, found in self._nearest_captions.items():
+            rows[row] = [all_features((t.joints for t in found), fps)]
+        return movement_figures(self.reference(CAPTIONS), real, rows, self.protocol)
+
+    @cached_property
+    def others(self) -> list[Truth]:
+        """As many training clips as are judged."""
+        count = max(len(self.truths), len(self.shown))
+        return [truth_of(self.train, i) for i in spread_any(self.train, count)]
+
+    @cached_property
+    def _nearest_captions(self) -> dict[str, list[Truth]]:
+        """The training clip that each lookup finds for every caption."""
+        found = {row: lookup(self.train, self.truths) for row, lookup in LOOKUPS.items()}
+        return {row: clips for row, clips in found.items() if clips}
+
+    @cached_property
+    def _still(self) -> list[NDArray[np.float64]]:
+        lengths = [len(t.joints) for t in self.truths]
+        return mean_poses([t.joints for t in self.others], self.dataset.layout.fps, lengths)
+
+    def _repeats(self, made: Sequence[Arrays]) -> list[Sequence[Arrays]]:
+        """What was generated, repeat by repeat."""
+        each = len(self.performances) // self.draws
+        return [made[first : first + each] for first in range(0, len(made), each)]
+
+    def _rows(self, some: Sequence[Arrays]) -> list[Row]:
+        return [row for table in some for row in as_rows(table, CLIP)]
+
+    def _first(self, made: Sequence[Arrays]) -> list[NDArray[np.float64]]:
+        """Joints [T, N, 3] of the first repeat."""
+        return [table[name] for table in made for name in sorted(table) if name.startswith(MOTION)]
+
+    def _latents(self, made: Sequence[Arrays], role: str) -> list[torch.Tensor]:
+        """A judge's latents [n, Z] of all clips, once for each repeat."""
+        name = LATENT[role]
+        return [
+            torch.from_numpy(np.concatenate([table[name] for table in some if name in table]))
+            for some in self._repeats(made)
+        ]
+
+
+def _captions(judge: Judge, truths: Sequence[Truth]) -> list[str]:
+    """The words that a judge reads."""
+    return [t.face_caption if judge.motions.part == "face" else t.caption for t in truths]
+
+
+register(EvaluateStage())

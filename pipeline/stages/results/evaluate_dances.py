@@ -1,0 +1,262 @@
+"""Evaluation of dances: motion generated from held-out music, beside the ground truth and trivial answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+from pydantic import Field
+
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import GENERATOR, Every, StageConfig, StageContext, register
+from motionloom.pipeline.contract.units import Arrays, Row, even_slices
+from motionloom.pipeline.evaluation.answers import mean_poses, nearest_dances, random_dances
+from motionloom.pipeline.evaluation.clip_metrics import (
+    BEAT_ALIGN,
+    DANCE_METRICS,
+    MIN_FRAMES,
+    RECOGNITION,
+    Joints,
+    Performance,
+    clip_figures,
+    measure_clip,
+)
+from motionloom.pipeline.evaluation.dances import (
+    SOUND,
+    DanceClip,
+    commonest,
+    dances_of,
+    digest_of_dances,
+    other_songs,
+    require_dances,
+)
+from motionloom.pipeline.evaluation.estimate import plain, row_estimates, set_estimates
+from motionloom.pipeline.evaluation.figures import (
+    CHANCE,
+    MODEL,
+    NEAREST_MUSIC,
+    OTHER_MUSIC,
+    RANDOM_DANCE,
+    RECORDED,
+    STILL,
+    Estimate,
+    Fact,
+    Figure,
+    FigureFile,
+    Metric,
+    group_figures,
+)
+from motionloom.pipeline.evaluation.movement import all_features, movement_figures
+from motionloom.pipeline.inference.bundle import Bundle, bundle_driven_by
+from motionloom.pipeline.stages.results.evaluation import Evaluation, EvaluationStage
+
+_AT_ONCE = 16
+"""Dances generated together, at most."""
+WAY = tuple(
+    Metric(column.name.replace("beat_align", "beat_way"), f"way to the truth, {column.title}", "higher")
+    for column in BEAT_ALIGN.columns
+)
+"""How far Beat Align goes from other music (0) to the recorded dances (1)."""
+
+
+class EvaluateDancesConfig(StageConfig):
+    """How much is measured."""
+
+    clips: int | None = Field(100, ge=2)
+    """At most this many clips with music of the test split, different songs first; null takes all."""
+    repeats: int = Field(5, ge=1)
+    """Dances generated to each clip's music; MultiModality needs 2."""
+    decodings: int = Field(1, ge=1)
+    """Dances that a diffusion decoder makes of each repetition's tokens (UDE Tables 1 and 2: 30)."""
+    seconds: float | None = Field(None, ge=1)
+    """Longer clips are cut to this."""
+    shuffles: int = Field(5, ge=1)
+    """Other songs that each dance is compared with, for the beats of shuffled music."""
+    pool: int = Field(400, ge=2)
+    """Training dances that the trivial answers choose from, at most."""
+    feature_fps: float = Field(60.0, gt=0)
+    """Frame rate that motions are resampled to for FID, Diversity and MultiModality; published: 60."""
+    sampling: SamplingConfig = SamplingConfig()
+
+
+class EvaluateDancesStage(EvaluationStage):
+    """Dances to held-out music."""
+
+    name = "evaluate_dances"
+    summary = "figures of dances to held-out music"
+    config = EvaluateDancesConfig
+    takes = ("data", Every("generators", GENERATOR))
+
+    def evaluation(self, context: StageContext) -> _DanceEvaluation:
+        return _DanceEvaluation(context)
+
+
+class _DanceEvaluation(Evaluation):
+    """What one evaluation measures."""
+
+    def __init__(self, context: StageContext) -> None:
+        super().__init__(context)
+        found = bundle_driven_by("audio", context.every("generators"), context.stage_cache)
+        if found is None:
+            raise UserError(f"stage '{context.name}': no generator of this run is conditioned on music")
+        self.bundle: Bundle = found
+        require_dances(self.dataset)
+        require_dances(self.train)
+        self.fps = self.dataset.layout.fps
+        self.clips = self._dances(self.dataset, self.config.clips, self.bundle.generator.unit_frames)
+
+    def _dances(self, dataset: ClipDataset, count: int | None, unit: int = 1) -> list[DanceClip]:
+        """Dances that are long enough to be measured, cut to what the generator can make."""
+        longest = min(self.config.seconds or np.inf, self.bundle.max_seconds)
+        cut = None if np.isinf(longest) else float(longest)
+        found = dances_of(dataset, count, unit=unit, seconds=cut)
+        found = [clip for clip in found if len(clip.joints) >= MIN_FRAMES]
+        if not found:
+            raise UserError(
+                f"{self.dataset.where}: no clip with music of split '{dataset.split}' is long enough to be "
+                f"measured"
+            )
+        return found
+
+    def share(self) -> None:
+        """This process's share of the dances."""
+        self.drawn_as(self.bundle)
+        pieces = self.pieces
+        sizes = [piece.stop - piece.start for _, piece in pieces]
+        self.make("generated", "generating", sizes, lambda k: self.dance(*pieces[k]))
+        self.make_reference(SOUND, self.config.feature_fps)
+
+    @cached_property
+    def pieces(self) -> list[tuple[int, slice]]:
+        """Repeats and clips that are danced together."""
+        found = even_slices(len(self.clips), _AT_ONCE)
+        return [(repeat, piece) for repeat in range(self.draws) for piece in found]
+
+    def dance(self, repeat: int, piece: slice) -> Arrays:
+        """Joints [T, N, 3] of dances to some clips' own music, by their numbers."""
+        some = self.clips[piece]
+        seed, noise_seed = self.seeds(repeat, piece.start)
+        motions = self.bundle.generate(
+            sounds=[clip.sound for clip in some],
+            conditions={"audio": [clip.music for clip in some]},
+            seconds=[clip.seconds for clip in some],
+            seed=seed,
+            noise_seed=noise_seed,
+            sampling=self.config.sampling,
+        )
+        return {f"{number:06d}": motion.joints for number, motion in enumerate(motions)}
+
+    @cached_property
+    def protocol(self) -> dict[str, Fact]:
+        """What one has to know to get the same figures again, but for the seed."""
+        config, clips = self.config, self.clips
+        return {
+            "split": self.dataset.split,
+            "clips": len(clips),
+            "songs": len({clip.song for clip in clips}),
+            "clips_sha256": digest_of_dances(clips),
+            "shuffles": config.shuffles,
+            "feature_fps": config.feature_fps,
+            **self.drawn_as(self.bundle),
+        }
+
+    def measured(self) -> FigureFile:
+        """All figures, each beside its trivial answers."""
+        clips = self.clips
+        motions = {MODEL: self.generated()} | self.answers()
+        rows = {row: [self.each(one) for one in repeats] for row, repeats in motions.items()}
+        apart = other_songs(clips, self.config.shuffles, self.context.seed)
+        if any(apart):
+            rows[OTHER_MUSIC] = self.under_other_music(motions[MODEL], apart)
+        figures = clip_figures(DANCE_METRICS, rows, self.protocol)
+        figures += self.way(rows) if any(apart) else []
+        chance = plain({f"recognition.{name}": share for name, share in commonest(clips).items()})
+        figures += group_figures(RECOGNITION.group, RECOGNITION.columns, {CHANCE: chance}, self.protocol)
+        features = {
+            row: [all_features(one, self.fps, self.config.feature_fps) for one in repeats]
+            for row, repeats in motions.items()
+        }
+        real = features[RECORDED][0]
+        figures += movement_figures(self.reference(SOUND), real, features, self.protocol)
+        return FigureFile("evaluate_dances", tuple(figures), self.about(self.bundle))
+
+    def answers(self) -> dict[str, list[list[Joints]]]:
+        """Dances that need no model, once or several times."""
+        clips, pool = self.clips, self._dances(self.train, self.config.pool)
+        real = [clip.joints for clip in clips]
+        rng = np.random.default_rng([self.context.seed, 17])
+        out = {
+            RECORDED: [real],
+            RANDOM_DANCE: [random_dances(pool, clips, rng) for _ in range(self.config.repeats)],
+            STILL: [mean_poses([clip.joints for clip in pool], self.fps, [len(joints) for joints in real])],
+        }
+        nearest = nearest_dances(self.train, pool, self.dataset, clips)
+        return out if nearest is None else out | {NEAREST_MUSIC: [nearest]}
+
+    def generated(self) -> list[list[Joints]]:
+        """Dances to all clips' own music, once for each repeat."""
+        out: list[list[Joints]] = [[] for _ in range(self.draws)]
+        found = self.context.units.read("generated", len(self.pieces))
+        for (repeat, _), motions in zip(self.pieces, found, strict=True):
+            out[repeat] += [motions[name] for name in sorted(motions)]
+        return out
+
+    def each(self, motions: Sequence[Joints]) -> list[Row]:
+        """The values of one motion for each clip, against the clip's own music."""
+        pairs = zip(motions, self.clips, strict=True)
+        return [measure_clip(DANCE_METRICS, _performance(joints, clip)) for joints, clip in pairs]
+
+    def under_other_music(
+        self, repeats: Sequence[Sequence[Joints]], apart: Sequence[Sequence[int]]
+    ) -> list[list[Row]]:
+        """The same dances against the music of other songs, over the seconds that both last.
+
+        Every other song counts as one more repeat; a clip that has fewer of them has empty rows.
+        """
+        most = max(map(len, apart))
+        metrics = (BEAT_ALIGN, RECOGNITION)
+        return [
+            [
+                measure_clip(metrics, _performance(joints, self.clips[row[turn]])) if turn < len(row) else {}
+                for joints, row in zip(motions, apart, strict=True)
+            ]
+            for motions in repeats
+            for turn in range(most)
+        ]
+
+    def way(self, rows: Mapping[str, Sequence[Sequence[Row]]]) -> list[Figure]:
+        """How far Beat Align goes from other music to the recorded dances, repeat by repeat.
+
+        Left out where the recorded dances are less than 0.01 above other music **[ours]**: then it says
+        nothing.
+        """
+        turns = len(rows[OTHER_MUSIC]) // self.draws
+        true = row_estimates(rows[RECORDED])
+        ways: list[dict[str, float]] = []
+        for repeat, made in enumerate(rows[MODEL]):
+            other = row_estimates(rows[OTHER_MUSIC][repeat * turns : (repeat + 1) * turns])
+            ways.append(dict(_ways(row_estimates([made]), other, true)))
+        return group_figures(
+            BEAT_ALIGN.group, WAY, {MODEL: set_estimates(ways, self.config.decodings)}, self.protocol
+        )
+
+
+def _ways(
+    made: Mapping[str, Estimate], other: Mapping[str, Estimate], true: Mapping[str, Estimate]
+) -> Iterator[tuple[str, float]]:
+    for column, way in zip(BEAT_ALIGN.columns, WAY, strict=True):
+        if not all(column.name in found for found in (made, other, true)):
+            continue
+        room = true[column.name].value - other[column.name].value
+        if room >= 0.01:
+            yield way.name, (made[column.name].value - other[column.name].value) / room
+
+
+def _performance(joints: Joints, clip: DanceClip) -> Performance:
+    return Performance(joints, clip.joints, clip.fps, truth=clip.truth, beats=clip.beats)
+
+
+register(EvaluateDancesStage())

@@ -1,0 +1,254 @@
+"""What the processes of a run make for an evaluation: clips reconstructed, captions performed, measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import StageConfig, StageContext
+from motionloom.pipeline.contract.units import Arrays, as_table, even_slices
+from motionloom.pipeline.evaluation.answers import NearestClip
+from motionloom.pipeline.evaluation.clip_metrics import CAPTION_METRICS, Performance, measure_clip
+from motionloom.pipeline.evaluation.details import Details
+from motionloom.pipeline.evaluation.judges import Judge
+from motionloom.pipeline.evaluation.movement import features_of
+from motionloom.pipeline.evaluation.reconstruction import clip_errors, face_errors, read_basis
+from motionloom.pipeline.evaluation.truth import (
+    Truth,
+    drawn,
+    has_caption,
+    reconstruct_all,
+    reconstruct_truth,
+    spread_any,
+    truth_of,
+)
+from motionloom.pipeline.inference.bundle import Bundle, bundle_driven_by
+from motionloom.pipeline.stages.results.evaluation import Evaluation
+from motionloom.pipeline.store.evaluator import LoadedEvaluator
+from motionloom.pipeline.store.networks import TrainedTokenizer, embed_motions
+
+_RECONSTRUCTED, _GENERATED = 16, 64
+"""Clips at a time, at most."""
+JOINTS, FACE, CLIP, MOVEMENT, MOTION = "joints/", "face/", "clip/", "movement/", "motion/"
+"""Begin the names of what is measured of a clip, or made for it."""
+CAPTIONS = "texts.json"
+"""The member of a clip that holds its captions."""
+LATENT = {"tma": "latent", "evaluator": "latent_evaluator", "face_evaluator": "latent_face"}
+"""Role of a judge -> name of its latents of what was generated or reconstructed."""
+
+
+class EvaluateConfig(StageConfig):
+    """How much is measured."""
+
+    clips: int | None = Field(400, ge=1)
+    """At most this many clips of the test split; null takes all."""
+    repeats: int = Field(20, ge=1)
+    """Repetitions of generation and of drawing retrieval batches."""
+    decodings: int = Field(1, ge=1)
+    """Motions that a diffusion decoder makes of each repetition's tokens (UDE Tables 1 and 2: 30)."""
+    size: int = Field(32, ge=2)
+    """Candidates in retrieval by TMA (32: protocol D; 256: protocol C); an evaluator's are at most 32."""
+    among: int = Field(61, ge=2)
+    """Candidates of the accuracy of UDE's Table 1."""
+    lengths: Literal["free", "recorded"] = "free"
+    """How long generated motions are: as the generator decides, or as the recorded clip is, which is all that
+    VAEs and diffusion models can do."""
+    sampling: SamplingConfig = SamplingConfig()
+    face_basis: Path | None = None
+    """A head's expression basis, `.npy` of floats [V, 3, 50] in metres (such as the expression part of
+    SMPL-X's `shapedirs`, which its licence lets nobody pass on): with it errors of vertices are measured."""
+
+    @field_validator("sampling")
+    @classmethod
+    def _judged_by_others(cls, sampling: SamplingConfig) -> SamplingConfig:
+        if sampling.candidates > 1:
+            raise ValueError(
+                "TMA would choose the motions that it then judges; leave candidates at 1 here, and measure "
+                "chosen motions by what they do"
+            )
+        return sampling
+
+
+class EvaluationUnits(Evaluation):
+    """What is made clip by clip."""
+
+    def __init__(self, context: StageContext) -> None:
+        super().__init__(context)
+        self.tokenizer: TrainedTokenizer | None = context.given.get("tokenizer")
+        makers = context.every("generators")
+        # Without generators a tokenizer alone is measured (`generators: []`).
+        self.bundle: Bundle | None = None
+        if makers:
+            self.bundle = bundle_driven_by("text", makers, context.stage_cache) or Bundle(
+                makers, context.stage_cache
+            )
+        self.details = Details(self.dataset.layout, self.dataset.split)
+        self.judges = self._judges()
+        if self.tokenizer is not None:
+            unit = self.tokenizer.net.group_frames
+        elif self.bundle is not None:
+            unit = self.bundle.generator.unit_frames
+        else:
+            raise UserError(
+                f"stage '{context.name}': no tokenizer and no generator to evaluate; name one in its inputs"
+            )
+        self.said = has_caption(self.dataset)
+        chosen = drawn(self.dataset, self.config.clips) if self.said.any() else []
+        self.truths = self._truths(chosen, unit)
+        """Clips with a caption, which is performed."""
+        self.shown: list[Truth] = []
+        """Clips that are reconstructed."""
+        if self.tokenizer is not None:
+            every = self.said.all()
+            self.shown = (
+                self.truths if every else self._truths(spread_any(self.dataset, self.config.clips), unit)
+            )
+
+    def _judges(self) -> dict[str, Judge]:
+        """TMA and the evaluator, those that are there, by role."""
+        given, out = self.context.given, dict[str, Judge]()
+        if "tma" in given:
+            out["tma"] = Judge.tma(given["tma"])
+        if "evaluator" in given:
+            found: LoadedEvaluator = given["evaluator"]
+            found.require_layout(self.dataset.layout, self.context.inputs["evaluator"].name)
+            out["evaluator"] = Judge.evaluator(found)
+        if "face_evaluator" in given:
+            out["face_evaluator"] = Judge.faces(given["face_evaluator"])
+        return out
+
+    def judged(self, judge: Judge, truths: Sequence[Truth]) -> list[Truth]:
+        """Those that a judge can judge: faces where there are some."""
+        return [t for t in truths if judge.motions.part != "face" or t.face is not None]
+
+    @cached_property
+    def basis(self) -> NDArray[np.float64] | None:
+        """The head whose vertices are measured."""
+        path = self.config.face_basis
+        return None if path is None else read_basis(path)
+
+    @cached_property
+    def performed_by(self) -> dict[str, Judge]:
+        """The judges of what the generators make."""
+        makes_faces = self.bundle is not None and (
+            bool(self.bundle.faces) or self.bundle.generator.part == "all"
+        )
+        return {
+            role: judge
+            for role, judge in self.judges.items()
+            if judge.motions.part != "face" or (makes_faces and self.judged(judge, self.truths))
+        }
+
+    @property
+    def performs(self) -> bool:
+        """Whether motions are made for captions."""
+        bundle = self.bundle
+        return bool(self.truths) and bundle is not None and "text" in bundle.generator.modalities
+
+    @cached_property
+    def slices(self) -> list[slice]:
+        """Clips that are reconstructed together."""
+        return even_slices(len(self.shown), _RECONSTRUCTED)
+
+    @cached_property
+    def performances(self) -> list[tuple[int, slice]]:
+        """Repeats and clips whose captions are performed together."""
+        pieces = even_slices(len(self.truths), _GENERATED) if self.performs else []
+        return [(repeat, piece) for repeat in range(self.draws) for piece in pieces]
+
+    def share(self) -> None:
+        """This process's share of all that is made clip by clip."""
+        if self.performs and self.bundle is not None:
+            self.drawn_as(self.bundle)
+            for judge in self.performed_by.values():
+                # Captions that it cannot read are refused before anything is made.
+                judge.texts(self.judged(judge, self.truths))
+        slices, pieces = self.slices, self.performances
+        self.make(
+            "reconstructed",
+            "reconstructing",
+            [piece.stop - piece.start for piece in slices],
+            lambda k: self.reconstruct(self.shown[slices[k]]),
+        )
+        self.make(
+            "generated",
+            "generating",
+            [piece.stop - piece.start for _, piece in pieces],
+            lambda k: self.perform(*pieces[k]),
+        )
+        if self.performs:
+            self.make_reference(CAPTIONS)
+
+    def _truths(self, chosen: Sequence[int], unit: int) -> list[Truth]:
+        """The clips `chosen` that are long enough for one group of tokens."""
+        found = [truth_of(self.dataset, i) for i in sorted(chosen)]
+        return [truth for truth in found if len(truth.features) >= unit]
+
+    @cached_property
+    def _nearest(self) -> NearestClip:
+        return NearestClip(self.train)
+
+    def reconstruct(self, truths: Sequence[Truth]) -> Arrays:
+        """Errors of clips through the tokenizer, and of expressions where a tokenizer models them."""
+        tokenizer = self.tokenizer
+        assert tokenizer is not None
+        bodies = [reconstruct_truth(tokenizer, truth) for truth in truths]
+        pairs = zip(truths, bodies, strict=True)
+        out = as_table([clip_errors(tokenizer, self._nearest, truth, body) for truth, body in pairs], JOINTS)
+        faces = self.context.given.get("face_tokenizer", tokenizer)
+        models_faces = faces.layout.has("face") and faces.net.part in ("face", "all")
+        if models_faces:
+            out |= as_table([face_errors(faces, truth, self.basis) for truth in truths], FACE)
+        for role, judge in self.judges.items():
+            some = self.judged(judge, truths)
+            if judge.motions.part != "face":
+                made = bodies
+            elif models_faces:
+                made = [reconstruct_all(faces, t)[:, faces.layout.slice("face")] for t in some]
+            else:
+                continue
+            if made:
+                latents = embed_motions(judge.motions, made, [t.present for t in some])
+                out[LATENT[role]] = latents.numpy()
+        return out
+
+    def perform(self, repeat: int, piece: slice) -> Arrays:
+        """Motions for the captions of some clips, as latents and by whether they do what is said."""
+        assert self.bundle is not None
+        truths, fps = self.truths[piece], self.dataset.layout.fps
+        recorded = [len(t.features) / fps for t in truths]
+        seed, noise_seed = self.seeds(repeat, piece.start)
+        motions = self.bundle.generate(
+            [t.caption for t in truths],
+            face=[t.face_caption for t in truths],
+            seconds=recorded if self.config.lengths == "recorded" else None,
+            seed=seed,
+            noise_seed=noise_seed,
+            sampling=self.config.sampling,
+        )
+        made_for = [
+            Performance(m.joints, t.joints, fps, m.face, t.truth)
+            for t, m in zip(truths, motions, strict=True)
+        ]
+        out = as_table([measure_clip(CAPTION_METRICS, one) for one in made_for], CLIP)
+        moves = [features_of(m.joints, fps) for m in motions]
+        out |= {MOVEMENT + kind: np.stack([move[kind] for move in moves]) for kind in moves[0]}
+        if repeat == 0:
+            out |= {f"{MOTION}{number:03d}": m.joints for number, m in enumerate(motions)}
+        for role, judge in self.performed_by.items():
+            if judge.motions.part == "face":
+                made = [m.face for t, m in zip(truths, motions, strict=True) if t.face is not None]
+            else:
+                made = [m.features for m in motions]
+            shown = [x for x in made if x is not None]
+            if shown:
+                out[LATENT[role]] = embed_motions(judge.motions, shown).numpy()
+        return out

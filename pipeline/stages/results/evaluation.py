@@ -1,0 +1,154 @@
+"""What the stages that evaluate have in common: their work is shared, their figures are written and shown."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from motionloom.datasets.base.progress import Meter
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.pipeline.contract.showing import FigureTable, Showing
+from motionloom.pipeline.contract.stage import SHOWING, Finished, Inputs, StageContext, StageKind
+from motionloom.pipeline.contract.units import Arrays, even_slices
+from motionloom.pipeline.evaluation.details import detail_showings
+from motionloom.pipeline.evaluation.figures import FILE_NAME, Fact, FigureFile, facts, figure_tables
+from motionloom.pipeline.evaluation.movement import FEATURE_FPS, Features, all_features
+from motionloom.pipeline.inference.bundle import Bundle
+
+_REFERENCE = 64
+"""Motions at a time whose features are taken."""
+
+
+class EvaluationStage(StageKind):
+    """A kind of stage that writes figures."""
+
+    shares = True
+
+    @abstractmethod
+    def evaluation(self, context: StageContext) -> Evaluation:
+        """The evaluation of one run."""
+
+    def gives(self, config: Any) -> frozenset[str]:
+        return frozenset({"figures", SHOWING})
+
+    def share(self, context: StageContext) -> None:
+        """Make and measure this process's share of the clips."""
+        self.evaluation(context).share()
+
+    def run(self, context: StageContext) -> None:
+        """Write `metrics.json` and print it as tables."""
+        found = self.evaluation(context).measured()
+        found.write(context.folder / FILE_NAME)
+        print_figures(context.console, found)
+        context.units.clear()
+
+    def show(self, stage: Finished, given: Inputs) -> list[Showing]:
+        """The tables, and what is drawn beside them."""
+        found = FigureFile.read(stage.folder / FILE_NAME)
+        tables = [FigureTable(*table) for table in figure_tables(found.figures)]
+        return [*tables, *detail_showings(stage.folder, found.details)]
+
+
+class Evaluation:
+    """One evaluation; the clips are the same in every process."""
+
+    def __init__(self, context: StageContext) -> None:
+        self.context, self.config = context, context.config
+        data = context.given["data"]
+        self.dataset: ClipDataset = data.held_out(prefer="test")
+        self.train: ClipDataset = data.split("train")
+
+    @abstractmethod
+    def share(self) -> None:
+        """This process's share of what is made clip by clip."""
+
+    @abstractmethod
+    def measured(self) -> FigureFile:
+        """The figures, from what all processes have made."""
+
+    @property
+    def draws(self) -> int:
+        """Motions drawn for each clip."""
+        return int(self.config.repeats * self.config.decodings)
+
+    def seeds(self, draw: int, first: int) -> tuple[int, int | None]:
+        """Of the tokens of a draw from clip `first` on; of the noise where they are decoded several times."""
+        turn, decoding = divmod(draw, self.config.decodings)
+        seed = self.context.seed + 7919 * (turn + 1) + first
+        return seed, None if self.config.decodings == 1 else seed + 104_729 * (decoding + 1)
+
+    def drawn_as(self, bundle: Bundle) -> dict[str, Fact]:
+        """How motions are drawn, and how often, for the protocol of their figures."""
+        config = self.config
+        nested = {} if config.decodings == 1 else {"decodings": config.decodings}
+        if nested and "sampler" not in bundle.generator.settings:
+            raise UserError(
+                f"stage '{self.context.name}': decodings {config.decodings}, but '{bundle.main.name}' has no "
+                f"diffusion decoder; set decodings to 1"
+            )
+        return facts({"repeats": config.repeats, **nested, "sampling": bundle.in_effect(config.sampling)})
+
+    def about(self, bundle: Bundle | None) -> dict[str, Any]:
+        """What is evaluated: the stage, the split and what made the motions."""
+        made_by = dict[str, Finished | None]()
+        if bundle is not None:
+            face = bundle.choose_face(self.config.sampling.face_model)
+            made_by = {"generator": bundle.main, "face_generator": face}
+        return {
+            "stage": self.context.name,
+            "split": self.dataset.split,
+            "seed": self.context.seed,
+            "made_by": {role: stage.name for role, stage in made_by.items() if stage is not None},
+        }
+
+    def make(self, name: str, what: str, sizes: Sequence[int], result: Callable[[int], Arrays]) -> None:
+        """This process's share of units called `name`, with so many clips each."""
+        units = self.context.units
+        with Meter(what, units.mine(sizes), console=self.context.console) as meter:
+            units.make(name, len(sizes), result, lambda k: meter.advance(sizes[k]))
+
+    def make_reference(self, member: str, feature_fps: float = FEATURE_FPS) -> None:
+        """This process's share of the features of all motions whose clips have `member`."""
+        motions = self._reference(member)
+        slices = even_slices(len(motions), _REFERENCE)
+
+        def features(number: int) -> Arrays:
+            some = (_joints(dataset, index) for dataset, index in motions[slices[number]])
+            return dict(all_features(some, self.dataset.layout.fps, feature_fps))
+
+        self.make("reference", "features of all motions", [s.stop - s.start for s in slices], features)
+
+    def reference(self, member: str) -> Features:
+        """What all processes made of it: features [n, F]."""
+        count = len(even_slices(len(self._reference(member)), _REFERENCE))
+        parts = list(self.context.units.read("reference", count))
+        return {kind: np.concatenate([part[kind] for part in parts]) for kind in parts[0]}
+
+    def _reference(self, member: str) -> list[tuple[ClipDataset, int]]:
+        return [
+            (dataset, index)
+            for dataset in (self.train, self.dataset)
+            for index in np.flatnonzero(dataset.has(member)).tolist()
+        ]
+
+
+def _joints(dataset: ClipDataset, index: int) -> Any:
+    layout = dataset.layout
+    return joints_of(np.asarray(dataset.motion(index))[:, layout.part("bodyhand")], layout)
+
+
+def print_figures(console: Console, found: FigureFile) -> None:
+    """The tables on the terminal."""
+    for title, columns, rows in figure_tables(found.figures):
+        table = Table(*map(escape, columns), title=escape(title), title_justify="left")
+        for row in rows:
+            table.add_row(*map(escape, row))
+        console.print(table)

@@ -1,0 +1,126 @@
+"""Generation stage: motions for held-out captions and music, written for tools and as a page to watch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import (
+    GENERATOR,
+    Every,
+    StageConfig,
+    StageContext,
+    StageKind,
+    register,
+)
+from motionloom.pipeline.evaluation.dances import DanceClip, dances_of, with_music
+from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
+from motionloom.pipeline.inference.bundle import bundle_driven_by
+from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.shown import FigureOptions
+from motionloom.pipeline.inference.writers import Format, default_formats
+from motionloom.pipeline.render.score import Score
+
+
+class GenerateConfig(StageConfig):
+    """Which captions, how drawn, written as what."""
+
+    captions: list[str] = Field(default_factory=list)
+    """Captions to perform; empty takes `count` from the test split."""
+    count: int = Field(8, ge=0)
+    dances: int = Field(4, ge=0)
+    """Songs of the test split to dance to, where a generator is conditioned on music; different songs first.
+    """
+    dance_seconds: float = Field(20.0, ge=1)
+    """Longer songs are cut to this."""
+    sampling: SamplingConfig = SamplingConfig()
+    formats: list[Format] = Field(default_factory=default_formats)
+    figure: FigureOptions = FigureOptions()
+    """How the shown figure follows the generated joints."""
+
+
+class GenerateStage(StageKind):
+    """Motions for captions and music, written for tools and as a page to watch."""
+
+    name = "generate"
+    summary = "motions from captions and music"
+    config = GenerateConfig
+    takes = ("data", Every("generators", GENERATOR))
+    version = 5  # rigid figures
+
+    def gives(self, config: Any) -> frozenset[str]:
+        return frozenset({"motions"})
+
+    def run(self, context: StageContext) -> None:
+        from motionloom.pipeline.inference.outputs import page_note, write_motions
+
+        config: GenerateConfig = context.config
+        said, danced = _performed(context), _danced(context)
+        if not said and not danced:
+            raise UserError(
+                f"stage '{context.name}': nothing to generate from: no held-out clip has a caption or music "
+                f"that a generator of this run is conditioned on; give captions"
+            )
+        motions = [*said, *(motion for motion, _ in danced)]
+        write_motions(
+            context.folder / "motions",
+            motions,
+            config.formats,
+            title=f"Generated motions of {context.recipe}",
+            note=page_note(len(motions), context.recipe, context.seed),
+            seed=context.seed,
+            scores=[Score()] * len(said) + [clip.score() for _, clip in danced],
+            figure=config.figure,
+        )
+        titles = [motion.caption for motion in said] + [f"dance to {clip.title}" for _, clip in danced]
+        for motion, title in zip(motions, titles, strict=True):
+            line = f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {title}"
+            context.console.print(line, markup=False)
+
+
+def _performed(context: StageContext) -> list[GeneratedMotion]:
+    """The captions of the config, or of held-out clips, performed."""
+    config: GenerateConfig = context.config
+    bundle = bundle_driven_by("text", context.every("generators"), context.stage_cache)
+    captions, faces = list(config.captions), list(config.captions)
+    if not captions:
+        dataset = context.given["data"].held_out(prefer="test")
+        chosen = spread(dataset, config.count) if config.count and has_caption(dataset).any() else []
+        truths = [truth_of(dataset, i) for i in chosen]
+        captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
+        if bundle is None:
+            return []
+    if bundle is None:
+        raise UserError(f"stage '{context.name}': captions are given and no generator is conditioned on text")
+    if not captions:
+        return []
+    return bundle.generate(captions, face=faces, seed=context.seed, sampling=config.sampling)
+
+
+def _danced(context: StageContext) -> list[tuple[GeneratedMotion, DanceClip]]:
+    """Dances to the music of held-out clips."""
+    config: GenerateConfig = context.config
+    dataset = context.given["data"].held_out(prefer="test")
+    if not config.dances or not with_music(dataset).any():
+        return []
+    bundle = bundle_driven_by("audio", context.every("generators"), context.stage_cache)
+    if bundle is None:
+        return []
+    longest = min(config.dance_seconds, bundle.max_seconds)
+    clips = dances_of(dataset, config.dances, unit=bundle.generator.unit_frames, seconds=longest)
+    if not clips:
+        return []
+    made = bundle.generate(
+        sounds=[clip.sound for clip in clips],
+        conditions={"audio": [clip.music for clip in clips]},
+        seconds=[clip.seconds for clip in clips],
+        seed=context.seed,
+        sampling=config.sampling,
+    )
+    return list(zip(made, clips, strict=True))
+
+
+register(GenerateStage())

@@ -1,0 +1,121 @@
+"""What the report says of the run itself: its stages and settings, the data, and what is missing.
+
+A page made within a run names no times and no machine, since equal runs write equal pages; one made by
+`motionloom report` does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from motionloom.datasets.base.progress import duration
+from motionloom.pipeline.contract.stage import Finished, StageContext, stage_kind
+from motionloom.pipeline.render.page import Page
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.run_state import RunState
+from motionloom.pipeline.store.yaml import flatten, setting_text
+
+SPLITS = ("train", "val", "test")
+
+
+def say_missing(page: Page, state: RunState) -> None:
+    """What the run does not have yet, where something is missing."""
+    lines = [f"{stage.name}: {stage.say()}" for stage in state.unfinished if stage.kind != "report"]
+    if not lines:
+        return
+    page.add_heading("Still missing")
+    page.add_text(
+        f"{len(lines)} of {len(state.stages)} stages are not there, so this page shows less than that of a "
+        f"finished run. Go on with: motionloom run {state.folder / 'recipe.yaml'} -o {state.folder}"
+    )
+    page.add_list(lines)
+
+
+def add_run_facts(page: Page, context: StageContext, state: RunState | None) -> None:
+    """Stages, sizes of the data, settings."""
+    page.add_heading("What was run")
+    if state is None:
+        _stages_of_recipe(page, context)
+    else:
+        _stages_of_run(page, state)
+    if "data" in context.inputs:
+        _data(page, context.given["data"])
+    with page.folded("Settings of every stage"):
+        for name, kind, settings in _settings(context, state):
+            rows = [[key, setting_text(value)] for key, value in flatten(settings).items()]
+            page.add_table(["setting", "value"], rows, f"{name} ({kind})")
+
+
+def _stages_of_recipe(page: Page, context: StageContext) -> None:
+    rows = []
+    for stage in _upstream(context):
+        train = getattr(stage.config, "train", None)
+        steps = getattr(train, "steps", None)
+        rows.append([stage.name, stage.kind.summary, f"{steps:,}" if steps else None])
+    page.add_table(["stage", "what it makes", "steps"], rows, f"The stages of this page, seed {context.seed}")
+    page.add_text("How long each stage took, and on what, is on the page that motionloom report makes.")
+
+
+def _stages_of_run(page: Page, state: RunState) -> None:
+    known = [stage.seconds for stage in state.stages if stage.seconds is not None]
+    noted = list(dict.fromkeys(stage.hardware for stage in state.stages if stage.hardware))
+    rows = []
+    for stage in state.stages:
+        summary = stage_kind(stage.kind, f"{state.folder / 'recipe.yaml'}: stages.{stage.name}").summary
+        steps = None if stage.steps is None else f"{stage.steps:,}"
+        time = None if stage.seconds is None else duration(stage.seconds)
+        rows.append([stage.name, summary, stage.say(), steps, time, stage.hardware or None])
+    done = sum(stage.usable for stage in state.stages)
+    page.add_facts(
+        {
+            "recipe": state.recipe,
+            "seed": "not said" if state.seed is None else str(state.seed),
+            "stages finished": f"{done} of {len(state.stages)}",
+            "time of finished stages": duration(sum(known)) if known else "not noted",
+            "ran on": "; ".join(noted) or "not noted",
+        }
+    )
+    columns = ["stage", "what it makes", "state", "steps", "time", "ran on"]
+    page.add_table(columns, rows, "The stages of the run", pinned=True)
+
+
+def _data(page: Page, data: Data) -> None:
+    rows = []
+    for split in SPLITS:
+        if split not in data.splits:
+            continue
+        clips = data.split(split)
+        minutes = float(clips.frames.sum()) / clips.layout.fps / 60
+        said, music = int(clips.has("texts.json").sum()), int(clips.has("audio.flac").sum())
+        rows.append([split, f"{len(clips):,}", f"{minutes:,.1f}", f"{said:,}", f"{music:,}"])
+    layout = data.layout
+    page.add_table(
+        ["split", "clips", "minutes", "with a caption", "with music"],
+        rows,
+        f"The data: {layout.num_joints} joints at {layout.fps:g} frames a second, layout {layout.name}",
+    )
+
+
+def _settings(context: StageContext, state: RunState | None) -> Iterator[tuple[str, str, dict[str, object]]]:
+    if state is not None:
+        for stage in state.stages:
+            yield stage.name, stage.kind, dict(stage.settings)
+        return
+    for finished in _upstream(context):
+        yield finished.name, finished.kind.name, finished.config.dump()
+
+
+def _upstream(context: StageContext) -> list[Finished]:
+    """The stages that the page is made from, those that others read first."""
+    out: dict[Path, Finished] = {}
+
+    def take(stage: Finished) -> None:
+        if stage.folder not in out:
+            for above in stage.inputs.values():
+                take(above)
+            out.setdefault(stage.folder, stage)
+
+    for stage in context.inputs.values():
+        take(stage)
+    return list(out.values())

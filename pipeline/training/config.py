@@ -1,0 +1,139 @@
+"""Training configuration: length, precision, checkpoints, and where batches come from.
+
+It is apart from `trainer.py` because a recipe is read and planned without Lightning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar, Literal
+
+from pydantic import BaseModel, Field
+from torch.utils.data import Dataset
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.contract.stage import RUNTIME, StageConfig
+from motionloom.pipeline.launch.hardware import Hardware, require_loggers
+
+BatchSource = Callable[[int, int, int], Dataset[object]]
+"""(items per global micro-batch, rank, world) -> dataset; item k is this rank's batch of micro-step k."""
+
+EvalSource = Callable[[], Dataset[object]]
+"""Sized dataset of all validation batches: every process reads the same, so the figures depend on no rank."""
+
+
+class TrainConfig(Config):
+    """Length and arithmetic of one training run."""
+
+    steps: int = Field(1000, ge=1)
+    """Optimizer steps."""
+    seed: int | None = Field(None, ge=0)
+    """Of this training's first weights, batches and draws; null = the recipe's. Trainings of one recipe that
+    differ in it alone say how far a result is chance."""
+    batch_size: int = Field(256, ge=1)
+    """Global batch, over all processes and accumulated parts."""
+    accumulate: int = Field(1, ge=1)
+    """Parts the batch of a step is cut into, to need less memory; the gradient is the mean of theirs.
+
+    Equal to the whole batch where a loss is a mean over samples and the parts hold equally many real frames
+    or tokens. Two things cannot be: a contrastive loss sees the negatives of its own part only, and a learnt
+    codebook is updated with every part (an average and resets over smaller batches). More processes instead
+    of more parts change neither.
+    """
+    draws: Literal["rank", "sample"] = "rank"
+    """What dropout, noise and latents of a step depend on: the rank (torch's generators; other numbers of
+    processes draw otherwise) or each sample of the global batch (elastic: any number of processes, and of
+    parts, draws the same; slower, with dropout of attention weights much slower)."""
+    precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
+    strategy: Literal["ddp", "fsdp"] = Field("ddp", json_schema_extra=RUNTIME)
+    """What several processes hold: each the whole network (`ddp`), or each a part of the weights, gradients
+    and optimizer state (`fsdp`: gpt stages, for networks that do not fit; not with compile or 16-mixed).
+    One process holds all; the results are the same."""
+    compile: bool = False
+    """Compile networks and losses with torch.compile, as one graph."""
+    ema: float | None = Field(None, ge=0, lt=1)
+    """Decay a step of an average of the weights, such as 0.999; validation and the saved model take the
+    average. null or 0 turns it off."""
+    checkpoint_activations: bool = Field(False, json_schema_extra=RUNTIME)
+    """Keep only the borders of transformer blocks for the backward pass and compute the rest again there:
+    less memory, about a third more time, the same figures."""
+    checkpoint_every: int = Field(100, ge=1, json_schema_extra=RUNTIME)
+    """Steps between checkpoints; what a kill can cost."""
+    keep_checkpoints: int = Field(2, ge=2, json_schema_extra=RUNTIME)
+    """Newest checkpoints that are kept: the newest, and at least one more in case that is torn or damaged."""
+    keep_every: int = Field(0, ge=0, json_schema_extra=RUNTIME)
+    """Also keep, for ever, each checkpoint whose step is a multiple of this; 0 keeps none of them."""
+    validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
+    """Steps between validations, rounded up to checkpoints; 0 turns them off."""
+    on_not_finite: Literal["stop", "continue"] = Field("stop", json_schema_extra=RUNTIME)
+    """What to do if a loss or gradient is not finite; the batch of that step is saved either way."""
+
+    def local_batch(self, world: int) -> int:
+        """Items a process reads at once; the global batch must divide evenly."""
+        parts = world * self.accumulate
+        if self.batch_size % parts:
+            raise UserError(
+                f"train.batch_size {self.batch_size} does not divide by {world} processes x accumulate "
+                f"{self.accumulate}; make it a multiple of {parts}"
+            )
+        return self.batch_size // parts
+
+
+class TrainedStageConfig(StageConfig):
+    """Base of the configs of stages that train."""
+
+    shardable: ClassVar[bool] = False
+    """Whether `train.strategy: fsdp` can cut the network: it must be used through `forward` alone."""
+
+    optim: OptimConfig = OptimConfig()
+    train: TrainConfig = TrainConfig()
+
+    def require_fit(self, hardware: Hardware) -> None:
+        """The global batch must divide over the processes, and FSDP suit the network and the arithmetic."""
+        self.train.local_batch(hardware.world())
+        require_loggers(hardware.loggers)
+        if self.train.draws == "sample" and self.train.compile and self.train.checkpoint_activations:
+            raise UserError(
+                "train.checkpoint_activations repeats draws by sample in the backward pass, which "
+                "train.compile cannot do; set train.draws: rank, or one of them to false"
+            )
+        if self.train.strategy == "fsdp":
+            self._require_shardable()
+
+    def schedule_of_length(self) -> str | None:
+        """The learning-rate schedule that depends on `train.steps`, as one says it; None if none does.
+
+        Without one, more steps only add to those of a shorter training.
+        """
+        return _schedule_of_length(self)
+
+    def _require_shardable(self) -> None:
+        if not self.shardable:
+            raise UserError(
+                "train.strategy fsdp is for gpt stages: the other networks fit on every GPU, and learnt "
+                "codebooks must be whole on every process; set train.strategy: ddp"
+            )
+        if self.train.compile:
+            raise UserError(
+                "train.compile makes one graph and train.strategy fsdp gathers weights between the blocks; "
+                "set one of them back"
+            )
+        if self.train.ema:
+            raise UserError(
+                "train.ema averages whole weights and train.strategy fsdp keeps each in several processes; "
+                "set train.ema: null or strategy: ddp"
+            )
+        if self.train.precision == "16-mixed":
+            raise UserError("train.strategy fsdp has no gradient scaler; set train.precision: bf16-mixed")
+
+
+def _schedule_of_length(config: BaseModel, prefix: str = "") -> str | None:
+    for name in type(config).model_fields:
+        value = getattr(config, name)
+        if isinstance(value, OptimConfig) and value.schedule != "constant":
+            return f"{prefix}{name}.schedule {value.schedule}"
+        found = _schedule_of_length(value, f"{prefix}{name}.") if isinstance(value, BaseModel) else None
+        if found:
+            return found
+    return None

@@ -1,0 +1,122 @@
+"""Stopping at a signal without losing a step: the training saves after the current step and ends.
+
+- The handler notes the signal and nothing else. Saving inside a handler would see a step half taken, and a
+  collective there would wait for ranks that are elsewhere.
+- All ranks agree on the step, by one all-reduce of a number about twice a second.
+
+SIGTERM is what schedulers, Kubernetes and torchrun send first; SIGUSR1 and SIGUSR2 are the warnings that
+SLURM and submitit are asked to send before a time limit or a preemption. Ctrl-C ends a run at once, and it
+goes on from its newest checkpoint.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from types import FrameType
+
+import torch
+import torch.distributed as dist
+
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name))
+"""What a training answers by saving."""
+
+Handler = Callable[[int, FrameType | None], object] | int | None
+
+_BETWEEN = 0.5
+"""Seconds from one agreement of the ranks to the next."""
+_GROWTH = 4
+"""An interval in steps grows by no more than this at once: the first steps are slow."""
+_PATIENCE = timedelta(minutes=30)
+
+
+class Signals:
+    """Notes the first signal instead of letting it end the process; a context manager.
+
+    Further ones change nothing: launchers repeat what the whole process group has got already. Only the main
+    thread can be asked to note signals; in another one this does nothing.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        """The first signal that has come; 0 for none."""
+        self.answered = False
+        """Whether the training ends because of it."""
+        self._before: dict[signal.Signals, Handler] = {}
+
+    def __enter__(self) -> Signals:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """As it was before; a signal that came too late for the training is passed on."""
+        for number, handler in self._before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        self._before = {}
+        if kind is None and self.number and not self.answered:
+            signal.raise_signal(self.number)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.number = self.number or number
+
+
+@contextmanager
+def unsignalled() -> Iterator[None]:
+    """Processes started inside never get those signals: a group that is signalled keeps its loader workers.
+
+    They end with their parent, or when it asks them to.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)  # what came meanwhile is delivered now
+
+
+class Agreement:
+    """Which signal any rank has got, asked of all ranks at the same steps; one process asks itself."""
+
+    def __init__(self, signals: Signals, world: int) -> None:
+        self.signals = signals
+        self.group = dist.new_group(backend="gloo", timeout=_PATIENCE) if world > 1 else None
+        self._count = self._next = self._last = 0
+        self._every = 1
+        self._time = time.monotonic()
+
+    def after_step(self) -> int:
+        """The signal, or 0; every rank calls this after every step and every validation batch."""
+        if self.group is None:
+            return self.signals.number
+        self._count += 1
+        return self.now() if self._count >= self._next else 0
+
+    def now(self) -> int:
+        """The signal, or 0, asked in any case."""
+        if self.group is None:
+            return self.signals.number
+        seconds = time.monotonic() - self._time
+        asked = torch.tensor([float(self.signals.number), seconds], dtype=torch.float64)
+        dist.all_reduce(asked, dist.ReduceOp.MAX, self.group)
+        taken, seconds = self._count - self._last, float(asked[1])
+        if taken > 0:  # the slowest rank's clock decides for all
+            fitting = int(taken * _BETWEEN / max(seconds, 1e-6))
+            self._every = max(1, min(fitting, _GROWTH * self._every))
+        self._last, self._next, self._time = self._count, self._count + self._every, time.monotonic()
+        return int(asked[0])
+
+    def restart_pace(self) -> None:
+        """From here on borders come at another pace: batches of a validation, or steps again."""
+        self._every, self._last, self._time = 1, self._count, time.monotonic()
+        self._next = self._count + 1
+
+    def barrier(self) -> None:
+        if self.group is not None:
+            dist.barrier(self.group)

@@ -1,0 +1,179 @@
+"""Per-rank training telemetry: speed, step times and what each process waits for.
+
+A row every ten steps goes into `flight/rank_N.jsonl` of the stage's folder, which the report draws.
+"""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from motionloom.models.training.distributed import rank, world_size
+from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
+from motionloom.pipeline.store.training_log import FLIGHT, FlightLog
+
+
+@dataclass
+class WaitTimes:
+    """Seconds that this process has waited, by cause."""
+
+    data: float = 0.0
+    """For the next batch: what the reader had not prepared while the step before it was computed."""
+    checkpoints: float = 0.0
+    """For copying the state, and for the checkpoint before it if that was still being written."""
+    ranks: float = 0.0
+    """For ranks that came later to a step."""
+    wall: float = 0.0
+    """Seconds that have passed in all."""
+
+    @contextmanager
+    def waiting_for(self, cause: str) -> Iterator[None]:
+        """Count the time inside as a wait for `cause`, a field."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            setattr(self, cause, getattr(self, cause) + time.perf_counter() - begin)
+
+    def since(self, before: WaitTimes) -> WaitTimes:
+        """What has come since `before`, a copy made earlier."""
+        return WaitTimes(
+            self.data - before.data,
+            self.checkpoints - before.checkpoints,
+            self.ranks - before.ranks,
+            self.wall - before.wall,
+        )
+
+    def shares(self) -> dict[str, float]:
+        """Share of the wall time, 0 to 1, by cause."""
+        wall = max(self.wall, 1e-9)
+        causes = {"data": self.data, "checkpoints": self.checkpoints, "ranks": self.ranks}
+        return {cause: min(1.0, max(0.0, seconds / wall)) for cause, seconds in causes.items()}
+
+
+class Telemetry:
+    """Measures the steps of one process.
+
+    Args:
+        folder: The stage's.
+        rows: Most rows of the log; 0 writes none.
+    """
+
+    def __init__(self, folder: Path, rows: int, module: StageModule, batch_size: int) -> None:
+        self.module, self.batch_size = module, batch_size
+        self.waits = WaitTimes()
+        self._log = FlightLog(folder / FLIGHT / f"rank_{rank()}.jsonl", rows) if rows else None
+        self._first = module.step
+        self._start = self._step_start = time.perf_counter()
+        self._row_start = replace(self.waits)
+        self._seconds: list[float] = []
+        """Of the steps since the last row."""
+        self._own: list[float] = []
+        """Without the wait for the batch."""
+        self._latest: deque[float] = deque(maxlen=100)
+        self._lengths: list[Tensor] = []
+        self._units, self._unit = 0.0, ""
+        if self._log is not None:
+            self._log.begin(module.step)
+
+    def batch(self, batch: Batch) -> None:
+        """A batch has been read: count its frames or tokens."""
+        length = batch.get("length")
+        if isinstance(length, Tensor):
+            self._unit = "tokens" if "tokens" in batch else "frames"
+            self._lengths.append(length)
+
+    def begin_step(self) -> None:
+        """Validations and checkpoints do not count in the time of a step."""
+        self._step_start, self._data_before = time.perf_counter(), self.waits.data
+
+    def end_step(self) -> None:
+        seconds = time.perf_counter() - self._step_start
+        self._seconds.append(seconds)
+        self._latest.append(seconds)
+        self._own.append(seconds - (self.waits.data - self._data_before))
+
+    def end_row(self) -> dict[str, float]:
+        """Write a row; all ranks call this after the same step. What loggers get of it."""
+        late = all_ranks(([0.0] * LOG_EVERY + self._own)[-LOG_EVERY:], self.module.device)
+        self.waits.ranks += waited_in_steps(late, rank())
+        self.waits.wall = time.perf_counter() - self._start
+        waited, self._row_start = self.waits.since(self._row_start), replace(self.waits)
+        seconds, self._seconds, self._own = self._seconds, [], []
+        units, latest = self._read_lengths(), sorted(self._latest)
+        row: dict[str, float] = {
+            "samples_per_second": len(seconds) * self.batch_size / max(waited.wall, 1e-9),
+            "step_seconds": statistics.median(seconds),
+            "step_seconds_p95": latest[-(-95 * len(latest) // 100) - 1],
+            **{f"waited/{cause}": share for cause, share in waited.shares().items()},
+            "rss_mib": _rss_mib(),
+        }
+        if self._unit:
+            row[f"{self._unit}_per_second"] = units * world_size() / max(waited.wall, 1e-9)
+        if self.module.device.type == "cuda":
+            row["cuda_peak_mib"] = torch.cuda.max_memory_allocated(self.module.device) / 2**20
+        if self._log is not None:
+            self._log.append({"step": self.module.step, **row})
+        return {f"flight/{name}": value for name, value in row.items()}
+
+    def summary(self) -> str:
+        """Speed and waits since this process began to train, in words; "" if it took no step."""
+        steps, wall = self.module.step - self._first, time.perf_counter() - self._start
+        self._read_lengths()
+        if not steps:
+            return ""
+        self.waits.wall = wall
+        speeds = [f"{steps * self.batch_size / wall:,.1f} samples/s"]
+        if self._unit:
+            speeds.append(f"{self._units * world_size() / wall:,.0f} {self._unit}/s")
+        shares = self.waits.shares()
+        waits = [
+            f"{100 * shares['data']:.1f} % for data",
+            f"{100 * shares['checkpoints']:.1f} % for checkpoints",
+        ]
+        if world_size() > 1:
+            waits.append(f"{100 * shares['ranks']:.1f} % for other ranks")
+        return f"{', '.join(speeds)}; waited {', '.join(waits)}"
+
+    def _read_lengths(self) -> float:
+        units = float(torch.cat([own.reshape(-1) for own in self._lengths]).sum()) if self._lengths else 0.0
+        self._lengths = []
+        self._units += units
+        return units
+
+
+def all_ranks(values: Sequence[float], device: torch.device) -> Tensor:
+    """The values of all ranks, float64 [W, len(values)] on the CPU; a collective."""
+    own = torch.tensor(values, dtype=torch.float64)
+    if world_size() == 1:
+        return own[None]
+    own = own.to(device)
+    found = [torch.empty_like(own) for _ in range(world_size())]
+    dist.all_gather(found, own)
+    return torch.stack(found).cpu()
+
+
+def waited_in_steps(seconds: Tensor, rank: int) -> float:
+    """Seconds that a rank has waited in its steps [W, K] for the rank that came last to each.
+
+    A rank whose batch came late keeps the others waiting in the step's first collective: their step takes
+    longer than its own by as much.
+    """
+    return float((seconds[rank] - seconds.min(dim=0).values).sum())
+
+
+def _rss_mib() -> float:
+    """The most memory this process has had so far."""
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most / 2**20 if sys.platform == "darwin" else most / 2**10

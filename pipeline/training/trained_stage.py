@@ -1,0 +1,184 @@
+"""A stage that trains one network: the part of the contract that all such kinds share.
+
+How a network is built is said once, in `facts` and `network`. Training calls them with what the input stages
+made, a dry run with previews of it, and loading with the facts that were written beside the weights.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
+
+import torch
+from torch import nn
+
+from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.models.training.distributed import rank
+from motionloom.models.training.lora import trained_share
+from motionloom.pipeline.contract.showing import ModelCard
+from motionloom.pipeline.contract.stage import (
+    SHOWING,
+    Every,
+    Finished,
+    Inputs,
+    Role,
+    StageContext,
+    StageKind,
+)
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.store.files import copy_files
+from motionloom.pipeline.store.weights import MODEL_FILES, ModelFacts, load_facts, load_weights, save_model
+from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainedStageConfig
+
+if TYPE_CHECKING:
+    from motionloom.models.training.stage_module import Batch, StageModule
+
+Log = Callable[[str], None]
+"""Prints one line to the console."""
+
+C = TypeVar("C", bound=TrainedStageConfig)
+I = TypeVar("I", bound=Inputs)  # noqa: E741
+N = TypeVar("N", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class Batches:
+    """Where a training's batches come from."""
+
+    train: BatchSource
+    validation: EvalSource | None
+
+
+class Example(NamedTuple):
+    """A batch of the shapes that training sees, for dry runs."""
+
+    batch: Batch
+    note: str = ""
+    """What its tokens are."""
+
+
+def caption_example(batch: int, frames: int, dim: int, width: int) -> Example:
+    """Clips of `frames` frames and `dim` columns with captions of `width` features."""
+    return Example(
+        {
+            "motion": torch.empty(batch, frames, dim),
+            "length": torch.full((batch,), frames),
+            "conditions": {"text": MODALITIES["text"].example(batch, frames, width)},
+            "similarity": torch.empty(batch, width),
+        }
+    )
+
+
+class TrainedStage(StageKind[C], Generic[C, I, N]):
+    """A kind that trains a network of type `N`, by a config `C`, from inputs `I`."""
+
+    config: type[C]
+    inputs: type[I] = cast(type[I], Inputs)
+    """Declares what the stage takes."""
+    trains = True
+
+    def roles(self) -> tuple[Role | Every, ...]:
+        return self.inputs.roles() or super().roles()
+
+    @abstractmethod
+    def facts(self, config: C, inputs: I) -> ModelFacts:
+        """All that building the network needs beside the inputs that an export takes along."""
+
+    @abstractmethod
+    def network(self, facts: ModelFacts, inputs: I) -> N:
+        """The untrained network; `UserError` where it does not fit the inputs."""
+
+    @abstractmethod
+    def module(self, config: C, net: N, inputs: I, seed: int) -> StageModule:
+        """The network with its losses and optimizers."""
+
+    @abstractmethod
+    def batches(self, config: C, net: N, inputs: I, seed: int, log: Log) -> Batches:
+        """Training and validation batches."""
+
+    @abstractmethod
+    def example(self, config: C, net: N, inputs: I, batch: int) -> Example:
+        """A batch of `batch` rows, as large as training may see."""
+
+    def dry_module(self, config: C, net: N, inputs: I) -> StageModule:
+        """The module whose memory a dry run counts."""
+        return self.module(config, net, inputs, seed=0)
+
+    def prepare(self, config: C, net: N, inputs: I) -> None:
+        """Set what the network takes over from other stages before training: statistics, weights."""
+
+    def trained(self, config: C, net: N) -> None:
+        """Turn the trained network, in place, into what is saved."""
+
+    def loaded(self, net: N, facts: ModelFacts, inputs: I) -> object:
+        """What other stages get: the trained network, frozen, or an object around it."""
+        return net
+
+    def gives(self, config: C) -> frozenset[str]:
+        return frozenset({SHOWING})
+
+    def run(self, context: StageContext) -> None:
+        from motionloom.pipeline.training.trainer import fit
+
+        config, inputs = context.config, self.inputs.of(context.given)
+        facts = self.facts(config, inputs)
+        seed = context.seed if config.train.seed is None else config.train.seed
+        torch.manual_seed(seed)
+        net = self.network(facts, inputs)
+        self.prepare(config, net, inputs)
+        module = self.module(config, net, inputs, seed)
+        log = _printer(context)
+        batches = self.batches(config, net, inputs, seed, log)
+        part, whole = trained_share(net)
+        if part < whole:
+            log(f"{part:,} of {whole:,} parameters are trained ({part / whole:.1%})")
+        fit(context, module, config.train, batches.train, batches.validation)
+        if rank() == 0:
+            self.trained(config, net)
+            save_model(context.folder, net, facts)
+
+    def preview(self, config: C, given: Inputs) -> object:
+        inputs = self.inputs.of(given)
+        facts = self.facts(config, inputs)
+        return self.loaded(_frozen(self.network(facts, inputs)), facts, inputs)
+
+    def preview_of_finished(self, stage: Finished, given: Inputs) -> object:
+        """The network of a stage outside the recipe's run, without its weights."""
+        facts, inputs = load_facts(stage.folder), self.inputs.of(given)
+        return self.loaded(_frozen(self.network(facts, inputs)), facts, inputs)
+
+    def load(self, stage: Finished, given: Inputs, device: torch.device) -> Any:
+        facts, inputs = load_facts(stage.folder), self.inputs.of(given)
+        net = self.network(facts, inputs)
+        load_weights(stage.folder, net)
+        return self.loaded(_frozen(net.to(device)), facts, inputs)
+
+    def export(self, stage: Finished, target: Path) -> None:
+        copy_files(stage.folder, target, MODEL_FILES)
+
+    def estimate(self, config: C, given: Inputs, hardware: Hardware) -> ModelCard:
+        """Parameters and memory of one training process, from the code that will run, on fake tensors."""
+        from motionloom.pipeline.training.memory import model_card
+
+        inputs = self.inputs.of(given)
+        size = config.train.local_batch(hardware.world())
+
+        def make() -> tuple[StageModule, Batch, str]:
+            net = self.network(self.facts(config, inputs), inputs)
+            return self.dry_module(config, net, inputs), *self.example(config, net, inputs, size)
+
+        return model_card(make, config.train, size, hardware)
+
+
+def _frozen(net: N) -> N:
+    return net.eval().requires_grad_(False)
+
+
+def _printer(context: StageContext) -> Log:
+    def log(line: str) -> None:
+        context.console.print(f"    {line}")
+
+    return log

@@ -1,0 +1,351 @@
+"""The training loop of a stage, on Lightning Fabric: steps, validation, checkpoints, logs, exact resume.
+
+The batch of step k is a pure function of (seed, k) and every step seeds its own random draws, so a resumed
+training repeats the undisturbed one bit for bit, and the loader's whole state is the step number. Checkpoints
+are written in the background every `checkpoint_every` steps, at the end, and when a signal interrupts the
+training.
+"""
+
+from __future__ import annotations
+
+import signal
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext, suppress
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+import torch.distributed as dist
+from lightning.fabric import Fabric
+from torch import Tensor
+
+from motionloom.datasets.base.files import remove_temporaries
+from motionloom.datasets.schema import UserError
+from motionloom.models.training.averaging import AveragedWeights
+from motionloom.models.training.distributed import rank, world_size
+from motionloom.models.training.sharding import make_whole
+from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
+from motionloom.pipeline.contract.stage import StageContext
+from motionloom.pipeline.launch.process import Interrupted, TeamError
+from motionloom.pipeline.launch.team import lead_finds
+from motionloom.pipeline.store.training_log import CRASHES
+from motionloom.pipeline.training.background import BackgroundWriter, name_of, step_of
+from motionloom.pipeline.training.checkpointing import (
+    Checkpoint,
+    load_optimizer,
+    load_row,
+    load_weights,
+    optimizer_state,
+    read_checkpoint,
+    readable,
+    rows_of_ranks,
+    weights_of,
+)
+from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
+from motionloom.pipeline.training.execution import TrainingData, execution, launch, prepare_module
+from motionloom.pipeline.training.failures import FailureGuard, StallTimer
+from motionloom.pipeline.training.loggers import Loggers
+from motionloom.pipeline.training.preemption import Agreement, Signals
+from motionloom.pipeline.training.profiler import StepProfiler
+from motionloom.pipeline.training.progress import MetricLog, StepProgress
+from motionloom.pipeline.training.telemetry import Telemetry
+
+
+def fit(
+    context: StageContext,
+    module: StageModule,
+    config: TrainConfig,
+    train: BatchSource,
+    validation: EvalSource | None,
+) -> None:
+    """Train `module` for `config.steps`, resuming from the newest good checkpoint in the stage's folder."""
+    hardware = context.hardware
+    if hardware.threads:
+        torch.set_num_threads(hardware.threads)
+    if hardware.resolved_accelerator() == "gpu":
+        hardware.device()  # refuses in one sentence where there is no GPU
+    fabric = launch(hardware, config)
+    resume = lead_finds(partial(_find_resume_point, context, config))
+    net = module.net
+    training = Training(
+        context, module, config, fabric, TrainingData(train, validation, config, hardware), resume
+    )
+    try:
+        training.run()
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(training.folder)
+        raise
+    except RuntimeError as error:
+        if isinstance(error, dist.DistBackendError) or "by peer" in str(error) or "imed out" in str(error):
+            raise TeamError(str(error)) from None
+        raise
+    if module.net is not net:  # a sharded copy was trained
+        make_whole(module.net, net)
+        module.net = net
+    if training.average is not None:
+        training.average.fill(net)
+    module.to("cpu")
+
+
+class ResumePoint(NamedTuple):
+    """Where a training begins."""
+
+    checkpoint: Path | None
+    """None for the beginning."""
+    longer: bool = False
+    """Whether the checkpoint is of a training of fewer steps."""
+
+
+class Training:
+    """One training of a stage, in this process."""
+
+    def __init__(
+        self,
+        context: StageContext,
+        module: StageModule,
+        config: TrainConfig,
+        fabric: Fabric,
+        data: TrainingData,
+        resume: ResumePoint,
+    ) -> None:
+        self.context, self.module, self.config, self.fabric, self.data = context, module, config, fabric, data
+        self.folder = context.folder / "checkpoints"
+        console, name, hardware = context.console, context.name, context.hardware
+        self.every = min(config.checkpoint_every, config.steps)
+        checkpoints = -(-config.validate_every // self.every)
+        self.validate_every = checkpoints * self.every if data.validation is not None else 0
+        prepare_module(module, config)
+        if config.compile:
+            module.compile_losses()
+        self.how = execution(fabric, module, config)
+        self.optimizers = module.configure_optimizers()
+        self.average = AveragedWeights(module.net, config.ema) if config.ema else None
+        self.log = MetricLog(
+            context.folder,
+            Loggers(hardware.loggers, context.folder, context.recipe, f"{context.recipe}/{name}"),
+        )
+        self.validation_is_due = False
+        if resume.checkpoint is not None:
+            self._load(read_checkpoint(resume.checkpoint), longer=resume.longer)
+        since = step_of(resume.checkpoint) if resume.checkpoint else None
+        self.writer = BackgroundWriter(
+            keep=config.keep_checkpoints, keep_every=config.keep_every, since=since
+        )
+        self._saved, self._writing = module.step if resume.checkpoint else -1, False
+        self.telemetry = Telemetry(context.folder, hardware.flight_rows, module, config.batch_size)
+        self.failures = FailureGuard(
+            name, context.folder, module, data, console, stop=config.on_not_finite == "stop"
+        )
+        self.stall = StallTimer(
+            context.folder / CRASHES / f"stalled_rank_{rank()}.txt", hardware.stall_seconds
+        )
+        self.profiler: StepProfiler | None = None
+        if hardware.profile:
+            self.profiler = StepProfiler(
+                name, context.folder, hardware.profile, module.step, config.steps, module.device, console
+            )
+
+    def run(self) -> None:
+        self.log.open(self.module.step)
+        self.progress = StepProgress(
+            self.context.name, self.module.step, self.config.steps, self.context.console
+        )
+        with Signals() as self.signals, self.stall.running():
+            self.agreement = Agreement(self.signals, world_size())
+            try:
+                self._run()
+            except BaseException as error:
+                if isinstance(error, Exception):
+                    self.failures.save_error(error)
+                with suppress(UserError, OSError):  # the error says more than one of the writing
+                    self._finish_writing()
+                self.log.fail()
+                raise
+            finally:
+                self.progress.close()
+                if self.profiler is not None:
+                    self.profiler.close()
+        summary = self.telemetry.summary()
+        if summary:
+            self.context.console.print(f"    {self.context.name}: {summary}")
+
+    def _run(self) -> None:
+        module, steps = self.module, self.config.steps
+        if self.validation_is_due:
+            self._validate()
+            if not self.validation_is_due:
+                self._save(again=True)
+            self._answer(self.agreement.now())
+        batches = self.data.batches(module.step) if module.step < steps else iter(())
+        while module.step < steps:
+            self._step(batches)
+            border = module.step % self.every == 0 or module.step == steps
+            if self.validate_every and module.step % self.validate_every == 0:
+                self._validate()
+            if border:
+                self._save()
+            self._answer(self.agreement.now() if border else self.agreement.after_step())
+        self._finish_writing()
+        self._answer(self.agreement.now())
+        self.log.finish(module.step)
+
+    def _step(self, batches: Iterator[Batch]) -> None:
+        self.telemetry.begin_step()
+        if self.profiler is not None:
+            self.profiler.begin_step(self.module.step)
+        loss = self.module.take_step(self._parts(batches), self.optimizers, self.how)
+        step = self.module.step
+        if self.average is not None:
+            self.average.update(self.module.net, step)
+        self.telemetry.end_step()
+        if self.profiler is not None:
+            self.profiler.end_step(step)
+        if self.failures.due(step):
+            self.failures.check(scaled=self.how.scaler is not None)
+        if step % LOG_EVERY == 0:
+            self._log_row()
+        self.progress.show(step, loss)
+        if self._writing and not self.writer.busy:
+            self._finish_writing()
+        self.stall.progress()
+
+    def _parts(self, batches: Iterator[Batch]) -> Iterator[Batch]:
+        """The parts of one step's batch, each read when it is wanted."""
+        for _ in range(self.config.accumulate):
+            with self.telemetry.waits.waiting_for("data"):
+                batch = next(batches)
+            batch = self.fabric.to_device(batch)
+            self.telemetry.batch(batch)
+            yield batch
+
+    def _log_row(self) -> None:
+        """A row of the log: means of the last ten steps over all ranks."""
+        means = self.module.take_row()
+        if world_size() > 1 and means:
+            values = torch.stack(list(means.values()))
+            dist.all_reduce(values)
+            means = dict(zip(means, (values / world_size()).unbind(), strict=True))
+        gauges = _numbers(self.module.gauges) | self.telemetry.end_row()
+        self.log.append(self.module.step, _numbers(means), gauges)
+
+    def _validate(self) -> None:
+        """Losses on all held-out batches, their means weighted by rows; a signal ends it after a batch."""
+        module, loader = self.module, self.data.held_out()
+        self.failures.check(scaled=self.how.scaler is not None)
+        modes = [(part, part.training) for part in module.modules()]
+        module.eval()
+        sums: dict[str, Tensor] = {}
+        rows, cut = 0, False
+        self.agreement.restart_pace()
+        with self.average.swapped(module.net) if self.average else nullcontext(), torch.no_grad():
+            for number, batch in enumerate(loader):
+                batch = self.fabric.to_device(batch)
+                with self.how.autocast():
+                    values = module.validation_step(batch, number)
+                size = len(batch["length"])
+                rows += size
+                sums = {k: sums.get(k, 0.0) + _at_least_float32(v) * size for k, v in values.items()}
+                self.stall.progress()
+                if number + 1 < len(loader) and self.agreement.after_step():
+                    cut = True
+                    break
+        self.agreement.restart_pace()
+        for part, mode in modes:
+            part.training = mode
+        self.validation_is_due = cut
+        if not cut:
+            self.log.append(module.step, _numbers({f"val/{k}": v / rows for k, v in sums.items()}), {})
+
+    def _answer(self, number: int) -> None:
+        """End with `Interrupted`, this step saved, if a signal has come to any rank."""
+        if not number:
+            return
+        self.signals.answered = True
+        self._save()
+        self._finish_writing()
+        self.agreement.barrier()  # nobody leaves before the file is whole
+        raise Interrupted(self.context.name, self.module.step, self.config.steps, signal.Signals(number).name)
+
+    def _save(self, *, again: bool = False) -> None:
+        """Save this step unless it is saved (`again`: in any case); every rank calls it."""
+        step = self.module.step
+        if step == self._saved and not again:
+            return
+        self.failures.check(scaled=self.how.scaler is not None)
+        with self.telemetry.waits.waiting_for("checkpoints"):
+            self._finish_writing()
+            state = self._state()
+            if rank() == 0:
+                self.writer.write(state, self.folder / name_of(step))
+                self._writing = True
+        self._saved = step
+        self.stall.progress()
+
+    def _finish_writing(self) -> None:
+        """Wait until what is being written is on disk; `UserError` where it could not be written."""
+        self.writer.finish()
+        if self._writing:
+            self._writing = False
+            self.log.saved(self._saved)
+
+    def _state(self) -> Checkpoint:
+        module = self.module
+        return {
+            "global_step": module.step,
+            "steps": self.config.steps,
+            "state_dict": weights_of(module),
+            "optimizer_states": [optimizer_state(module, optimizer) for optimizer in self.optimizers],
+            "scaler": {} if self.how.scaler is None else self.how.scaler.state_dict(),
+            "average": None if self.average is None else self.average.state_dict(),
+            "log": self.log.state_dict(),
+            "row": rows_of_ranks(module),
+            "validate": self.validation_is_due,
+        }
+
+    def _load(self, state: Checkpoint, *, longer: bool) -> None:
+        module, name = self.module, self.context.name
+        module.step = state["global_step"]
+        load_weights(module, state["state_dict"])
+        for optimizer, one in zip(self.optimizers, state["optimizer_states"], strict=True):
+            load_optimizer(module, optimizer, one)
+        if self.how.scaler is not None and state["scaler"]:
+            self.how.scaler.load_state_dict(state["scaler"])
+        if self.average is not None and state["average"] is not None:
+            self.average.load_state_dict(state["average"])
+        self.log.load_state_dict(state["log"])
+        load_row(module, state["row"])
+        self.validation_is_due = state["validate"]
+        if rank() == 0 and longer:
+            self.context.console.print(f"    {name} continues from step {module.step} to {self.config.steps}")
+        elif rank() == 0:
+            self.context.console.print(f"    resuming {name} at step {module.step} of {self.config.steps}")
+
+
+def _numbers(values: dict[str, Tensor] | dict[str, float | Tensor]) -> dict[str, float]:
+    return {name: float(value) for name, value in values.items()}
+
+
+def _at_least_float32(value: Tensor) -> Tensor:
+    return value if value.dtype in (torch.float32, torch.float64) else value.float()
+
+
+def _find_resume_point(context: StageContext, config: TrainConfig) -> ResumePoint:
+    """Done by the lead, once what a killed run was writing is gone."""
+    folder = context.folder / "checkpoints"
+    if folder.is_dir():
+        remove_temporaries(folder)
+    return resume_point(
+        folder, config, partial(context.console.print, style="yellow", markup=False, soft_wrap=True)
+    )
+
+
+def resume_point(
+    folder: Path, config: TrainConfig, log: Callable[[str], None] = warnings.warn
+) -> ResumePoint:
+    """The newest good checkpoint; `log` gets why any was passed over."""
+    for path, checkpoint in readable(folder, log):
+        return ResumePoint(path, checkpoint["steps"] < config.steps)
+    return ResumePoint(None)

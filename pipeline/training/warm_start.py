@@ -1,0 +1,84 @@
+"""Trainings that go on from another network of their kind: what both must have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from motionloom.datasets.motion.layout import MotionLayout, require_layout
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.stage import CPU, Stage
+from motionloom.pipeline.store.run_folder import in_export, is_place
+from motionloom.pipeline.store.text import TextSource
+
+START = "start"
+"""The role of the network that a training starts from."""
+
+
+def starts_from(name: str, first: str, others: Mapping[str, Stage]) -> bool:
+    """Whether a stage is `first`, or was trained on from it, directly or over others; "" is none."""
+    if not first:
+        return not name
+    seen: set[str] = set()
+    while name not in seen:
+        if name == first:
+            return True
+        seen.add(name)
+        name = others[name].inputs.get(START, "") if name in others else ""
+    return False
+
+
+def sizes_that_differ(ours: BaseModel, theirs: object, free: Set[str]) -> list[str]:
+    """Settings of two networks that are not the same, without those that only training reads (`free`)."""
+    return [
+        f"net.{name}"
+        for name in type(ours).model_fields
+        if name not in free and getattr(ours, name) != getattr(theirs, name, None)
+    ]
+
+
+def require_same_start(stage: Stage, others: Mapping[str, Stage], free: Set[str]) -> None:
+    """Refuse a start whose network, or the statistics of whose input, are not those of `stage`."""
+    start = others.get(stage.inputs.get(START, ""))
+    if start is None:
+        return
+    wrong = sizes_that_differ(stage.config.net, start.config.net, free)
+    if stage.kind.name != start.kind.name:
+        wrong = [f"kind ({start.kind.name})"]
+    stats = start.inputs.get("stats", "")
+    if stats and stage.inputs.get("stats") != stats:
+        wrong.append("inputs.stats")
+    if wrong:
+        like = f", like inputs: {{stats: {stats}}}" if "inputs.stats" in wrong else ""
+        raise UserError(
+            f"stage '{stage.name}' starts from '{start.name}', which differs in {', '.join(wrong)}; give "
+            f"both the same{like}"
+        )
+
+
+def require_start_layout(data: MotionLayout, start: MotionLayout) -> None:
+    """Refuse clips of another layout, family or frame rate than those that the start was trained on."""
+    if data != start:
+        require_layout(data, start, "the data of a training that starts from another")
+
+
+def same_encoder(one: str, other: str, stages: Mapping[str, Stage]) -> bool:
+    """Whether the text stages of these names are one stage, or two of one encoder; unknown ones pass."""
+    if one == other or one not in stages or other not in stages:
+        return True
+    first, second = stages[one], stages[other]
+    tma = first.inputs.get("tma") == second.inputs.get("tma")
+    return first.kind.name == second.kind.name and tma and _encoder(first) == _encoder(second)
+
+
+def _encoder(stage: Stage) -> object:
+    """What encodes words: the encoder that a text stage names, a folder by its place, or all that it says."""
+    if is_place(stage.name) and in_export(Path(stage.name)):
+        return TextSource(Path(stage.name).resolve(), "", CPU, exported=True).encoder_name
+    spec = getattr(stage.config, "encoder", None)
+    if not isinstance(spec, str):
+        return stage.config
+    folder = Path(spec).expanduser()
+    return str(folder.resolve()) if folder.is_dir() else spec

@@ -1,0 +1,22 @@
+"""Lists the packages: every folder with Python files is `motionloom.<folder>`. All else is in pyproject.toml.
+
+A new folder, such as a model's, is so a package without being named anywhere.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from setuptools import setup
+
+ROOTS = ("configs", "datasets", "models", "pipeline")
+
+
+def packages() -> list[str]:
+    """Dotted names of all folders that hold Python files."""
+    here = Path(__file__).resolve().parent
+    folders = {path.parent.relative_to(here) for root in ROOTS for path in (here / root).rglob("*.py")}
+    return sorted(".".join(("motionloom", *folder.parts)) for folder in folders)
+
+
+setup(packages=packages())

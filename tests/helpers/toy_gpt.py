@@ -1,0 +1,62 @@
+"""A small GPT of two streams, and one aligned with a small TMA behind a small tokenizer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.gpt.losses import GptLossConfig
+from motionloom.models.gpt.module import GptModule
+from motionloom.models.gpt.network import GptConfig, InterleavedGPT
+from motionloom.models.gpt.tokens import TokenSequence, interleave
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.tokenizer.base import Stream, Tokenizer
+from motionloom.models.tokenizer.build import build_tokenizer
+from motionloom.models.tokenizer.config import H2VQConfig, SeparateConfig
+from motionloom.models.training.stage_module import OptimConfig
+
+PATTERN = ("body", "body", "hand")
+STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
+ENDS = {"body": 7, "hand": 5}
+TINY = GptConfig(
+    layers=2, dim=32, heads=4, ff=64, block_size=30, dropout=0.0, attention_dropout=0.0, pkeep=1.0
+)
+LAYOUT = MotionLayout.named("wholebody313")
+HAND = torch.from_numpy(LAYOUT.part("hand"))
+
+
+def toy_gpt(std: float = 0.02, text_dim: int = 6, **config: Any) -> InterleavedGPT:
+    """Heads of a wide `std` make peaked distributions, in which a mix-up shows."""
+    torch.manual_seed(0)
+    net = InterleavedGPT(TINY.model_copy(update=config), STREAMS, PATTERN, text_dim=text_dim)
+    for head in net.heads:
+        torch.nn.init.normal_(head.weight, std=std)
+    return net
+
+
+def aligned_gpt(
+    kind: type[H2VQConfig | SeparateConfig] = H2VQConfig, loss: dict[str, Any] | None = None, **config: Any
+) -> tuple[GptModule, Tokenizer, Tma]:
+    torch.manual_seed(0)
+    tokenizer = build_tokenizer(kind(width=16, depth=1, code_dim=8, num_codes=9), LAYOUT)
+    for book in tokenizer.codebooks().values():
+        book.codebook.normal_()
+    tma = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 313, 10)
+    net = InterleavedGPT(TINY.model_copy(update=config), tokenizer.streams, tokenizer.pattern, text_dim=16)
+    module = GptModule(
+        net, OptimConfig(), seed=0, max_steps=10, loss=GptLossConfig(**(loss or {})),
+        tokenizer=tokenizer, tma=tma,
+    )  # fmt: skip
+    return module, tokenizer, tma
+
+
+def sequences(groups: list[int], net: InterleavedGPT) -> tuple[TokenSequence, Tensor]:
+    """Closed sequences of any codes, and a text for each."""
+    draws = torch.Generator().manual_seed(1)
+    shape = {name: (len(groups), max(groups) * net.pattern.count(name)) for name in net.names}
+    codes = {name: torch.randint(net.num_codes[name], shape[name], generator=draws) for name in net.names}
+    sequence = interleave(codes, net.pattern, ends=net.num_codes, groups=torch.tensor(groups))
+    return sequence, torch.randn(len(groups), net.text_in.in_features, generator=draws)

@@ -1,0 +1,74 @@
+"""What all quantizers have in common: padding, freezing, one graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import nn
+
+from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, ResidualQuantizer
+from motionloom.models.quantize.fsq import FsqQuantizer
+from motionloom.models.quantize.gradient import GradientQuantizer, GradientQuantizerConfig
+
+SMALL = QuantizerConfig(num_codes=6, dim=4)
+LEARNT = GradientQuantizerConfig(num_codes=6, dim=4)
+KINDS: dict[str, Callable[[], nn.Module]] = {
+    "ema": lambda: EmaQuantizer(SMALL),
+    "residual": lambda: ResidualQuantizer(SMALL, 2),
+    "gradient": lambda: GradientQuantizer(GradientQuantizerConfig(num_codes=6, dim=4)),
+    "gradient from data": lambda: GradientQuantizer(
+        GradientQuantizerConfig(num_codes=6, dim=4, start="data")
+    ),
+    "fsq": lambda: FsqQuantizer(4, (4, 4)),
+}
+
+
+@pytest.fixture(params=list(KINDS))
+def make(request: pytest.FixtureRequest) -> Callable[[], nn.Module]:
+    torch.manual_seed(0)
+    return KINDS[request.param]
+
+
+@pytest.mark.parametrize("padding", [7.0, float("nan")])
+def test_masked_batch_equals_truncated_batch(make: Callable[[], nn.Module], padding: float) -> None:
+    padded, plain = make(), make()
+    padded.load_state_dict(plain.state_dict())
+    mask = torch.arange(17)[None] < 12
+    for _ in range(4):
+        z = torch.randn(1, 12, 4)
+        wide = torch.cat([z, torch.full((1, 5, 4), padding)], 1).requires_grad_()
+        a, b = padded(wide, mask), plain(z)
+        assert torch.equal(a.codes[:, :12], b.codes)
+        torch.testing.assert_close(a.penalty, b.penalty)
+        for name, value in b.metrics.items():
+            torch.testing.assert_close(a.metrics[name], value)
+        if a.penalty.requires_grad and padding == 7.0:
+            a.penalty.backward()
+            assert wide.grad is not None and (wide.grad[:, 12:] == 0).all()
+    for name, value in plain.state_dict().items():
+        torch.testing.assert_close(padded.state_dict()[name], value)
+
+
+@pytest.mark.parametrize("how", ["eval", "frozen", "update=False"])
+def test_never_updates(make: Callable[[], nn.Module], how: str) -> None:
+    quantizer = make()
+    quantizer(torch.randn(2, 20, 4))
+    before = {k: v.clone() for k, v in quantizer.state_dict().items()}
+    if how == "eval":
+        quantizer.eval()
+    elif how == "frozen":
+        quantizer.freeze()
+        quantizer.train()
+        assert not (isinstance(quantizer, GradientQuantizer) and quantizer.codebook.requires_grad)
+    for _ in range(3):
+        quantizer(torch.randn(2, 20, 4), update=how != "update=False")
+    assert all(torch.equal(v, before[k]) for k, v in quantizer.state_dict().items())
+
+
+@pytest.mark.slow
+def test_compiles_to_one_graph(make: Callable[[], nn.Module]) -> None:
+    quantizer, z = make(), torch.randn(2, 20, 4)
+    quantizer(z)
+    assert torch._dynamo.explain(quantizer)(z).graph_break_count == 0

@@ -1,0 +1,139 @@
+"""The list of figures: intervals, files, and that a new metric is one function and one line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from run_records import write_run
+
+from motionloom.pipeline.contract.units import Row
+from motionloom.pipeline.evaluation import clip_metrics
+from motionloom.pipeline.evaluation.clip_metrics import ClipMetric, Performance, clip_figures, measure_clip
+from motionloom.pipeline.evaluation.estimate import RESAMPLES, estimate, row_estimates, weighted
+from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, Figure, FigureFile, Metric, figure_tables
+from motionloom.pipeline.results.compare.runs import open_runs
+from motionloom.pipeline.results.compare.tables import compared_tables
+from motionloom.pipeline.results.paper.compare import compare_with_paper
+
+TRIALS = 1500
+
+
+def covered(draw: Callable[[np.random.Generator], np.ndarray], true: float) -> float:
+    """How often an interval has the true mean."""
+    rng, hits = np.random.default_rng(0), 0
+    for _ in range(TRIALS):
+        found = estimate(draw(rng))
+        assert found.interval is not None
+        hits += abs(found.value - true) <= found.interval
+    return hits / TRIALS
+
+
+@pytest.mark.parametrize("repeats", [2, 3, 20])
+def test_intervals_over_repeats_hold_what_they_say(repeats: int) -> None:
+    """Student's t: with 1.96 two repeats would cover 70 %."""
+    assert 0.93 < covered(lambda rng: rng.normal(1.0, 2.0, repeats), 1.0) < 0.97
+
+
+@pytest.mark.parametrize("repeats", [1, 3])
+def test_intervals_over_clips_hold_what_they_say(repeats: int) -> None:
+    """100 clips that differ more than the repeats of one clip do: repeats alone say nothing of them."""
+
+    def draw(rng: np.random.Generator) -> np.ndarray:
+        return rng.normal(0.5, 1.0, 100) + rng.normal(0.0, 0.3, (repeats, 100))
+
+    assert 0.93 < covered(draw, 0.5) < 0.97
+
+
+def test_a_bootstrap_by_hand() -> None:
+    """Ratios of sums, clips without a value, repeats of a clip together."""
+    values = np.array([[1.0, 4.0, np.nan, 2.0], [3.0, 4.0, 5.0, np.nan]])
+    weights = np.array([[1.0, 2.0, 1.0, 1.0], [1.0, 2.0, 3.0, 1.0]])
+    found = estimate(values, weights)
+    total, each = np.array([4.0, 16.0, 15.0, 2.0]), np.array([2.0, 4.0, 3.0, 1.0])
+    assert found.value == pytest.approx(37 / 10) and found.over == "clips"
+    counts = np.random.default_rng(4).multinomial(4, [0.25] * 4, size=RESAMPLES)
+    means = [(count @ total) / (count @ each) for count in counts]
+    assert found.interval == pytest.approx(3.182446 * np.std(means) * np.sqrt(4 / 3), rel=1e-5)
+
+
+def test_what_does_not_vary_has_no_interval() -> None:
+    for values in ([2.0], [2.0, 2.0], [[1.0, 1.0, 1.0]], [[3.0]]):
+        assert estimate(values).interval is None
+    one = estimate([[3.0], [5.0]])
+    assert (one.value, one.over) == (4.0, "repeats"), "one clip: only its repeats vary"
+
+
+def test_weights_are_read_from_rows() -> None:
+    rows = [weighted("a", 6.0, 2.0) | {"b": 1.0}, weighted("a", 10.0, 10.0), weighted("a", 1.0, 0.0)]
+    found = row_estimates([rows])
+    assert found["a"].value == pytest.approx(16 / 12) and found["b"].value == 1.0 and set(found) == {"a", "b"}
+
+
+def test_a_file_comes_back(tmp_path: Path) -> None:
+    facts = {"clips": 3, "sampling.top_p": None, "lengths": "free"}
+    figures = (
+        Figure("a.x", 0.1234567, 0.01, "mm", "lower", MODEL, facts, "A", "X", "clips"),
+        Figure("a.x", 2.0, None, "mm", "lower", RECORDED, facts, "A", "X", note="few"),
+        Figure("b.y", 0.5, protocol={"clips": 4}, group="B", title="Y", unit="share"),
+    )
+    FigureFile("evaluate", figures, {"stage": "e"}, {"fps": 20}).write(tmp_path / "metrics.json")
+    again = FigureFile.read(tmp_path / "metrics.json")
+    assert again.figures == (replace(figures[0], value=0.12346), *figures[1:])
+    assert (again.about, again.details, again.kind) == ({"stage": "e"}, {"fps": 20}, "evaluate")
+    first, second = figure_tables(again.figures)
+    assert first[1:] == (["", "X, mm"], [["model", "0.1 ± 0.0"], [RECORDED, "2.0"]])
+    assert all(words in first[0] for words in ("A", "3 clips", "over clips", "X: few"))
+    assert second[2] == [["model", "50 %"]]
+
+
+def reach(performance: Performance) -> Row:
+    """How far the root gets, in metres: a new metric."""
+    path = performance.joints[:, 0] - performance.joints[0, 0]
+    return {"reach.root": float(np.linalg.norm(path, axis=-1).max())}
+
+
+def test_a_new_metric_is_one_function_and_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The line reaches the file, the terminal's tables, compare and a table of one's own."""
+    line = ClipMetric(
+        "How far motions get", reach, (Metric("reach.root", "reach of the root", "higher", "m"),)
+    )
+    monkeypatch.setattr(clip_metrics, "CAPTION_METRICS", (*clip_metrics.CAPTION_METRICS, line))
+    metrics, rng = clip_metrics.CAPTION_METRICS, np.random.default_rng(0)
+    real = [rng.normal(size=(20, 22, 3)) for _ in range(5)]
+
+    def file(scale: float) -> FigureFile:
+        rows = {
+            row: [[measure_clip(metrics, Performance(size * one, one, 20.0)) for one in real]]
+            for row, size in ((MODEL, scale), (RECORDED, 1.0))
+        }
+        figures = clip_figures(metrics, rows, {"clips": 5})
+        return FigureFile("evaluate", tuple(figures), {"made_by": {"generator": "gpt"}})
+
+    runs = []
+    for name, scale in (("near", 1.5), ("far", 30.0)):
+        stages = {
+            "gpt": {"kind": "gpt"},
+            "evaluate": {
+                "kind": "evaluate", "inputs": {"generators.gpt": "gpt"}, "figures": file(scale)
+            },
+        }  # fmt: skip
+        runs.append(write_run(tmp_path / name, stages))
+    title, columns, rows = figure_tables(file(1.5).figures)[-1]
+    assert title.startswith("How far motions get") and columns == ["", "reach of the root, m"]
+    assert [row[0] for row in rows] == ["model", RECORDED]
+    (table,) = [one for one in compared_tables(open_runs(runs)) if one.title == "How far motions get"]
+    assert [dict(row.best) for row in table.rows] == [{}, {"reach.root": True}]
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(
+        "title: mine\nsection: '1'\nmeasured: {data: D}\n"
+        "columns: [{name: reach, better: higher, figure: reach.root}]\n"
+        "rows: [{method: theirs, paper: '1.5', ours: {generator: {kind: gpt}}}]\n"
+    )
+    filled = compare_with_paper(str(mine), runs, console=Console(quiet=True))
+    assert [row.label for row in filled.rows if row.source == "ours"] == ["near gpt", "far gpt"]
+    assert all(row.cells[0] for row in filled.rows)

@@ -1,0 +1,59 @@
+"""The row that only looks up its training clips: the nearest caption by words, and by labels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.evaluation.clip_metrics import CAPTION_METRICS, Performance, measure_clip
+from motionloom.pipeline.evaluation.lookup import by_labels, by_words
+from motionloom.pipeline.evaluation.truth import has_caption, truth_of
+
+
+@pytest.fixture(scope="module")
+def splits(tmp_path_factory: pytest.TempPathFactory) -> tuple[ShardDataset, ShardDataset]:
+    folder = tmp_path_factory.mktemp("lookup") / "shards"
+    config = SynthConfig(
+        seed=3, clips=40, layout="body133", actions=["kick", "wave"], test_fraction=0.3,
+        hold_out=[{"action": "kick", "side": "left"}],
+    )  # fmt: skip
+    synthesize(config, folder, progress=False)
+    return ShardDataset.open(folder, "train"), ShardDataset.open(folder, "test")
+
+
+def test_a_lookup_finds_training_motion_of_the_action(splits: tuple[ShardDataset, ShardDataset]) -> None:
+    train, test = splits
+    truths = [truth_of(test, index) for index in range(len(test))]
+    held_out = [t.truth["side"] == "left" and t.truth["action"] == "kick" for t in truths if t.truth]
+    assert any(held_out) and not all(held_out)
+    for lookup in (by_words, by_labels):
+        found = lookup(train, truths)
+        assert len(found) == len(truths) and {one.id for one in found} <= set(train.ids)
+        for one, t in zip(found, truths, strict=True):
+            assert one.truth is not None and t.truth is not None
+            assert one.truth["action"] == t.truth["action"]
+            assert not (one.truth["action"] == "kick" and one.truth["side"] == "left")
+        values = [
+            measure_clip(CAPTION_METRICS, Performance(one.joints, t.joints, test.layout.fps, None, t.truth))
+            for one, t in zip(found, truths, strict=True)
+        ]
+        new = [value["agreement.everything"] for value, held in zip(values, held_out, strict=True) if held]
+        assert not any(new), "nobody has been trained on held-out combinations"
+
+
+def test_what_was_trained_on_is_found_itself(splits: tuple[ShardDataset, ShardDataset]) -> None:
+    train, _ = splits
+    truths = [truth_of(train, index) for index in range(len(train))]
+    assert has_caption(train).all()
+    for one, t in zip(by_words(train, truths), truths, strict=True):
+        assert t.caption in [caption.text for caption in train.texts(train.ids.index(one.id))]
+    for one, t in zip(by_labels(train, truths), truths, strict=True):
+        assert one.truth == t.truth
+
+
+def test_data_without_truth_have_no_labels(splits: tuple[ShardDataset, ShardDataset]) -> None:
+    train, test = splits
+    assert by_labels(train, [replace(truth_of(test, 0), truth=None)]) == []

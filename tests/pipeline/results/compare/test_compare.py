@@ -1,0 +1,298 @@
+"""Several runs compared: what differs, who is best where, what is missing, and that nothing is trusted."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from run_records import log, metrics
+from run_records import write_compared as write_run
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.evaluation.figures import STILL
+from motionloom.pipeline.results.compare.command import compare_runs
+from motionloom.pipeline.results.compare.curves import curve_charts
+from motionloom.pipeline.results.compare.page import comparison_page, missing_lines
+from motionloom.pipeline.results.compare.runs import ABSENT, open_runs, setting_differences
+from motionloom.pipeline.results.compare.tables import ComparedTable, compared_tables
+
+QUIET = Console(quiet=True)
+NASTY = "<img src=x onerror='window.hacked=1'>"
+
+
+def tables_of(*folders: Path) -> dict[str, ComparedTable]:
+    """By their title."""
+    return {table.title: table for table in compared_tables(open_runs(folders))}
+
+
+def best_of(table: ComparedTable) -> dict[str, dict[str, bool]]:
+    return {row.run.label: dict(row.best) for row in table.rows}
+
+
+def test_only_what_differs_is_listed_stage_by_stage(tmp_path: Path) -> None:
+    one = write_run(tmp_path / "one")
+    changed = {"kind": "h2vq", "train": {"steps": 100}, "net": {"width": 16, "ema": 0.9}}
+    two = write_run(tmp_path / "two", seed=8, stages={"tokenizer": changed, "tma": {"kind": "tma", "a": 1}})
+    found = {d.stage: d for d in setting_differences(open_runs([one, two]))}
+    assert set(found) == {"", "tokenizer", "tma"}
+    assert [(d.key, d.values) for d in found[""].differences] == [("seed", (7, 8))]
+    assert [(d.key, d.values) for d in found["tokenizer"].differences] == [
+        ("net.width", (8, 16)),
+        ("net.ema", (ABSENT, 0.9)),
+    ]
+    assert found["tma"].missing == ("one",) and found["tma"].differences == ()
+
+
+def test_a_finished_stage_has_the_settings_that_made_it(tmp_path: Path) -> None:
+    one, two = write_run(tmp_path / "one"), write_run(tmp_path / "two")
+    recipe = two / "recipe.yaml"
+    recipe.write_text(recipe.read_text().replace("width: 8", "width: 99"))
+    assert setting_differences(open_runs([one, two])) == []
+    (two / "stages/tokenizer/artifact.json").unlink()
+    (stage,) = setting_differences(open_runs([one, two]))
+    assert [(d.key, d.values) for d in stage.differences] == [("net.width", (8, 99))]
+
+
+def test_best_is_marked_among_runs_measured_alike(tmp_path: Path) -> None:
+    low = write_run(tmp_path / "low", figures=metrics(mpjpe=40.0, r1=0.40))
+    high = write_run(tmp_path / "high", seed=8, figures=metrics(mpjpe=60.0, r1=0.60))
+    tables = tables_of(low, high)
+    table = tables["reconstruction"]
+    assert best_of(table) == {"low": {"reconstruction.mpjpe": True}, "high": {}}, "bit/s is no merit"
+    assert table.difference == ""
+    assert [(r.title, r.runs, r.figures["reconstruction.mpjpe"].value) for r in table.references] == [
+        ("nearest training clip", (), 80.0),
+        ("mean pose, still", (), 200.0),
+    ]
+    assert best_of(tables["precision"]) == {"low": {}, "high": {"tma.t2m_r1": True}}
+    assert "tma.matching_score" not in best_of(tables["precision"])["low"], "equal: nobody is best"
+    assert best_of(tables["spread"]) == {"low": {}, "high": {}}, "Diversity is not ranked, FID is equal"
+
+
+def test_overlapping_intervals_leave_doubt(tmp_path: Path) -> None:
+    runs = [
+        write_run(tmp_path / name, figures=metrics(r1=r1, half=0.06))
+        for name, r1 in (("a", 0.4), ("b", 0.5), ("c", 0.2))
+    ]
+    assert best_of(tables_of(*runs)["precision"])["b"] == {"tma.t2m_r1": False}
+    metrics(r1=0.9, half=0.06).write(runs[1] / "stages/evaluate/metrics.json")
+    assert best_of(tables_of(*runs)["precision"])["b"] == {"tma.t2m_r1": True}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"repeats": 5}, "repeats (one: 2; two: 5)"),
+        ({"lengths": "recorded"}, "lengths (one: free; two: recorded)"),
+        ({"clips_sha256": "other"}, "different clips"),
+        ({"judge": "other"}, "different judges"),
+        ({"sampling.temperature": 0.0}, "sampling.temperature (one: 1.0; two: 0.0)"),
+    ],
+)
+def test_another_protocol_is_said_and_not_ranked(change: dict[str, Any], words: str, tmp_path: Path) -> None:
+    one = write_run(tmp_path / "one", figures=metrics(mpjpe=40.0, r1=0.4))
+    two = write_run(tmp_path / "two", figures=metrics(mpjpe=60.0, r1=0.6, **change))
+    tables = tables_of(one, two)
+    assert best_of(tables["precision"]) == {"one": {}, "two": {}}
+    assert words in tables["precision"].difference
+    assert best_of(tables["reconstruction"])["one"] == {"reconstruction.mpjpe": True}, (
+        "which it does not concern"
+    )
+    three = write_run(tmp_path / "three", figures=metrics(mpjpe=60.0, r1=0.7))
+    table = tables_of(one, two, three)["precision"]
+    assert best_of(table) == {"one": {}, "two": {}, "three": {"tma.t2m_r1": True}}
+    assert [row.protocol for row in table.rows] == [0, 1, 0]
+
+
+def test_references_that_differ_say_whose_they_are(tmp_path: Path) -> None:
+    known = metrics()
+    still = [one if one.row != STILL else replace(one, value=300.0) for one in known.figures]
+    other = replace(known, figures=tuple(still))
+    one, two = write_run(tmp_path / "one", figures=metrics()), write_run(tmp_path / "two", figures=other)
+    rows = tables_of(one, two)["reconstruction"].references
+    assert [(row.title, row.runs) for row in rows] == [
+        ("nearest training clip", ()),
+        ("mean pose, still", ("one",)),
+        ("mean pose, still", ("two",)),
+    ]
+
+
+def test_unfinished_runs_show_what_they_have(tmp_path: Path) -> None:
+    done = write_run(tmp_path / "done", logs={"tokenizer": log(100)}, figures=metrics())
+    going = write_run(tmp_path / "going", finished=("data",), logs={"tokenizer": log(40, 2.0)})
+    runs = open_runs([done, going])
+    assert missing_lines(runs[0]) == []
+    assert missing_lines(runs[1]) == ["tokenizer: in training, step 40 of 100", "evaluate: not run yet"]
+    loss = next(chart for chart in curve_charts(runs) if chart.figure == "loss")
+    assert [(c.run.label, c.split, c.steps[-1]) for c in loss.curves] == [
+        ("done", "train", 100),
+        ("done", "val", 100),
+        ("going", "train", 40),
+        ("going", "val", 40),
+    ]
+    html = unescape(comparison_page(runs).html())
+    assert "going – tokenizer: in training, step 40 of 100; evaluate: not run yet" in html
+    assert "Without any figures yet: going." in html and "3 of 3" in html and "1 of 3" in html
+    assert "2 min 03 s" not in html and "3 min 03 s" in html and "an abacus" in html
+
+
+def test_figures_of_a_stage_whose_input_was_made_anew_are_outdated(tmp_path: Path) -> None:
+    one, two = (write_run(tmp_path / name, figures=metrics()) for name in ("one", "two"))
+    path = two / "stages/data/artifact.json"
+    path.write_text(path.read_text().replace('"fingerprint": "of-data"', '"fingerprint": "new"'))
+    runs = open_runs([one, two])
+    assert missing_lines(runs[1]) == [
+        "tokenizer: outdated: 'data' has been made anew since",
+        "evaluate: outdated: 'data' has been made anew since",
+    ]
+    assert [row.run.label for row in compared_tables(runs)[0].rows] == ["one"]
+
+
+def test_a_later_evaluation_is_taken_while_it_is_the_newest(tmp_path: Path) -> None:
+    one, two = (write_run(tmp_path / name, figures=metrics(mpjpe=50.0)) for name in ("one", "two"))
+    again = one / "evaluate/metrics.json"
+    again.parent.mkdir()
+    metrics(mpjpe=45.0).write(again)
+    newest = max(path.stat().st_mtime for path in one.rglob("artifact.json"))
+    for age, mean in ((+10, 45.0), (-10, 50.0)):
+        os.utime(again, (newest + age, newest + age))
+        row = tables_of(one, two)["reconstruction"].rows[0]
+        assert row.figures["reconstruction.mpjpe"].value == mean
+
+
+def test_mistakes_are_one_sentence(tmp_path: Path) -> None:
+    good, other = write_run(tmp_path / "good", figures=metrics()), write_run(tmp_path / "other")
+    with pytest.raises(UserError, match="name two runs or more"):
+        open_runs([good])
+    with pytest.raises(UserError, match="9 runs: one page compares at most 8"):
+        open_runs([good] * 9)
+    with pytest.raises(UserError, match="is named twice"):
+        open_runs([good, tmp_path / "other" / ".." / "good"])
+    with pytest.raises(UserError, match="nothing: no such folder"):
+        open_runs([good, tmp_path / "nothing"])
+    with pytest.raises(UserError, match="is a folder; name a file"):
+        compare_runs([good, other], tmp_path, console=QUIET)
+    out = tmp_path / "page.html"
+    for name, text, words in (
+        ("stages/evaluate/metrics.json", "{", "metrics.json: not valid JSON"),
+        ("stages/evaluate/metrics.json", "[]", "metrics.json: holds no JSON object"),
+        ("stages/tokenizer/metrics.jsonl", '{"step": 1}\n{"st', "metrics.jsonl: not a training log"),
+        ("stages/tokenizer/metrics.jsonl", "7\n", "metrics.jsonl: line 1 is no row"),
+        ("stages/tokenizer/artifact.json", "nonsense", "artifact.json: not valid JSON"),
+        ("recipe.yaml", "stages: 5", "recipe.yaml: holds no stages"),
+    ):
+        path = good / name
+        before = path.read_text() if path.is_file() else None
+        path.write_text(text)
+        with pytest.raises(UserError, match=words) as found:
+            compare_runs([good, other], out, console=QUIET)
+        assert "\n" not in str(found.value)
+        path.unlink() if before is None else path.write_text(before)
+    assert not out.exists()
+    compare_runs([good, other], out, console=QUIET)
+    assert out.is_file()
+
+
+def test_names_never_become_html(tmp_path: Path) -> None:
+    entry = {"kind": NASTY, "train": {"steps": 20}, NASTY: NASTY}
+    runs = [
+        write_run(
+            tmp_path / f"{number}{NASTY}",
+            stages={NASTY: {**entry, "n": number}},
+            finished=(),
+            logs={"tokenizer": [{"step": 1, f"train/{NASTY}": 1.0}, {"step": 2, f"train/{NASTY}": 2.0}]},
+        )
+        for number in (1, 2)
+    ]
+    html = compare_runs(runs, tmp_path / "page.html", console=QUIET).read_text()
+    assert "<img" not in html and html.count("&lt;img") > 5
+
+
+def test_the_record_for_programs(tmp_path: Path, call: Callable[..., Any]) -> None:
+    one = write_run(tmp_path / "one", figures=metrics(mpjpe=40.0), logs={"tokenizer": log(100)})
+    two = write_run(tmp_path / "two", seed=8, finished=("data",), logs={"tokenizer": [*log(20)]})
+    (two / "stages/tokenizer/metrics.jsonl").write_text('{"step": 10, "train/loss": NaN}\n')
+    done = call("compare", one, two, "-o", tmp_path / "a/page.html", "--json", tmp_path / "a/page.json")
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-2:] == [str(tmp_path / "a/page.html"), str(tmp_path / "a/page.json")]
+    assert re.search(r"│ one +│ 3 of 3 +│ 40.0 +│ 0.500 ± 0.010 +│", done.out)
+    assert "two: missing tokenizer: in training, step 10 of 100; evaluate: not run yet" in done.out
+    assert "settings that differ: seed" in done.out
+    record = json.loads((tmp_path / "a/page.json").read_text())
+    assert [run["name"] for run in record["runs"]] == ["one", "two"]
+    assert record["settings"] == [
+        {"stage": None, "missing": [], "differences": {"seed": {"one": 7, "two": 8}}}
+    ]
+    curve = next(c for c in record["curves"] if c["run"] == "two")
+    assert (curve["figure"], curve["last_step"], curve["last"]) == ("loss", 10, None)
+    assert record["tables"][0]["runs"][0]["figures"]["reconstruction.mpjpe"] == {
+        "value": 40.0,
+        "interval": None,
+        "over": None,
+    }
+    assert record["tables"][0]["missing"] == ["two"]
+
+
+def test_it_needs_no_torch(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name, figures=metrics()) for name in ("one", "two")]
+    code = (
+        "import sys\nfrom motionloom.pipeline.cli.main import app\n"
+        f"app(['compare', {str(runs[0])!r}, {str(runs[1])!r}, '-o', {str(tmp_path / 'page.html')!r}],"
+        " standalone_mode=False)\nprint('torch' in sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "False" and (tmp_path / "page.html").is_file()
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (1200, 900)])
+def test_the_page_in_a_browser(width: int, height: int, browser: Any, tmp_path: Path) -> None:
+    long = {"kind": "h2vq", "train": {"steps": 100}, "net": {"width": 9, "a": list(range(90))}}
+    runs = [
+        write_run(
+            tmp_path / f"{name}_{'x' * 40}",
+            stages={} if number else {"tokenizer": long},
+            logs={"tokenizer": log(100, 1.0 + number)},
+            figures=metrics(mpjpe=40.0 + number, r1=0.4 + 0.1 * number),
+        )
+        for number, name in enumerate(("first", "second", "third"))
+    ]
+    path = compare_runs(runs, tmp_path / "page.html", console=QUIET)
+    trouble: list[str] = []
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.on("console", lambda m: trouble.append(m.text))
+    page.on("pageerror", lambda error: trouble.append(str(error)))
+    page.on("request", lambda r: None if r.url.startswith("file:") else trouble.append(r.url))
+    page.goto(path.as_uri())
+    assert page.title() == f"{runs[0].name}, {runs[1].name} and {runs[2].name} compared"
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    curves = page.locator("svg.chart").first.locator("polyline.curve")
+    assert curves.count() == 3, "training; one validation is a dot"
+    colours = page.evaluate(
+        "[...document.querySelectorAll('svg.chart')[0].querySelectorAll('polyline')]"
+        ".map(line => getComputedStyle(line).stroke)"
+    )
+    assert len(set(colours)) == 3
+    assert page.locator("svg.chart").first.bounding_box()["width"] <= width
+    wide = page.evaluate(
+        "[...document.querySelectorAll('.scroll')].map(b => [b.scrollWidth > b.clientWidth + 2,"
+        " b.classList.contains('wide')])"
+    )
+    assert all(a == b for a, b in wide), "a table that is cut says so"
+    assert any(a for a, _ in wide) or width > 390
+    assert page.locator("span.best").count() > 0
+    page.emulate_media(media="print")
+    assert page.evaluate("getComputedStyle(document.getElementById('theme')).display") == "none"
+    assert page.evaluate("getComputedStyle(document.querySelector('.scroll')).overflowX") == "visible"
+    page.close()
+    assert not trouble

@@ -1,0 +1,126 @@
+"""A run that was trained, whole and with stages taken away: its report and its place in a comparison."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from motionloom.pipeline.evaluation.figures import FigureFile
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def unfinished(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run as a kill in the middle of the GPT's training leaves it."""
+    folder = tmp_path_factory.mktemp("unfinished") / "run"
+    shutil.copytree(small_run.folder, folder)
+    for name in ("face_gpt", "face_vae", "face_diffusion", "generate", "evaluate", "report"):
+        shutil.rmtree(folder / "stages" / name)
+    gpt = folder / "stages/gpt"
+    for name in ("artifact.json", "timing.json", "model.safetensors", "model.json"):
+        (gpt / name).unlink()
+    rows = (gpt / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (gpt / "metrics.jsonl").write_text("".join(row for row in rows if json.loads(row)["step"] <= 12))
+    return folder
+
+
+def text_of(page: Path) -> str:
+    html = page.read_text(encoding="utf-8")
+    return unescape(re.sub(r"<[^>]+>", " ", re.sub(r"<(script|style).*?</\1>", "", html, flags=re.S)))
+
+
+def test_an_evaluation_keeps_joints_confusions_and_cases(small_run: Any) -> None:
+    folder = small_run.folder / "stages/evaluate"
+    file = FigureFile.read(folder / "metrics.json")
+    figures, mpjpe = file.details, file.of("reconstruction.mpjpe")
+    assert (
+        mpjpe is not None
+        and len(figures["joint_errors_mm"]) == 52
+        and len(figures["hand_joint_errors_mm"]) == 30
+    )
+    mean = sum(figures["joint_errors_mm"]) / 52
+    assert mean == pytest.approx(mpjpe.value, abs=0.02)
+    assert {(c["of"], c["by"]) for c in figures["confusions"]} >= {
+        ("generated", "retrieval"),
+        ("real", "retrieval"),
+        ("generated", "joints"),
+    }
+    for matrix in figures["confusions"]:
+        assert sum(map(sum, matrix["counts"])) <= mpjpe.protocol["clips"]
+    assert {case["of"] for case in figures["cases"]} == {"reconstruction", "generated"}
+    worst = [c["error"] for c in figures["cases"] if c["of"] == "generated" and c["place"] == "worst 1"]
+    best = [c["error"] for c in figures["cases"] if c["of"] == "generated" and c["place"] == "best 1"]
+    assert worst >= best and (folder / "cases.safetensors").is_file()
+
+
+def test_the_page_of_a_run_says_where_it_errs_and_what_was_run(small_run: Any) -> None:
+    text = text_of(small_run.folder / "stages/report/report.html")
+    for words in (
+        "Where reconstructions err: mean error of each joint over",
+        "left index finger, middle joint",
+        "Taken for which action",
+        "Worst and best reconstructions",
+        "Worst and best generated motions",
+        "Settings of every stage",
+        "The data: 52 joints at 20 frames a second",
+    ):
+        assert words in text, words
+    assert "left_hand" not in text.split("What was run")[0]
+    assert "in training" not in text and "Still missing" not in text
+
+
+def test_the_report_of_an_unfinished_run(unfinished: Path, call: Callable[..., Any]) -> None:
+    done = call("report", unfinished)
+    assert done.code == 0, done.err
+    assert "not finished: gpt (in training, step 12 of 30), face_gpt (not run yet)" in done.out
+    text = text_of(unfinished / "report/report.html")
+    assert "gpt: in training, step 12 of 30" in text and "evaluate: not run yet" in text
+    assert "the recorded clip, and what the tokenizer keeps of it." in text
+    assert "a motion that the model made" not in text and "Figures on held-out clips" not in text
+    assert "gpt: cross-entropy" in text and "tokenizer: reconstruction" in text, "its curves so far"
+    assert "9 of 15" not in text and "8 of 15" in text
+
+
+def test_the_report_of_a_run_that_has_hardly_begun(
+    unfinished: Path, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    shutil.copy(unfinished / "recipe.yaml", bare)
+    done = call("report", bare)
+    assert done.code == 0, done.err
+    text = text_of(bare / "report/report.html")
+    assert "data: not run yet" in text and "0 of 15" in text and "Settings of every stage" in text
+
+
+def test_a_whole_and_an_unfinished_run_compared(
+    small_run: Any, unfinished: Path, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    twin = tmp_path / "twin"
+    shutil.copytree(small_run.folder, twin)
+    done = call(
+        "compare", small_run.folder, unfinished, twin, "-o", tmp_path / "page.html", "--json", tmp_path / "x"
+    )
+    assert done.code == 0, done.err
+    assert "missing gpt: in training, step 12 of 30; face_gpt: not run yet" in done.out
+    record = json.loads((tmp_path / "x").read_text())
+    assert record["settings"] == [], "one recipe made them"
+    mpjpe = FigureFile.read(small_run.folder / "stages/evaluate/metrics.json").of("reconstruction.mpjpe")
+    assert mpjpe is not None
+    table = record["tables"][0]
+    assert len(table["runs"]) == 2 and table["difference"] is None
+    for row in table["runs"]:
+        assert row["figures"]["reconstruction.mpjpe"]["value"] == mpjpe.value
+        assert row["best"] == {}, "twins are equal"
+    titles = " ".join(t["title"] for t in record["tables"])
+    for words in ("as the papers count", "faces", "TMA-R-Precision", "latents", "what its caption says"):
+        assert words in titles
+    assert {c["stage"] for c in record["curves"]} >= {"tokenizer", "tma", "gpt"}

@@ -1,0 +1,243 @@
+"""The page about a data set: what it says, that it hides nothing and trusts nothing, and how it plays."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Caption, Dropped
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
+from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.shards.writer import write_dataset
+from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
+from motionloom.pipeline.results.data_page.facts import choose, gather, watch
+from motionloom.pipeline.results.data_page.page import write_data_report
+
+NASTY = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=1'><b>bold</b> & \"q\""
+CONFIG = SynthConfig(clips=40, min_seconds=2.0, max_seconds=5.0)
+
+
+def nasty_sample(index: int) -> Sample:
+    sample = make_sample(index, CONFIG)
+    texts = [Caption(text=f"{NASTY} {index}"), *sample.texts]
+    if index % 2:
+        texts.append(Caption(text="a person stands", tokens=["a/DET", "person/NOUN", "stand/VERB"]))
+    meta = sample.meta.model_copy(
+        update={"id": f"{sample.meta.id}{'<i>' * (index == 3)}", "licence": f"CC0{NASTY}"}
+    )
+    return replace(sample, meta=meta, texts=texts)
+
+
+@pytest.fixture(scope="module")
+def nasty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("nasty")
+    dropped = [
+        Dropped(source=f"take/{k}{NASTY}", reason=f"{k / 10:.2f} s, shorter than 1 s") for k in range(7)
+    ]
+    write_dataset(
+        root,
+        [(split_of(k, CONFIG), k) for k in range(CONFIG.clips)],
+        nasty_sample,
+        DatasetFacts(
+            name="nasty",
+            layout=CONFIG.motion_layout,
+            licence="mixed",
+            converter="synth",
+            converter_version=7,
+            options={"body_model": {"sentence": f"No body model. {NASTY}"}, "deep": {"er": [1, NASTY]}},
+            dropped=[*dropped, Dropped(source="b", reason="NaN at frame 3")],
+            audio={"rate": 30720, "name": NASTY},
+            notes=[f"a note {NASTY}"],
+        ),
+        WriteOptions(progress=False),
+    )
+    return root
+
+
+@pytest.fixture(scope="module")
+def page(nasty: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "deep" / "report.html"
+    write_data_report(nasty, path, check=True)
+    return path
+
+
+def test_one_small_file_that_loads_nothing(page: Path) -> None:
+    text = page.read_text()
+    assert list(page.parent.iterdir()) == [page]
+    assert len(text) < 3_000_000
+    assert set(re.findall(r"<[a-z]+[^<>]*?\s(?:src|href)\s*=\s*[\"']?(.)", text)) == {"#"}
+    assert not re.search(r"@import|url\(|fetch\(|XMLHttpRequest|WebSocket", text)
+    assert "default-src 'none'" in text
+
+
+def test_nothing_of_the_data_becomes_markup(page: Path) -> None:
+    text = page.read_text()
+    assert "<img" not in text and "<b>" not in text and "<i>" not in text.replace("<i style", "")
+    assert "<script>window" not in text and "hacked=1" in text
+
+
+def test_it_says_what_is_in_the_set(page: Path, nasty: Path) -> None:
+    text = re.sub(r"<[^>]+>", " ", page.read_text().partition("<body>")[2].partition("<script")[0])
+    facts, _ = gather(nasty)
+    for word in ("Data set nasty", "wholebody363 (exact)", "synth version 7", "40", "train", "val", "test"):
+        assert word in text, word
+    whole = page.read_text()
+    for word in (
+        "shorter than 1 s",
+        "NaN at frame 3",
+        "8 clips of 48 were left out",
+        "7 × … s, shorter than … s",
+        "1 × NaN at frame …",
+        "No body model.",
+        "a note",
+        "deep.er",
+        "30720",
+        "Most common verbs (the source",
+        "No errors",
+        "40 warnings",
+        "positions: deviation",
+        "root yaw velocity",
+        "Most unusual values",
+    ):
+        assert word in whole, word
+    assert whole.count("<h1>") == 1 and whole.count("<h2") == 8
+    assert [f.name for f in facts.splits] == ["train", "val", "test"]
+    assert sum(len(f.seconds) for f in facts.splits) == 40
+    assert facts.captions.count == 40 * 4 + 20 and facts.captions.verbs == {"stand": 20}
+    assert facts.captions.repeated[0] == ("a person stands", 20)
+    assert facts.captions.per_clip == {4: 20, 5: 20}
+
+
+def test_statistics_are_of_the_training_split(nasty: Path) -> None:
+    facts, opened = gather(nasty)
+    motion = np.concatenate([opened["train"].motion(k) for k in range(len(opened["train"]))]).astype(
+        np.float64
+    )
+    np.testing.assert_allclose(facts.moments.mean, motion.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(facts.moments.std, motion.std(axis=0), atol=1e-6)
+    np.testing.assert_array_equal(facts.low, motion.min(axis=0).astype(np.float32))
+    away = np.abs(motion - motion.mean(axis=0)) / motion.std(axis=0)
+    assert facts.outliers[0].deviations == pytest.approx(away.max(), rel=1e-4)
+    best = facts.outliers[0]
+    assert opened["train"].motion(best.clip)[best.frame, best.column] == np.float32(best.value)
+    assert [o.deviations for o in facts.outliers] == sorted(
+        (o.deviations for o in facts.outliers), reverse=True
+    )
+
+
+def test_the_same_data_give_the_same_page(page: Path, nasty: Path, tmp_path: Path) -> None:
+    write_data_report(nasty, tmp_path / "again.html", check=True)
+    assert (tmp_path / "again.html").read_bytes() == page.read_bytes()
+
+
+def test_clips_to_watch_differ(nasty: Path) -> None:
+    facts, opened = gather(nasty)
+    chosen = choose(facts, opened, 12)
+    assert len(set(chosen)) == 12 and chosen == choose(facts, opened, 12)
+    assert choose(facts, opened, 5) == chosen[:5]
+    actions = {(opened[split].meta(clip).truth or {})["action"] for split, clip in chosen}
+    assert len(actions) >= 8
+    assert len(choose(facts, opened, 100)) == 40
+    motion = watch(opened["train"], 0)
+    assert motion.fps == 20 and motion.face_controls is not None
+    assert motion.face_controls.shape == (len(motion.joints), 5)
+
+
+def raw_sample(index: int, layout: MotionLayout) -> Sample:
+    rng = np.random.default_rng(index)
+    motion = 0.1 * np.cumsum(rng.standard_normal((40 + index, layout.dim)), axis=0).astype(np.float32) / 8
+    meta = layout.clip_meta(
+        f"raw-{index}", source="made", split="train", frames=len(motion), licence="", has_hands=False
+    )
+    return Sample(meta, motion)
+
+
+@pytest.mark.parametrize("name", ["smpl75", "smplx322"])
+def test_raw_sets_without_captions_have_a_page(name: str, tmp_path: Path) -> None:
+    layout = MotionLayout.named(name)
+    write_dataset(
+        tmp_path,
+        [("train", k) for k in range(3)],
+        partial(raw_sample, layout=layout),
+        DatasetFacts("raw", layout, licence="x", converter="made", converter_version=1, options={}),
+        WriteOptions(progress=False),
+    )
+    write_data_report(tmp_path, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert "No clip has a caption." in text and "neutral skeleton" in text and "none stated" in text
+    assert "None: every clip of the source is here." in text
+    write_data_report(tmp_path, tmp_path / "still.html", clips=0)
+    assert "Watch" not in (tmp_path / "still.html").read_text()
+
+
+def test_commands(call: Callable[..., Any], nasty: Path, tmp_path: Path) -> None:
+    copied = shutil.copytree(nasty, tmp_path / "set")
+    done = call("data", "report", copied, "--clips", 1)
+    assert done.code == 0 and (copied / "report.html").is_file()
+    assert call("data", "check", copied).code == 0  # the page does not disturb the set
+    strict = call("data", "check", copied, "--strict")
+    assert strict.code == 1 and "warning: " in strict.out and "40 licence" in strict.out
+
+
+def test_loose_files_are_checked(call: Callable[..., Any], tmp_path: Path) -> None:
+    np.save(tmp_path / "good.npy", np.zeros((4, 263), np.float32))
+    good = call("data", "check", tmp_path / "good.npy", "--layout", "h3d263")
+    assert good.code == 0 and "good.npy: ok, h3d263 [4, 263] float32" in good.out
+    assert call("data", "check", tmp_path / "good.npy").code == 1
+    (tmp_path / "bad\x1b[2Jname\n.txt").write_text("")
+    bad = call("data", "check", tmp_path, "--layout", "h3d263")
+    assert bad.code == 1 and "\x1b" not in bad.out and r"bad\x1b[2Jname\x0a.txt: no usable text" in bad.out
+
+
+# ---- in a browser
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 400)])
+def test_it_plays_and_stays_quiet(browser: Any, until: Any, page: Path, scheme: str, width: int) -> None:
+    trouble: list[str] = []
+    sheet = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    sheet.on("console", lambda m: trouble.append(m.text) if m.type in ("error", "warning") else None)
+    sheet.on("pageerror", lambda e: trouble.append(str(e)))
+    sheet.on("request", lambda r: trouble.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
+    sheet.goto(page.as_uri())
+    until(sheet, "window.__viewer && window.__viewer.draws > 0")
+    assert sheet.locator("canvas").count() == 12
+    first = sheet.evaluate("__viewer.frame")
+    until(sheet, f"Math.abs(__viewer.frame - {first}) >= 3")
+    sheet.evaluate("() => { __viewer.play(false); __viewer.setFrame(2); }")
+    for number in (0, 11):
+        canvas = sheet.locator("canvas").nth(number)
+        canvas.scroll_into_view_if_needed()
+        sheet.wait_for_timeout(200)
+        before = canvas.screenshot()
+        sheet.evaluate("__viewer.setFrame(30)")
+        sheet.wait_for_timeout(200)
+        assert canvas.screenshot() != before
+        sheet.evaluate("__viewer.setFrame(2)")
+    assert NASTY in sheet.locator("figcaption").nth(0).text_content()
+    assert sheet.locator("img, b").count() == 0 and sheet.evaluate("window.hacked") is None
+    folded = sheet.locator("details").first
+    assert not folded.locator("table").is_visible()
+    folded.locator("summary").click()
+    assert folded.locator("table").is_visible()
+    assert sheet.evaluate("document.documentElement.scrollWidth") <= width
+    ink, paper = (
+        sheet.evaluate(f"getComputedStyle(document.body).{name}") for name in ("color", "backgroundColor")
+    )
+    light = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
+    assert abs(light[0] - light[1]) > 450 and (light[1] > light[0]) == (scheme == "light")
+    levels = sheet.evaluate("[...document.querySelectorAll('h1, h2, h3')].map(h => Number(h.tagName[1]))")
+    assert levels[0] == 1 and all(deeper - level <= 1 for level, deeper in pairwise(levels))
+    sheet.close()
+    assert not trouble

@@ -1,0 +1,132 @@
+"""A recipe cut into groups: exactly its stages, in an order that can run, on machines that they can use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from motionloom.datasets.convert.registry import converters
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.runs.launch_plan import LaunchPlan, SlurmOptions, make_launch_plan
+from motionloom.pipeline.runs.plan import Selection, selected
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.resolve import shipped_recipes
+
+
+def plan_of(name: str | Path, *overrides: str, nodes: int = 1, gpus: int = 1, parts: int = 1) -> LaunchPlan:
+    return make_launch_plan(
+        load_recipe(name, overrides), SlurmOptions(parts=parts), given=str(name), overrides=overrides,
+        out=Path("/runs/x"), nodes=nodes, gpus_per_node=gpus,
+    )  # fmt: skip
+
+
+def stages(plan: LaunchPlan) -> list[tuple[str, ...]]:
+    return [group.stages for group in plan.groups]
+
+
+@pytest.mark.parametrize("name", sorted({*shipped_recipes()} - {"finetune"}))  # test_finetune.py
+def test_groups_select_their_stages_and_trainings_take_all_gpus(name: str) -> None:
+    plan = plan_of(name)
+    done: set[str] = set()
+    for number, group in enumerate(plan.groups):
+        assert group.after == (plan.groups[number - 1].name if number else None)
+        reached = selected(plan.recipe, Selection(until=",".join(group.last)))
+        assert reached - done == set(group.stages)
+        done |= reached
+    assert done == {stage.name for stage in plan.recipe.stages}
+
+    plan = plan_of(name, nodes=2, gpus=8)
+    if "paper" not in name:
+        return
+    for group in plan.groups:
+        kinds = [plan.recipe.stage(stage).kind for stage in group.stages]
+        if group.machines.gpus == 8:
+            assert all(kind.trains or kind.shares for kind in kinds) and group.machines.nodes == 2
+        else:
+            assert not any(kind.trains or kind.shares for kind in kinds)
+            assert (group.machines.nodes, group.machines.processes) == (1, 1)
+    assert [group.machines.gpus for group in plan.groups][:2] == [0, 8]
+
+
+def test_the_paper_waits_in_three_queues() -> None:
+    plan = plan_of("humantomato-paper", nodes=2, gpus=8)
+    trained = ("tokenizer", "face_tokenizer", "tma", "tokens", "face_tokens", "gpt", "face_gpt", "evaluate")
+    assert stages(plan) == [("data", "stats", "text"), trained, ("generate", "report")]
+    first, second, third = plan.groups
+    assert (first.name, second.name, third.name) == ("1-data", "2-train", "3-generate")
+    assert second.settings == ("hardware.nodes=2", "hardware.devices=8", "hardware.accelerator=gpu")
+    assert "hardware.accelerator=cpu" in first.settings and "hardware.accelerator=cpu" not in third.settings
+    words = plan.command(second, "unused.yaml", ["motionloom"])
+    assert words[:7] == ["motionloom", "run", "humantomato-paper", "-o", "/runs/x", "--until", "evaluate"]
+
+
+def test_a_conversion_at_the_beginning_is_made_in_parts() -> None:
+    plan = plan_of("bvh-body", parts=3)
+    steps = [(group.parts.step, group.parts.count) for group in plan.groups if group.parts]
+    assert steps == [("features", 3), ("shards", 3)]
+    assert stages(plan)[:3] == [("data",), ("data",), ("data", "stats", "text")]
+    python = ["python", "-P"]
+    parts = plan.groups[0].parts
+    assert parts is not None
+    assert plan.part_command(parts, "r.yaml", python)[2:] == [
+        *("-m", "motionloom.pipeline.runs.convert_part", "bvh-body", "/runs/x", "data", "features", "3")
+    ]
+    assert plan_of("bvh-body").groups[0].parts is None
+    assert [kind.name for kind in converters() if kind.features_first] == ["bvh"]
+
+
+def test_without_gpus_all_is_for_cpus() -> None:
+    plan = plan_of("ude-tiny", gpus=0, nodes=2)
+    assert all(group.machines.gpus == 0 for group in plan.groups)
+    assert all("hardware.accelerator=cpu" in group.settings for group in plan.groups)
+    train = plan.groups[1]
+    assert (train.machines.nodes, train.machines.processes) == (2, 1)
+
+
+def test_names_suit_slurm(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text("extends: humantomato-paper\nname: 9.Own_Recipe-of-a-very-long-and-winding-name\n")
+    plan = plan_of(path)
+    assert plan.name == "run-9-own-recipe-of-a-very-long-an"
+    assert max(len(plan.job(group)) for group in plan.groups) <= 56
+
+
+def test_a_resolved_recipe_takes_no_overrides_twice() -> None:
+    overrides = ("tma.train.steps=5",)
+    recipe = load_recipe("humantomato-tiny", overrides)
+    given = plan_of("humantomato-tiny", *overrides)
+    own = LaunchPlan(given.name, recipe, None, overrides, given.out, given.groups)
+    group = given.groups[0]
+    assert "tma.train.steps=5" in given.command(group, "r.yaml", ["motionloom"])
+    words = own.command(group, "r.yaml", ["motionloom"])
+    assert words[2] == "r.yaml" and "tma.train.steps=5" not in words
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ({"nodes": 0}, "take 1 node or more"),
+        ({"gpus": -1}, "take 1 node or more"),
+        ({"gpus": 7}, "stage tokenizer: train.batch_size .* does not divide by 7 processes"),
+    ],
+)
+def test_what_cannot_run_is_refused_before_it_waits(call: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        plan_of("humantomato-tiny", **call)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["partition"], "write KEY=VALUE"),
+        (["partitoin=gpu"], "did you mean 'partition'"),
+        (["account=a\n#SBATCH --wrap=x"], "one line"),
+        (["extra.comment=a\nrm -rf x"], "one line"),
+        (["time_minutes=3"], "warn_seconds 120 is more than half"),
+    ],
+)
+def test_wrong_options_are_explained(words: list[str], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        SlurmOptions.from_words(words)
