@@ -81,11 +81,7 @@ def told(truth: Truth) -> str:
 
 
 def retrieval(
-    run: Path,
-    stage: str,
-    truths: list[Truth],
-    draws: int,
-    motions: list[NDArray[np.float32]] | None = None,
+    run: Path, stage: str, truths: list[Truth], draws: int, motions: list[NDArray[np.float32]] | None = None
 ) -> dict[str, float]:
     """Mean recall over draws of 32 clips with different truths; `motions` made for their captions instead of
     their own."""

@@ -90,10 +90,7 @@ def recalls(row: LatentRow) -> Values:
 def caption_distance(row: LatentRow) -> Values:
     """Mean distance of each caption's latent from its motion's, both of length 1, and as they are."""
     unit = matching_score(_unit(row.text), _unit(row.motion))
-    return {
-        "matching_score": float(unit),
-        "latent_distance": float(matching_score(row.text, row.motion)),
-    }
+    return {"matching_score": float(unit), "latent_distance": float(matching_score(row.text, row.motion))}
 
 
 def guo_precision(row: LatentRow) -> Values:

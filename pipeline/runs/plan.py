@@ -222,12 +222,7 @@ def _decide_again(
 
 
 def _decide(
-    recipe: Recipe,
-    stage: Stage,
-    fingerprint: str,
-    run: Path,
-    rows: dict[str, PlannedStage],
-    forced: set[str],
+    recipe: Recipe, stage: Stage, fingerprint: str, run: Path, rows: dict[str, PlannedStage], forced: set[str]
 ) -> tuple[Action, str]:
     folder = stage_folder(run, stage.name)
     artifact, started = Artifact.find(folder), Started.find(folder)

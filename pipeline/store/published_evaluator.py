@@ -47,12 +47,7 @@ _OTHER = "OTHER"
 
 _MAKE = "make the folder again by docs/guo_evaluator.py"
 
-_SEQUENCE = {
-    "input_emb": "project",
-    "output_net.0": "narrow",
-    "output_net.1": "norm",
-    "output_net.3": "out",
-}
+_SEQUENCE = {"input_emb": "project", "output_net.0": "narrow", "output_net.1": "norm", "output_net.3": "out"}
 _MOVEMENT = {"main.0": "first", "main.3": "second", "out_net": "out"}
 
 Untagged = Literal["refuse", "other"]

@@ -19,15 +19,7 @@ from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.models.training.distributed import rank
 from motionloom.models.training.lora import trained_share
 from motionloom.pipeline.contract.showing import ModelCard
-from motionloom.pipeline.contract.stage import (
-    SHOWING,
-    Every,
-    Finished,
-    Inputs,
-    Role,
-    StageContext,
-    StageKind,
-)
+from motionloom.pipeline.contract.stage import SHOWING, Every, Finished, Inputs, Role, StageContext, StageKind
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.files import copy_files
 from motionloom.pipeline.store.weights import MODEL_FILES, ModelFacts, load_facts, load_weights, save_model

@@ -247,10 +247,7 @@ class PacerStage(TrainedStage[PacerConfig, PacerInputs, Pacer]):
 
     def curves(self, config: PacerConfig) -> tuple[Curve, ...]:
         """For the report."""
-        return (
-            Curve("pacer_distance"),
-            Curve("critic_margin", "margin of the critic"),
-        )
+        return (Curve("pacer_distance"), Curve("critic_margin", "margin of the critic"))
 
 
 register(PacerStage())

@@ -19,10 +19,7 @@ from motionloom.pipeline.runs.launch_plan import LaunchPlan, SlurmOptions, make_
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.slurm import submit_run
 
-pytestmark = [
-    pytest.mark.slurm,
-    pytest.mark.skipif(bool(why_not()), reason=why_not()),
-]
+pytestmark = [pytest.mark.slurm, pytest.mark.skipif(bool(why_not()), reason=why_not())]
 WORDS = ["light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=0.5", "memory_gb_per_gpu=0.5"]
 OPTIONS = SlurmOptions.from_words([*WORDS, "extra.comment=two words"])
 

@@ -105,12 +105,7 @@ class FeatureStep(Generic[C]):
     """The sample of a clip with its features. Picklable."""
 
     def make(
-        self,
-        clips: Sequence[C],
-        folder: Path,
-        pool: Workers,
-        how: WriteOptions,
-        say: Callable[[str], None],
+        self, clips: Sequence[C], folder: Path, pool: Workers, how: WriteOptions, say: Callable[[str], None]
     ) -> Convert[C]:
         """Make the batches that `clips` need and that are not there: all, or those of a part.
 

@@ -118,11 +118,7 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         tokenizer: TrainedTokenizer = inputs.tokenizer
         prior_tma = inputs.tma if config.prior == "tma" else None
         text_dim = inputs.text.dim if prior_tma is None else prior_tma.net.config.latent
-        extra = {
-            "text_dim": text_dim,
-            "prior": config.prior,
-            **stream_facts(tokenizer.net),
-        }
+        extra = {"text_dim": text_dim, "prior": config.prior, **stream_facts(tokenizer.net)}
         if inputs.start is not None:
             require_start_layout(inputs.data.layout, tokenizer.layout)
         layout = LayoutFacts.of(inputs.data.layout)

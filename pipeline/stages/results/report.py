@@ -221,12 +221,7 @@ def _motions(
 
 
 def _rows(
-    context: StageContext,
-    truth: Truth,
-    made: GeneratedMotion | None,
-    words: str,
-    group: str,
-    score: Score,
+    context: StageContext, truth: Truth, made: GeneratedMotion | None, words: str, group: str, score: Score
 ) -> list[ViewerMotion]:
     """A clip, what the tokenizer keeps of it, and what was made instead."""
     tokenizer, face_tokenizer = context.given.get("tokenizer"), context.given.get("face_tokenizer")

@@ -218,10 +218,7 @@ def test_another_run_that_is_gone(runs: Path) -> None:
         ("runs/other", r"runs/other: a whole run; name one of its stages.*data, net"),
         ("runs/other/stages", r"no finished stage \(no artifact.json\); name the folder of a stage"),
         ("runs/other/stages/data", r"its input 'start' is the stage '.*data' of kind root, which is no net"),
-        (
-            "[net, runs/other/stages/data]",
-            "'runs/other/stages/data' is no stage that gives a generator",
-        ),
+        ("[net, runs/other/stages/data]", "'runs/other/stages/data' is no stage that gives a generator"),
         (
             "[runs/other/stages/net, runs/sub/other/stages/net]",
             "two are called 'other:net'; name each once, or rename",

@@ -14,13 +14,7 @@ from toy_stages import register_toys
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import (
-    ALIGNMENT,
-    GENERATOR,
-    FunctionStage,
-    StageConfig,
-    StageContext,
-)
+from motionloom.pipeline.contract.stage import ALIGNMENT, GENERATOR, FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.evaluation.retrieval import retrieve
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe

@@ -189,10 +189,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no folder": (shutil.rmtree, "no such folder"),
     "no facts": (lambda f: (f / "evaluator.json").unlink(), r"evaluator\.json: no such file"),
     "no file": (lambda f: (f / "stats.safetensors").unlink(), r"stats\.safetensors: no such file"),
-    "other layout": (
-        lambda f: rewrite(f, "evaluator.json", layout="body133"),
-        "key 'layout' = 'body133'",
-    ),
+    "other layout": (lambda f: rewrite(f, "evaluator.json", layout="body133"), "key 'layout' = 'body133'"),
     "no checksum": (
         lambda f: rewrite(f, "evaluator.json", sha256={}),
         r"key 'sha256\.model\.safetensors' is required",

@@ -15,11 +15,7 @@ import torch
 
 from motionloom.datasets.base.files import HashingFile
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.training.checkpointing import (
-    read_checkpoint,
-    readable,
-    write_checkpoint,
-)
+from motionloom.pipeline.training.checkpointing import read_checkpoint, readable, write_checkpoint
 
 SEAL = 84
 CONTENT = {
@@ -53,10 +49,7 @@ def test_what_is_written_comes_back(folder: Path) -> None:
     raw = path.read_bytes()
     digest = hashlib.sha256(raw[:-SEAL]).hexdigest()
     assert raw[-SEAL:] == f"\nmotionloom sha256 {digest}\n".encode()
-    for content in (
-        read_checkpoint(path),
-        torch.load(path, weights_only=True),
-    ):
+    for content in (read_checkpoint(path), torch.load(path, weights_only=True)):
         assert content["global_step"] == 20
         for name, value in CONTENT["state_dict"].items():  # type: ignore[attr-defined]
             assert torch.equal(content["state_dict"][name], value)

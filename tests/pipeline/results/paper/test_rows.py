@@ -206,7 +206,7 @@ def test_dances_and_texts_of_one_model_share_a_row(tmp_path: Path, records: Modu
     row = next(row for row in table.rows if row.source == "ours")
     assert row.method == "Ours (gru)" and row.evaluations == ("evaluate", "evaluate_dances")
     assert {row.label for row in table.rows if row.source == "reference"} == {
-        "mean pose, still (u evaluate_dances)",
+        "mean pose, still (u evaluate_dances)"
     }
     with_dmd = filled("ude/5", tmp_path / "u")
     assert not ours(with_dmd)  # its UTT is a GRU

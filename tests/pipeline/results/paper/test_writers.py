@@ -46,10 +46,7 @@ TABLE = FilledTable(
         FilledRow("missing", "m2", "missing", (None, None, None)),
         FilledRow("reference", "", "chance", (None, Cell("0.5", 0.5), None), "r{1}"),
     ),
-    differences=(
-        Difference("r{1}", "e", "data", "S", "D"),
-        Difference("r{1}", "e", "clips", "3", None),
-    ),
+    differences=(Difference("r{1}", "e", "data", "S", "D"), Difference("r{1}", "e", "clips", "3", None)),
     notes=("A note of 5 %.",),
 )
 
