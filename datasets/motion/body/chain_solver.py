@@ -121,12 +121,17 @@ class _Solver:
         return np.asarray((square * self.weights[:, rows].T).sum(axis=-1) / 2, dtype=np.float64)
 
     def _local(self, world: Floats, before: Floats) -> Floats:
-        """Local rotations of world rotations; the ends' stay as they were."""
+        """Local rotations of world rotations; the ends' stay as they were.
+
+        Products of products drift away from rotations, at each step and down the chain by more and more, so
+        one step of Newton's iteration takes each back to the nearest rotation.
+        """
         local = before.copy()
         for joint in self.inner:
             above = self.parents[joint]
             turned = world[:, joint]
-            local[:, joint] = turned if above < 0 else world[:, above].swapaxes(-1, -2) @ turned
+            own = turned if above < 0 else world[:, above].swapaxes(-1, -2) @ turned
+            local[:, joint] = own @ (1.5 * np.eye(3) - 0.5 * own.swapaxes(-1, -2) @ own)
         return local
 
     def _step(self, joints: Floats, world: Floats, damping: Floats, rows: Rows) -> tuple[Floats, Floats]:

@@ -75,7 +75,9 @@ def test_bones_of_stretched_figures_keep_one_length_and_directions_stay() -> Non
     joints = stretched(clean, skeleton, seed=4)
     assert np.ptp(lengths(joints, skeleton), axis=0).max() > 0.1
     fitted = fit_rigid(joints, skeleton)
-    assert np.ptp(lengths(fitted.joints, skeleton), axis=0).max() < 1e-6
+    assert np.ptp(lengths(fitted.joints, skeleton), axis=0).max() < 1e-10
+    turned = fitted.rotations @ fitted.rotations.swapaxes(-1, -2)
+    np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-10)
     again, _ = forward_kinematics(
         fitted.rotations, fitted.root, fitted.skeleton.offsets, fitted.skeleton.parents
     )
