@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Dropped
 
 LEFT_OUT_FILE = "left-out.txt"
@@ -94,10 +95,5 @@ def write_left_out(out: Path, dropped: Sequence[Dropped]) -> None:
     if not dropped:
         path.unlink(missing_ok=True)
         return
-    lines = [f"{drop.kind}\t{_one_line(drop.source)}\t{_one_line(drop.reason)}\n" for drop in dropped]
+    lines = [f"{drop.kind}\t{printable(drop.source)}\t{printable(drop.reason)}\n" for drop in dropped]
     write_text(path, "".join(lines))
-
-
-def _one_line(text: str) -> str:
-    """Names may be any bytes, and one line is one clip."""
-    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)

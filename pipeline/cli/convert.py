@@ -21,6 +21,7 @@ from rich.table import Table
 from typer.core import TyperGroup
 from typer.main import get_command
 
+from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.registry import converter_named, names
 from motionloom.datasets.schema import MANIFEST_FILE, Config, Manifest, UserError
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
@@ -285,8 +286,3 @@ def _say_left_out(manifest: Manifest, out: Path, console: Console) -> None:
 def say(console: Console, text: str) -> None:
     """Print text from a stranger's file: one line, and no control characters for the terminal to obey."""
     console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
-
-
-def printable(text: str) -> str:
-    """The text with control characters written out."""
-    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)

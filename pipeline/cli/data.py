@@ -11,9 +11,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Dropped, Manifest, UserError
 from motionloom.datasets.shards.left_out import grouped
-from motionloom.pipeline.cli.convert import convert_app, printable, say, say_manifest
+from motionloom.pipeline.cli.convert import convert_app, say, say_manifest
 from motionloom.pipeline.cli.options import AsJson, plain, print_json
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.render.labels import label

@@ -47,7 +47,7 @@ def test_the_list_is_one_line_each_and_goes_when_there_is_nothing(tmp_path: Path
     ]
     write_left_out(tmp_path, names)
     assert (tmp_path / LEFT_OUT_FILE).read_text() == (
-        "unreadable\ta\\x0ab.bvh\todd\\x09name \\x1b[31m\nrejected\ttake/0.bvh\tno captions\n"
+        "unreadable\ta\\nb.bvh\todd\\tname \\x1b[31m\nrejected\ttake/0.bvh\tno captions\n"
     )
     write_left_out(tmp_path, [])
     write_left_out(tmp_path, [])

@@ -196,7 +196,7 @@ def test_loose_files_are_checked(call: Callable[..., Any], tmp_path: Path) -> No
     assert call("data", "check", tmp_path / "good.npy").code == 1
     (tmp_path / "bad\x1b[2Jname\n.txt").write_text("")
     bad = call("data", "check", tmp_path, "--layout", "h3d263")
-    assert bad.code == 1 and "\x1b" not in bad.out and r"bad\x1b[2Jname\x0a.txt: no usable text" in bad.out
+    assert bad.code == 1 and "\x1b" not in bad.out and r"bad\x1b[2Jname\n.txt: no usable text" in bad.out
 
 
 # ---- in a browser
