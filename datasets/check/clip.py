@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
+from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits, require_sensible
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, ClipMeta, ShardInfo
 from motionloom.datasets.shards.sample import captions_from_json, meta_from_json, require_finite
@@ -112,7 +112,7 @@ def _check_audio(file: BinaryIO, path: Path, clip: TarClip) -> int | None:
     audio = npy_from_bytes(read_member(file, clip, "audio.npy"), f"{path}: '{clip.key}.audio.npy'")
     if audio.ndim != 2 or not len(audio):
         raise ValueError(f"audio.npy is {list(audio.shape)}, not [T_audio >= 1, features]")
-    require_finite("audio.npy", audio)
+    require_sensible("audio.npy", audio)
     return int(audio.shape[1])
 
 

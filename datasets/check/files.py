@@ -2,7 +2,7 @@
 
 | suffix | read as |
 |---|---|
-| `.tar` | a WebDataset shard without manifest (`shards/foreign.py`) |
+| `.tar` | a WebDataset shard, of other tools too: `motion.npy` and `json` or `meta.json` for each key |
 | `.npy` | a motion array of the layout asked for (Motion-X's `smplx322` unless given), or joints |
 | `.npz` | SMPL parameters as AMASS publishes them |
 | `.pkl` | an AIST++ annotation, through the restricted unpickler |
@@ -15,14 +15,17 @@ Nothing is written, run or extracted, whatever a file holds.
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from motionloom.datasets.audio.sound import read_sound
-from motionloom.datasets.check.foreign import inspect_tar
-from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
+from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits, require_sensible
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
@@ -33,6 +36,7 @@ from motionloom.datasets.convert.common.splits import read_ids, read_split_files
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import SPLITS, UserError
+from motionloom.datasets.shards.tar import npy_from_bytes, scan_tar
 from motionloom.datasets.text.clean import usable_caption
 
 TEXTS = ("auto", "humanml", "plain", "ids")
@@ -126,9 +130,45 @@ def _check_splits(folder: Path, splits: Sequence[str]) -> Verdict:
 
 
 def _check_tar(path: Path, rules: FileRules) -> Verdict:
-    layout = rules.motion_layout() if rules.layout in LAYOUTS else None
-    report = inspect_tar(path, layout)
-    return Verdict(path, f"shard of {report.samples} samples", report.problems, report.notes)
+    clips = scan_tar(path, foreign=True)
+    problems: list[str] = []
+    with path.open("rb") as file:
+        for clip in clips:
+            for name, (start, size) in clip.members.items():
+                file.seek(start)
+                if problem := _member_problem(f"'{clip.key}.{name}'", name, file.read(size), rules):
+                    problems.append(problem)
+    return Verdict(path, f"shard of {len(clips)} samples", problems)
+
+
+def _member_problem(where: str, name: str, raw: bytes, rules: FileRules) -> str:
+    """What is wrong with a member of a stranger's shard; empty when nothing is."""
+    try:
+        if name.endswith("json"):
+            json.loads(raw)
+        elif name.endswith("npy"):
+            values = npy_from_bytes(raw, where)
+            if name == "motion.npy":
+                _check_motion(values, rules.motion_layout() if rules.layout in LAYOUTS else None)
+            else:
+                require_sensible(name, values)
+    except UserError as error:
+        return str(error)
+    except (ValueError, RecursionError) as error:
+        return f"{where}: {'not valid JSON' if name.endswith('json') else 'unfit'} ({error})"
+    return ""
+
+
+def _check_motion(values: NDArray[np.floating], layout: MotionLayout | None) -> None:
+    if values.ndim != 2 or not len(values):
+        raise ValueError(f"{values.dtype} {list(values.shape)}, wanted floats [T >= 1, D]")
+    require_sensible("motion.npy", values)
+    if layout is None:
+        return
+    if values.shape[1] != layout.dim:
+        raise ValueError(f"{values.shape[1]} columns, layout {layout.name} has {layout.dim}")
+    if absurd := beyond(values, layout, human_limits(layout), ABSURD):
+        raise ValueError(f"{absurd}: a wrong unit, scale or layout")
 
 
 def _check_npy(path: Path, rules: FileRules) -> Verdict:
@@ -152,7 +192,8 @@ def _check_npy(path: Path, rules: FileRules) -> Verdict:
 
 def _layout_hint(path: Path, layout: MotionLayout) -> str:
     try:
-        shape, _ = read_array_header(path)
+        with path.open("rb") as file:
+            shape = read_array_header(file, str(path)).shape
     except UserError:
         return ""
     if len(shape) == 3 and (shape[1:] in JOINTS.values()):

@@ -23,9 +23,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.shards.sample import require_finite
 
 ABSURD = 10.0
 """An error is this many times the first limit."""
+LARGEST = 1e6
+"""No feature of motion or music is larger, whatever it means."""
+
+
+def require_sensible(what: str, values: NDArray[np.floating]) -> None:
+    """`ValueError` naming the first row of [..., E] that holds NaN, infinity or a number beyond `LARGEST`."""
+    require_finite(what, values)
+    far = (np.abs(values) > LARGEST).any(axis=-1)
+    if far.any():
+        raise ValueError(f"{what}: absurd value in row {int(far.argmax())}; at most {LARGEST:g} is sensible")
+
 
 _PER_SECOND = {"root_yaw_velocity": 40.0, "root_xz_velocity": 15.0, "velocities": 40.0}
 """Limits of columns that hold a change per frame, given a second."""

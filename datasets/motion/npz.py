@@ -1,7 +1,7 @@
-"""Reading .npz files from outside: never a pickle, never more memory than allowed, and headers without data.
+"""Reading .npy and .npz from outside: never a pickle, never more memory than the file holds or is allowed.
 
 `np.load` would do for trusted files. A planner must know shape and type of the arrays of thousands of clips,
-though, and a file may state any size, so headers are read first and checked against the archive's own list.
+though, and a file may state any size, so headers are read first and compared with the bytes that are there.
 """
 
 from __future__ import annotations
@@ -33,10 +33,43 @@ class ArrayHeader:
     dtype: np.dtype[Any]
     start: int
     """Bytes before the data."""
+    fortran: bool = False
 
     @property
-    def size(self) -> int:
-        return math.prod(self.shape) * self.dtype.itemsize
+    def end(self) -> int:
+        """Bytes of the whole file."""
+        return self.start + math.prod(self.shape) * self.dtype.itemsize
+
+
+def read_npy_header(stream: IO[bytes], where: str, size: int) -> ArrayHeader:
+    """Header of the .npy file of `size` bytes that begins at the stream's position; reads no data.
+
+    `UserError` beginning with `where` for anything else, for Python objects, and for a size that does not fit
+    shape and type.
+    """
+    begin = stream.tell()
+    try:
+        version = npy_format.read_magic(stream)
+        # Version 3 differs only in the names of record fields, which no motion file has.
+        read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
+        shape, fortran, dtype = read(stream)
+    except OSError:
+        raise
+    except Exception as error:  # numpy's header parser fails in many ways on broken text
+        reason = " ".join(str(error).split())[:120]
+        raise UserError(f"{where}: not an .npy file, or cut within its header ({reason})") from None
+    if dtype.hasobject:
+        raise UserError(
+            f"{where}: object array (a pickle), which would run code when read; save plain numbers or text"
+        )
+    if any(count < 0 for count in shape):
+        raise UserError(f"{where}: the header states a negative size {list(shape)}")
+    header = ArrayHeader(shape, dtype, stream.tell() - begin, fortran)
+    if header.end != size:
+        what = "truncated array" if size < header.end else "more data than the header states"
+        expected, found = header.end - header.start, size - header.start
+        raise UserError(f"{where}: {what}: {expected} bytes expected for {list(shape)}, {found} found")
+    return header
 
 
 class NpzFile:
@@ -45,7 +78,7 @@ class NpzFile:
     `label` stands for the path in these sentences, where they go into a manifest.
     """
 
-    def __init__(self, path: Path, label: str | None = None) -> None:
+    def __init__(self, path: Path | IO[bytes], label: str | None = None) -> None:
         self.label = str(path) if label is None else label
         try:
             self._zip = zipfile.ZipFile(path)
@@ -67,33 +100,15 @@ class NpzFile:
     def header(self, name: str) -> ArrayHeader:
         """Shape and type of an array; reads no data, but finds sizes that do not fit and Python objects."""
         with self._open(name) as stream:
-            version = npy_format.read_magic(stream)
-            if version not in ((1, 0), (2, 0)):
-                raise UserError(f"{self.label}: array '{name}' has the unknown .npy version {version}")
-            first = version == (1, 0)
-            read = npy_format.read_array_header_1_0 if first else npy_format.read_array_header_2_0
-            shape, _, dtype = read(stream)
-            if any(count < 0 for count in shape):
-                raise ValueError(f"a negative size in {list(shape)}")
-            header = ArrayHeader(shape, dtype, stream.tell())
-        if dtype.hasobject:
-            raise UserError(
-                f"{self.label}: array '{name}' holds Python objects (a pickle), which can run code and is "
-                f"never read; save it as plain numbers or text"
+            return read_npy_header(
+                stream, f"{self.label}: array '{name}'", self._zip.getinfo(f"{name}.npy").file_size
             )
-        stated = self._zip.getinfo(f"{name}.npy").file_size
-        if stated != header.start + header.size:
-            raise UserError(
-                f"{self.label}: array '{name}' of shape {list(shape)} needs {header.start + header.size} "
-                f"bytes, the file holds {stated}"
-            )
-        return header
 
-    def array(self, name: str, *, limit: int = MAX_BYTES) -> NDArray[np.floating]:
+    def array(self, name: str, *, limit: int = MAX_BYTES) -> NDArray[Any]:
         header = self.header(name)
-        if header.size > limit:
+        if header.end > limit:
             raise UserError(
-                f"{self.label}: array '{name}' of shape {list(header.shape)} takes {header.size:,} bytes; "
+                f"{self.label}: array '{name}' of shape {list(header.shape)} takes {header.end:,} bytes; "
                 f"more than {limit:,} are not read"
             )
         with self._open(name) as stream:

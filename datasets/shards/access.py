@@ -1,4 +1,4 @@
-"""How the bytes of a clip are reached: in a mapped file, by requests, or in whole shards in memory.
+"""How the bytes of a clip are reached: in a mapped file, or in whole shards in memory.
 
 An access is made for one split and answers `member(shard, clip, column)` with a buffer and the byte in it
 where the member starts. Whole shards are read front to back through WebDataset: the index says which clips a
@@ -18,8 +18,6 @@ import tarfile
 from collections import OrderedDict
 from collections.abc import Collection, Sequence
 from typing import BinaryIO
-
-from numpy.typing import NDArray
 
 from motionloom.datasets.schema import ShardInfo, UserError
 from motionloom.datasets.shards.index import SplitIndex
@@ -73,36 +71,6 @@ class MappedShards:
         return found
 
 
-class RangedShards:
-    """A range request for each member; those of one batch are made at the same time."""
-
-    def __init__(self, store: Store, shards: list[ShardInfo], index: SplitIndex) -> None:
-        self._store, self._shards = store, shards
-        self._offsets: NDArray = index.offsets
-        self._sizes: NDArray = index.sizes
-        self._held: dict[tuple[int, int], bytes] = {}
-
-    def member(self, shard: int, clip: int, column: int) -> tuple[Buffer, int]:
-        found = self._held.get((clip, column))
-        if found is None:
-            found = self._store.read_pieces([self._piece(shard, clip, column)])[0]
-        return found, 0
-
-    def prefetch(self, places: Sequence[tuple[int, int]], members: Collection[str]) -> None:
-        columns = [MEMBERS.index(member) for member in members]
-        wanted = {
-            (clip, column): self._piece(shard, clip, column)
-            for shard, clip in places
-            for column in columns
-            if self._sizes[clip, column]
-        }
-        self._held = dict(zip(wanted, self._store.read_pieces(list(wanted.values())), strict=True))
-
-    def _piece(self, shard: int, clip: int, column: int) -> tuple[str, int, int]:
-        start = int(self._offsets[clip, column])
-        return self._shards[shard].name, start, start + int(self._sizes[clip, column])
-
-
 GROUPS_HELD = 2
 """A batch may begin in one group of shards and end in the next."""
 
@@ -147,7 +115,7 @@ class StreamedShards:
             self._held[shard] = read_shard(self._store, self._shards[shard], self._index, rows, self._members)
 
 
-Access = MappedShards | RangedShards | StreamedShards
+Access = MappedShards | StreamedShards
 
 
 def read_shard(

@@ -39,9 +39,8 @@ class CacheConfig(Config):
 
     folder: str | None = None
     """A folder that processes and runs may share; unset means `motionloom/shards` in the user's cache."""
-    gigabytes: float = Field(50.0, ge=0)
-    """Size limit (10^9 bytes); the shards unused for longest go first. 0 keeps no shard: every clip is a
-    range request of its own."""
+    gigabytes: float = Field(50.0, gt=0)
+    """Size limit (10^9 bytes); the shards unused for longest go first."""
 
     @property
     def limit(self) -> int:
@@ -70,10 +69,9 @@ class FileCache:
     def get(self, name: str, size: int, make: Callable[[Path], object]) -> BinaryIO:
         """The file `name`, opened. `make` writes it to the path it is given when it is not there yet.
 
-        `size` (bytes, 0 if unknown) is made room for. With a limit of 0 (no shards are kept) nothing is
-        ever deleted, as only manifests and indices come here.
+        `size` (bytes, 0 if unknown) is made room for.
         """
-        if self.limit and size > self.limit:
+        if size > self.limit:
             raise UserError(
                 f"{self.folder}: a file of {size} bytes is larger than the cache's limit of {self.limit}; "
                 f"raise its gigabytes"
@@ -100,8 +98,6 @@ class FileCache:
 
     def _make_room(self, size: int, keep: str = "") -> None:
         """Delete the files unused for longest until `size` more bytes fit, and what killed processes left."""
-        if not self.limit:
-            return
         files = []
         used = size
         with os.scandir(self.folder) as entries:

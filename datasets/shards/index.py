@@ -30,9 +30,10 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from motionloom.datasets.base.files import write_with
+from motionloom.datasets.motion.npz import read_npy_header
 from motionloom.datasets.schema import INDEX_FILE, PRESENT_ALL, Config, Dropped, ShardInfo, Split, UserError
 from motionloom.datasets.shards.sample import MEMBERS
-from motionloom.datasets.shards.tar import TarClip, read_npy_header, scan_tar
+from motionloom.datasets.shards.tar import TarClip, scan_tar
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "frames": (np.int32, 1),
@@ -92,18 +93,14 @@ def clip_entries(
         for clip, (source, present) in zip(clips, written, strict=True):
             start, size = clip.members["motion.npy"]
             file.seek(start)
-            header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'")
-            if header.data + int(np.prod(header.shape)) * header.dtype.itemsize != size:
-                raise UserError(
-                    f"{path}: '{clip.key}.motion.npy' has the wrong size; convert the dataset again"
-                )
+            header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'", size)
             entries.append(
                 ClipEntry(
                     key=clip.key,
                     id=source,
                     present=present,
                     frames=header.shape[0],
-                    motion_data=start + header.data,
+                    motion_data=start + header.start,
                     motion_itemsize=header.dtype.itemsize,
                     members=clip.members,
                 )

@@ -33,7 +33,7 @@ from motionloom.datasets.schema import (
     Split,
     UserError,
 )
-from motionloom.datasets.shards.access import Access, MappedShards, RangedShards, StreamedShards
+from motionloom.datasets.shards.access import Access, MappedShards, StreamedShards
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.index import read_index
@@ -221,8 +221,6 @@ class ShardDataset:
         if reading.mode == "streamed":
             group = reading.shards_per_group
             return StreamedShards(self._store, shards, index, self._first, group)
-        if not self._store.mappable:
-            return RangedShards(self._store, shards, index)
         self._ahead = False
         local = isinstance(self._store, LocalStore)
         return MappedShards(self._store, shards, index, room=0 if local else reading.cache.limit)

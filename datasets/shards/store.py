@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import io
 import os
 import random
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar, cast
@@ -24,13 +23,8 @@ from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, Use
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 
 SCHEMES = ("file", "http", "https", "s3")
-CHUNK = 8 * 2**20
-"""Bytes of one range request when a shard is read front to back without a cache."""
 
 _CONNECT_SECONDS, _READ_SECONDS = 15, 60
-
-Piece = tuple[str, int, int]
-"""(file name, first byte, byte behind the last)."""
 
 
 def is_url(place: Path | str) -> bool:
@@ -70,9 +64,6 @@ def _scheme(place: str) -> str | None:
 class LocalStore:
     """A folder of this machine."""
 
-    mappable = True
-    """Whether `open_shard` gives a file of this machine, which can be memory-mapped."""
-
     def __init__(self, root: Path) -> None:
         self.root = root
         self.place = str(root)
@@ -94,17 +85,6 @@ class LocalStore:
         """A whole shard, buffered, from its beginning."""
         return self._open(shard.name)
 
-    def read_pieces(self, pieces: Sequence[Piece]) -> list[bytes]:
-        """Pieces of files, each of exactly the length asked for."""
-        found = []
-        for name, start, end in pieces:
-            with self._open(name) as file:
-                file.seek(start)
-                found.append(file.read(end - start))
-            if len(found[-1]) != end - start:
-                raise UserError(f"{self.where(name)}: ends before byte {end}: truncated or changed")
-        return found
-
     def _open(self, name: str) -> BinaryIO:
         try:
             return (self.root / name).open("rb")
@@ -115,7 +95,7 @@ class LocalStore:
 
 
 class RemoteStore:
-    """A URL. Whole shards are kept in a cache, if that has room; manifest and index always are.
+    """A URL. What is read is kept in a cache, whole.
 
     Data sets of one process share connections; another process (forked or spawned) opens its own.
     """
@@ -123,7 +103,6 @@ class RemoteStore:
     def __init__(self, url: str, cache: CacheConfig) -> None:
         self.place = url
         self.cache = FileCache(cache)
-        self.mappable = cache.limit > 0
 
     def where(self, name: str) -> str:
         return f"{self.place}/{name}"
@@ -146,37 +125,7 @@ class RemoteStore:
 
     def open_shard(self, shard: ShardInfo) -> BinaryIO:
         """A shard in the cache was checked against the manifest's sha256 when it arrived."""
-        if self.mappable:
-            return self.cache.get(f"{shard.sha256}.tar", shard.bytes, lambda path: self._fetch(shard, path))
-        raw = _RangeFile(self, shard.name, shard.bytes)
-        return cast(BinaryIO, io.BufferedReader(raw, CHUNK))
-
-    def read_pieces(self, pieces: Sequence[Piece]) -> list[bytes]:
-        """All at once; those that failed are then repeated one by one."""
-        if len(pieces) > 1:
-            names, starts, ends = zip(*pieces, strict=True)
-            urls = [self.where(name) for name in names]
-            found = self._system().cat_ranges(urls, list(starts), list(ends), on_error="return")
-        else:
-            found = [None] * len(pieces)
-        out = []
-        for (name, start, end), got in zip(pieces, found, strict=True):
-            whole = isinstance(got, bytes) and len(got) == end - start
-            out.append(cast(bytes, got) if whole else self._piece(self.where(name), start, end))
-        return out
-
-    def _piece(self, url: str, start: int, end: int) -> bytes:
-        def read() -> bytes:
-            found: bytes = self._system().cat_file(url, start=start, end=end)
-            if len(found) > end - start:
-                raise UserError(
-                    f"{url}: the server ignores byte ranges; let the cache keep shards (gigabytes > 0)"
-                )
-            if len(found) < end - start:
-                raise OSError(f"{len(found)} of the {end - start} bytes from {start}: truncated or changed")
-            return found
-
-        return persist(url, read)
+        return self.cache.get(f"{shard.sha256}.tar", shard.bytes, lambda path: self._fetch(shard, path))
 
     def _download(self, name: str, path: Path) -> None:
         url = self.where(name)
@@ -244,23 +193,6 @@ def _as_before(raw: bytes, digest: str | None, where: str) -> bytes:
     if digest is not None and hashlib.sha256(raw).hexdigest() != digest:
         raise UserError(f"{where}: changed while the data set was in use; start again")
     return raw
-
-
-class _RangeFile(io.RawIOBase):
-    def __init__(self, store: RemoteStore, name: str, size: int) -> None:
-        self._store, self._name, self._size, self._at = store, name, size, 0
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        end = min(self._at + len(buffer), self._size)
-        if end == self._at:
-            return 0
-        data = self._store.read_pieces([(self._name, self._at, end)])[0]
-        buffer[: len(data)] = data
-        self._at = end
-        return len(data)
 
 
 ATTEMPTS = 8

@@ -1,8 +1,8 @@
 """Reading a shard's directory without trusting it.
 
-Only plain files of known member names, contiguous per key, are accepted; a path separator, a link, a device,
-a repeated or interleaved key or an object array stops the read with the shard's and the member's name.
-Nothing is ever extracted, and nothing is unpickled.
+Only plain files, contiguous per key, are accepted; a path that leaves the shard, a link, a device, a repeated
+or interleaved key or an object array stops the read with the shard's and the member's name. Nothing is ever
+extracted, and nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import io
 import tarfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
-from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.npz import read_npy_header
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import MEMBERS
 
-NPY_HEADER_LIMIT = 4096
+MOST_CLIPS = 20_000
+"""Clips of one shard; a directory of more is a bomb."""
 
 
 @dataclass
@@ -31,76 +31,101 @@ class TarClip:
     members: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class NpyHeader:
-    """What an .npy member says about itself; `data` is the byte, from its start, where the values begin."""
+def scan_tar(path: Path, *, foreign: bool = False, most: int = MOST_CLIPS) -> list[TarClip]:
+    """The clips of a shard in the order they stand; `UserError` names what is wrong with the file.
 
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    data: int
-
-
-def scan_tar(path: Path) -> list[TarClip]:
-    """The clips of a shard in the order they stand; `UserError` names what is wrong with the file."""
+    Our members only, unless the shard is `foreign`: then names may hold folders, the metadata may be called
+    `json`, and files that belong to no clip are passed over. `most` is how many clips it may have.
+    """
     clips: list[TarClip] = []
     seen: set[str] = set()
-    size = path.stat().st_size
+    size, end = path.stat().st_size, 0
+    if size == 0:
+        raise UserError(f"{path}: empty file, 0 bytes: an interrupted download or write")
     try:
         with tarfile.open(path, mode="r:") as archive:
             for info in archive:
-                key, member = _checked_name(path, info)
+                archive.members = []  # tarfile keeps every entry
+                end = info.offset_data + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+                key, member = _checked_name(path, info, foreign)
+                if not key or not member:
+                    continue
                 if info.offset_data + info.size > size:
-                    raise UserError(f"{path}: truncated inside '{info.name}'; convert the dataset again")
+                    last = f"the last whole key is '{clips[-1].key}'" if clips else "no key is whole"
+                    raise UserError(f"{path}: truncated inside '{info.name}'; {last}")
                 if not clips or clips[-1].key != key:
+                    if clips:
+                        _require_whole(path, clips, foreign)
                     if key in seen:
-                        raise UserError(f"{path}: the members of key '{key}' do not stand together")
+                        raise UserError(
+                            f"{path}: duplicate key '{key}': it comes again after others, or its members "
+                            f"do not stand together"
+                        )
+                    if len(clips) >= most:
+                        raise UserError(f"{path}: more than {most} clips, which no shard of ours has")
                     seen.add(key)
                     clips.append(TarClip(key))
                 if member in clips[-1].members:
-                    raise UserError(f"{path}: '{info.name}' appears twice")
+                    raise UserError(f"{path}: '{info.name}' appears twice: duplicate member")
                 clips[-1].members[member] = (info.offset_data, info.size)
-    except (tarfile.TarError, EOFError, OSError) as error:
+    except (tarfile.TarError, EOFError, OSError, ValueError) as error:
         raise UserError(f"{path}: not a readable tar file ({error}); convert the dataset again") from None
-    for clip in clips:
-        missing = {"motion.npy", "meta.json"} - clip.members.keys()
-        if missing:
-            raise UserError(f"{path}: key '{clip.key}' has no {sorted(missing)[0]}")
+    if not clips and foreign:
+        raise UserError(f"{path}: holds no clips")
+    if clips:
+        _require_whole(path, clips, foreign)
+    _check_end(path, end)
     return clips
 
 
-def _checked_name(path: Path, info: tarfile.TarInfo) -> tuple[str, str]:
-    """(key, member) of one entry, refused when it is anything but a plain file with a name we write."""
+def _checked_name(path: Path, info: tarfile.TarInfo, foreign: bool) -> tuple[str, str]:
+    """(key, member) of one entry, refused when it is anything but a plain file with a harmless name."""
+    name, parts = info.name, info.name.split("/")
+    if name.startswith("/") or ".." in parts or ":" in parts[0] or {"\\", "\0"} & set(name):
+        raise UserError(
+            f"{path}: '{name}' is a path that leaves the shard (path traversal); shards hold plain names only"
+        )
     if not info.isreg():
-        raise UserError(f"{path}: '{info.name}' is a link, folder or device; shards hold plain files only")
-    if "/" in info.name or "\\" in info.name or info.name.startswith("."):
-        raise UserError(f"{path}: '{info.name}' is a path; shards hold plain names only")
-    key, _, member = info.name.partition(".")
+        raise UserError(f"{path}: '{name}' is a link, folder or device; shards hold plain files only")
+    if foreign:
+        folder, slash, last = name.rpartition("/")
+        stem, _, member = last.partition(".")
+        return (folder + slash + stem if stem else ""), member
+    if "/" in name or name.startswith("."):
+        raise UserError(f"{path}: '{name}' is a path; shards hold plain names only")
+    key, _, member = name.partition(".")
     if member not in MEMBERS:
-        raise UserError(f"{path}: '{info.name}' is not a known member; known: {', '.join(MEMBERS)}")
+        raise UserError(f"{path}: '{name}' is not a known member; known: {', '.join(MEMBERS)}")
     return key, member
 
 
+def _require_whole(path: Path, clips: list[TarClip], foreign: bool) -> None:
+    clip = clips[-1]
+    missing = {"motion.npy", "meta.json"} - clip.members.keys()
+    if foreign and "json" in clip.members:
+        missing.discard("meta.json")
+    if missing:
+        last = f" (truncated? the last whole key is '{clips[-2].key}')" if len(clips) > 1 else ""
+        raise UserError(f"{path}: missing field: key '{clip.key}' has no {sorted(missing)[0]}{last}")
+
+
+def _check_end(path: Path, end: int) -> None:
+    """After the last entry come zeros: tar readers pass over anything else without a word."""
+    with path.open("rb") as file:
+        file.seek(end)
+        while block := file.read(1 << 20):
+            if block.count(0) != len(block):
+                raise UserError(
+                    f"{path}: the data after byte {end} are no tar entries: damaged, or two archives in one "
+                    f"file"
+                )
+
+
 def npy_from_bytes(raw: bytes, where: str) -> NDArray[np.floating]:
-    """The array of a whole .npy member, a view of its bytes; `UserError` also when it is cut."""
-    header = read_npy_header(io.BytesIO(raw), where)
-    if header.data + int(np.prod(header.shape)) * header.dtype.itemsize != len(raw):
-        raise UserError(f"{where}: the array is cut short or too long")
-    return np.frombuffer(raw, header.dtype, offset=header.data).reshape(header.shape)
-
-
-def read_npy_header(file: BinaryIO, where: str) -> NpyHeader:
-    """Parse the header at the file's position; object arrays, Fortran order and non-floats are refused."""
-    start = file.tell()
-    head = io.BytesIO(file.read(NPY_HEADER_LIMIT))
-    try:
-        version = npy_format.read_magic(head)
-        read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
-        shape, fortran, dtype = read(head)
-    except ValueError as error:
-        raise UserError(f"{where}: not a valid .npy array ({error})") from None
-    if dtype.hasobject or dtype.kind != "f":
-        raise UserError(f"{where}: holds {dtype} values, floats only are accepted")
-    if fortran and len(shape) > 1:
+    """The floats of a whole .npy member, a view of its bytes; `UserError` for anything else."""
+    header = read_npy_header(io.BytesIO(raw), where, len(raw))
+    if header.dtype.kind != "f":
+        raise UserError(f"{where}: holds {header.dtype} values, floats only are accepted")
+    if header.fortran and len(header.shape) > 1:
         raise UserError(f"{where}: in Fortran order; write it in C order")
-    file.seek(start)
-    return NpyHeader(tuple(shape), dtype, head.tell())
+    return np.frombuffer(raw, header.dtype, offset=header.start).reshape(header.shape)

@@ -8,15 +8,15 @@ missing axes. A transposed array is refused, not turned: [322, 322] could not be
 
 from __future__ import annotations
 
-import math
 import os
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.npz import ArrayHeader, read_npy_header
 from motionloom.datasets.schema import UserError
 
 Limit = float | NDArray[np.float64]
@@ -34,66 +34,39 @@ def load_array(
     label = str(path) if name is None else name
     try:
         with path.open("rb") as file:
-            shape, dtype = _header(file, label)
-            _check_header(shape, dtype, width, label)
+            header = read_array_header(file, label)
+            _check_header(header, width, label)
             file.seek(0)
             found = npy_format.read_array(file, allow_pickle=False)
     except OSError as error:
         raise UserError(f"{label}: cannot be read ({error.strerror or error})") from None
-    values = np.ascontiguousarray(found, dtype=dtype.newbyteorder("="))
+    values = np.ascontiguousarray(found, dtype=header.dtype.newbyteorder("="))
     _check_values(values, limit, label)
     return values
 
 
-def read_array_header(path: Path, *, name: str | None = None) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
-    """(shape, dtype) of an `.npy` file without reading its data; `UserError` if it is not whole.
-
-    The size of the file is compared with the header, so a cut file is found here. Shape and dtype are as
-    stored; `load_array` judges them.
-    """
+def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | None = None) -> int:
+    """T of a file that `load_array` accepts as far as header and size tell; `UserError` otherwise."""
     label = str(path) if name is None else name
     try:
         with path.open("rb") as file:
-            return _header(file, label)
+            header = read_array_header(file, label)
     except OSError as error:
         raise UserError(f"{label}: cannot be read ({error.strerror or error})") from None
+    _check_header(header, width, label)
+    return header.shape[0]
 
 
-def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | None = None) -> int:
-    """T of a file that `load_array` accepts as far as header and size tell; `UserError` otherwise."""
-    shape, dtype = read_array_header(path, name=name)
-    _check_header(shape, dtype, width, str(path) if name is None else name)
-    return shape[0]
-
-
-def _header(file: BinaryIO, label: str) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
+def read_array_header(file: IO[bytes], label: str) -> ArrayHeader:
+    """The header of a whole `.npy` file; `UserError` when it is cut or too long."""
     size = os.fstat(file.fileno()).st_size
     if size == 0:
         raise UserError(f"{label}: empty file")
-    try:
-        version = npy_format.read_magic(file)
-        # Version 3 differs only in the names of record fields, which no motion file has.
-        read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
-        shape, _, dtype = read(file)
-    except OSError:
-        raise
-    except Exception as error:  # numpy's header parser fails in many ways on broken text
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(f"{label}: not an .npy file, or cut within its header ({reason})") from None
-    if dtype.hasobject:
-        raise UserError(f"{label}: object array, which would run code when read; save plain numbers")
-    if any(count < 0 for count in shape):
-        raise UserError(f"{label}: the header states a negative size {list(shape)}")
-    expected, found = math.prod(shape) * dtype.itemsize, size - file.tell()
-    if found != expected:
-        what = "truncated array" if found < expected else "more data than the header states"
-        raise UserError(f"{label}: {what}: {expected} bytes expected for {list(shape)}, {found} found")
-    return shape, dtype
+    return read_npy_header(file, label, size)
 
 
-def _check_header(
-    shape: tuple[int, ...], dtype: np.dtype[np.generic], width: int | tuple[int, ...], label: str
-) -> None:
+def _check_header(header: ArrayHeader, width: int | tuple[int, ...], label: str) -> None:
+    shape, dtype = header.shape, header.dtype
     columns = (width,) if isinstance(width, int) else width
     if len(shape) > 1 and shape[0] == 0:
         raise UserError(f"{label}: zero length, no frames")

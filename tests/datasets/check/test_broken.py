@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from motionloom.datasets.check.files import FileRules, Verdict, check_file, check_folder
-from motionloom.datasets.check.foreign import inspect_tar
 from motionloom.datasets.convert.common.splits import read_split_files
 from motionloom.datasets.schema import UserError
 
@@ -40,14 +39,14 @@ REJECTED: dict[str, tuple[str, ...] | None] = {
     "shards/control_ok.tar": OK,
     "shards/truncated.tar": ("truncated", "'000001", "last whole key is '000000'"),
     "shards/no_end_blocks.tar": OK,
-    "shards/path_traversal.tar": ("../../PWNED_tar.txt", "/tmp/PWNED_abs.txt", "path traversal"),
-    "shards/symlink_member.tar": ("000009.motion.npy", "link", "never followed"),
+    "shards/path_traversal.tar": ("../../PWNED_tar.txt", "path traversal"),
+    "shards/symlink_member.tar": ("000009.motion.npy", "link", "plain files"),
     "shards/duplicate_keys.tar": ("duplicate key '000000'",),
     "shards/duplicate_member.tar": ("000000.motion.npy", "twice", "duplicate member"),
-    "shards/split_sample.tar": ("'000000'", "do not stand together", "missing field"),
-    "shards/missing_field.tar": ("key '000001' has no json",),
+    "shards/split_sample.tar": ("'000000'", "missing field"),
+    "shards/missing_field.tar": ("key '000001' has no",),
     "shards/bad_json.tar": ("'000000.json'", "not valid JSON"),
-    "shards/not_a_tar.tar": ("not a tar",),
+    "shards/not_a_tar.tar": ("not a readable tar",),
     "shards/zero_bytes.tar": ("empty", "0 bytes"),
     "bvh/control_ok.bvh": OK,
     "bvh/missing_frames.bvh": ("10", "6 found"),
@@ -122,13 +121,6 @@ def test_a_folder_is_checked_file_by_file(broken: Path) -> None:
     assert {str(v.path.relative_to(broken)) for v in verdicts if v.ok} == {
         name for name, words in REJECTED.items() if words is OK
     }
-
-
-def test_shards_are_counted_and_noted(broken: Path) -> None:
-    assert inspect_tar(broken / "shards/control_ok.tar").samples == 3
-    unfinished = inspect_tar(broken / "shards/no_end_blocks.tar")
-    assert unfinished.samples == 3 and "closing zero blocks" in unfinished.notes[0]
-    assert inspect_tar(broken / "shards/truncated.tar").samples == 1
 
 
 def test_splits_that_overlap_are_an_error(broken: Path, tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ import pytest
 from motionloom.datasets.check.dataset import CheckReport, check, examine
 from motionloom.datasets.check.files import FileRules, check_file, check_folder
 from motionloom.datasets.check.findings import LISTED, Findings
-from motionloom.datasets.check.foreign import inspect_tar
 from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
@@ -26,6 +25,7 @@ from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 
 LAYOUT = MotionLayout.named("body133")
+RULES = FileRules(layout="body133")
 
 
 def walk(seed: int, frames: int = 40) -> np.ndarray:
@@ -240,29 +240,29 @@ def sample(key: str, motion: bytes = MOTION) -> tuple[tuple[str, bytes], ...]:
 
 def test_strange_but_good_shards(tmp_path: Path) -> None:
     for number, key in enumerate(("./000", "walks/fast/000", "ä" * 120)):
-        report = inspect_tar(tar(tmp_path / f"{number}.tar", *sample(key), ("README", b"x")), LAYOUT)
-        assert (report.samples, report.problems) == (1, []) and "README" in report.notes[0]
+        verdict = check_file(tar(tmp_path / f"{number}.tar", *sample(key), ("README", b"x")), RULES)
+        assert verdict.ok and verdict.what == "shard of 1 samples", verdict
 
 
 @pytest.mark.parametrize(
     ("members", "word"),
     [
-        (sample("a", npy(np.array([object()]))), "not a readable array"),
-        (sample("a", MOTION[:-4]), "not a readable array"),
-        (sample("a", npy(np.full((4, 133), np.nan, np.float32))), "nan at frame 0, column 0"),
+        (sample("a", npy(np.array([object()]))), "object array"),
+        (sample("a", MOTION[:-4]), "truncated array"),
+        (sample("a", npy(np.full((4, 133), np.nan, np.float32))), "NaN or infinity in row 0"),
         (sample("a", npy(np.zeros((4, 263), np.float32))), "263 columns, layout body133 has 133"),
         (sample("a", npy(np.full((4, 133), 5e4, np.float32))), "wrong unit"),
+        (sample("a", npy(np.full((4, 133), 1e308))), "absurd"),
         (sample("a", npy(np.zeros((4, 133), np.int64))), "int64"),
         (sample("a", npy(np.zeros((0, 133), np.float32))), "T >= 1"),
         (sample("a\\b"), "path traversal"),
         (sample("C:/a"), "path traversal"),
-        ((("x.json", b"[" * 100_000),), "not valid JSON"),
-        ((), "holds no samples"),
+        ((*sample("a"), ("a.x.json", b"[" * 100_000)), "not valid JSON"),
+        ((), "holds no clips"),
     ],
 )
 def test_bad_foreign_shards(tmp_path: Path, members: tuple[tuple[str, bytes], ...], word: str) -> None:
-    report = inspect_tar(tar(tmp_path / "x.tar", *members), LAYOUT)
-    assert word in " ".join(report.problems) and report.samples == 0
+    assert word in " ".join(check_file(tar(tmp_path / "x.tar", *members), RULES).problems)
 
 
 def test_cut_joined_and_packed_shards(tmp_path: Path) -> None:
@@ -270,17 +270,17 @@ def test_cut_joined_and_packed_shards(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for cut in range(512, len(whole) - 10240, 700):
         path.write_bytes(whole[:cut])
-        report = inspect_tar(path)  # wherever it is cut, a shard is refused or whole samples are left
-        assert report.problems or (report.samples == 1 and report.notes)
+        verdict = check_file(path)  # wherever it is cut, a shard is refused or whole samples are left
+        assert not verdict.ok or verdict.what in ("shard of 1 samples", "shard of 2 samples")
     path.write_bytes(whole + whole)
-    assert "two archives in one file" in " ".join(inspect_tar(path).problems)
+    assert "two archives in one file" in str(check_file(path))
     header = whole.index(b"b.motion.npy")
     path.write_bytes(whole[:header] + b"damage" * 20 + whole[header + 120 :])
-    assert "are no tar entries" in " ".join(inspect_tar(path).problems)
+    assert "are no tar entries" in str(check_file(path))
     path.write_bytes(gzip.compress(whole))
-    assert "gzip" in inspect_tar(path).problems[0]
+    assert "not a readable tar" in str(check_file(path))
     for kind in (tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE, tarfile.CHRTYPE):
-        assert "plain files" in inspect_tar(tar(path, ("a.motion.npy", b""), kind=kind)).problems[0]
+        assert "plain files" in str(check_file(tar(path, ("a.motion.npy", b""), kind=kind)))
 
 
 # ---- single files

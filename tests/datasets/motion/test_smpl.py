@@ -232,7 +232,7 @@ def test_pickles_are_never_opened(tmp_path: Path) -> None:
         BodyModel.load(path, "smpl22")
     model = made_up_model(24) | {"J_regressor": np.array([{"a": 1}], dtype=object)}
     np.savez(tmp_path / "model.npz", allow_pickle=True, **model)
-    with pytest.raises(UserError, match="'J_regressor' holds Python objects"):
+    with pytest.raises(UserError, match="'J_regressor': object array"):
         BodyModel.load(tmp_path / "model.npz", "smpl22")
 
 
@@ -278,11 +278,11 @@ def test_npz_reads_headers_and_refuses_what_does_not_fit(tmp_path: Path) -> None
     np.savez_compressed(path, good=values, big=values.astype(">f4"), text="male", nothing=np.zeros((0, 3)))
     with NpzFile(path) as file:
         assert file.names == {"good", "big", "text", "nothing"}
-        assert (file.header("good").shape, file.header("good").size) == ((7, 5), 280)
+        assert (file.header("good").shape, file.header("good").dtype) == ((7, 5), np.float64)
         np.testing.assert_array_equal(file.numbers("good"), values)
         np.testing.assert_array_equal(file.numbers("big"), values.astype(np.float32))
         assert file.array("text").item() == "male" and file.array("nothing").shape == (0, 3)
-        with pytest.raises(UserError, match=r"'good' of shape \[7, 5\] takes 280 bytes; more than 100"):
+        with pytest.raises(UserError, match=r"'good' of shape \[7, 5\] takes 408 bytes; more than 100"):
             file.array("good", limit=100)
 
     header = b"\x93NUMPY\x01\x00"

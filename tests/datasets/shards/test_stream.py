@@ -119,7 +119,7 @@ def test_filtered_clips_and_lengths_keep_the_groups() -> None:
 # --- the reader ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("place", ["folder", "web, cached", "web, not cached"])
+@pytest.mark.parametrize("place", ["folder", "web"])
 def test_streamed_batches_equal_indexed_ones(
     place: str, root: Path, stats: FeatureStats, text: TextCache, loopback: ModuleType, tmp_path: Path
 ) -> None:
@@ -151,8 +151,7 @@ def test_streamed_batches_equal_indexed_ones(
         compare(root, None)
         return
     with loopback.web(root) as (url, _):
-        gigabytes = 1.0 if place == "web, cached" else 0.0
-        compare(url, CacheConfig(folder=str(tmp_path), gigabytes=gigabytes))
+        compare(url, CacheConfig(folder=str(tmp_path)))
 
 
 def test_each_shard_is_read_once_an_epoch_and_two_groups_are_held(

@@ -117,12 +117,11 @@ def test_the_same_losses_from_s3_with_failing_requests(
     with loopback.bucket(shards, every=20) as (environment, network):
         for name, value in environment.items():
             monkeypatch.setenv(name, value)
-        remote = [("cached", "tokenizer", "indexed", 1.0), ("ranges", None, "indexed", 0.0)]
-        if order == "streamed":
-            remote = [("cached", "tokenizer", "streamed", 1.0), ("ranges", "tokenizer", "streamed", 0.0)]
-        for name, last, mode, gigabytes in remote:
+        modes = ["indexed"] if order == "global" else ["indexed", "streamed"]
+        for mode in modes:
+            name, last = mode, None if order == "global" else "tokenizer"
             before = network.requests, network.failures
-            cache = {"folder": str(tmp_path / "cache" / name), "gigabytes": gigabytes}
+            cache = {"folder": str(tmp_path / "cache" / name)}
             got = run(name, last, path="s3://shards/made", mode=mode, cache=cache)
             assert got.keys() >= {"stats", "tokenizer losses", "tokenizer" if last else "tma losses"}
             assert all(value == want[key] for key, value in got.items())
@@ -137,7 +136,7 @@ def test_reader_and_cache_may_change_without_training_again(
     with loopback.web(shards) as (url, _):
         common = {"path": url, "order": "streamed"}
         old, new = ({"folder": str(tmp_path / name)} for name in "ab")
-        first = recipe(tmp_path, "one", {**common, "cache": {**old, "gigabytes": 0}})
+        first = recipe(tmp_path, "one", {**common, "cache": old})
         assert call("run", first, "--out", tmp_path / "run", "--until", "stats").code == 0
         second = recipe(tmp_path, "two", {**common, "mode": "streamed", "cache": new})
         done = call("run", second, "--out", tmp_path / "run", "--until", "tokenizer", "--replace")
