@@ -173,7 +173,7 @@ def report(
 
     Example: `motionloom data report shards -o shards.html`
     """
-    from motionloom.pipeline.results.data_page.page import write_data_report
+    from motionloom.pipeline.results.data_page import write_data_report
 
     console, path = make_console(), out or root / "report.html"
     require_file_place(path)

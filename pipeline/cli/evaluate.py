@@ -28,9 +28,7 @@ def evaluate(
         typer.Option(help="Measure nothing; show a table of a paper with the finished runs' rows: ude/2."),
     ] = None,
     tables: Annotated[bool, typer.Option("--tables", help="List the tables of the papers.")] = False,
-    format_: Annotated[
-        str | None, typer.Option("--format", help="Of a table: text, markdown, csv, latex or json.")
-    ] = None,
+    format_: Annotated[str | None, typer.Option("--format", help="Of a table: markdown or latex.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="File for a table.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -43,7 +41,7 @@ def evaluate(
     runs = run_folders or []
     if tables or table is not None:
         if as_json:
-            raise UserError("--json is of figures measured anew; of a table, give --format json")
+            raise UserError("--json is of figures measured anew; leave it out")
         _show_table(table, tables, runs, format_, out, measuring=clips or repeats or device != "auto")
         return
     if format_ is not None or out is not None:

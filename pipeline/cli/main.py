@@ -298,9 +298,6 @@ def compare(
         list[Path], typer.Argument(metavar="RUN RUN...", help="Two run folders or more, finished or not.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The page.")] = Path("compare.html"),
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the same here, for programs.")
-    ] = None,
 ) -> None:
     """Several runs on one page: settings that differ, figures side by side, training curves over each other.
 
@@ -311,7 +308,7 @@ def compare(
     """
     from motionloom.pipeline.results.compare.command import compare_runs
 
-    compare_runs(run_folders, out, json_file=json_file, console=make_console())
+    compare_runs(run_folders, out, console=make_console())
 
 
 @app.command()

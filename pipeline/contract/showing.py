@@ -48,8 +48,8 @@ class FigureTable:
 
 
 @dataclass(frozen=True)
-class JointMap:
-    """Errors drawn on a body."""
+class JointErrors:
+    """Errors of each joint."""
 
     title: str
     skeleton: str
@@ -69,8 +69,6 @@ class Matrix:
     rows: Sequence[str]
     columns: Sequence[str]
     counts: Sequence[Sequence[int]]
-    more: bool = False
-    """Less important than the others: the page folds it away."""
 
 
 @dataclass(frozen=True)

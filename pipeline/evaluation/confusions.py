@@ -1,12 +1,11 @@
 """What is taken for what: the caption that TMA finds nearest to a motion, against its own caption **[ours]**.
 
 Each motion is compared with every different caption of the evaluated clips, by the cosine of TMA's latents.
-Of synthetic clips the captions' attributes are compared, and, without any network, the action that the joints
-show; of others the captions themselves. Generated motions are those of the first repeat.
+Of synthetic clips their actions are compared, and, without any network, the action that the joints show; of
+others the captions themselves. Generated motions are those of the first repeat.
 
 An entry of `confusions` is a matrix: `counts` [rows, columns] of clips, `of` real or generated motions, `by`
-retrieval or joints, `about` an attribute or "caption". The last column may be something else than a row:
-`NOT_SAID` or `ANOTHER`.
+retrieval or joints, `about` "action" or "caption". The last column may be `ANOTHER`, which is no row.
 """
 
 from __future__ import annotations
@@ -24,11 +23,8 @@ from motionloom.datasets.synth.measure import measure
 from motionloom.pipeline.evaluation.latent_metrics import Latents
 from motionloom.pipeline.evaluation.truth import Truth
 
-ATTRIBUTES = ("action", "direction", "side", "count", "speed", "left_hand", "right_hand", "style", "genre")
-"""Of synthetic clips, those that body and hands show; TMA does not see the face."""
 CAPTIONS = 8
 """Captions in a matrix, so that it can be read."""
-NOT_SAID = "(not said)"
 ANOTHER = "(another)"
 Pair = tuple[str, str]
 
@@ -40,8 +36,10 @@ def retrieval_confusions(latents: Latents, truths: Sequence[Truth]) -> list[dict
     for of, motion in (("generated", latents.made[0]), ("real", latents.real)):
         taken = nearest_captions(latents.text, motion, words)
         facts = {"of": of, "by": "retrieval", "captions": len(set(words))}
-        if any(truth.truth for truth in truths):
-            out += _attributes(truths, taken, facts)
+        actions = [(truth.truth or {}).get("action") for truth in truths]
+        if all(actions):
+            pairs = [(str(own), str(actions[k])) for own, k in zip(actions, taken, strict=True)]
+            out.append(_matrix(pairs, {**facts, "about": "action"}))
         else:
             pairs = [(own, words[k]) for own, k in zip(words, taken, strict=True)]
             out += _captions(pairs, facts)
@@ -65,20 +63,6 @@ def nearest_captions(text: Tensor, motion: Tensor, words: Sequence[str]) -> list
     first = sorted({caption: row for row, caption in reversed(list(enumerate(words)))}.values())
     near = normalize(motion.double(), dim=-1) @ normalize(text[first].double(), dim=-1).T
     return torch.tensor(first)[near.argmax(1).cpu()].tolist()  # type: ignore[no-any-return]
-
-
-def _attributes(truths: Sequence[Truth], taken: Sequence[int], facts: dict[str, Any]) -> list[dict[str, Any]]:
-    out = []
-    for name in ATTRIBUTES:
-        said = [(truth.truth or {}).get(name) for truth in truths]
-        pairs = [
-            (str(own), NOT_SAID if said[k] is None else str(said[k]))
-            for own, k in zip(said, taken, strict=True)
-            if own is not None
-        ]
-        if len({own for own, _ in pairs}) > 1:
-            out.append(_matrix(pairs, {**facts, "about": name}))
-    return out
 
 
 def _captions(pairs: Sequence[Pair], facts: dict[str, Any]) -> list[dict[str, Any]]:

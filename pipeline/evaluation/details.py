@@ -26,7 +26,7 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import HANDS, UserError
-from motionloom.pipeline.contract.showing import JointMap, Matrix, Showing
+from motionloom.pipeline.contract.showing import JointErrors, Matrix, Showing
 from motionloom.pipeline.evaluation.confusions import measured_confusions, retrieval_confusions
 from motionloom.pipeline.evaluation.latent_metrics import Latents, caption_distances
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth
@@ -157,7 +157,7 @@ def detail_showings(folder: Path, figures: Mapping[str, Any]) -> list[Showing]:
     if "joint_errors_mm" in figures:
         clips = f"{figures['reconstructed_clips']} {figures['split']} clips"
         out.append(
-            JointMap(
+            JointErrors(
                 f"Where reconstructions err: mean error of each joint over {clips}, mm",
                 figures["skeleton"],
                 figures["joint_errors_mm"],
@@ -175,25 +175,17 @@ def detail_showings(folder: Path, figures: Mapping[str, Any]) -> list[Showing]:
 
 
 def _matrix(found: dict[str, Any]) -> Matrix:
-    about = "genre of a dance" if found["about"] == "genre" else label(found["about"])
-    motion = _MOTIONS[found["of"]]
+    about, motion = found["about"], _MOTIONS[found["of"]]
+    title, corner = f"Taken for which {about}", f"own {about} ↓ taken for →"
     if found["by"] == "joints":
         title = f"The action that is asked for, and what the joints of the {motion} show"
         corner = "asked for ↓ shown →"
-    elif found["about"] == "caption":
-        title = f"Captions confused most often: the nearest of {found['captions']} captions to each {motion}"
-        corner = "own caption ↓ taken for →"
     else:
-        title = f"Taken for which {about}: the nearest of {found['captions']} captions to each {motion}"
-        corner = f"own {about} ↓ taken for →"
-    return Matrix(
-        title,
-        corner,
-        [name if found["about"] == "caption" else label(name) for name in found["rows"]],
-        [name if found["about"] == "caption" else label(name) for name in found["columns"]],
-        found["counts"],
-        more=found["about"] not in ("action", "caption"),
-    )
+        title += f": the nearest of {found['captions']} captions to each {motion}"
+    names = [
+        [name if about == "caption" else label(name) for name in found[side]] for side in ("rows", "columns")
+    ]
+    return Matrix(title, corner, *names, found["counts"])
 
 
 def _pair(case: Case, made: str, figures: Mapping[str, Any]) -> list[ViewerMotion]:

@@ -38,6 +38,19 @@ class Line:
     colour: int | None = None
 
 
+def log_lines(
+    rows: Sequence[Mapping[str, float]], figure: str, name: str, colour: int | None = None
+) -> list[Line]:
+    """A figure of a training log, the validation's dashed; nothing where it was not logged."""
+    out = []
+    for split in ("train", "val"):
+        points = [(row["step"], row[f"{split}/{figure}"]) for row in rows if f"{split}/{figure}" in row]
+        if points:
+            steps, values = zip(*points, strict=True)
+            out.append(Line(f"{name} ({split})", steps, values, split == "val", colour))
+    return out
+
+
 def line_chart(
     lines: Sequence[Line], *, x_label: str = "step", y_label: str = "", log_y: bool = False, title: str = ""
 ) -> str:
@@ -73,43 +86,6 @@ def line_chart(
     return _svg(title, parts, {"x": x_label, "lines": hover}) + _legend(lines)
 
 
-def bar_chart(
-    values: ArrayLike,
-    *,
-    x_label: str = "",
-    y_label: str = "",
-    title: str = "",
-    labels: Sequence[str] | None = None,
-) -> str:
-    """SVG of one bar per value [K] (a histogram when bars are many); zero bars are marked below the axis."""
-    heights = np.nan_to_num(np.asarray(values, np.float64).ravel())
-    if not len(heights):
-        return _svg(title, [_text(WIDTH / 2, HEIGHT / 2, "no data yet", "middle")], None)
-    x_axis = _Axis(0, len(heights), LEFT, WIDTH - RIGHT, nice=False)
-    y_axis = _Axis(min(0.0, float(heights.min())), max(float(heights.max()), 1e-9), HEIGHT - BOTTOM, TOP)
-    parts = _axes(x_axis, y_axis, x_label, y_label, False, x_ticks=labels is None)
-    step = x_axis(1) - x_axis(0)
-    gap = 0.18 * step if step > 4 else 0.0
-    wide, zero = step - gap, y_axis(0)
-    for index, height in enumerate(heights.tolist()):
-        x, y = x_axis(index) + gap / 2, y_axis(height)
-        name = labels[index] if labels is not None else str(index)
-        tip = f"<title>{escape(name)}: {height:g}</title>"
-        if height == 0 and len(heights) > 16:
-            parts.append(
-                f'<rect class="dead" x="{x:.2f}" y="{zero:.1f}" width="{wide:.2f}" height="5">{tip}</rect>'
-            )
-            continue
-        top, tall = min(y, zero), abs(zero - y)
-        parts.append(
-            f'<rect class="bar" x="{x:.2f}" y="{top:.1f}" width="{wide:.2f}" height="{tall:.1f}">{tip}</rect>'
-        )
-    if labels is not None:
-        for index, label in enumerate(labels):
-            parts.append(_text(x_axis(index + 0.5), HEIGHT - BOTTOM + 17, label[:14], "middle"))
-    return _svg(title, parts, None)
-
-
 def histogram(
     counts: Mapping[str, ArrayLike],
     edges: tuple[float, float],
@@ -118,7 +94,10 @@ def histogram(
     y_label: str = "",
     title: str = "",
 ) -> str:
-    """SVG of stacked counts: for each name one count per equal bin [K] of the range `edges`, and a legend."""
+    """SVG of stacked counts: for each name one count per equal bin [K] of the range `edges`, and a legend.
+
+    A name alone has its empty bins marked below the axis: unused codes of a codebook.
+    """
     stacks = {name: np.asarray(values, np.float64).ravel() for name, values in counts.items()}
     tallest = float(np.sum(list(stacks.values()), axis=0).max(initial=0.0)) if stacks else 0.0
     if tallest <= 0:
@@ -130,14 +109,20 @@ def histogram(
     step = (edges[1] - edges[0]) / bins
     below = np.zeros(bins)
     for index, (name, values) in enumerate(stacks.items()):
-        for bin_ in np.flatnonzero(values).tolist():
-            low, high = edges[0] + bin_ * step, edges[0] + (bin_ + 1) * step
-            left, right = x_axis(low) + 0.5, x_axis(high) - 0.5
-            top, base = y_axis(below[bin_] + values[bin_]), y_axis(below[bin_])
-            tip = f"<title>{escape(f'{name}, {low:.4g} to {high:.4g}: {values[bin_]:g}')}</title>"
+        for number, value in enumerate(values.tolist()):
+            low, high = edges[0] + number * step, edges[0] + (number + 1) * step
+            left, right = x_axis(low), x_axis(high)
+            gap = min(0.5, 0.1 * (right - left))
+            base, top = y_axis(below[number]), y_axis(below[number] + value)
+            kind, tall = f"stack s{index % COLOURS}", base - top
+            if not value:
+                if len(stacks) > 1:
+                    continue
+                kind, top, tall = "dead", base, 5.0
+            tip = f"<title>{escape(f'{name}, {low:.4g} to {high:.4g}: {value:g}')}</title>"
             parts.append(
-                f'<rect class="stack s{index % COLOURS}" x="{left:.1f}" y="{top:.1f}" '
-                f'width="{right - left:.1f}" height="{base - top:.1f}">{tip}</rect>'
+                f'<rect class="{kind}" x="{left + gap:.2f}" y="{top:.1f}" '
+                f'width="{right - left - 2 * gap:.2f}" height="{tall:.1f}">{tip}</rect>'
             )
         below += values
     return _svg(title, parts, None) + _legend([Line(name, (), ()) for name in stacks])

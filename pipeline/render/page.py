@@ -19,7 +19,6 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.charts import (
     COLOURS,
     Line,
-    bar_chart,
     histogram,
     line_chart,
     matrix_table,
@@ -120,13 +119,6 @@ class Page:
         """Counts [R, C] of what was taken for what; neighbours stand side by side where there is room."""
         return self._add_beside("matrices", matrix_table(rows, columns, counts, title=title, corner=corner))
 
-    def add_drawing(self, drawing: str, title: str) -> Page:
-        """A drawing of this package's own, as HTML that needs no more escaping, with its title."""
-        self._blocks.append(
-            f'<figure class="drawing"><figcaption>{escape(title)}</figcaption>{drawing}</figure>'
-        )
-        return self
-
     @contextmanager
     def folded(self, summary: str) -> Iterator[Page]:
         """Blocks that are closed until the reader opens them."""
@@ -136,9 +128,8 @@ class Page:
 
     def add_folded(self, summary: str, columns: Sequence[str], rows: Sequence[Sequence[Value]]) -> Page:
         """A table that is closed until the reader opens it."""
-        table = _table(columns, rows, "", 3)
-        self._blocks.append(f"<details><summary>{escape(summary)}</summary>{table}</details>")
-        return self
+        with self.folded(summary):
+            return self.add_table(columns, rows)
 
     def add_facts(self, facts: Mapping[str, Value]) -> Page:
         """A short list of names and values, shown as tiles."""
@@ -156,19 +147,6 @@ class Page:
         chart = line_chart(lines, x_label=x_label, y_label=y_label, log_y=log_y, title=title)
         return self._add_chart(chart, title)
 
-    def add_bars(
-        self,
-        values: ArrayLike,
-        title: str,
-        x_label: str = "",
-        y_label: str = "",
-        labels: Sequence[str] | None = None,
-    ) -> Page:
-        """A bar chart, for example the uses of each code of a codebook; unused ones are marked."""
-        return self._add_chart(
-            bar_chart(values, x_label=x_label, y_label=y_label, labels=labels, title=title), title
-        )
-
     def add_histogram(
         self,
         counts: Mapping[str, ArrayLike],
@@ -177,7 +155,7 @@ class Page:
         x_label: str = "",
         y_label: str = "clips",
     ) -> Page:
-        """Stacked counts per bin of a range, one colour a name."""
+        """Stacked counts per bin of a range, one colour a name; of one name the empty bins are marked."""
         chart = histogram(counts, edges, x_label=x_label, y_label=y_label, title=title)
         return self._add_chart(chart, title)
 

@@ -9,11 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from motionloom.datasets.base.files import write_json
 from motionloom.pipeline.launch.console import make_console
-from motionloom.pipeline.results.compare.curves import curve_charts
 from motionloom.pipeline.results.compare.page import comparison_page, missing_lines
-from motionloom.pipeline.results.compare.record import comparison_record
 from motionloom.pipeline.results.compare.runs import (
     ComparedRun,
     StageDifferences,
@@ -40,7 +37,6 @@ def compare_runs(
     runs: Sequence[Path],
     out: Path = Path("compare.html"),
     *,
-    json_file: Path | None = None,
     console: Console | None = None,
 ) -> Path:
     """Settings, curves and figures of several runs, finished or not, on one page; returns its path.
@@ -48,23 +44,15 @@ def compare_runs(
     Args:
         runs: Two run folders or more, at most eight.
         out: The page.
-        json_file: The same as JSON: figures with who is best, settings that differ, ends of curves.
         console: Where the short table goes; standard output by default.
     """
     console = console or make_console()
-    for path in (out, json_file):
-        if path is not None:
-            require_file_place(path)
+    require_file_place(out)
     opened = open_runs(runs)
     differences, tables = setting_differences(opened), compared_tables(opened)
-    page = comparison_page(opened)
-    page.write(out)
-    if json_file is not None:
-        write_json(json_file, comparison_record(opened, differences, curve_charts(opened), tables))
+    comparison_page(opened, differences, tables).write(out)
     print_comparison(console, opened, differences, tables)
-    for path in (out, json_file):
-        if path is not None:
-            console.print(str(path.resolve()), soft_wrap=True)
+    console.print(str(out.resolve()), soft_wrap=True)
     return out
 
 

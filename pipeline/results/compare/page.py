@@ -10,27 +10,27 @@ from collections.abc import Mapping, Sequence
 
 from motionloom.datasets.base.progress import duration
 from motionloom.pipeline.evaluation.figures import heading
-from motionloom.pipeline.render.charts import Line
+from motionloom.pipeline.render.charts import log_lines
 from motionloom.pipeline.render.labels import curve_label
 from motionloom.pipeline.render.page import Cell, Page, Value
-from motionloom.pipeline.results.compare.curves import CurveChart, curve_charts
-from motionloom.pipeline.results.compare.runs import (
-    ABSENT,
-    ComparedRun,
-    StageDifferences,
-    setting_differences,
-)
-from motionloom.pipeline.results.compare.tables import ComparedTable, compared_tables
+from motionloom.pipeline.results.compare.runs import ABSENT, ComparedRun, StageDifferences, stage_names
+from motionloom.pipeline.results.compare.tables import ComparedTable
 from motionloom.pipeline.store.yaml import setting_text
 
 NO_PAGES = ("report",)
 """Kinds of stages that nothing compared here comes from."""
 LETTERS = "ABCDEFGH"
+FIRST = ("loss", "recon", "contrastive", "ce", "accuracy")
+"""Curves that are drawn first: what their names begin with, or end in behind the name of a stream."""
+OPEN = 4
+"""Charts of a stage that are not folded away."""
 NAMED = 3
 """So many runs are named in the page's title, more are counted."""
 
 
-def comparison_page(runs: Sequence[ComparedRun]) -> Page:
+def comparison_page(
+    runs: Sequence[ComparedRun], differences: Sequence[StageDifferences], tables: Sequence[ComparedTable]
+) -> Page:
     """The page of `runs`."""
     names = " and ".join((", ".join(run.label for run in runs[:-1]), runs[-1].label))
     what = "settings that differ, figures on held-out clips, training curves"
@@ -39,10 +39,9 @@ def comparison_page(runs: Sequence[ComparedRun]) -> Page:
     else:
         page = Page(f"{len(runs)} runs compared", f"{names}: {what}")
     _who(page, runs)
-    _settings(page, runs, setting_differences(runs))
-    charts, tables = curve_charts(runs), compared_tables(runs)
+    _settings(page, runs, differences)
     _figures(page, runs, tables)
-    _curves(page, runs, charts)
+    _curves(page, runs)
     return page
 
 
@@ -144,29 +143,36 @@ def _figure_table(page: Page, table: ComparedTable, several: bool, silent: Seque
         page.add_text(f"No such figures of: {', '.join(without)}.")
 
 
-def _curves(page: Page, runs: Sequence[ComparedRun], charts: Sequence[CurveChart]) -> None:
+def _curves(page: Page, runs: Sequence[ComparedRun]) -> None:
     page.add_heading("Training curves")
-    if not charts:
+    stages = [stage for stage in stage_names(runs) if any(stage in run.logs for run in runs)]
+    if not stages:
         page.add_text("No run has logged a training yet.")
         return
     page.add_text(
         "One colour a run; whole lines are training, dashed ones validation. A loss says something only "
         "between trainings whose losses and data are set alike."
     )
-    stages = dict.fromkeys(chart.stage for chart in charts)
     for stage in stages:
-        own = [chart for chart in charts if chart.stage == stage]
         page.add_subheading(stage)
         for line in _remarks(runs, stage):
             page.add_text(line)
-        for chart in own:
-            if chart.open:
-                _chart(page, chart)
-        rest = [chart for chart in own if not chart.open]
-        if rest:
-            with page.folded(f"{len(rest)} more curves of {stage}"):
-                for chart in rest:
-                    _chart(page, chart)
+        logs = [(run, run.logs.get(stage, [])) for run in runs]
+        keys = {key.partition("/")[2] for _, rows in logs for row in rows for key in row if "/" in key}
+        figures = sorted(keys, key=_place)
+        for figure in figures[:OPEN]:
+            _chart(page, logs, stage, figure)
+        if more := figures[OPEN:]:
+            with page.folded(f"{len(more)} more curves of {stage}"):
+                for figure in more:
+                    _chart(page, logs, stage, figure)
+
+
+def _place(figure: str) -> tuple[int, str]:
+    for number, name in enumerate(FIRST):
+        if figure == name or figure.startswith(f"{name}_") or figure.endswith(f"_{name}"):
+            return number, figure
+    return len(FIRST), figure
 
 
 def _remarks(runs: Sequence[ComparedRun], stage: str) -> list[str]:
@@ -193,12 +199,11 @@ def _remarks(runs: Sequence[ComparedRun], stage: str) -> list[str]:
     return out
 
 
-def _chart(page: Page, chart: CurveChart) -> None:
-    lines = [
-        Line(f"{c.run.label} ({c.split})", c.steps, c.values, dashed=c.split == "val", colour=c.run.colour)
-        for c in chart.curves
-    ]
-    page.add_plot(lines, f"{chart.stage}: {curve_label(chart.figure)}")
+def _chart(
+    page: Page, logs: Sequence[tuple[ComparedRun, Sequence[Mapping[str, float]]]], stage: str, figure: str
+) -> None:
+    lines = [line for run, rows in logs for line in log_lines(rows, figure, run.label, run.colour)]
+    page.add_plot(lines, f"{stage}: {curve_label(figure)}")
 
 
 def _chip(run: ComparedRun) -> Cell:

@@ -36,7 +36,7 @@ def compare_with_paper(
     Args:
         table: Its name, such as `humantomato/7`, or a YAML file of the same form.
         runs: Run folders; without any, the paper's numbers stand alone.
-        format: text, markdown, csv, latex or json; by default what the suffix of `out` says, else text.
+        format: markdown or latex; by default what the suffix of `out` says, or a table for the terminal.
         out: File to write in place of printing.
         console: Where to print; standard output by default.
     """
@@ -45,13 +45,13 @@ def compare_with_paper(
     if out is not None:
         require_file_place(out)
     filled = fill(table, paper_table(table), runs)
-    if out is not None:
+    if form is None:
+        print_text(filled, console)
+    elif out is None:
+        console.print(WRITERS[form](filled), soft_wrap=True, markup=False, emoji=False, end="")
+    else:
         write_text(out, WRITERS[form](filled))
         console.print(str(out), soft_wrap=True)
-    elif form == "text":
-        print_text(filled, console)
-    else:
-        console.print(WRITERS[form](filled), soft_wrap=True, markup=False, emoji=False, end="")
     return filled
 
 
@@ -66,13 +66,13 @@ def list_tables(console: Console | None = None) -> None:
     (console or make_console()).print(grid)
 
 
-def _format(given: str | None, out: Path | None) -> str:
-    if given is None:
-        return SUFFIXES.get(out.suffix.lower(), "text") if out is not None else "text"
-    if given not in WRITERS:
-        near = difflib.get_close_matches(given, WRITERS, n=1, cutoff=0.5)
-        hint = f"did you mean '{near[0]}'?" if near else f"choose {', '.join(WRITERS)}"
-        raise UserError(f"--format {given}: no such format; {hint}")
+def _format(given: str | None, out: Path | None) -> str | None:
+    if given is None and out is not None:
+        if out.suffix.lower() not in SUFFIXES:
+            raise UserError(f"{out}: a table is written as {' or '.join(SUFFIXES)}; name such a file")
+        return SUFFIXES[out.suffix.lower()]
+    if given is not None and given not in WRITERS:
+        raise UserError(f"--format {given}: no such format; choose {' or '.join(WRITERS)}")
     return given
 
 

@@ -1,13 +1,9 @@
-"""A filled table as Markdown, CSV, LaTeX and JSON, and as a table for terminals."""
+"""A filled table as Markdown, as LaTeX, and as a table for terminals."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -16,16 +12,12 @@ from rich.table import Table
 
 from motionloom.pipeline.results.paper.filled import (
     Cell,
-    FilledRow,
     FilledTable,
     groups,
     heading,
     lines_below,
     who,
 )
-
-WIDTH = 200
-"""Characters of a line of text in a file."""
 
 
 def markdown(table: FilledTable) -> str:
@@ -40,48 +32,6 @@ def markdown(table: FilledTable) -> str:
     body = [f"| {' | '.join(row)} |" for row in rows]
     below = [f"- {_plain_markdown(line)}" for line in lines_below(table)]
     return "\n".join([f"**{_plain_markdown(table.caption)}**", "", *body, "", *below, ""])
-
-
-def csv_text(table: FilledTable) -> str:
-    """One line a row, numbers as they are printed; ± in a column of its own where there is one."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    columns = zip(*(row.cells for row in table.rows), strict=True)
-    spreads = [any(cell and cell.spread is not None for cell in cells) for cells in columns]
-    names = []
-    for at, head in enumerate(table.heads):
-        names += [head.title, f"{head.title} ±"] if spreads[at] else [head.title]
-    writer.writerow(["source", "method", "row", "run", "stages", *names])
-    for row in table.rows:
-        values: list[str] = []
-        for at, cell in enumerate(row.cells):
-            mean, _, spread = (cell.text if cell else "").partition(" ± ")
-            values += [mean, spread] if spreads[at] else [mean]
-        writer.writerow([row.source, row.method, row.label, row.run, " ".join(row.stages), *values])
-    return out.getvalue()
-
-
-def json_text(table: FilledTable) -> str:
-    """All there is: numbers as they are and as they are printed, differences and notes."""
-    data: dict[str, object] = {
-        "table": table.name,
-        "title": table.title,
-        "section": table.section,
-        "measured": dict(table.measured),
-        "columns": [asdict(head) for head in table.heads],
-        "rows": [_plain(row) for row in table.rows],
-        "differences": [asdict(one) for one in table.differences],
-        "notes": list(table.notes),
-    }
-    return json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def text(table: FilledTable, width: int | None = None) -> str:
-    """For a terminal of `width` characters."""
-    out = io.StringIO()
-    console = Console(file=out, width=width or WIDTH, highlight=False, color_system=None)
-    print_text(table, console)
-    return out.getvalue()
 
 
 def print_text(table: FilledTable, console: Console) -> None:
@@ -109,12 +59,6 @@ def _marked(cell: Cell | None, mark: str) -> str:
 def _plain_markdown(text: str) -> str:
     """Text that Markdown shows as it is, also in a cell."""
     return re.sub(r"([\\|*<`\[])", r"\\\1", text.replace("\n", " "))
-
-
-def _plain(row: FilledRow) -> dict[str, object]:
-    out = asdict(row)
-    del out["alike"]
-    return out
 
 
 # LaTeX: a `tabular` with booktabs' rules.
@@ -202,12 +146,5 @@ def _line(cells: list[str]) -> str:
     return " & ".join(cells) + r" \\"
 
 
-WRITERS: dict[str, Callable[[FilledTable], str]] = {
-    "text": text,
-    "markdown": markdown,
-    "csv": csv_text,
-    "latex": latex,
-    "json": json_text,
-}
-
-SUFFIXES = {".md": "markdown", ".csv": "csv", ".tex": "latex", ".json": "json", ".txt": "text"}
+WRITERS: dict[str, Callable[[FilledTable], str]] = {"markdown": markdown, "latex": latex}
+SUFFIXES = {".md": "markdown", ".tex": "latex"}

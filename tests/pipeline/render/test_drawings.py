@@ -1,4 +1,4 @@
-"""Charts, bodies, matrices and marked cells as HTML: right numbers, readable names, nothing unescaped."""
+"""Charts, matrices and marked cells as HTML: right numbers, readable names, nothing unescaped."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from hypothesis import strategies as st
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body_map import Scale, body_map
-from motionloom.pipeline.render.charts import Line, bar_chart, line_chart, matrix_table
+from motionloom.pipeline.render.charts import Line, histogram, line_chart, matrix_table
 from motionloom.pipeline.render.labels import curve_label, joint_label
 from motionloom.pipeline.render.page import Cell, Page
 
 NASTY = '<b onclick="x">&'
-WHOLE, BODY = Skeleton.named("smplx52"), Skeleton.named("smpl22")
+WHOLE = Skeleton.named("smplx52")
 
 
 class Balanced(HTMLParser):
@@ -63,41 +62,6 @@ def test_joints_and_figures_of_a_log_have_names_for_people() -> None:
         "my_own_figure": "my own figure",
     }.items():
         assert curve_label(key) == words
-
-
-def test_every_joint_is_drawn_with_its_error() -> None:
-    errors, hands = np.linspace(0, 120, 52).tolist(), np.linspace(5, 9, 30).tolist()
-    html = body_map(WHOLE, errors, hands, NASTY)
-    Balanced(html)
-    assert "<b" not in html.replace("<body", "")
-    tips = dict(re.findall(r"<title>([^:<]+): ([\d.]+) mm</title>", html))
-    for joint, error in zip(WHOLE.joints, [*errors[:22], *hands], strict=True):
-        assert tips[joint_label(joint)] == f"{error:.1f}"
-    assert html.count("<svg") == 2 and "50 mm" in html and "10 mm" in html
-    assert body_map(BODY, errors[:22], (), "t").count("<svg") == 1
-    places = [float(x) for x in re.findall(r'<(?:circle|text)[^>]* (?:c?x)="([-\d.]+)"', html)]
-    assert min(places) >= 0 and max(places) <= 400
-
-
-def test_left_is_on_the_right_as_one_sees_a_person() -> None:
-    html = body_map(BODY, [1.0] * 22, (), "t")
-    place = {
-        name: float(re.search(rf'x="([\d.]+)"[^>]*>{name}<', html).group(1))  # type: ignore[union-attr]
-        for name in ("left hand", "right hand", "left foot", "right foot")
-    }
-    assert place["right hand"] < place["right foot"] < 200 < place["left foot"] < place["left hand"]
-
-
-def test_colours_run_from_light_to_dark() -> None:
-    scale = Scale.for_errors([3.0, 47.0, float("nan")])
-    assert scale.top == 50.0 and Scale.for_errors([]).top == 1.0
-    light = [sum(int(scale.colour(e)[k : k + 2], 16) for k in (1, 3, 5)) for e in (0, 10, 20, 30, 40, 50)]
-    assert light == sorted(light, reverse=True) and len(set(light)) == 6
-    assert scale.colour(99.0) == scale.colour(50.0)
-    with pytest.raises(UserError, match="3 errors for the 22 joints of smpl22"):
-        body_map(BODY, [1.0] * 3)
-    with pytest.raises(UserError, match="4 errors of fingers for 30 joints"):
-        body_map(WHOLE, [1.0] * 52, [1.0] * 4)
 
 
 def test_a_matrix_says_counts_and_shares() -> None:
@@ -157,12 +121,13 @@ def test_charts_draw_any_numbers(values: list[float]) -> None:
     for log in (False, True):
         svg = line_chart([Line("a", range(len(values)), values)], log_y=log)
         assert svg.startswith("<svg") and "inf" not in svg and "nan" not in svg
-    assert bar_chart(values).count("<rect") == len(values)
+    counts = np.abs(values)
+    assert histogram({"n": counts}, (0, len(values))).count("<rect") == (len(values) if counts.any() else 0)
 
 
 def test_charts_without_data_say_so() -> None:
     assert "no data" in line_chart([]) and "no data" in line_chart([Line("a", [1], [np.nan])])
-    assert "no data" in bar_chart([])
-    assert bar_chart([0] * 20 + [3]).count('class="dead"') == 20
+    assert "no data" in histogram({}, (0, 1))
+    assert histogram({"uses": [0] * 20 + [3]}, (0, 21)).count('class="dead"') == 20
     with pytest.raises(ValueError, match="line 'a'"):
         line_chart([Line("a", [1, 2], [1])])

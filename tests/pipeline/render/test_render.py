@@ -253,7 +253,7 @@ def test_page_is_whole_and_escapes(tmp_path: Path, walk: Walk) -> None:
     page.add_heading(NASTY).add_text(f"one {NASTY}\n\ntwo").add_facts({NASTY: NASTY, "FID": 1.17399})
     page.add_table([NASTY, "n"], [[NASTY, 1.5], ["x", None]], NASTY).add_heading("Second")
     page.add_plot([Line(NASTY, [0, 1], [1, 2]), Line("b", [0, 1], [2, 1])], NASTY, NASTY, NASTY)
-    page.add_bars([1, 2], NASTY, labels=[NASTY, "b"])
+    page.add_histogram({NASTY: [1, 2], "b": [2, 3]}, (0, 2), NASTY)
     motion = ViewerMotion(walk(2), 20, SMPLX.parents, NASTY, NASTY, NASTY)
     page.add_viewer([motion], NASTY).add_viewer([motion])
     page.write(tmp_path / "page.html")

@@ -240,9 +240,9 @@ def test_report_page_with_two_viewers_and_charts(visit: Any, until: Any, tmp_pat
     ]
     page = Page("Report", "of a run").add_heading("Curves").add_text("text")
     page.add_plot([Line("train", range(100), np.linspace(2, 1, 100)), Line("val", [0, 99], [2, 1.2])], "Loss")
-    page.add_bars(np.arange(64) % 7, "Codes").add_heading("Motions").add_viewer(motions, "two").add_viewer(
-        motions[:1]
-    )
+    page.add_histogram({"uses": np.arange(64) % 7}, (0, 64), "Codes").add_heading("Motions").add_viewer(
+        motions, "two"
+    ).add_viewer(motions[:1])
     page.add_table(["a", "b"], [["x", 1.0]]).write(tmp_path / "page.html")
     sheet = visit(tmp_path / "page.html", width=1100, height=900)
     assert sheet.evaluate("__viewers.length") == 2

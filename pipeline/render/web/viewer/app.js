@@ -13,9 +13,14 @@ function element(tag, properties, ...children) {
   return node;
 }
 
+const isDark = () => (document.documentElement.dataset.theme || (window.matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light")) === "dark";
+
 function readTheme(root) {
-  const style = getComputedStyle(root);
-  const value = (name) => style.getPropertyValue(`--mlv-${name}`).trim();
+  const style = getComputedStyle(root), pair = "light-dark(";
+  const value = (name) => {
+    const text = style.getPropertyValue(`--mlv-${name}`).trim();
+    return text.startsWith(pair) ? text.slice(pair.length, -1).split(", ")[Number(isDark())] : text;
+  };
   const parts = (text) => (text.startsWith("#") ? [1, 3, 5].map((k) => parseInt(text.slice(k, k + 2), 16)) : text.match(/\d+/g).slice(0, 3).map(Number));
   const share = (text) => parts(text).map((v) => v / 255);
   // In the order of the body's swatches: limbs and trunk, skin and hair, face.
@@ -208,10 +213,7 @@ function mountViewer(root, data, options) {
   button("follow", () => toggle("follow", "follow"));
   button("loop", () => toggle("loop", "loop"));
   button("close", () => toggle("close", "close"));
-  button("theme", () => {
-    const dark = getComputedStyle(root).colorScheme === "dark";
-    document.documentElement.dataset.theme = dark ? "light" : "dark";
-  });
+  button("theme", () => { document.documentElement.dataset.theme = isDark() ? "light" : "dark"; });
   const setSpeed = (value) => { state.speed = value; player.setSpeed(value); };
   bar.speed.addEventListener("change", () => setSpeed(Number(bar.speed.value)));
   button("sound", () => setSound(!player.on));

@@ -20,10 +20,10 @@ function buildProgram(gl, [vertex, fragment]) {
   return { program, at };
 }
 
-/* All of one context's objects; null where it cannot draw the body. In `software` vertices come skinned. */
-function makePainter(gl, software) {
-  const body = openBody(), skinning = software ? PLACED : SKINNING;
-  const [figures, falls, shadows] = [bodyProgram(skinning), fallProgram(skinning), SHADOW_PROGRAM].map((source) => buildProgram(gl, source));
+/* All of one context's objects; null where it cannot draw the body. */
+function makePainter(gl) {
+  const body = openBody();
+  const [figures, falls, shadows] = [BODY_PROGRAM, FALL_PROGRAM, SHADOW_PROGRAM].map((source) => buildProgram(gl, source));
   if (!body || !figures || !falls || !shadows) return null;
   const details = body.details.map((mesh) => uploadDetail(gl, mesh));
   const clips = new Map();
@@ -48,24 +48,15 @@ function makePainter(gl, software) {
   const arrayOfClip = (clip, level) => {
     if (!clips.has(clip)) clips.set(clip, []);
     const made = clips.get(clip);
-    if (!made[level]) made[level] = uploadClip(gl, details[level], fitMesh(details[level].mesh, body, clip.pose), software);
+    if (!made[level]) made[level] = uploadClip(gl, details[level], fitMesh(details[level].mesh, body, clip.pose));
     return made[level];
   };
-  const skin = (use, item, level) => {
-    const own = arrayOfClip(item.clip, level), { mesh, looks } = details[level], { size } = item.clip.pose;
+  const skin = (item, level) => {
+    const own = arrayOfClip(item.clip, level);
+    skinMesh(details[level].mesh, own.fitted, item.bones, item.face, item.clip.pose.size, own.placed);
     gl.bindVertexArray(own.array);
-    if (software) {
-      skinMesh(mesh, own.fitted, item.bones, item.face, size, own.placed);
-      gl.bindBuffer(gl.ARRAY_BUFFER, own.buffer);
-      gl.bufferSubData(gl.ARRAY_BUFFER, 0, own.placed);
-    } else {
-      gl.uniform4fv(use.at.bones, item.bones);
-      gl.uniform1fv(use.at.face, item.face);
-      gl.uniform1f(use.at.lookSize, 127 * mesh.moveStep * size);
-      gl.uniform1i(use.at.looks, 0);
-      gl.activeTexture(gl.TEXTURE0);
-      gl.bindTexture(gl.TEXTURE_2D, looks);
-    }
+    gl.bindBuffer(gl.ARRAY_BUFFER, own.buffer);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, own.placed);
     gl.drawElements(gl.TRIANGLES, details[level].indices, gl.UNSIGNED_SHORT, 0);
   };
   const aim = (use, { lens, box }) => {
@@ -95,7 +86,7 @@ function makePainter(gl, software) {
         gl.viewport(column * TILE, line * TILE, TILE, TILE);
         gl.uniform4f(falls.at.field, x + width / 2, z + depth / 2, 2 / width, 2 / depth);
         gl.uniform3f(falls.at.fall, LAMP_SLOPE[0], LAMP_SLOPE[1], item.level);
-        skin(falls, item, details.length - 1);
+        skin(item, details.length - 1);
       });
       gl.blendEquation(gl.FUNC_ADD);
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -134,7 +125,7 @@ function makePainter(gl, software) {
       aim(figures, item);
       gl.uniform3fv(figures.at.palette, item.palette);
       gl.uniform3fv(figures.at.lamp, LAMP_ABOVE);
-      skin(figures, item, item.detail);
+      skin(item, item.detail);
     },
     forget(clip) {
       for (const made of clips.get(clip) || []) if (made) made.remove();
@@ -144,12 +135,7 @@ function makePainter(gl, software) {
 }
 
 function uploadDetail(gl, mesh) {
-  const looks = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, looks);
-  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA8_SNORM, mesh.shapes, mesh.rows.length / mesh.shapes / 4);
-  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, mesh.shapes, mesh.rows.length / mesh.shapes / 4, gl.RGBA, gl.BYTE, mesh.rows);
-  for (const size of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, size, gl.NEAREST);
-  const fill = (data, kind = gl.ARRAY_BUFFER) => {
+  const fill = (data, kind) => {
     const buffer = gl.createBuffer();
     gl.bindVertexArray(null);
     gl.bindBuffer(kind, buffer);
@@ -157,31 +143,23 @@ function uploadDetail(gl, mesh) {
     return buffer;
   };
   return {
-    mesh, looks, indices: mesh.triangles.length, triangles: fill(mesh.triangles, gl.ELEMENT_ARRAY_BUFFER),
-    joints: fill(mesh.joints), shares: fill(mesh.shares), swatch: fill(mesh.swatch), row: fill(mesh.row),
+    mesh, indices: mesh.triangles.length, triangles: fill(mesh.triangles, gl.ELEMENT_ARRAY_BUFFER),
+    swatch: fill(mesh.swatch, gl.ARRAY_BUFFER),
   };
 }
 
-/* A clip's own vertices at rest; in software `placed` is where they are moved to. */
-function uploadClip(gl, detail, fitted, software) {
+/* A clip's own vertices at rest, and in `placed` where they are moved to. */
+function uploadClip(gl, detail, fitted) {
   const array = gl.createVertexArray(), buffer = gl.createBuffer();
   gl.bindVertexArray(array);
   gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-  gl.bufferData(gl.ARRAY_BUFFER, fitted, software ? gl.DYNAMIC_DRAW : gl.STATIC_DRAW);
+  gl.bufferData(gl.ARRAY_BUFFER, fitted, gl.DYNAMIC_DRAW);
   gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 24, 0);
   gl.vertexAttribPointer(1, 3, gl.FLOAT, false, 24, 12);
   gl.bindBuffer(gl.ARRAY_BUFFER, detail.swatch);
-  gl.vertexAttribIPointer(4, 1, gl.UNSIGNED_BYTE, 0, 0);
-  if (!software) {
-    gl.bindBuffer(gl.ARRAY_BUFFER, detail.joints);
-    gl.vertexAttribIPointer(2, 4, gl.UNSIGNED_BYTE, 0, 0);
-    gl.bindBuffer(gl.ARRAY_BUFFER, detail.shares);
-    gl.vertexAttribPointer(3, 4, gl.UNSIGNED_BYTE, true, 0, 0);
-    gl.bindBuffer(gl.ARRAY_BUFFER, detail.row);
-    gl.vertexAttribIPointer(5, 1, gl.UNSIGNED_SHORT, 0, 0);
-  }
-  for (const k of software ? [0, 1, 4] : [0, 1, 2, 3, 4, 5]) gl.enableVertexAttribArray(k);
+  gl.vertexAttribIPointer(2, 1, gl.UNSIGNED_BYTE, 0, 0);
+  for (const k of [0, 1, 2]) gl.enableVertexAttribArray(k);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, detail.triangles);
   gl.bindVertexArray(null);
-  return { array, buffer, fitted, placed: software ? new Float32Array(fitted.length) : null, remove: () => { gl.deleteVertexArray(array); gl.deleteBuffer(buffer); } };
+  return { array, buffer, fitted, placed: new Float32Array(fitted.length), remove: () => { gl.deleteVertexArray(array); gl.deleteBuffer(buffer); } };
 }

@@ -6,18 +6,10 @@ const arrayOf = (base64, Type) => new Type(bytesOf(base64).buffer);
 function openMesh(raw) {
   const packed = arrayOf(raw.places, Uint16Array), places = new Float32Array(packed.length), count = packed.length / 3;
   for (let k = 0; k < places.length; k++) places[k] = raw.low[k % 3] + raw.step[k % 3] * packed[k];
-  // Row 0 of the shapes' displacements is for vertices that never move; those that do have the rows below.
-  const moving = arrayOf(raw.moving, Uint16Array), width = raw.shapes;
-  const moves = arrayOf(raw.moves, Int8Array), rows = new Int8Array(4 * width * (moving.length + 1));
-  const row = new Uint16Array(count);
-  moving.forEach((vertex, k) => {
-    row[vertex] = k + 1;
-    for (let s = 0; s < width; s++) {
-      for (let i = 0; i < 3; i++) rows[4 * ((k + 1) * width + s) + i] = moves[3 * (k * width + s) + i];
-    }
-  });
+  const row = new Uint16Array(count); // of the shapes' displacements, counted from 1; 0 where a vertex never moves
+  arrayOf(raw.moving, Uint16Array).forEach((vertex, k) => { row[vertex] = k + 1; });
   return {
-    count, places, row, rows, shapes: width, moveStep: raw.moveStep, normals: arrayOf(raw.normals, Int8Array),
+    count, places, row, moves: arrayOf(raw.moves, Int8Array), shapes: raw.shapes, moveStep: raw.moveStep, normals: arrayOf(raw.normals, Int8Array),
     joints: arrayOf(raw.joints, Uint8Array), shares: arrayOf(raw.shares, Uint8Array),
     swatch: arrayOf(raw.swatch, Uint8Array), triangles: arrayOf(raw.triangles, Uint16Array),
   };
@@ -66,10 +58,9 @@ function fitMesh(mesh, body, pose) {
 
 /* Vertices [x, y, z, nx, ny, nz] each of `fitted`, moved by three rows [m, m, m, shift] a joint, into `out`.
 
-   For browsers without a GPU: there a vertex that is moved by the shader costs two to three times as much, because
-   each of its bones is fetched by itself. */
+   The script does it, not a shader: so there is one way for browsers with a graphics card and without. */
 function skinMesh(mesh, fitted, bones, face, size, out) {
-  const { count, joints, shares, row, rows, shapes } = mesh, step = mesh.moveStep * size;
+  const { count, joints, shares, row, moves, shapes } = mesh, step = mesh.moveStep * size;
   for (let v = 0; v < count; v++) {
     let o = 4 * v, s = shares[o] / 255, b = 12 * joints[o];
     let xx = s * bones[b], xy = s * bones[b + 1], xz = s * bones[b + 2], xw = s * bones[b + 3];
@@ -85,9 +76,9 @@ function skinMesh(mesh, fitted, bones, face, size, out) {
     o = 6 * v;
     let x = fitted[o], y = fitted[o + 1], z = fitted[o + 2];
     if (row[v]) {
-      for (let k = 0, at = 4 * shapes * row[v]; k < shapes; k++, at += 4) {
+      for (let k = 0, at = 3 * shapes * (row[v] - 1); k < shapes; k++, at += 3) {
         const weight = face[k] * step;
-        if (weight) { x += weight * rows[at]; y += weight * rows[at + 1]; z += weight * rows[at + 2]; }
+        if (weight) { x += weight * moves[at]; y += weight * moves[at + 1]; z += weight * moves[at + 2]; }
       }
     }
     out[o] = xx * x + xy * y + xz * z + xw;

@@ -1,43 +1,11 @@
-/* The programs of the WebGL2 view: the skinned body, its fall onto the ground, and the soft shadow there. */
+/* The programs of the WebGL2 view: the body, its fall onto the ground, and the soft shadow there. */
 
-/* Where vertices are, and how they are turned: as the script has moved them (mesh.js), or skinned here. */
+/* Vertices come as the script has moved them (mesh.js). */
 const PLACED = `#version 300 es
 precision highp float;
 layout(location = 0) in vec3 place;
 layout(location = 1) in vec3 normal;
-layout(location = 4) in uint swatch;
-vec3 skinned() { return place; }
-vec3 turned() { return normal; }
-`;
-
-const SKINNING = `#version 300 es
-precision highp float;
-layout(location = 0) in vec3 place;
-layout(location = 1) in vec3 normal;
-layout(location = 2) in uvec4 joints;
-layout(location = 3) in vec4 shares;
-layout(location = 4) in uint swatch;
-layout(location = 5) in uint row;
-uniform vec4 bones[156];
-uniform highp sampler2D looks;
-uniform float face[7];
-uniform float lookSize;
-vec4 x, y, z;
-vec3 skinned() {
-  vec3 still = place;
-  if (row > 0u) {
-    for (int k = 0; k < 7; k++) {
-      if (face[k] != 0.0) still += face[k] * lookSize * texelFetch(looks, ivec2(k, int(row)), 0).xyz;
-    }
-  }
-  ivec4 at = 3 * ivec4(joints);
-  x = shares.x * bones[at.x] + shares.y * bones[at.y] + shares.z * bones[at.z] + shares.w * bones[at.w];
-  y = shares.x * bones[at.x + 1] + shares.y * bones[at.y + 1] + shares.z * bones[at.z + 1] + shares.w * bones[at.w + 1];
-  z = shares.x * bones[at.x + 2] + shares.y * bones[at.y + 2] + shares.z * bones[at.z + 2] + shares.w * bones[at.w + 2];
-  vec4 p = vec4(still, 1.0);
-  return vec3(dot(x, p), dot(y, p), dot(z, p));
-}
-vec3 turned() { return vec3(dot(x.xyz, normal), dot(y.xyz, normal), dot(z.xyz, normal)); }
+layout(location = 2) in uint swatch;
 `;
 
 /* The lens of space.js: `onto` scales and moves its pixels into the box that is drawn, `depths` is near and far. */
@@ -53,15 +21,15 @@ vec4 seen(vec3 p) {
 }
 `;
 
-const bodyProgram = (skinning) => [`${skinning}${LENS}
+const BODY_PROGRAM = [`${PLACED}${LENS}
 out vec3 vNormal;
 out vec3 vPlace;
 flat out uint vSwatch;
 void main() {
-  vPlace = skinned();
-  vNormal = turned();
+  vPlace = place;
+  vNormal = normal;
   vSwatch = swatch;
-  gl_Position = seen(vPlace);
+  gl_Position = seen(place);
 }`, `#version 300 es
 precision highp float;
 in vec3 vNormal;
@@ -87,14 +55,13 @@ void main() {
 }`];
 
 /* Height above the ground where the light meets it: red falls off within half a metre, green is all of the figure. */
-const fallProgram = (skinning) => [`${skinning}
+const FALL_PROGRAM = [`${PLACED}
 uniform vec4 field;
 uniform vec3 fall;
 out float vHeight;
 void main() {
-  vec3 p = skinned();
-  vHeight = max(p.y - fall.z, 0.0);
-  gl_Position = vec4((p.xz - fall.xy * vHeight - field.xy) * field.zw, 0.0, 1.0);
+  vHeight = max(place.y - fall.z, 0.0);
+  gl_Position = vec4((place.xz - fall.xy * vHeight - field.xy) * field.zw, 0.0, 1.0);
 }`, `#version 300 es
 precision highp float;
 in float vHeight;

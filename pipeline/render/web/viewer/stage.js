@@ -28,13 +28,13 @@ function makeStage() {
   const canvas = document.createElement("canvas");
   const software = drawnInSoftware();
   const gl = canvas.getContext("webgl2", { alpha: true, antialias: !software, depth: true, powerPreference: "high-performance" });
-  let painter = gl && makePainter(gl, software);
+  let painter = gl && makePainter(gl);
   if (!painter) return null;
   const limit = Math.min(gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), 8192); // asked once: an answer waits for all that is under way
   const watchers = new Set();
   const changed = () => { for (const watcher of watchers) watcher(); };
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); painter = null; changed(); });
-  canvas.addEventListener("webglcontextrestored", () => { painter = makePainter(gl, software); changed(); });
+  canvas.addEventListener("webglcontextrestored", () => { painter = makePainter(gl); changed(); });
 
   const stage = { canvas, gl, software, quality: 0, watchers, get ready() { return painter !== null; } };
   /* Draws the items and hands each to `show(item)`, its picture in `item.source` of the canvas. */

@@ -13,15 +13,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.progress import Progress
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Dropped
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
+from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
-from motionloom.pipeline.results.data_page.facts import choose, gather, watch
-from motionloom.pipeline.results.data_page.page import write_data_report
+from motionloom.pipeline.results.data_page import measure, to_watch, write_data_report
 
 NASTY = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=1'><b>bold</b> & \"q\""
 CONFIG = SynthConfig(clips=40, min_seconds=2.0, max_seconds=5.0)
@@ -88,7 +89,6 @@ def test_nothing_of_the_data_becomes_markup(page: Path) -> None:
 
 def test_it_says_what_is_in_the_set(page: Path, nasty: Path) -> None:
     text = re.sub(r"<[^>]+>", " ", page.read_text().partition("<body>")[2].partition("<script")[0])
-    facts, _ = gather(nasty)
     for word in ("Data set nasty", "wholebody363 (exact)", "synth version 7", "40", "train", "val", "test"):
         assert word in text, word
     whole = page.read_text()
@@ -98,41 +98,32 @@ def test_it_says_what_is_in_the_set(page: Path, nasty: Path) -> None:
         "8 clips of 48 were left out",
         "7 × … s, shorter than … s",
         "1 × NaN at frame …",
-        "No body model.",
         "a note",
         "deep.er",
         "30720",
-        "Most common verbs (the source",
         "No errors",
         "40 warnings",
-        "positions: deviation",
         "root yaw velocity",
         "Most unusual values",
     ):
         assert word in whole, word
-    assert whole.count("<h1>") == 1 and whole.count("<h2") == 8
-    assert [f.name for f in facts.splits] == ["train", "val", "test"]
-    assert sum(len(f.seconds) for f in facts.splits) == 40
-    assert facts.captions.count == 40 * 4 + 20 and facts.captions.verbs == {"stand": 20}
-    assert facts.captions.repeated[0] == ("a person stands", 20)
-    assert facts.captions.per_clip == {4: 20, 5: 20}
+    assert whole.count("<h1>") == 1 and whole.count("<h2") == 7
+    assert re.search(r"<dt>captions</dt><dd>180</dd>", whole), "40 clips of 4, and every other one more"
 
 
 def test_statistics_are_of_the_training_split(nasty: Path) -> None:
-    facts, opened = gather(nasty)
-    motion = np.concatenate([opened["train"].motion(k) for k in range(len(opened["train"]))]).astype(
-        np.float64
-    )
-    np.testing.assert_allclose(facts.moments.mean, motion.mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(facts.moments.std, motion.std(axis=0), atol=1e-6)
-    np.testing.assert_array_equal(facts.low, motion.min(axis=0).astype(np.float32))
+    train = ShardDataset.open(nasty, "train")
+    found = measure(train, Progress(disable=True))
+    motion = np.concatenate([train.motion(k) for k in range(len(train))]).astype(np.float64)
+    np.testing.assert_allclose(found.moments.mean, motion.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found.moments.std, motion.std(axis=0), atol=1e-6)
+    np.testing.assert_array_equal(found.low, motion.min(axis=0))
     away = np.abs(motion - motion.mean(axis=0)) / motion.std(axis=0)
-    assert facts.outliers[0].deviations == pytest.approx(away.max(), rel=1e-4)
-    best = facts.outliers[0]
-    assert opened["train"].motion(best.clip)[best.frame, best.column] == np.float32(best.value)
-    assert [o.deviations for o in facts.outliers] == sorted(
-        (o.deviations for o in facts.outliers), reverse=True
-    )
+    best = found.outliers[0]
+    assert best.deviations == pytest.approx(away.max(), rel=1e-4)
+    assert train.motion(best.clip)[best.frame, best.column] == np.float32(best.value)
+    deviations = [one.deviations for one in found.outliers]
+    assert deviations == sorted(deviations, reverse=True)
 
 
 def test_the_same_data_give_the_same_page(page: Path, nasty: Path, tmp_path: Path) -> None:
@@ -141,16 +132,13 @@ def test_the_same_data_give_the_same_page(page: Path, nasty: Path, tmp_path: Pat
 
 
 def test_clips_to_watch_differ(nasty: Path) -> None:
-    facts, opened = gather(nasty)
-    chosen = choose(facts, opened, 12)
-    assert len(set(chosen)) == 12 and chosen == choose(facts, opened, 12)
-    assert choose(facts, opened, 5) == chosen[:5]
-    actions = {(opened[split].meta(clip).truth or {})["action"] for split, clip in chosen}
-    assert len(actions) >= 8
-    assert len(choose(facts, opened, 100)) == 40
-    motion = watch(opened["train"], 0)
-    assert motion.fps == 20 and motion.face_controls is not None
-    assert motion.face_controls.shape == (len(motion.joints), 5)
+    opened = {split: ShardDataset.open(nasty, split) for split in ("train", "val", "test")}
+    chosen = to_watch(opened, 12)
+    assert len({motion.caption for motion in chosen}) == 12, "no caption twice while there are others"
+    assert len({motion.label.split(" ")[0] for motion in chosen}) > 1, "of several splits"
+    assert len(to_watch(opened, 100)) == 40
+    assert chosen[0].fps == 20 and chosen[0].face_controls is not None
+    assert chosen[0].face_controls.shape == (len(chosen[0].joints), 5)
 
 
 def raw_sample(index: int, layout: MotionLayout) -> Sample:
