@@ -16,14 +16,7 @@ from numpy.typing import ArrayLike
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.charts import (
-    COLOURS,
-    Line,
-    histogram,
-    line_chart,
-    matrix_table,
-    ranking,
-)
+from motionloom.pipeline.render.charts import COLOURS, Line, histogram, line_chart, matrix_table, ranking
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
     fill,

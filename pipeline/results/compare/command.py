@@ -34,10 +34,7 @@ KEYS = 6
 
 
 def compare_runs(
-    runs: Sequence[Path],
-    out: Path = Path("compare.html"),
-    *,
-    console: Console | None = None,
+    runs: Sequence[Path], out: Path = Path("compare.html"), *, console: Console | None = None
 ) -> Path:
     """Settings, curves and figures of several runs, finished or not, on one page; returns its path.
 

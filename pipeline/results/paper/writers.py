@@ -10,14 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from motionloom.pipeline.results.paper.filled import (
-    Cell,
-    FilledTable,
-    groups,
-    heading,
-    lines_below,
-    who,
-)
+from motionloom.pipeline.results.paper.filled import Cell, FilledTable, groups, heading, lines_below, who
 
 
 def markdown(table: FilledTable) -> str:
