@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -100,19 +101,31 @@ class UdeGenerator:
         )
 
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
-        stretch = Stretch(request.conditions, request.frames)
-        return self.drive([stretch], request.seeds, request.sampling, request.noise_seeds)
+        stretches = [Stretch(request.conditions, request.frames)]
+        if request.noise_seeds is None:
+            return self.drive(stretches, request.seeds, request.sampling)
+        # Decoded many times in a row: the tokens are drawn once.
+        key = _digest(request)
+        if key not in self._last:
+            self._last.clear()
+            self._last[key] = self.timeline.tokens(stretches, request.seeds, request.sampling)
+        return self._decoded(self._last[key], stretches, request.noise_seeds, request.sampling)
 
     def drive(
-        self,
-        stretches: Sequence[Stretch],
-        seeds: Sequence[int],
-        sampling: SamplingConfig,
-        noise_seeds: Sequence[int] | None = None,
+        self, stretches: Sequence[Stretch], seeds: Sequence[int], sampling: SamplingConfig
     ) -> list[NDArray[np.float32]]:
         """Tokens that go on from stretch to stretch, then all of them decoded at once."""
         codes = self.timeline.tokens(stretches, seeds, sampling)
-        noise = seeds if noise_seeds is None else noise_seeds
+        return self._decoded(codes, stretches, seeds, sampling)
+
+    @cached_property
+    def _last(self) -> dict[str, Codes]:
+        """The tokens drawn last, by `_digest`."""
+        return {}
+
+    def _decoded(
+        self, codes: Codes, stretches: Sequence[Stretch], noise: Sequence[int], sampling: SamplingConfig
+    ) -> list[NDArray[np.float32]]:
         given = [stretch.frames for stretch in stretches if stretch.frames is not None]
         if len(given) < len(stretches):
             return self.decode(codes, noise, sampling)
@@ -188,3 +201,13 @@ def bridged(groups: Tensor, count: int) -> Tensor:
         after = (groups[number + 1] // 2).clamp(max=count - count // 2)
         hidden |= (at >= (end - before)[:, None]) & (at < (end + after)[:, None])
     return hidden
+
+
+def _digest(request: GenerationRequest) -> str:
+    """Tells apart what tokens are drawn from."""
+    found = hashlib.sha256(repr((request.frames, request.seeds, request.sampling)).encode())
+    for name, condition in sorted(request.conditions.items()):
+        found.update(name.encode())
+        for part in condition:
+            found.update(b"" if part is None else repr(part.shape).encode() + part.cpu().numpy().tobytes())
+    return found.hexdigest()

@@ -222,9 +222,9 @@ class _Evaluation(EvaluationUnits):
         return mean_poses([t.joints for t in self.others], self.dataset.layout.fps, lengths)
 
     def _repeats(self, made: Sequence[Arrays]) -> list[Sequence[Arrays]]:
-        """What was generated, repeat by repeat."""
-        each = len(self.performances) // self.draws
-        return [made[first : first + each] for first in range(0, len(made), each)]
+        """What was generated, draw by draw."""
+        found = list(zip(self.performances, made, strict=True))
+        return [[table for (own, _), table in found if own == draw] for draw in range(self.draws)]
 
     def _rows(self, some: Sequence[Arrays]) -> list[Row]:
         return [row for table in some for row in as_rows(table, CLIP)]

@@ -131,14 +131,13 @@ class _DanceEvaluation(Evaluation):
 
     @cached_property
     def pieces(self) -> list[tuple[int, slice]]:
-        """Repeats and clips that are danced together."""
-        found = even_slices(len(self.clips), _AT_ONCE)
-        return [(repeat, piece) for repeat in range(self.draws) for piece in found]
+        """Draws and clips that are danced together."""
+        return self.in_turn(even_slices(len(self.clips), _AT_ONCE))
 
-    def dance(self, repeat: int, piece: slice) -> Arrays:
+    def dance(self, draw: int, piece: slice) -> Arrays:
         """Joints [T, N, 3] of dances to some clips' own music, by their numbers."""
         some = self.clips[piece]
-        seed, noise_seed = self.seeds(repeat, piece.start)
+        seed, noise_seed = self.seeds(draw, piece.start)
         motions = self.bundle.generate(
             sounds=[clip.sound for clip in some],
             conditions={"audio": [clip.music for clip in some]},
@@ -197,11 +196,11 @@ class _DanceEvaluation(Evaluation):
         return out if nearest is None else out | {NEAREST_MUSIC: [nearest]}
 
     def generated(self) -> list[list[Joints]]:
-        """Dances to all clips' own music, once for each repeat."""
+        """Dances to all clips' own music, once for each draw."""
         out: list[list[Joints]] = [[] for _ in range(self.draws)]
         found = self.context.units.read("generated", len(self.pieces))
-        for (repeat, _), motions in zip(self.pieces, found, strict=True):
-            out[repeat] += [motions[name] for name in sorted(motions)]
+        for (draw, _), motions in zip(self.pieces, found, strict=True):
+            out[draw] += [motions[name] for name in sorted(motions)]
         return out
 
     def each(self, motions: Sequence[Joints]) -> list[Row]:

@@ -160,9 +160,8 @@ class EvaluationUnits(Evaluation):
 
     @cached_property
     def performances(self) -> list[tuple[int, slice]]:
-        """Repeats and clips whose captions are performed together."""
-        pieces = even_slices(len(self.truths), _GENERATED) if self.performs else []
-        return [(repeat, piece) for repeat in range(self.draws) for piece in pieces]
+        """Draws and clips whose captions are performed together."""
+        return self.in_turn(even_slices(len(self.truths), _GENERATED) if self.performs else [])
 
     def share(self) -> None:
         """This process's share of all that is made clip by clip."""
@@ -220,12 +219,12 @@ class EvaluationUnits(Evaluation):
                 out[LATENT[role]] = latents.numpy()
         return out
 
-    def perform(self, repeat: int, piece: slice) -> Arrays:
+    def perform(self, draw: int, piece: slice) -> Arrays:
         """Motions for the captions of some clips, as latents and by whether they do what is said."""
         assert self.bundle is not None
         truths, fps = self.truths[piece], self.dataset.layout.fps
         recorded = [len(t.features) / fps for t in truths]
-        seed, noise_seed = self.seeds(repeat, piece.start)
+        seed, noise_seed = self.seeds(draw, piece.start)
         motions = self.bundle.generate(
             [t.caption for t in truths],
             face=[t.face_caption for t in truths],
@@ -241,7 +240,7 @@ class EvaluationUnits(Evaluation):
         out = as_table([measure_clip(CAPTION_METRICS, one) for one in made_for], CLIP)
         moves = [features_of(m.joints, fps) for m in motions]
         out |= {MOVEMENT + kind: np.stack([move[kind] for move in moves]) for kind in moves[0]}
-        if repeat == 0:
+        if draw == 0:
             out |= {f"{MOTION}{number:03d}": m.joints for number, m in enumerate(motions)}
         for role, judge in self.performed_by.items():
             if judge.motions.part == "face":

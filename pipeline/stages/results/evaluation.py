@@ -79,6 +79,12 @@ class Evaluation:
         """Motions drawn for each clip."""
         return int(self.config.repeats * self.config.decodings)
 
+    def in_turn(self, pieces: Sequence[slice]) -> list[tuple[int, slice]]:
+        """Draws and clips in the order in which they are made: all decodings of the same tokens in a row."""
+        nested = self.config.decodings
+        turns = [range(first, first + nested) for first in range(0, self.draws, nested)]
+        return [(draw, piece) for turn in turns for piece in pieces for draw in turn]
+
     def seeds(self, draw: int, first: int) -> tuple[int, int | None]:
         """Of the tokens of a draw from clip `first` on; of the noise where they are decoded several times."""
         turn, decoding = divmod(draw, self.config.decodings)
