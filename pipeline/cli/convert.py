@@ -237,10 +237,7 @@ def convert_command(
 
 
 def _say_plan(plan: ConversionPlan[Any], console: Console) -> None:
-    """Print the plan; for a source with subsets, next to the official release's counts."""
-    subsets = plan.subset_table()
-    if subsets is not None:
-        console.print(subsets)
+    """Print the plan, and what a few clips showed."""
     console.print(plan.table())
     if plan.look is None:
         return

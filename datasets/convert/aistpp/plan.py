@@ -6,7 +6,6 @@ is and whether it can be used); of the music only the headers are.
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import inside
-from motionloom.datasets.convert.common.plan import ConversionPlan, Subset, count_subsets, drop
+from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.splits import hash_split, join_splits, read_ids
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
@@ -35,8 +34,6 @@ class SequenceLists:
 
     splits: dict[str, Split] = field(default_factory=dict)
     ignored: frozenset[str] = frozenset()
-    files: tuple[Path, ...] = ()
-    """The files read."""
     notes: tuple[str, ...] = ()
 
 
@@ -56,16 +53,14 @@ def read_lists(config: AistppConfig) -> SequenceLists:
         lists += here
         absent += [] if here else [paths[0].name]
     found, notes = join_splits(lists, _SUFFIXES)
-    files = [path for _, path in lists]
-    if config.splits and not files:
+    if config.splits and not lists:
         raise UserError(f"{splits}: no crossmodal_train.txt, crossmodal_val.txt or crossmodal_test.txt")
-    if not files:
+    if not lists:
         notes.append("no split files: split 80/5/15 by a hash of the music")
     elif absent:
         notes.append(f"no {', '.join(absent)} beside the other split files")
     ignored: dict[str, int] = {}
     if ignore_list.is_file():
-        files.append(ignore_list)
         ignored, found_notes = read_ids(ignore_list, _SUFFIXES)
         notes += found_notes
     elif config.ignore_list:
@@ -77,7 +72,7 @@ def read_lists(config: AistppConfig) -> SequenceLists:
         notes.append(
             f"{len(both)} sequences of the split files are on the ignore list: {', '.join(both[:3])}"
         )
-    return SequenceLists(found, frozenset(ignored), tuple(files), tuple(notes))
+    return SequenceLists(found, frozenset(ignored), tuple(notes))
 
 
 FPS = 60.0
@@ -87,9 +82,6 @@ MUSIC_LICENCE = "CC-BY-4.0 AND LicenseRef-AIST-Dance-DB"
 """Annotations: CC BY 4.0. Music: the terms of use of the AIST Dance Video Database, which no converter can
 grant; shards that hold sound, or features made from it, stand under both.
 """
-RELEASED = {"crossmodal train": 980, "crossmodal val": 20, "crossmodal test": 20}
-"""Ids in the official cross-modal split files."""
-
 MOTIONS = "motions"
 SOUND_SUFFIXES = (".wav", ".flac", ".mp3", ".ogg")
 
@@ -220,19 +212,13 @@ def plan_aistpp(config: AistppConfig, settings: PlanSettings) -> ConversionPlan[
     draft.limit(AistClip.label)
 
     present = {name.removesuffix(".pkl") for name in names}
-    missing = {
-        sequence: split
-        for sequence, split in lists.splits.items()
-        if sequence not in present and sequence not in lists.ignored
-    }
-    for sequence, split in missing.items():
-        draft.miss(f"{MOTIONS}/{sequence}.pkl", f"listed in split '{split}', but not here")
+    for sequence, split in lists.splits.items():
+        if sequence not in present and sequence not in lists.ignored:
+            draft.miss(f"{MOTIONS}/{sequence}.pkl", f"listed in split '{split}', but not here")
     return draft.finish(
         found=len(names),
         frames=lambda clip: frames_after(clip.used, FPS, layout),
         licence=lambda clip: clip.licence,
-        ignored=_count_ignored(config, lists, music),
-        subsets=_subsets(present, lists, missing, draft.items),
     )
 
 
@@ -295,16 +281,6 @@ def _notes(config: AistppConfig, music: _Music, items: list[tuple[Split, AistCli
     notes = []
     if cut:
         notes.append(f"{cut} sequences end with their music, at most {config.max_music_gap:g} s early")
-    longer = sum(
-        music.seconds[clip.sound] - config.music_offset - clip.used / FPS > config.max_music_gap
-        for _, clip in items
-        if clip.sound is not None and Path(clip.sound).stem == clip.id
-    )
-    if longer:
-        notes.append(
-            f"{longer} sequences have music of their own that goes on for more than "
-            f"{config.max_music_gap:g} s after them; its end is cut"
-        )
     silent = sum(clip.sound is None for _, clip in items)
     if silent and config.music == "optional":
         notes.append(f"{silent} sequences have no music")
@@ -315,34 +291,3 @@ def _notes(config: AistppConfig, music: _Music, items: list[tuple[Split, AistCli
             some = ", ".join(shared[:5]) + (", ..." if len(shared) > 5 else "")
             notes.append(f"{len(shared)} pieces of music are in train and in {split}: {some}")
     return notes
-
-
-def _count_ignored(config: AistppConfig, lists: SequenceLists, music: _Music) -> int:
-    """Files of the source that are neither annotations of motion, music nor lists: keypoints, cameras."""
-    used = {path.resolve() for path in lists.files}
-    used |= {(config.sound_folder / name).resolve() for name in music.files.values()}
-    motions = (config.source / MOTIONS).resolve()
-    count = 0
-    for folder, _, names in os.walk(config.source):
-        here = Path(folder).resolve()
-        for name in names:
-            motion = here == motions and name.endswith(".pkl") and not name.startswith(".")
-            count += not motion and here / name not in used
-    return count
-
-
-def _subsets(
-    present: set[str], lists: SequenceLists, missing: dict[str, Split], items: list[tuple[Split, AistClip]]
-) -> dict[str, Subset]:
-    """By split file, with the official numbers; the ignored and the unlisted beside them."""
-    named = {None: "in no split"} | {split: f"crossmodal {split}" for split in SPLITS}
-
-    def subset(sequence: str) -> str:
-        return named[lists.splits.get(sequence)]
-
-    used = [subset(clip.id) for _, clip in items]
-    absent = [subset(sequence) for sequence in missing]
-    table = count_subsets(map(subset, present), used, absent, RELEASED if lists.splits else None)
-    if lists.ignored:
-        table["on the ignore list"] = Subset(len(present & lists.ignored))
-    return table

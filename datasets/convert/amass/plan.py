@@ -25,7 +25,7 @@ from motionloom.datasets.convert.captions.options import (
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id, inside, read_in_threads
-from motionloom.datasets.convert.common.plan import ConversionPlan, count_subsets, drop
+from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.splits import hash_split, keep_mirrors_together, original_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
@@ -104,16 +104,15 @@ class AmassFile:
         return parts[-3] if len(parts) > 2 else "."
 
 
-def list_files(source: Path) -> tuple[list[AmassFile], int, list[Dropped]]:
-    """Motion files in name order, the number of other files, and what cannot be opened.
+def list_files(source: Path) -> tuple[list[AmassFile], list[Dropped]]:
+    """Motion files in name order, and what cannot be opened.
 
-    Files that hold the shape of a subject without motion (`shape.npz`, `..._stagei.npz`) count as others.
+    Files that hold the shape of a subject without motion (`shape.npz`, `..._stagei.npz`) are none.
     """
     if not source.is_dir():
         raise UserError(f"{source}: no such folder")
     files: list[AmassFile] = []
     broken: list[Dropped] = []
-    others = 0
     for folder, folders, names in os.walk(source):
         links = [name for name in folders if (Path(folder) / name).is_symlink()]
         for name in (*names, *links):
@@ -123,9 +122,7 @@ def list_files(source: Path) -> tuple[list[AmassFile], int, list[Dropped]]:
             if name in links:
                 reason = "a link to a folder, which is not followed; put the folder in its place"
                 broken.append(Dropped(source=label, reason=reason))
-            elif not name.endswith(SUFFIX) or name == "shape.npz" or name.endswith("_stagei.npz"):
-                others += 1
-            else:
+            elif name.endswith(SUFFIX) and name != "shape.npz" and not name.endswith("_stagei.npz"):
                 try:
                     check_id(relative, label)
                     files.append(AmassFile(path, label, inside(source, relative).stat().st_size))
@@ -133,7 +130,7 @@ def list_files(source: Path) -> tuple[list[AmassFile], int, list[Dropped]]:
                     broken.append(drop(label, error))
     if not files:
         raise UserError(f"{source}: no {SUFFIX} file with motion in it")
-    return sorted(files, key=lambda file: file.label), others, sorted(broken, key=lambda drop: drop.source)
+    return sorted(files, key=lambda file: file.label), sorted(broken, key=lambda drop: drop.source)
 
 
 def read_headers(
@@ -156,10 +153,6 @@ def _read(file: AmassFile) -> MotionHeader | UserError:
         return read_motion_header(file.path, file.label)
     except UserError as error:
         return error
-
-
-_NOTED_LINES = 50
-"""Wrong caption lines that are noted one by one."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +180,6 @@ class AmassClip:
 
 @dataclass
 class _Draft(CaptionedPlan[AmassClip]):
-    missing_in: list[str] = field(default_factory=list)
-    """Subset of every missing clip."""
     match: CaptionMatch = field(default_factory=CaptionMatch)
     """Captions of whole files."""
 
@@ -198,7 +189,7 @@ def plan_amass(
 ) -> ConversionPlan[AmassClip]:
     """Find every clip and decide what becomes of it. `models` is the kind of the body model by gender."""
     layout = config.motion_layout()
-    files, others, broken = list_files(config.source)
+    files, broken = list_files(config.source)
     listed, notes = config.listed_splits()
     draft = _Draft(config, broken=broken, notes=notes)
     if config.humanml_index is not None:
@@ -222,12 +213,6 @@ def plan_amass(
         found=len(files),
         frames=lambda clip: frames_after(clip.last - clip.first, clip.fps, layout),
         licence=lambda clip: config.licence or LICENCE,
-        ignored=others,
-        subsets=count_subsets(
-            (file.subset for file in files),
-            (file.subset for file in {clip.file for _, clip in draft.items}),
-            draft.missing_in,
-        ),
     )
 
 
@@ -297,9 +282,7 @@ def _index_clips(
     for clip_id in listed:
         if clip_id not in known and (original_of(clip_id) or clip_id) not in known:
             draft.miss(clip_id, "in a split file, but not in the index")
-    draft.notes += problems[:_NOTED_LINES]
-    if len(problems) > _NOTED_LINES:
-        draft.notes.append(f"and {len(problems) - _NOTED_LINES} more caption lines left out")
+    draft.notes += problems
     return clips
 
 
@@ -307,7 +290,6 @@ def _rows_by_file(rows: list[IndexRow], files: list[AmassFile], draft: _Draft) -
     """Rows of every file (by label); rows without a file and files without a row are reported."""
     by_key: dict[str, AmassFile] = {}
     found: dict[str, list[IndexRow]] = {}
-    here = {clip_key(file.label).split("/")[0]: file.subset for file in files}
     for file in files:
         first = by_key.setdefault(clip_key(file.label), file)
         if first is not file:
@@ -319,7 +301,6 @@ def _rows_by_file(rows: list[IndexRow], files: list[AmassFile], draft: _Draft) -
             continue
         why = "HumanAct12 is not part of AMASS" if row.subset == "humanact12" else "its file is not here"
         draft.miss(row.source, f"clip '{row.id}' of the index: {why}")
-        draft.missing_in.append(here.get(row.subset, row.subset))
     for file in by_key.values():
         if file.label not in found:
             draft.leave_out(file.label, "in no row of the index")

@@ -106,7 +106,7 @@ def map_name(number: int) -> str:
 
 def guess_source(source: Path, target: Skeleton) -> JointGuess:
     """The guess for the first clip of a .bvh file, of a folder of such files, or of an archive."""
-    batches, _ = list_batches(source, SUFFIX)
+    batches = list_batches(source, SUFFIX)
     for batch in batches:
         for file in batch.read(SUFFIX):
             if file.error:
@@ -198,11 +198,11 @@ class BvhClip:
 
 def plan_bvh(config: BvhConfig, settings: PlanSettings) -> ConversionPlan[BvhClip]:
     """Find every clip and decide what becomes of it, without converting anything."""
-    batches, ignored = list_batches(config.source, SUFFIX)
+    batches = list_batches(config.source, SUFFIX)
     scans = scan_batches(
         batches, SUFFIX, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
     )
-    return _decide(config, batches, scans, ignored)
+    return _decide(config, batches, scans)
 
 
 def _header(data: bytes, label: str) -> tuple[int, float, str]:
@@ -215,9 +215,7 @@ def _header(data: bytes, label: str) -> tuple[int, float, str]:
     return section.frames, section.fps, key
 
 
-def _decide(
-    config: BvhConfig, batches: list[Batch], scans: list[BatchScan], ignored: int
-) -> ConversionPlan[BvhClip]:
+def _decide(config: BvhConfig, batches: list[Batch], scans: list[BatchScan]) -> ConversionPlan[BvhClip]:
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
     refused = config.licence_problem(config.licence)
     table = config.matched(file.path for _, file in found)
@@ -274,5 +272,4 @@ def _decide(
         found=len(found),
         frames=lambda clip: frames_after(clip.found.frames, config.source_fps or clip.found.fps, layout),
         licence=lambda clip: config.licence,
-        ignored=ignored,
     )

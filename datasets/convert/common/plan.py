@@ -7,8 +7,8 @@ and why, so nothing is skipped silently (`convert ... --plan` prints it and stop
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
 from rich.markup import escape
@@ -41,20 +41,6 @@ T = TypeVar("T")
 C = TypeVar("C", bound=PlannedClip)
 
 
-@dataclass(frozen=True)
-class Subset:
-    """A part of a source (a folder of the release) beside what the official release holds."""
-
-    found: int = 0
-    """Motion files here."""
-    used: int = 0
-    """Of these, those that become samples."""
-    missing: int = 0
-    """Listed by the split files, but not here."""
-    expected: int | None = None
-    """Clips of the official release; None where it states no number."""
-
-
 @dataclass
 class ConversionPlan(Generic[C]):
     """What a conversion would do. `items` become samples; everything else is listed with its reason.
@@ -76,11 +62,7 @@ class ConversionPlan(Generic[C]):
     """In the source and readable, but left out."""
     broken: list[Dropped] = field(default_factory=list)
     """In the source, but cannot be read."""
-    ignored: int = 0
-    """Files in the source that are not motion."""
     notes: list[str] = field(default_factory=list)
-    subsets: dict[str, Subset] = field(default_factory=dict)
-    """By name; empty for sources without subsets."""
     licences: dict[str, int] = field(default_factory=dict)
     """Clips to convert under each licence."""
     bytes_needed: int | None = None
@@ -122,16 +104,10 @@ class ConversionPlan(Generic[C]):
         self.items = kept
 
     def finish(
-        self,
-        *,
-        found: int,
-        frames: Callable[[C], int],
-        licence: Callable[[C], str],
-        ignored: int = 0,
-        subsets: Mapping[str, Subset] | None = None,
+        self, *, found: int, frames: Callable[[C], int], licence: Callable[[C], str]
     ) -> ConversionPlan[C]:
         """Itself, with its totals; `frames` (at the target rate) and `licence` are asked about every clip."""
-        self.found, self.ignored, self.subsets = found, ignored, dict(subsets or {})
+        self.found, self.notes = found, grouped_notes(self.notes)
         self.frames = dict.fromkeys(SPLITS, 0)
         for split, clip in self.items:
             self.frames[split] += frames(clip)
@@ -144,10 +120,12 @@ class ConversionPlan(Generic[C]):
     def table(self) -> Table:
         table = Table("what", "clips", "frames", "detail", title=escape(f"plan: {self.name}"))
         counts = self.counts()
-        table.add_row("found in the source", str(self.found), "", f"{self.ignored} other files ignored")
+        table.add_row("found in the source", str(self.found), "", "")
         for split in SPLITS:
             table.add_row(split, str(counts[split]), str(self.frames.get(split, 0)), "")
-        table.add_row("without captions", str(len(self.uncaptioned)), "", escape(_some(self.uncaptioned)))
+        if self.uncaptioned:
+            some = escape(_some(self.uncaptioned))
+            table.add_row("without captions", str(len(self.uncaptioned)), "", some)
         kinds = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
         for title, drops in kinds:
             table.add_row(title, str(len(drops)), "", escape(_some(grouped(drops))))
@@ -157,7 +135,7 @@ class ConversionPlan(Generic[C]):
             table.add_row("disk", "", "", f"{self.bytes_needed / 2**20:,.1f} MiB")
         if self.seconds_needed is not None:
             table.add_row("time", "", "", _duration(self.seconds_needed))
-        for note in grouped_notes(self.notes):
+        for note in self.notes:
             table.add_row("note", "", "", escape(note))
         if self.stop:
             table.add_row("stops here", "", "", escape(self.stop))
@@ -177,23 +155,12 @@ class ConversionPlan(Generic[C]):
             "frames": dict(self.frames),
             **left,
             "uncaptioned": list(self.uncaptioned),
-            "ignored": self.ignored,
             "notes": list(self.notes),
-            "subsets": {name: asdict(subset) for name, subset in self.subsets.items()},
             "licences": dict(self.licences),
             "bytes_needed": self.bytes_needed,
             "seconds_needed": self.seconds_needed,
             "look": None if self.look is None else self.look.dump(),
         }
-
-    def subset_table(self) -> Table | None:
-        if not self.subsets:
-            return None
-        table = Table("subset", "found", "to convert", "missing", "official release", title="subsets")
-        for name, subset in sorted(self.subsets.items()):
-            expected = "" if subset.expected is None else str(subset.expected)
-            table.add_row(escape(name), str(subset.found), str(subset.used), str(subset.missing), expected)
-        return table
 
     def left_out(self) -> list[Dropped]:
         return [
@@ -213,21 +180,6 @@ class ConversionPlan(Generic[C]):
             raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")
 
 
-def count_subsets(
-    found: Iterable[str],
-    used: Iterable[str],
-    missing: Iterable[str],
-    expected: Mapping[str, int] | None = None,
-) -> dict[str, Subset]:
-    """By name, from the subset of every motion file, of every clip used and of every missing one."""
-    here, taken, absent = Counter(found), Counter(used), Counter(missing)
-    official = expected or {}
-    return {
-        name: Subset(here[name], taken[name], absent[name], official.get(name))
-        for name in sorted(here.keys() | absent.keys() | official.keys())
-    }
-
-
 def limited(
     items: Sequence[tuple[Split, T]], key: Callable[[T], str], limit: int | None
 ) -> list[tuple[Split, T]]:
@@ -242,11 +194,6 @@ def drop(label: str, error: Exception) -> Dropped:
     """The manifest's record of a clip that failed."""
     text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     return Dropped(source=label, reason=text.removeprefix(f"{label}: "))
-
-
-def first_notes(notes: list[str], most: int, what: str) -> list[str]:
-    """The first notes of a kind, and how many more there are."""
-    return notes[:most] + ([f"... and {len(notes) - most} more {what}"] if len(notes) > most else [])
 
 
 def _duration(seconds: float) -> str:

@@ -77,8 +77,8 @@ class Batch:
                 yield SourceFile(name, name, b"", f"cannot read ({error.strerror})")
 
 
-def list_batches(source: Path, suffix: str) -> tuple[list[Batch], int]:
-    """Batches under `source` (a folder, a motion file or an archive), in name order, and how many others."""
+def list_batches(source: Path, suffix: str) -> list[Batch]:
+    """Batches under `source` (a folder, a motion file or an archive), in name order."""
     if source.is_file():
         names, root = [source.name], source.parent
     elif source.is_dir():
@@ -93,7 +93,7 @@ def list_batches(source: Path, suffix: str) -> tuple[list[Batch], int]:
         batches.append(Batch(root, None, tuple(loose[first : first + LOOSE_FILES_PER_BATCH])))
     if not batches:
         raise UserError(f"{source}: no {suffix} file and no archive ({', '.join(ARCHIVES)}) in it")
-    return batches, len(names) - len(archives) - len(loose)
+    return batches
 
 
 def _read_archive(path: Path, label: str, suffix: str) -> Iterator[SourceFile]:

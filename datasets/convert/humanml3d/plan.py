@@ -1,16 +1,13 @@
 """HumanML3D conversion, planning: options, and a plan of what becomes of every file of the source.
 
-Headers and captions are read, motion data is not. Everything in the folder is accounted for: clips to
-convert, left out, broken or missing, caption lines that are wrong, and a count of the files nobody needs.
+Headers and captions are read, motion data is not. Every clip is accounted for: to convert, left out, broken
+or missing; and so are caption lines that are wrong.
 """
 
 from __future__ import annotations
 
-import os
-import re
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
@@ -21,7 +18,7 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id, inside, read_in_threads
-from motionloom.datasets.convert.common.plan import ConversionPlan, count_subsets, drop, first_notes
+from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.splits import (
     SplitNames,
     hash_splits,
@@ -40,12 +37,6 @@ LICENCE = (
     "HumanML3D: motion derived from AMASS (non-commercial research only, no redistribution) and HumanAct12; "
     "captions MIT"
 )
-RELEASED: dict[str, int] = {"train": 23384, "val": 1460, "test": 4384}
-"""Ids in the official split files, mirrored ones included."""
-
-_SIDE = re.compile(r"\b(?:left|right|(?:counter|anti)?-?clockwise)\b", re.IGNORECASE)
-_NOTED_FILES = 50
-"""Caption files with bad lines that are named one by one."""
 
 
 class HumanMl3dConfig(ConvertConfig):
@@ -138,16 +129,16 @@ def plan_humanml3d(config: HumanMl3dConfig, settings: PlanSettings) -> Conversio
         draft.take(HumanMl3dClip(clip_id, split, found.files, found.frames, found.texts, licence))
     draft.broken += [problem for found in scanned.values() for problem in found.broken]
     draft.uncaptioned += [found.files[0] for found in whole.values() if not found.texts]
-    draft.notes += _caption_notes(scanned)
+    draft.notes += [problem for found in scanned.values() for problem in found.problems]
     strays = len(texts.keys() - present.keys())
     if strays:
         draft.notes.append(f"{strays} caption files in {folder}/ belong to no motion file here")
     draft.limit(HumanMl3dClip.label)
 
-    missing = {clip_id: split for clip_id, split in splits.items() if clip_id not in present}
     wanted = "/ or ".join(config.folders)
-    for clip_id, split in missing.items():
-        draft.miss(clip_id, f"listed in {split}.txt, but not in {wanted}/")
+    for clip_id, split in splits.items():
+        if clip_id not in present:
+            draft.miss(clip_id, f"listed in {split}.txt, but not in {wanted}/")
     return draft.finish(
         found=len(present),
         frames=lambda clip: (
@@ -156,13 +147,6 @@ def plan_humanml3d(config: HumanMl3dConfig, settings: PlanSettings) -> Conversio
             else frames_after(clip.frames, FPS, layout)
         ),
         licence=lambda clip: clip.licence,
-        ignored=_count_ignored(config, folder),
-        subsets=count_subsets(
-            (splits.get(clip_id, "in no split") for clip_id in present),
-            (split for split, _ in draft.items),
-            missing.values(),
-            RELEASED,
-        ),
     )
 
 
@@ -238,38 +222,3 @@ def _scan(
         return replace(found, broken=(drop(label, error),))
     joined = "; ".join(problems)
     return replace(found, texts=tuple(captions), problems=(f"{label}: {joined}",) if problems else ())
-
-
-def _caption_notes(scanned: dict[str, _Scanned]) -> list[str]:
-    """Caption lines that were left out, and mirrored clips that still name the side of their original."""
-    wrong = [problem for found in scanned.values() for problem in found.problems]
-    notes = first_notes(wrong, _NOTED_FILES, "caption files with lines left out")
-    copied = []
-    for clip_id, found in scanned.items():
-        original = scanned.get(original_of(clip_id) or "")
-        said = {caption.text for caption in original.texts} if original else set()
-        same = [
-            caption.text for caption in found.texts if caption.text in said and _SIDE.search(caption.text)
-        ]
-        copied += [f"{clip_id} '{same[0]}'"] if same else []
-    if copied:
-        notes.append(
-            f"{len(copied)} mirrored clips repeat a caption of their original that names a side, so it may "
-            f"be the wrong one: {', '.join(copied[:3])}{', ...' if len(copied) > 3 else ''}"
-        )
-    return notes
-
-
-def _count_ignored(config: HumanMl3dConfig, texts: str) -> int:
-    """Files of the source that are neither motion, captions nor split files: statistics, samples, lists."""
-    ours = {path.name for _, path in SplitNames().files(config.source)}
-    ends = {texts: ".txt", **dict.fromkeys(config.folders, ".npy")}
-    count = 0
-    for folder, _, names in os.walk(config.source):
-        here = Path(folder).relative_to(config.source).as_posix()
-        if here == ".":
-            count += sum(name not in ours for name in names)
-        else:
-            end = ends.get(here)
-            count += sum(end is None or not name.endswith(end) or name.startswith(".") for name in names)
-    return count

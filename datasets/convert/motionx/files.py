@@ -89,23 +89,11 @@ def read_frame_texts(path: Path, *, source: str, frames: int, fps: float, name: 
 
 Kind = Literal["motion", "face motion", "captions", "face texts", "body texts", "hand texts"]
 
-OFFICIAL = {
-    "EgoBody": 980,
-    "GRAB": 1335,
-    "HAA500": 5231,
-    "aist": 1470,
-    "animation": 329,
-    "dance": 163,
-    "fitness": 16730,
-    "game_motion": 10217,
-    "humanml": 26288,
-    "humman": 744,
-    "idea400": 12513,
-    "kungfu": 1040,
-    "music": 3565,
-    "perform": 475,
-}
-"""Subsets and the ids that the published `all.txt` lists for each."""
+_SUBSETS = (
+    "EgoBody", "GRAB", "HAA500", "aist", "animation", "dance", "fitness", "game_motion", "humanml", "humman",
+    "idea400", "kungfu", "music", "perform",
+)  # fmt: skip
+"""Subsets as the release spells them."""
 
 _VERSION = r"(?:[_-]?v?\d+(?:\.\d+)*)?"
 _KINDS: dict[Kind, tuple[str, str]] = {
@@ -122,7 +110,7 @@ _SMPLX = re.compile(r"smplx_?322", re.IGNORECASE)
 """The inner folder of motion and, although its files have 153 columns, of face motion."""
 _SCRIPTS = re.compile(r"(humanml|grab|egobody)_(motion|texts?|txt)", re.IGNORECASE)
 """What the authors' scripts call a subset until it is moved in its place."""
-_CASE = {name.lower(): name for name in OFFICIAL}
+_CASE = {name.lower(): name for name in _SUBSETS}
 _DEEP = 5
 """Levels below the source at which the folder of a kind may lie."""
 
@@ -140,8 +128,6 @@ class MotionXFiles:
     """Motion files whose id another file has already."""
     second: Counter[Kind] = field(default_factory=Counter)
     """Other files whose id a file of their kind has already."""
-    others: set[str] = field(default_factory=set)
-    """Files of no kind."""
 
     def notes(self) -> list[str]:
         lines = []
@@ -168,12 +154,10 @@ def find_files(source: Path) -> MotionXFiles:
     if not source.is_dir():
         raise UserError(f"{source}: no such folder")
     placed: list[tuple[_Place, str, str]] = []
-    others: set[str] = set()
     broken: list[Dropped] = []
     for parts, entry in _walk(source, (), frozenset()):
         place, name = _place(parts), "/".join((*parts, entry.name))
         if place is None or entry.name.startswith(".") or not entry.name.endswith(_KINDS[place.kind][1]):
-            others.add(name)
             continue
         shown = name.encode("utf-8", "backslashreplace").decode()
         try:
@@ -191,7 +175,6 @@ def find_files(source: Path) -> MotionXFiles:
     for place, clip_id, name in placed:
         kind = place.kind
         if has_inner[kind] and not place.smplx:
-            others.add(name)
             continue
         found.folders[kind][place.root] += 1
         first = found.by_kind[kind].setdefault(clip_id, name)
@@ -202,7 +185,6 @@ def find_files(source: Path) -> MotionXFiles:
             found.repeated.append(Dropped(source=name, reason=reason))
         else:
             found.second[kind] += 1
-    found.others.update(others)
     if not found.by_kind["motion"]:
         raise UserError(
             f"{source}: no Motion-X motion in it; give the folder that holds motion_data/smplx_322/ "

@@ -19,7 +19,7 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import read_in_threads
-from motionloom.datasets.convert.common.plan import ConversionPlan, count_subsets, drop, first_notes
+from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.splits import (
     SplitNames,
     hash_splits,
@@ -29,7 +29,6 @@ from motionloom.datasets.convert.common.splits import (
 )
 from motionloom.datasets.convert.motionx.files import (
     HUMANML,
-    OFFICIAL,
     Kind,
     MotionXFiles,
     find_files,
@@ -41,7 +40,7 @@ from motionloom.datasets.convert.motionx.files import (
 from motionloom.datasets.convert.motionx.parameters import FACE_WIDTH, RAW, aist_scale
 from motionloom.datasets.motion.body.smpl import SkeletonName
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SPLITS, Caption, Dropped, Split, UserError
+from motionloom.datasets.schema import Caption, Dropped, Split, UserError
 
 FPS = 30.0
 LAYOUTS = ("wholebody363", "wholebody313", "body133", "tomato623", "h3d263", "smplx322")
@@ -61,14 +60,9 @@ LICENCES = {
 """Our reading, on the careful side: motion that the user gets from its own site keeps that site's licence,
 all that Motion-X hands out needs its agreement as well, and both count where it has a first owner."""
 
-RELEASED: dict[Split, int] = {"train": 64867, "val": 4046, "test": 12167}
-"""Ids in the published split files."""
-
 _SPLIT_FOLDERS = ("", "split", "splits", "datasets")
 _LOOKED_AT = 8
 """Clips of `aist/` that the plan reads to tell their scale."""
-_NOTED_FILES = 20
-"""Text files with bad lines that are named one by one."""
 
 
 class MotionXConfig(ConvertConfig):
@@ -155,7 +149,7 @@ def plan_motionx(config: MotionXConfig, settings: PlanSettings) -> ConversionPla
     if not ids:
         present = sorted({subset_of(clip_id) for clip_id in motion})
         raise UserError(f"{config.source}: none of {config.subsets} in it, but {', '.join(present)}")
-    splits, split_files, notes = _read_splits(config, files, ids)
+    splits, notes = _read_splits(config, files, ids)
     scan = partial(_scan, config.source, files)
     scanned = list(read_in_threads(scan, ids, workers=settings.workers, progress=settings.progress))
 
@@ -187,33 +181,21 @@ def plan_motionx(config: MotionXConfig, settings: PlanSettings) -> ConversionPla
             )
         )  # fmt: skip
     draft.limit(MotionXClip.label)
-    missing = [clip_id for clip_id in splits if clip_id not in motion]
     unwanted = len(motion) - len(ids)
     texts_alone = [clip_id for clip_id in files.by_kind["captions"] if clip_id not in motion]
-    for clip_id in missing:
-        draft.miss(clip_id, f"listed in {splits[clip_id]}.txt, but its motion is not here")
+    for clip_id, split in splits.items():
+        if clip_id not in motion:
+            draft.miss(clip_id, f"listed in {split}.txt, but its motion is not here")
     draft.notes += [
         *_subset_notes(config, files, scanned),
         *([f"{unwanted} clips of other subsets are not asked for"] if unwanted else []),
         *([f"{len(texts_alone)} caption files have no motion"] if texts_alone else []),
-        *first_notes(
-            [problem for found in scanned for problem in found.problems],
-            _NOTED_FILES,
-            "text files with lines left out",
-        ),
+        *(problem for found in scanned for problem in found.problems),
     ]
-    expected = {name: OFFICIAL[name] for name in map(_folder, (*motion, *missing)) if name in OFFICIAL}
     return draft.finish(
         found=len(ids) + len(files.repeated),
         frames=lambda clip: frames_after(clip.frames, FPS, layout),
         licence=lambda clip: clip.licence,
-        ignored=len(files.others - split_files) + unwanted,
-        subsets=count_subsets(
-            map(_folder, motion),
-            (_folder(clip.id) for _, clip in draft.items),
-            map(_folder, missing),
-            expected,
-        ),
     )
 
 
@@ -223,8 +205,8 @@ def _wanted(config: MotionXConfig, clip_id: str) -> bool:
 
 def _read_splits(
     config: MotionXConfig, files: MotionXFiles, ids: list[str]
-) -> tuple[dict[str, Split], set[str], list[str]]:
-    """Split of every wanted id, the split files by their names in the source, and notes."""
+) -> tuple[dict[str, Split], list[str]]:
+    """Split of every wanted id, and notes."""
     names = SplitNames()
     if config.splits is not None:
         folder: Path | None = config.splits
@@ -234,8 +216,7 @@ def _read_splits(
         folder = config.source / found[0] if found else None
         origin = f"splits: {found[0] or '.'}/" if found else ""
     if folder is None:
-        hashed, notes = hash_splits(ids)
-        return hashed, set(), notes
+        return hash_splits(ids)
     listed, notes = read_split_files(folder)
     keep_mirrors_together(listed, original_of, folder)
     splits: dict[str, Split] = {}
@@ -245,16 +226,8 @@ def _read_splits(
             raise UserError(
                 f"{folder}: '{official}' is in {splits[official]}.txt and {split}.txt; that leaks"
             )
-    counts = Counter(splits.values())
-    numbers = ", ".join(f"{split} {counts[split]:,} ids of {RELEASED[split]:,}" for split in SPLITS)
-    used = set()
-    if folder.is_relative_to(config.source):
-        inner = folder.relative_to(config.source)
-        used = {
-            (inner / name).as_posix() for name in (*(path.name for _, path in names.files(folder)), "all.txt")
-        }
     wanted = {clip_id: split for clip_id, split in splits.items() if _wanted(config, clip_id)}
-    return wanted, used, [f"{origin}; {numbers} in the release", *notes]
+    return wanted, [*([origin] if origin else []), *notes]
 
 
 def _scan(source: Path, files: MotionXFiles, clip_id: str) -> _Scanned:
@@ -325,7 +298,3 @@ def _subset_notes(config: MotionXConfig, files: MotionXFiles, scanned: list[_Sca
             f"(/ 94, z negated), each judged by itself"
         )
     return notes
-
-
-def _folder(clip_id: str) -> str:
-    return subset_of(clip_id) or "(no folder)"
