@@ -6,8 +6,8 @@ Files that may be used are opened, but only for their headers and a few scalars.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -16,17 +16,18 @@ from pydantic import Field, model_validator
 from motionloom.datasets.convert.amass.index import INDEX_FPS, IndexRow, clip_key, read_index, thinning
 from motionloom.datasets.convert.amass.smpl_npz import MotionHeader, read_motion_header
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
-from motionloom.datasets.convert.captions.options import (
-    CaptionConfig,
-    CaptionedPlan,
-    CaptionMatch,
-    settle_captions,
-)
+from motionloom.datasets.convert.captions.options import CaptionConfig, CaptionedPlan, settle_captions
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id, inside, read_in_threads
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
-from motionloom.datasets.convert.common.splits import hash_split, keep_mirrors_together, original_of
+from motionloom.datasets.convert.common.splits import (
+    SplitNames,
+    hash_split,
+    keep_mirrors_together,
+    original_of,
+    read_split_files,
+)
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
 
@@ -74,6 +75,10 @@ class AmassConfig(CaptionConfig):
         if self.humanml_index is not None and self.captions is not None:
             raise ValueError("captions and humanml_index exclude each other; the index has humanml_texts")
         return self
+
+    @property
+    def has_captions(self) -> bool:
+        return self.captions is not None or self.humanml_texts is not None
 
     def motion_layout(self) -> MotionLayout:
         layout = super().motion_layout()
@@ -178,10 +183,7 @@ class AmassClip:
         return self.file.label if self.id == self.file.id else f"{self.file.label} ({self.id})"
 
 
-@dataclass
-class _Draft(CaptionedPlan[AmassClip]):
-    match: CaptionMatch = field(default_factory=CaptionMatch)
-    """Captions of whole files."""
+Draft = CaptionedPlan[AmassClip]
 
 
 def plan_amass(
@@ -190,24 +192,19 @@ def plan_amass(
     """Find every clip and decide what becomes of it. `models` is the kind of the body model by gender."""
     layout = config.motion_layout()
     files, broken = list_files(config.source)
-    listed, notes = config.listed_splits()
-    draft = _Draft(config, broken=broken, notes=notes)
+    draft = Draft(config, broken=broken)
     if config.humanml_index is not None:
-        clips = _index_clips(config, config.humanml_index, files, listed, draft, settings)
+        clips = _index_clips(config, config.humanml_index, files, draft, settings)
     else:
-        clips = _whole_clips(config, files, listed, draft, settings)
-    with_texts = config.captions is not None or config.humanml_texts is not None
+        clips = _whole_clips(config, files, draft, settings)
     for clip, reason in clips:
-        if config.splits is not None and clip.id not in listed:
-            reason = reason or "in no split file"
         reason = (
             reason
             or _body_problem(config, models, clip.header)
             or config.licence_problem(config.licence or LICENCE)
             or config.length_problem(clip.seconds)
         )
-        draft.decide(clip, clip.texts, reason, needed=with_texts, keep=config.uncaptioned == "keep")
-    settle_captions(config, draft, draft.match)
+        draft.decide(clip, clip.texts, reason)
     draft.limit(AmassClip.label)
     return draft.finish(
         found=len(files),
@@ -217,56 +214,40 @@ def plan_amass(
 
 
 def _whole_clips(
-    config: AmassConfig,
-    files: list[AmassFile],
-    listed: Mapping[str, Split],
-    draft: _Draft,
-    settings: PlanSettings,
-) -> list[tuple[AmassClip, str]]:
+    config: AmassConfig, files: list[AmassFile], draft: Draft, settings: PlanSettings
+) -> Iterator[tuple[AmassClip, str]]:
+    """Every file as one clip, and why it must be left out."""
     headers, broken = read_headers(files, settings)
+    listing = config.listing([file.label for file in files])
     draft.broken += broken
-    draft.match = config.matched([file.label for file in files] + [drop.source for drop in draft.broken])
-    clips: list[tuple[AmassClip, str]] = []
+    draft.notes += listing.notes
     seen: dict[str, str] = {}
     for file, header in headers:
         fps = _rate(config, file, header, draft)
         if not fps:
             continue
-        row = draft.match.rows.get(file.label)
-        clip_id = row.id if row else file.id
-        texts = row.texts if row else ()
-        split = listed.get(clip_id) or (row.split if row else None) or hash_split(clip_id)
+        clip_id = listing.id_of(file.label)
         first = seen.setdefault(clip_id, file.label)
-        reason = "" if first == file.label else f"second file for clip id '{clip_id}'; the first is {first}"
-        if row and row.left_out:
-            reason = reason or "in a split that is left out (splits_map)"
-        clips.append((AmassClip(file, clip_id, split, header, fps, 0, header.frames, texts), reason))
-    wanted = {row.id: row.file or f"{row.id}{SUFFIX}" for row in draft.match.unused}
-    wanted |= {clip_id: f"{clip_id}{SUFFIX}" for clip_id in listed if clip_id not in wanted}
-    here = {file.label for file in files} | {drop.source for drop in draft.broken}
-    for clip_id, name in wanted.items():
-        if clip_id not in seen and name not in here:
-            draft.miss(name, f"clip '{clip_id}' is listed, but not here")
-    return clips
+        again = "" if first == file.label else f"second file for clip id '{clip_id}'; the first is {first}"
+        split, texts = listing.split_of(file.label), listing.texts_of(file.label)
+        clip = AmassClip(file, clip_id, split, header, fps, 0, header.frames, texts)
+        yield clip, again or listing.problem(file.label)
+    settle_captions(config, draft, listing)
 
 
 def _index_clips(
-    config: AmassConfig,
-    index: Path,
-    files: list[AmassFile],
-    listed: Mapping[str, Split],
-    draft: _Draft,
-    settings: PlanSettings,
-) -> list[tuple[AmassClip, str]]:
+    config: AmassConfig, index: Path, files: list[AmassFile], draft: Draft, settings: PlanSettings
+) -> Iterator[tuple[AmassClip, str]]:
     """Every row of the index as one clip, or two with `mirror`."""
     rows = read_index(index)
+    listed: dict[str, Split] = {}
     if config.splits is not None:
+        listed, notes = read_split_files(config.splits, SplitNames(config.splits_map))
         keep_mirrors_together(listed, original_of, config.splits)
+        draft.notes += notes
     by_file = _rows_by_file(rows, files, draft)
     headers, broken = read_headers([file for file in files if file.label in by_file], settings)
     draft.broken += broken
-    clips: list[tuple[AmassClip, str]] = []
-    problems: list[str] = []
     for file, header in headers:
         fps = _rate(config, file, header, draft)
         for row in by_file[file.label] if fps else ():
@@ -275,18 +256,17 @@ def _index_clips(
             # Stretches of one file may overlap: without split files they stay together.
             split = listed.get(row.id) or listed.get(f"M{row.id}") or hash_split(clip_key(row.source))
             for clip_id, original in [(row.id, None), (f"M{row.id}", row.id)][: 1 + config.mirror]:
-                texts, reason = _index_texts(config, clip_id, last - first, fps, problems)
+                texts, reason = _index_texts(config, clip_id, last - first, fps, draft.notes)
                 clip = AmassClip(file, clip_id, split, header, fps, first, last, texts, original)
-                clips.append((clip, beyond or reason))
+                unlisted = "in no split file" if config.splits and clip_id not in listed else ""
+                yield clip, unlisted or beyond or reason
     known = {row.id for row in rows}
     for clip_id in listed:
         if clip_id not in known and (original_of(clip_id) or clip_id) not in known:
             draft.miss(clip_id, "in a split file, but not in the index")
-    draft.notes += problems
-    return clips
 
 
-def _rows_by_file(rows: list[IndexRow], files: list[AmassFile], draft: _Draft) -> dict[str, list[IndexRow]]:
+def _rows_by_file(rows: list[IndexRow], files: list[AmassFile], draft: Draft) -> dict[str, list[IndexRow]]:
     """Rows of every file (by label); rows without a file and files without a row are reported."""
     by_key: dict[str, AmassFile] = {}
     found: dict[str, list[IndexRow]] = {}
@@ -330,7 +310,7 @@ def _index_texts(
     return tuple(captions), ""
 
 
-def _rate(config: AmassConfig, file: AmassFile, header: MotionHeader, draft: _Draft) -> float:
+def _rate(config: AmassConfig, file: AmassFile, header: MotionHeader, draft: Draft) -> float:
     """Frames a second; 0, with the file among the broken, when neither states one."""
     fps = config.source_fps or header.fps or 0.0
     if not fps:

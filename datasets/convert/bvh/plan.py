@@ -24,7 +24,6 @@ from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.scan import Batch, BatchScan, FoundFile, list_batches, scan_batches
-from motionloom.datasets.convert.common.splits import hash_split
 from motionloom.datasets.motion.bvh.joint_map import JointMap, Unit, Up
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy
@@ -218,55 +217,42 @@ def _header(data: bytes, label: str) -> tuple[int, float, str]:
 def _decide(config: BvhConfig, batches: list[Batch], scans: list[BatchScan]) -> ConversionPlan[BvhClip]:
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
     refused = config.licence_problem(config.licence)
-    table = config.matched(file.path for _, file in found)
-    listed, notes = config.listed_splits()
+    listing = config.listing([file.path for _, file in found])
     broken = [scan.problem for scan in scans if scan.problem is not None]
-    draft = CaptionedPlan[BvhClip](config, broken=broken, notes=notes)
+    draft = CaptionedPlan[BvhClip](config, broken=broken, notes=listing.notes)
     ids: dict[str, str] = {}
     contents: dict[str, str] = {}
-    unreadable: set[str] = set()
     other_rate = 0
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
-    for number, clip in sorted(found, key=lambda pair: pair[1].path not in table.rows):
-        row = table.rows.get(clip.path)
+    for number, clip in sorted(found, key=lambda pair: pair[1].path not in listing.rows):
+        clip_id = listing.id_of(clip.path)
         try:
-            clip_id = row.id if row else check_id(str(PurePosixPath(clip.path).with_suffix("")), clip.label)
+            check_id(clip_id, clip.label)
+            if clip.problem:
+                raise UserError(clip.problem)
         except UserError as error:
             draft.fail(clip.label, error)
             continue
-        if clip.problem:
-            unreadable.add(clip_id)
-            draft.fail(clip.label, UserError(clip.problem))
-            continue
-        texts = row.texts if row else ()
-        other_rate += bool(row and row.fps and abs(row.fps - clip.fps) > 0.01 * clip.fps)
+        stated = listing.rows[clip.path].fps if clip.path in listing.rows else None
+        other_rate += stated is not None and abs(stated - clip.fps) > 0.01 * clip.fps
         if clip_id in ids:
             reason = f"second file for clip id '{clip_id}'; the first is {ids[clip_id]}"
         elif clip.sha256 in contents:
             reason = f"same bytes as {contents[clip.sha256]}"
-        elif config.splits and clip_id not in listed:
-            reason = "in no split file"
-        elif row and row.left_out:
-            reason = "in a split that is left out (splits_map)"
         else:
-            reason = refused or config.length_problem(clip.frames / (config.source_fps or clip.fps))
+            seconds = clip.frames / (config.source_fps or clip.fps)
+            reason = listing.problem(clip.path) or refused or config.length_problem(seconds)
         ids.setdefault(clip_id, clip.label)
         contents.setdefault(clip.sha256, clip.label)
-        split = listed.get(clip_id) or (row.split if row else None) or hash_split(clip_id)
-        made = BvhClip(batches[number], number, clip, clip_id, split, texts)
-        needed, keep = config.captions is not None, config.uncaptioned == "keep"
-        draft.decide(made, texts, reason, needed=needed, keep=keep)
+        texts = listing.texts_of(clip.path)
+        made = BvhClip(batches[number], number, clip, clip_id, listing.split_of(clip.path), texts)
+        draft.decide(made, texts, reason)
     if other_rate:
         draft.notes.append(
             f"{other_rate} captions state another frame rate than their file; the file's counts"
         )
     draft.limit(lambda clip: clip.id)
-    settle_captions(config, draft, table)
-    wanted = {row.id: row.file or row.id for row in table.unused}
-    wanted |= {clip_id: clip_id for clip_id in listed if clip_id not in wanted}
-    for clip_id, name in wanted.items():
-        if clip_id not in ids and clip_id not in unreadable:
-            draft.miss(name, f"clip '{clip_id}' is listed, but its file is not in the source")
+    settle_captions(config, draft, listing)
     layout = config.motion_layout()
     return draft.finish(
         found=len(found),

@@ -1,10 +1,14 @@
-"""Captions of your own in a conversion: the options, which clip a row means, and what has no counterpart."""
+"""Captions and split files of your own in a conversion: the options, which file a name means, what is left.
+
+A name in captions and in split files means the same: the file at that path (its suffix does not matter), else
+the only file whose path ends with it (`walk` means `walks/walk.bvh`), else the file whose whole path it ends
+with (`/data/mocap/walks/walk.bvh`). A name that two files fit is an error.
+"""
 
 from __future__ import annotations
 
 import difflib
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -15,57 +19,33 @@ from motionloom.datasets.base.files import sha256_of, sha256_of_json
 from motionloom.datasets.convert.captions.read import CaptionRow, bare, read_captions
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
-from motionloom.datasets.convert.common.splits import SplitNames, read_split_files
-from motionloom.datasets.schema import Caption, Split
+from motionloom.datasets.convert.common.splits import SplitNames, hash_split, read_split_files
+from motionloom.datasets.schema import Caption, Split, UserError
 
 
-@dataclass(frozen=True)
-class CaptionMatch:
-    """Rows by the paths of motion files."""
+class FileNames:
+    """The files of a source, found by the names that people give them."""
 
-    rows: dict[str, CaptionRow] = field(default_factory=dict)
-    unused: list[CaptionRow] = field(default_factory=list)
-    """Rows that name no motion file of the source."""
-    free: tuple[str, ...] = ()
-    """Files without a row."""
+    def __init__(self, paths: Iterable[str]) -> None:
+        self._whole = {bare(path): path for path in paths}
+        self._by_end: dict[str, list[str]] = {}
+        for name, path in self._whole.items():
+            for end in _ends(name)[1:]:
+                self._by_end.setdefault(end, []).append(path)
 
-    def nearest(self, row: CaptionRow, number: int = 2) -> list[str]:
-        return nearest(row.names()[0], self.free, number)
+    def call(self, name: str, path: str) -> None:
+        """Give a file a further name."""
+        self._whole.setdefault(name, path)
 
-
-def match(rows: Mapping[str, CaptionRow], paths: Iterable[str]) -> CaptionMatch:
-    """Find the row of every motion file.
-
-    Suffixes do not matter. A file's row is the one that names its path; else one that names the end of it
-    (`walk` means `walks/walk.bvh`), or whose own end it is (`mocap/walks/walk`); else the only one with the
-    same last name, where no other file has it.
-    """
-    files = {path: bare(path) for path in paths}
-    by_name: dict[str, CaptionRow] = {}
-    for row in rows.values():
-        for name in reversed(row.names()):
-            by_name.setdefault(name, row)
-    by_end = _by_end(by_name)
-    found: dict[str, CaptionRow] = {}
-    for path, name in files.items():
-        made = next((by_name[end] for end in _ends(name) if end in by_name), by_end.get(name))
-        if made is not None:
-            found[path] = made
-    used = {row.id for row in found.values()}
-    last = {path: name.rsplit("/", 1)[-1] for path, name in files.items() if path not in found}
-    left = [row for row in rows.values() if row.id not in used]
-    stems = Counter(stem for row in left for stem in _stems(row))
-    by_stem = {stem: row for row in left for stem in _stems(row) if stems[stem] == 1}
-    counts = Counter(last.values())
-    for path, stem in last.items():
-        if counts[stem] == 1 and stem in by_stem:
-            found[path] = by_stem[stem]
-    used = {row.id for row in found.values()}
-    return CaptionMatch(
-        found,
-        [row for row in rows.values() if row.id not in used],
-        tuple(path for path in files if path not in found),
-    )
+    def find(self, name: str, where: str) -> str | None:
+        """The file that a name means, or None; `UserError` beginning with `where` when two fit."""
+        name = bare(name)
+        if name in self._whole:
+            return self._whole[name]
+        fits = self._by_end.get(name, [])
+        if len(fits) > 1:
+            raise UserError(f"{where}: '{name}' may mean {' or '.join(fits[:_SHOWN])}; write the folder too")
+        return fits[0] if fits else next((self._whole[e] for e in _ends(name) if e in self._whole), None)
 
 
 def _ends(name: str) -> list[str]:
@@ -74,16 +54,72 @@ def _ends(name: str) -> list[str]:
     return ["/".join(pieces[first:]) for first in range(len(pieces))]
 
 
-def _stems(row: CaptionRow) -> set[str]:
-    return {name.rsplit("/", 1)[-1] for name in row.names()}
+@dataclass(frozen=True)
+class Listing:
+    """What captions and split files say of the files of a source, by their paths there."""
+
+    rows: dict[str, CaptionRow]
+    splits: dict[str, Split] | None
+    """None without split files."""
+    missing: dict[str, str]
+    """Names of clips that are listed but not here, and what was listed."""
+    unused: list[CaptionRow]
+    free: tuple[str, ...]
+    """Files without captions."""
+    notes: list[str]
+
+    def id_of(self, path: str) -> str:
+        return self.rows[path].id if path in self.rows else bare(path)
+
+    def split_of(self, path: str) -> Split:
+        """By the split files, else the captions, else a hash of the id."""
+        stated = self.rows[path].split if path in self.rows else None
+        return (self.splits or {}).get(path) or stated or hash_split(self.id_of(path))
+
+    def texts_of(self, path: str) -> tuple[Caption, ...]:
+        return self.rows[path].texts if path in self.rows else ()
+
+    def problem(self, path: str) -> str:
+        """Why the lists leave a file out; empty when they do not."""
+        if self.splits is not None and path not in self.splits:
+            return "in no split file"
+        left_out = path in self.rows and self.rows[path].left_out
+        return "in a split that is left out (splits_map)" if left_out else ""
+
+    def nearest(self, row: CaptionRow) -> list[str]:
+        return nearest(row.file or row.id, self.free)
 
 
-def _by_end(by_name: Mapping[str, CaptionRow]) -> dict[str, CaptionRow]:
-    ends: dict[str, CaptionRow | None] = {}
-    for name, row in by_name.items():
-        for end in _ends(name)[1:]:
-            ends[end] = row if ends.get(end, row) is row else None
-    return {end: row for end, row in ends.items() if row is not None}
+def list_clips(
+    paths: Sequence[str], rows: Iterable[CaptionRow], listed: dict[str, Split] | None, notes: list[str]
+) -> Listing:
+    """Find the file of every caption row and of every name in the split files (`listed`)."""
+    names = FileNames(paths)
+    found: dict[str, CaptionRow] = {}
+    missing: dict[str, str] = {}
+    unused: list[CaptionRow] = []
+    for row in rows:
+        path = (names.find(row.file, row.where) if row.file else None) or names.find(row.id, row.where)
+        if path is None:
+            unused.append(row)
+            missing[row.file or row.id] = row.id
+        elif path in found:
+            raise UserError(f"{row.where}: '{row.id}' and '{found[path].id}' both mean {path}")
+        else:
+            found[path] = row
+    for path, row in found.items():
+        names.call(row.id, path)
+    splits: dict[str, Split] = {}
+    for name, split in (listed or {}).items():
+        path = names.find(name, f"{split}.txt")
+        if path is None:
+            missing.setdefault(name, bare(name))
+        elif splits.setdefault(path, split) != split:
+            raise UserError(
+                f"'{name}' in {split}.txt means {path}, which is in {splits[path]}.txt too; that leaks"
+            )
+    free = tuple(path for path in paths if path not in found)
+    return Listing(found, None if listed is None else splits, missing, unused, free, notes)
 
 
 def nearest(name: str, candidates: Sequence[str], number: int = 2) -> list[str]:
@@ -120,6 +156,11 @@ class CaptionConfig(ConvertConfig):
     them.
     """
 
+    @property
+    def has_captions(self) -> bool:
+        """Whether captions are given."""
+        return self.captions is not None
+
     @field_validator("splits_map")
     @classmethod
     def _readable(cls, mapping: str) -> str:
@@ -130,17 +171,12 @@ class CaptionConfig(ConvertConfig):
         """What the output depends on; `stop` is `drop`: where it does not stop, every clip has captions."""
         return super().options() | {"uncaptioned": "drop" if self.uncaptioned == "stop" else self.uncaptioned}
 
-    def listed_splits(self) -> tuple[dict[str, Split], list[str]]:
-        """Splits of the split files by id, and notes; neither without such files."""
-        if self.splits is None:
-            return {}, []
-        listed, notes = read_split_files(self.splits, SplitNames(self.splits_map))
-        return {bare(clip_id): split for clip_id, split in listed.items()}, notes
-
-    def matched(self, paths: Iterable[str]) -> CaptionMatch:
-        """The captions of motion files by their paths in the source."""
-        rows = read_captions(self.captions, SplitNames(self.splits_map)) if self.captions else {}
-        return match(rows, paths)
+    def listing(self, paths: Sequence[str]) -> Listing:
+        """What captions and split files say of motion files, by their paths in the source."""
+        names = SplitNames(self.splits_map)
+        rows = read_captions(self.captions, names).values() if self.captions else ()
+        listed, notes = read_split_files(self.splits, names) if self.splits else (None, [])
+        return list_clips(paths, rows, listed, notes)
 
 
 def digest_of(path: Path) -> dict[str, str]:
@@ -162,9 +198,11 @@ class CaptionedPlan(ConversionPlan[C]):
     captioned: int = 0
     """Clips that have them, and nothing against them."""
 
-    def decide(self, clip: C, texts: Sequence[Caption], reason: str, *, needed: bool, keep: bool) -> None:
-        """Take a clip or leave it out: for `reason`, or for want of captions that are `needed`."""
-        if needed and not texts:
+    def decide(self, clip: C, texts: Sequence[Caption], reason: str) -> None:
+        """Take a clip or leave it out: for `reason`, or for want of captions where some were given."""
+        assert isinstance(self.config, CaptionConfig)
+        keep = self.config.uncaptioned == "keep"
+        if self.config.has_captions and not texts:
             self.uncaptioned.append(clip.label())
             if not reason:
                 self.bare_clips.append(clip.label())
@@ -177,8 +215,12 @@ class CaptionedPlan(ConversionPlan[C]):
             self.take(clip)
 
 
-def settle_captions(config: CaptionConfig, draft: CaptionedPlan[C], found: CaptionMatch) -> None:
-    """Say in the plan how captions and clips fit, and why the conversion must not start if it must not."""
+def settle_captions(config: CaptionConfig, draft: CaptionedPlan[C], found: Listing) -> None:
+    """Say in the plan what is listed but missing, how captions and clips fit, and why the conversion must not
+    start if it must not.
+    """
+    for name, clip_id in found.missing.items():
+        draft.miss(name, f"clip '{clip_id}' is listed, but its file is not in the source")
     if config.captions is None:
         return
     bare_clips, captioned = draft.bare_clips, draft.captioned
@@ -205,7 +247,7 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:_SHOWN]) + more
 
 
-def _unused(found: CaptionMatch) -> str:
+def _unused(found: Listing) -> str:
     """How many clips have captions and no file, and the first of them with the nearest names."""
     shown = []
     for row in found.unused[:_SHOWN]:

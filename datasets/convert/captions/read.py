@@ -1,35 +1,32 @@
-"""Captions that people bring for their clips, in any of six forms that are recognised by themselves.
+"""Captions that people bring for their clips, in any of five forms that are recognised by themselves.
 
 | form | by |
 |---|---|
-| one JSON object a line | `.jsonl`, `.ndjson`, or several objects in one file |
+| one JSON object a line | `{` |
 | a JSON list of such objects | `[` |
-| one JSON object, name -> caption(s) | `{` |
 | CSV, TSV with a header | anything else that is a file |
 | a folder of .txt files with the clips' names, a caption a line | a folder |
 | the same with HumanML3D's lines `caption#tokens#start#end` | the first lines |
+
+Every error about such a file begins with `FILE:LINE`, and what the record says passes through pydantic.
 """
 
 from __future__ import annotations
 
-import math
+import csv
+import json
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from motionloom.datasets.convert.captions.forms import (
-    Record,
-    folder_records,
-    json_records,
-    kind_of,
-    read_text,
-    table_records,
-)
-from motionloom.datasets.convert.common.files import check_id
+from pydantic import AliasChoices, ConfigDict, Field, FiniteFloat
+
+from motionloom.datasets.convert.captions.humanml_text import parse_caption
+from motionloom.datasets.convert.common.files import check_id, read_text_file
 from motionloom.datasets.convert.common.splits import SplitNames
-from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.schema import Caption, Config, Split, UserError
 
 SOURCE = "captions"
 """`source` of captions that state none."""
@@ -40,14 +37,10 @@ TEXT_KEYS = ("caption", "text", "description")
 
 _TEXT = {word: re.compile(rf"{word}s?(?:_?\d+)?") for word in TEXT_KEYS}
 _SUFFIX = re.compile(r"\.(?:bvh|npz|npy|pkl|fbx|c3d|glb|txt|json|csv|mp4|wav)$", re.IGNORECASE)
-NEEDED = (
-    f"a column for the clip ({', '.join((*ID_KEYS, *FILE_KEYS))}) and one for the caption "
-    f"({', '.join(TEXT_KEYS)})"
-)
-
-
-Times = tuple[float, float | None]
-"""Start and end of a caption in seconds; end None is the clip's."""
+_NUMBER = r"\s*(?:nan|[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|[-+]?\.\d+)\s*"
+_HUMANML = re.compile(rf"[^#].*#.*#{_NUMBER}#{_NUMBER}")
+_DELIMITERS = {",": "a ','", "\t": "a tab", ";": "a ';'"}
+_RECORD = '{"id": "walk-001", "captions": ["a person walks"]}'
 
 
 @dataclass(frozen=True)
@@ -62,12 +55,21 @@ class CaptionRow:
     left_out: bool
     """The clip is in a split that is not wanted."""
     fps: float | None
-    record: Record
-    """What it was made of; knows where it stands."""
+    where: str
+    """`FILE:LINE`, or the file and which of its records."""
 
-    def names(self) -> tuple[str, ...]:
-        """What the clip is called, without suffix; the file first."""
-        return tuple(dict.fromkeys(bare(name) for name in (self.file, self.id) if name))
+
+class _Given(Config):
+    """What a record says beside its captions."""
+
+    model_config = ConfigDict(extra="ignore", coerce_numbers_to_str=True)
+
+    id: str | None = Field(None, validation_alias=AliasChoices(*ID_KEYS))
+    file: str | None = Field(None, validation_alias=AliasChoices(*FILE_KEYS))
+    split: str | None = None
+    fps: FiniteFloat | None = Field(None, gt=0)
+    start: FiniteFloat = Field(0.0, ge=0)
+    end: FiniteFloat | None = None
 
 
 def bare(name: str) -> str:
@@ -76,142 +78,80 @@ def bare(name: str) -> str:
     return name[: -len(end[0])] if (end := _SUFFIX.search(name)) else name
 
 
-def is_record(values: dict[str, object]) -> bool:
-    """Whether the keys name a clip and its captions."""
-    return any(key in values for key in (*ID_KEYS, *FILE_KEYS)) and bool(_text_keys(values))
+def read_captions(path: Path, splits: SplitNames | None = None) -> dict[str, CaptionRow]:
+    """The rows of a file or folder by clip id; `UserError` names file and line of anything malformed.
+
+    `splits` says what other names of splits mean.
+    """
+    names, rows, files = splits or SplitNames(), dict[str, CaptionRow](), dict[str, str]()
+    for where, values in _records(path):
+        row, is_list = _row(where, values, names)
+        before = rows.get(row.id)
+        if row.file and files.setdefault(row.file, row.id) != row.id:
+            raise UserError(f"{where}: file '{row.file}' has a record already ('{files[row.file]}')")
+        if before is not None and is_list:
+            raise UserError(f"{where}: clip id '{row.id}' has a record already ({before.where})")
+        rows[row.id] = row if before is None else _joined(before, row)
+    if not rows:
+        raise UserError(f"{path}: no captions in it")
+    names.require_known()
+    return rows
 
 
-def _text_keys(values: Iterable[str]) -> tuple[str, ...]:
-    """The keys that hold captions: of the first word that any key has."""
-    return _captions_among(tuple(values))
+def _row(where: str, values: dict[str, object], splits: SplitNames) -> tuple[CaptionRow, bool]:
+    """The row of a record, and whether it holds all captions of its clip (a list) and not one of them."""
+    keys = _text_keys(tuple(values))
+    values = {key: value for key, value in values.items() if value is not None and str(value).strip()}
+    about = _Given.parse(values, where)
+    name = about.id or about.file
+    if name is None or not keys:
+        lacks = "name its clip (id, name or file)" if name is None else "hold a caption or captions"
+        raise UserError(f"{where}: the record does not {lacks}; expected the likes of {_RECORD}")
+    clip_id = bare(name)
+    if about.id is None and re.match(r"/|[A-Za-z]:/", clip_id):  # only its own machine knows such a path
+        clip_id = clip_id.rsplit("/", 1)[-1]
+    check_id(clip_id, where)
+    is_list = any(isinstance(values.get(key), list) for key in keys)
+    given = {"source": SOURCE} if is_list else {"source": SOURCE, "start": about.start, "end": about.end}
+    texts = [text for key in keys for text in _captions(f"{where}: '{key}'", values.get(key), given)]
+    choice = splits.of(about.split, lambda: where) if about.split else None
+    stated = None if choice == "drop" else choice
+    file = about.file and about.file.strip().replace("\\", "/").removeprefix("./")
+    row = CaptionRow(clip_id, tuple(texts), file, stated, choice == "drop", about.fps, where)
+    return row, is_list
+
+
+def _captions(where: str, value: object, given: dict[str, object]) -> Iterator[Caption]:
+    """The captions under one key that hold words; `given` is what the record says of all."""
+    for item in value if isinstance(value, list) else [] if value is None else [value]:
+        if isinstance(item, Caption):  # read by its grammar already
+            yield item
+            continue
+        caption = Caption.parse(given | (item if isinstance(item, dict) else {"text": item}), where)
+        if not 0 <= caption.start < (float("inf") if caption.end is None else caption.end):
+            raise UserError(f"{where}: the caption ends at {caption.end} s and starts at {caption.start:g} s")
+        words = " ".join(caption.text.split())
+        if any("\ud800" <= letter <= "\udfff" for letter in words):
+            raise UserError(f"{where} holds half a character (\\ud800 to \\udfff)")
+        if words:
+            yield caption.model_copy(update={"text": words})
 
 
 @lru_cache(maxsize=64)
-def _captions_among(values: tuple[str, ...]) -> tuple[str, ...]:
-    for pattern in _TEXT.values():
-        if keys := tuple(key for key in values if pattern.fullmatch(key)):
-            return keys
-    return ()
+def _text_keys(keys: tuple[str, ...]) -> tuple[str, ...]:
+    """The keys that hold captions: of the first word that any key has."""
+    found = (tuple(key for key in keys if pattern.fullmatch(key)) for pattern in _TEXT.values())
+    return next((keys for keys in found if keys), ())
 
 
-def row_of(record: Record, splits: SplitNames) -> tuple[CaptionRow, bool]:
-    """The row of a record, and whether it holds all captions of its clip (a list) and not one of them."""
-    values = record.values
-    given, file = _name(record, ID_KEYS), _name(record, FILE_KEYS)
-    keys = _text_keys(values)
-    if given is None and file is None:
-        raise record.wrong("the record does not name its clip ('id', 'name' or 'file')")
-    if not keys:
-        raise record.wrong("the record has no 'caption' and no 'captions'")
-    clip_id = bare(given) if given is not None else _id_of(file or "")
-    try:
-        check_id(clip_id, "")
-    except UserError as error:
-        raise record.wrong(str(error).removeprefix(": ")) from None
-    is_list = any(isinstance(values[key], list) for key in keys)
-    times = (0.0, None) if is_list else _times(record, values)
-    texts = tuple(text for key in keys for text in _captions(record, key, times))
-    split = values.get("split")
-    if split is not None and not isinstance(split, str):
-        raise record.wrong(f"'split' is {kind_of(split)}, not a text")
-    choice = splits.of(split, lambda: record.where) if split and split.strip() else None
-    fps = _number(record, values, "fps")
-    stated = None if choice == "drop" else choice
-    return CaptionRow(clip_id, texts, file, stated, choice == "drop", fps, record), is_list
-
-
-def _id_of(file: str) -> str:
-    """The id of a clip that only its file names: the path without suffix, or an absolute path's last name."""
-    name = bare(file)
-    return name.rsplit("/", 1)[-1] if name.startswith("/") or re.match(r"[A-Za-z]:/", name) else name
-
-
-def _name(record: Record, keys: tuple[str, ...]) -> str | None:
-    for key in keys:
-        value = record.values.get(key)
-        if isinstance(value, int) and not isinstance(value, bool):
-            value = str(value)
-        if value is None:
-            continue
-        if not isinstance(value, str) or not value.strip():
-            shown = "empty" if value == "" or isinstance(value, str) else kind_of(value)
-            raise record.wrong(f"'{key}' is {shown}, not the name of a clip")
-        return value.strip().replace("\\", "/").removeprefix("./")
-    return None
-
-
-def _captions(record: Record, key: str, times: Times) -> list[Caption]:
-    """The captions that hold words under one key; `times` are those of a bare text."""
-    value = record.values[key]
-    made = []
-    for item in value if isinstance(value, list) else [] if value is None else [value]:
-        if isinstance(item, Caption):  # read by its grammar already, and clean
-            made.append(item)
-            continue
-        if isinstance(item, str):
-            given: dict[str, object] = {"text": item, "start": times[0], "end": times[1], "source": SOURCE}
-        elif isinstance(item, dict):
-            given = _caption_object(record, key, item)
-        else:
-            raise record.wrong(f"'{key}' holds {kind_of(item)} where a text belongs")
-        words = " ".join(str(given["text"]).split())
-        try:
-            words.encode("utf-8")
-        except UnicodeEncodeError:
-            raise record.wrong(f"'{key}' holds half a character (\\ud800 to \\udfff)") from None
-        if words:
-            made.append(Caption(**given | {"text": words}))
-    return made
-
-
-def _caption_object(record: Record, key: str, item: dict[str, object]) -> dict[str, object]:
-    known = ("text", "caption", "start", "end", "source", "tokens")
-    extra = sorted(set(item) - set(known))
-    text = item.get("text", item.get("caption"))
-    if extra:
-        raise record.wrong(f"a caption has the unknown key '{extra[0]}' (known: {', '.join(known)})")
-    if not isinstance(text, str):
-        raise record.wrong("a caption has no 'text'")
-    tokens, source = item.get("tokens"), item.get("source", SOURCE)
-    if not (tokens is None or (isinstance(tokens, list) and all(isinstance(token, str) for token in tokens))):
-        raise record.wrong("'tokens' is not a list of texts")
-    if not isinstance(source, str):
-        raise record.wrong(f"'source' is {kind_of(source)}, not a text")
-    start, end = _times(record, item)
-    return {"text": text, "start": start, "end": end, "source": source, "tokens": tokens}
-
-
-def _times(record: Record, values: dict[str, object]) -> Times:
-    start = _number(record, values, "start") or 0.0
-    end = _number(record, values, "end")
-    if start < 0 or (end is not None and end <= start):
-        raise record.wrong(f"the caption ends at {end} s and starts at {start:g} s")
-    return start, end
-
-
-def _number(record: Record, values: dict[str, object], key: str) -> float | None:
-    value = values.get(key)
-    if value is None or (isinstance(value, str) and not value.strip()):
-        return None
-    try:
-        number = (
-            float(value) if isinstance(value, (str, int, float)) and not isinstance(value, bool) else math.nan
-        )
-    except (ValueError, OverflowError):
-        number = math.nan
-    if not math.isfinite(number):
-        shown = f"'{value[:20]}'" if isinstance(value, str) else kind_of(value)
-        raise record.wrong(f"'{key}' is {shown}, not a number")
-    return number
-
-
-def joined(before: CaptionRow, row: CaptionRow, record: Record) -> CaptionRow:
+def _joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
     """One row of two records that hold a caption each of the same clip."""
     for what in ("file", "split", "fps"):
         old, new = getattr(before, what), getattr(row, what)
         if old is not None and new is not None and old != new:
-            there = before.record.where
-            raise record.wrong(f"{what} of clip '{row.id}' is '{new}' here and '{old}' at {there}")
+            raise UserError(
+                f"{row.where}: {what} of clip '{row.id}' is '{new}' here and '{old}' at {before.where}"
+            )
     return replace(
         before,
         texts=before.texts + tuple(text for text in row.texts if text not in before.texts),
@@ -222,43 +162,117 @@ def joined(before: CaptionRow, row: CaptionRow, record: Record) -> CaptionRow:
     )
 
 
-def read_captions(path: Path, splits: SplitNames | None = None) -> dict[str, CaptionRow]:
-    """The rows of a file or folder by clip id; `UserError` names file, line and column of anything malformed.
-
-    `splits` says what other names of splits mean.
-    """
-    if not path.exists():
-        raise UserError(f"{path}: cannot read the captions (no such file or folder)")
-    names, rows, files = splits or SplitNames(), dict[str, CaptionRow](), dict[str, str]()
-    lists: set[str] = set()
-    for record in _records(path):
-        row, is_list = row_of(record, names)
-        before = rows.get(row.id)
-        if row.file and files.setdefault(row.file, row.id) != row.id:
-            raise record.wrong(f"file '{row.file}' has a record already ('{files[row.file]}')")
-        if before is None:
-            rows[row.id] = row
-        elif is_list or row.id in lists:
-            there = before.record.where
-            what = f"clip id '{row.id}' has a line already ({there}); keep all its captions in one record"
-            raise record.wrong(what)
-        else:
-            rows[row.id] = joined(before, row, record)
-        if is_list:
-            lists.add(row.id)
-    if not rows:
-        raise UserError(f"{path}: no captions in it")
-    names.require_known()
-    return rows
-
-
-def _records(path: Path) -> Iterator[Record]:
+def _records(path: Path) -> Iterator[tuple[str, dict[str, object]]]:
+    """(place, values) of every record of a file or folder."""
     if path.is_dir():
-        return folder_records(path)
-    text = read_text(path)
+        return _of_folder(path)
+    text = read_text_file(path)
     start = text.lstrip()[:1]
-    if not start:
-        return iter(())
-    if start in "[{" or path.suffix.lower() in (".jsonl", ".ndjson", ".json"):
-        return json_records(path, text, is_record)
-    return table_records(path, text, lambda header: is_record(dict.fromkeys(header)), NEEDED)
+    if start == "[" or (start and path.suffix.lower() == ".json" and start != "{"):
+        return _of_list(path, text)
+    return _of_lines(path, text) if start in ("{", "") else _of_table(path, text)
+
+
+def _of_list(path: Path, text: str) -> Iterator[tuple[str, dict[str, object]]]:
+    values = _decode(str(path), text)
+    for number, value in enumerate(values if isinstance(values, list) else [values], start=1):
+        yield _record(f"{path}: record {number}", value)
+
+
+def _of_lines(path: Path, text: str) -> Iterator[tuple[str, dict[str, object]]]:
+    for number, line in enumerate(text.split("\n"), start=1):
+        if line.strip():
+            yield _record(f"{path}:{number}", _decode(f"{path}:{number}", line))
+
+
+def _record(where: str, value: object) -> tuple[str, dict[str, object]]:
+    if not isinstance(value, dict):
+        raise UserError(f"{where}: no record; expected the likes of {_RECORD}")
+    return where, value
+
+
+def _decode(where: str, text: str) -> object:
+    try:
+        return json.loads(text, object_pairs_hook=_without_repeats)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{where}: not valid JSON ({error or 'too deep'})") from None
+
+
+def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key appears twice")
+    return found
+
+
+def _of_folder(folder: Path) -> Iterator[tuple[str, dict[str, object]]]:
+    """A record for each file, named by its path without `.txt`.
+
+    The folder is in HumanML3D's grammar when the first line of any file is: then all lines must be.
+    """
+    paths = sorted(p for p in folder.rglob("*.txt") if p.is_file() and not p.name.startswith("."))
+    if not paths:
+        raise UserError(f"{folder}: no .txt file in it; expected one caption a line in FOLDER/CLIP.txt")
+    texts = {path: read_text_file(path).split("\n") for path in paths}
+    firsts = (next((line for line in lines if line.strip()), "") for lines in texts.values())
+    humanml = any(_HUMANML.fullmatch(line) for line in firsts)
+    for path, lines in texts.items():
+        name = path.relative_to(folder).as_posix().removesuffix(".txt")
+        made = _humanml(path, lines) if humanml else [line for line in lines if line.strip()]
+        yield f"{path}:1", {"id": name, "captions": made}
+
+
+def _humanml(path: Path, lines: Iterable[str]) -> list[Caption]:
+    made = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            try:
+                made.append(parse_caption(line, seconds=None, source=SOURCE))
+            except UserError as error:
+                raise UserError(f"{path}:{number}: {error}; expected caption#tokens#start#end") from None
+    return made
+
+
+def _of_table(path: Path, text: str) -> Iterator[tuple[str, dict[str, object]]]:
+    """The rows by the names of the header, in lower case."""
+    lines = text.split("\n")
+    first = next(number for number, line in enumerate(lines) if line.strip())
+    delimiter, names = _header(path, lines[first], first + 1)
+    # The reader wants the newlines back: those inside quotes belong to the caption.
+    reader = csv.reader((f"{line}\n" for line in lines[first + 1 :]), delimiter=delimiter, strict=True)
+    while True:
+        place = f"{path}:{first + 2 + reader.line_num}"  # the line on which the next row starts
+        try:
+            row = next(reader)
+        except StopIteration:
+            return
+        except csv.Error:
+            raise UserError(f"{place}: a quote is not closed before the next column") from None
+        if not any(field.strip() for field in row):
+            continue
+        if len(row) != len(names):
+            raise UserError(
+                f"{place}: {len(row)} columns, but the first line names {len(names)} ({', '.join(names)}); "
+                f"put a caption that holds {_DELIMITERS[delimiter]} in quotes"
+            )
+        yield place, dict(zip(names, row, strict=True))
+
+
+def _header(path: Path, line: str, number: int) -> tuple[str, list[str]]:
+    usual = "\t" if path.suffix.lower() in (".tsv", ".tab") else ","
+    for delimiter in dict.fromkeys((usual, *_DELIMITERS)):
+        try:
+            fields = next(csv.reader([line], delimiter=delimiter))
+        except csv.Error:
+            continue
+        names = [re.sub(r"[\s-]+", "_", field.strip().lower()) for field in fields]
+        if _text_keys(tuple(names)) and set(names) & {*ID_KEYS, *FILE_KEYS}:
+            twice = next((name for name in names if name and names.count(name) > 1), None)
+            if twice is not None:
+                raise UserError(f"{path}:{number}: a second column '{twice}'")
+            return delimiter, names
+    raise UserError(
+        f"{path}:{number}: the first line must name a column for the clip "
+        f"({', '.join((*ID_KEYS, *FILE_KEYS))}) and one for the caption ({', '.join(TEXT_KEYS)}), but is "
+        f"'{line.strip()[:60]}'"
+    )

@@ -23,7 +23,7 @@ def read_text_file(path: Path, name: str | None = None) -> str:
     """The text of a UTF-8 file, with or without a byte order mark; every line ends in a plain newline.
 
     `name` stands for the path in errors that go into a manifest. `UserError` when the file cannot be read, is
-    far too long, or is not UTF-8; the last names the byte, counted from 0 at the start of the file.
+    far too long, no text at all, or is not UTF-8; the last names line and byte, counted from 0.
     """
     name = str(path) if name is None else name
     try:
@@ -33,13 +33,16 @@ def read_text_file(path: Path, name: str | None = None) -> str:
         raise UserError(f"{name}: cannot read ({error.strerror})") from None
     if len(raw) > MAX_TEXT_BYTES:
         raise UserError(f"{name}: more than {MAX_TEXT_BYTES} bytes; is it a text file?")
+    if b"\0" in raw or raw.startswith(b"PK\x03\x04"):
+        raise UserError(f"{name}: not a text file in UTF-8; save it as text, CSV or JSON in UTF-8")
     body = raw.removeprefix(_BOM)
     try:
         text = body.decode("utf-8")
     except UnicodeDecodeError as error:
         at = error.start + len(raw) - len(body)
+        line = raw[:at].count(b"\n") + 1
         raise UserError(
-            f"{name}: not UTF-8 text at byte {at} (0x{raw[at]:02x}); save the file as UTF-8"
+            f"{name}:{line}: not UTF-8 text at byte {at} (0x{raw[at]:02x}); save the file as UTF-8"
         ) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 

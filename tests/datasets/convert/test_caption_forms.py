@@ -1,4 +1,4 @@
-"""Captions as people have them: six forms that give the same data set, and errors that name the place."""
+"""Captions as people have them: five forms that give the same data set, and errors that name the place."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bvh_clips import write_clip, write_map
 from rich.console import Console
 
 from motionloom.datasets.convert.bvh.plan import BvhConfig
-from motionloom.datasets.convert.captions.options import match, nearest
+from motionloom.datasets.convert.captions.options import list_clips, nearest
 from motionloom.datasets.convert.captions.read import read_captions
 from motionloom.datasets.convert.common.splits import SplitNames, hash_split, read_split_files
 from motionloom.datasets.convert.registry import prepare
@@ -58,13 +58,6 @@ def json_list(path: Path, rows: Rows) -> Path:
     return path
 
 
-def json_object(path: Path, rows: Rows) -> Path:
-    path = path.with_suffix(".json")
-    given = {f"{name}.bvh": texts[0] if len(texts) == 1 else texts for name, texts in rows.items()}
-    path.write_text("\ufeff" + json.dumps(given, ensure_ascii=False), encoding="utf-8")
-    return path
-
-
 def table(path: Path, rows: Rows, delimiter: str) -> Path:
     path = path.with_suffix(".tsv" if delimiter == "\t" else ".csv")
     out = io.StringIO()
@@ -93,7 +86,6 @@ FORMS: dict[str, Callable[[Path, Rows], Path]] = {
     "lines of captions": lambda path, rows: lines(path, rows, "captions"),
     "lines of one caption": lambda path, rows: lines(path, rows, "caption"),
     "JSON list": json_list,
-    "JSON object": json_object,
     "CSV": lambda path, rows: table(path, rows, ","),
     "CSV with semicolons": lambda path, rows: table(path, rows, ";"),
     "TSV": lambda path, rows: table(path, rows, "\t"),
@@ -146,32 +138,31 @@ def test_every_form_gives_the_same_data_set(
 LINE = '{"id": "a", "captions": ["x"]}'
 BROKEN = [  # (file, content, where and what)
     ("c.jsonl", LINE + '\n{"id": "b" "caption": "x"}', ":2: not valid JSON"),
-    ("c.jsonl", LINE + "\n" + LINE + LINE, ":2: not valid JSON (extra data)"),
-    ("c.jsonl", LINE + '\n{"id": "b", "captions": 5}', ":2: 'captions' holds a number"),
+    ("c.jsonl", LINE + "\n" + LINE + LINE, ":2: not valid JSON (Extra data"),
+    ("c.jsonl", LINE + '\n{"id": "b", "captions": 5}', ":2: 'captions': key 'text'"),
     ("c.jsonl", '\n{"id": null, "caption": "x"}', ":2: the record does not name its clip"),
-    ("c.jsonl", LINE + '\n{"id": "b"}', ":2: the record has no 'caption' and no 'captions'"),
-    ("c.jsonl", '["a", "x"]', ": record 1: a text where a record belongs"),
-    ("c.jsonl", '{"id": "a", "captions": [{"text": "x", "begin": 1}]}', ":1: a caption has the unknown key"),
-    ("c.jsonl", '{"id": "a", "caption": "x", "start": 3, "end": 2}', ":1: the caption ends at 2"),
-    ("c.jsonl", '{"id": "a", "caption": "\\ud800"}', ":1: 'caption' holds half a character"),
-    ("c.json", '[{"id": "a", "caption": "x"},\n {"id": 1.5, "caption": "x"}]', ": record 2: 'id' is"),
-    ("c.json", '[\n{"id": "a", "caption": "x"}\n{"id": "b"}]', ":3: not valid JSON"),
-    ("c.json", '{"a": ["x"],\n "b": ["y" 3]}', ":2: not valid JSON"),
-    ("c.json", '{"a": ["x"],\n "b": true}', ": 'b': 'captions' holds true or false"),
-    ("c.json", '{"a": ["x"], "b": ["y"], "a": "z"}', ": 'a' appears twice"),
-    ("c.json", '"a"', ": neither a list nor an object"),
+    ("c.jsonl", LINE + '\n{"id": "b"}', ":2: the record does not hold a caption"),
+    ("c.jsonl", '["a", "x"]', ": record 1: no record"),
+    ("c.jsonl", '{"id": "a", "captions": [{"text": "x", "begin": 1}]}', ":1: 'captions': unknown key"),
+    ("c.jsonl", '{"id": "a", "caption": "x", "start": 3, "end": 2}', ":1: 'caption': the caption ends at 2"),
+    ("c.jsonl", '{"id": "a", "caption": "\\ud800"}', ":1: 'caption' holds half"),
+    ("c.json", '[{"id": "a", "caption": "x"},\n {"id": {}, "caption": "x"}]', ": record 2: key 'id'"),
+    ("c.json", '[\n{"id": "a", "caption": "x"}\n{"id": "b"}]', ": not valid JSON"),
+    ("c.json", '{"id": "a", "caption": "y", "id": "z"}', ":1: not valid JSON (a key appears twice)"),
+    ("c.json", '"a"', ": record 1: no record"),
     ("c.csv", "name,words\na,x", ":1: the first line must name a column for the clip"),
-    ("c.csv", "name,caption\na,he walks, then sits", ":2: 3 columns, but the first line names 2"),
+    ("c.csv", "name,caption\na,he walks, then sits", ":2: 3 columns, but the first line names 2 (name"),
     ("c.csv", 'name,caption\na,"x\n\ny"\nb', ":5: 1 columns, but the first line names 2"),
     ("c.csv", 'name,caption\na,x\nb,"he walks\nc,z\n', ":3: a quote is not closed"),
-    ("c.csv", "name,caption,start\na,x,0\nb,x,soon", ":3: 'start' is 'soon', not a number"),
-    ("c.csv", "name,caption\n ,x", ":2: 'name' is empty"),
+    ("c.csv", "name,caption,start\na,x,0\nb,x,soon", ":3: key 'start' = 'soon'"),
+    ("c.csv", "name,caption,start\na,x,1e999", ":2: key 'start'"),
+    ("c.csv", "name,caption\n ,x", ":2: the record does not name its clip"),
     ("c.csv", "name,caption,caption\na,x,y", ":1: a second column 'caption'"),
     ("c.tsv", "name\tcaption\na\tx\n../b\ty", ":3: clip id '../b' is not a plain relative name"),
     ("c/a.txt", "walks#a/DET#0.0#0.0\njumps#a/DET#0.0", ":2: 3 of the 4 fields"),
     ("c/a.txt", "walks#a/DET#0.0#0.0\njumps#a/DET#one#2.0", ":2: start 'one' is not a number"),
-    ("c.jsonl", "é walks\r\nà l".encode() + b"\xe9ger", ":2: byte 0xe9 is not UTF-8"),
-    ("c.csv", "a".encode("utf-16"), ": UTF-16 text"),
+    ("c.jsonl", "é walks\r\nà l".encode() + b"\xe9ger", ":2: not UTF-8 text at byte"),
+    ("c.csv", "a".encode("utf-16"), ": not a text file"),
     ("c/a.txt", b"PK\x03\x04sheet", ": not a text file"),
 ]  # fmt: skip
 
@@ -187,16 +178,14 @@ def test_a_broken_line_is_named(name: str, content: str | bytes, place: str, tmp
 
 
 def test_nothing_to_read(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no such file or folder"):
+    with pytest.raises(UserError, match="cannot read"):
         read_captions(tmp_path / "none.csv")
     with pytest.raises(UserError, match=r"no \.txt file in it; expected one caption a line"):
         read_captions(tmp_path)
-    for name, text in (("c.csv", " \n"), ("c.json", "[ ]"), ("d.json", "{\n}"), ("c.jsonl", "")):
+    for name, text in (("c.csv", " \n"), ("c.json", "[ ]"), ("c.jsonl", "")):
         (tmp_path / name).write_text(text)
         with pytest.raises(UserError, match="no captions in it"):
             read_captions(tmp_path / name)
-    with pytest.raises(UserError, match=r"it holds c\.csv, c\.json, c\.jsonl; name the file itself"):
-        read_captions(tmp_path)
 
 
 def test_captions_with_times_other_keys_and_several_columns(tmp_path: Path) -> None:
@@ -227,15 +216,32 @@ def test_captions_with_times_other_keys_and_several_columns(tmp_path: Path) -> N
 def test_names_of_clips_find_their_files(tmp_path: Path) -> None:
     def found(names: list[str], paths: list[str]) -> dict[str, str]:
         rows = read_captions(lines(tmp_path / "c", {name: ["x"] for name in names}, "captions"))
-        return {path: row.id for path, row in match(rows, paths).rows.items()}
+        listing = list_clips(paths, rows.values(), None, [])
+        return {path: row.id for path, row in listing.rows.items()}
 
     assert found(["a"], ["x/a.bvh"]) == {"x/a.bvh": "a"}
     assert found(["mocap/x/a"], ["x/a.bvh", "y/a.bvh"]) == {"x/a.bvh": "mocap/x/a"}
-    assert found(["x/a", "a"], ["x/a.bvh", "y/a.bvh"]) == {"x/a.bvh": "x/a", "y/a.bvh": "a"}
-    assert found(["raw/a.BVH"], ["clean/a.bvh", "clean/b.bvh"]) == {"clean/a.bvh": "raw/a"}
-    assert found(["raw/a"], ["clean/a.bvh", "other/a.bvh"]) == {}
-    assert found(["raw/a", "cut/a"], ["clean/a.bvh"]) == {}
+    assert found(["raw/a"], ["clean/a.bvh"]) == {}, "another folder is another clip"
     assert found(["take.001"], ["take.001.bvh"]) == {"take.001.bvh": "take.001"}
+    for names, said in ((["a"], "'a' may mean x/a.bvh or y/a.bvh"), (["x/a", "q/x/a"], "both mean x/a.bvh")):
+        with pytest.raises(UserError, match=said):
+            found(names, ["x/a.bvh", "y/a.bvh"])
+
+
+def test_split_files_name_clips_as_captions_do(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "train.txt").write_text("walk_a.bvh\nturn\n")
+    (tmp_path / "val.txt").write_text("jump\n")
+    made = plan(source, None, splits=tmp_path)
+    assert {clip.id: split for split, clip in made.items} == {
+        "walk_a": "train",
+        "sub/turn": "train",
+        "jump": "val",
+    }
+    (tmp_path / "val.txt").write_text("jump\nsub/turn\nhop\n")
+    with pytest.raises(
+        UserError, match=r"'sub/turn' in val\.txt means sub/turn\.bvh, which is in train\.txt too"
+    ):
+        plan(source, None, splits=tmp_path)
 
 
 def test_nearest_names_among_few_and_among_many() -> None:

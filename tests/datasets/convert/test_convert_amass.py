@@ -259,7 +259,7 @@ def test_captions_splits_and_missing_clips(amass: ModuleType, tmp_path: Path) ->
     assert [caption.text for caption in texts] == ["walks to the left"]
     assert amass.meta_of(tmp_path / "out", "KIT/3/b_poses")[0].split == "val"
     assert amass.reasons(manifest) == {
-        "KIT/3/gone_poses.npz": "clip 'gone' is listed, but not here",
+        "KIT/3/gone_poses.npz": "clip 'gone' is listed, but its file is not in the source",
         "KIT/3/c_poses.npz": "no captions",
     }
     (tmp_path / "splits").mkdir()
