@@ -24,7 +24,7 @@ from torch import Tensor
 from motionloom.models.gpt.losses import group_counts, soft_codes
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate
-from motionloom.models.gpt.tokens import deinterleave
+from motionloom.models.gpt.tokens import as_codes
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.contract.lookup import finished_stages
@@ -74,7 +74,8 @@ def measure(run: Path, stage: str, size: int, count: int) -> dict[tuple[str, flo
         tokens, kinds, text = batch["tokens"], batch["kinds"], batch["text"]
         groups = group_counts(tokens, kinds, gpt.ends, len(gpt.pattern))
         logits = gpt(tokens, kinds, text, known=batch.get("known"))
-        truth = deinterleave(tokens, gpt.pattern, ends=gpt.num_codes).codes
+        rows = tokens[:, : int(groups.max()) * len(gpt.pattern)].unflatten(1, (-1, len(gpt.pattern)))
+        truth = as_codes(rows, gpt.pattern, groups).codes
         own = generate(gpt, text, groups=groups, seed=k).codes
         sizes = gpt.num_codes
         weights: dict[str, dict[str, Tensor]] = {

@@ -16,8 +16,8 @@ from collections.abc import Callable
 import torch
 from vector_quantize_pytorch import VectorQuantize
 
-from motionloom.models.quantize.base import nearest
-from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, cluster_sums
+from motionloom.models.quantize.base import QuantizerConfig, nearest
+from motionloom.models.quantize.ema import EmaQuantizer, cluster_sums
 
 
 def interleaved_medians(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:

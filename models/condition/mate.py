@@ -89,7 +89,7 @@ class Mate(nn.Module):
         self.aggregate = _token(dim)
         self.aggregate_of = nn.ParameterDict({name: _token(dim) for name in widths})
         self.dropout = random.Dropout(config.dropout)
-        self.stack = Transformer.of(config, config.layers, attention_dropout=config.attention_dropout)
+        self.stack = Transformer(config, config.layers, attention_dropout=config.attention_dropout)
 
     def forward(self, conditions: Conditions, batch: int | None = None) -> Encoded:
         """Encode the conditions of a batch; modalities that the mapping lacks count as absent in every row.

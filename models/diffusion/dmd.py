@@ -155,7 +155,7 @@ class Dmd(nn.Module):
 
     def _stack(self, layers: int) -> Transformer:
         config = self.config
-        return Transformer.of(config, layers, attention_dropout=config.attention_dropout)
+        return Transformer(config, layers, attention_dropout=config.attention_dropout)
 
 
 def dmd_loss(

@@ -28,9 +28,6 @@ class DmdModule(StageModule):
         self.noiser = net.config.schedule.noiser()
         self.tokenizer = Frozen(tokenizer)
 
-    def on_fit_start(self) -> None:
-        self.tokenizer.to(self.device)
-
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D] (the tokenizer's columns), "length" [B], "present" bool
         [B, D] (optional: all). Time steps and noise are drawn in each call.

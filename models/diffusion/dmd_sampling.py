@@ -26,6 +26,7 @@ from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.models.training.stage_module import evaluating
 
 
 @torch.no_grad()
@@ -76,19 +77,17 @@ def decode_motions(
     for row, size in enumerate(wanted):
         rows_of[size].append(row)
     out: dict[int, Tensor] = {}
-    was_training = net.training
-    net.eval()
-    try:
+    with evaluating(net):
         for size, rows in rows_of.items():
             index = torch.tensor(rows, device=codes.groups.device)
             mine = {name: values[index] for name, values in codes.codes.items()}
             gone = None if absent is None else {name: values[index] for name, values in absent.items()}
             unread = None if hidden is None else hidden[index]
             windows = _Windows(net, mine, gone, unread, size, window, overlap)
-            made = _denoise(net, windows, size, [seeds[row] for row in rows], sampler, steps)
+            noise = [torch.Generator().manual_seed(seeds[row]) for row in rows]
+            x = torch.stack([torch.randn(size, net.motion_dim, generator=g) for g in noise]).to(index.device)
+            made = net.config.schedule.denoise(windows.denoise, x, noise, sampler, steps)
             out.update(zip(rows, made, strict=True))
-    finally:
-        net.train(was_training)
     return [out[row] for row in range(count)]
 
 
@@ -173,34 +172,11 @@ class _Windows:
         return out[:, : self.frames]
 
 
-def _denoise(
-    net: Dmd, windows: _Windows, frames: int, seeds: Sequence[int], sampler: Sampler, steps: int
-) -> Tensor:
-    """Motions [n, T, D] from noise."""
-    noise = [torch.Generator().manual_seed(seed) for seed in seeds]
-    x = torch.stack([torch.randn(frames, net.motion_dim, generator=g) for g in noise])
-    return _denoised(net, windows, x, noise, sampler, steps)
-
-
-def _denoised(
-    net: Dmd, windows: _Windows, x: Tensor, noise: list[torch.Generator], sampler: Sampler, steps: int
-) -> Tensor:
-    """Motions [n, T, D] from noise x [n, T, D]; `noise` is what steps draw from that draw."""
-    x = x.to(windows.condition.device)
-    scheduler = net.config.schedule.sampler(sampler, steps)
-    x = x * scheduler.init_noise_sigma
-    extra = {} if sampler == "dpm++" else {"generator": noise}
-    for step in scheduler.timesteps:
-        found = windows.denoise(scheduler.scale_model_input(x, step), step)
-        stepped: Tensor = scheduler.step(found.to(x.dtype), step, x, **extra).prev_sample
-        x = stepped
-    return x
-
-
 @torch.no_grad()
 def decode_window(
     net: Dmd, codes: Mapping[str, Tensor], x: Tensor, *, seed: int, sampler: Sampler, steps: int
 ) -> Tensor:
     """One window [T, D] of tokens [1, G * per], denoised from x [T, D] as it is; `net` in evaluation mode."""
     windows = _Windows(net, codes, None, None, len(x), len(x), 0)
-    return _denoised(net, windows, x[None], [torch.Generator().manual_seed(seed)], sampler, steps)[0]
+    noise, x = [torch.Generator().manual_seed(seed)], x[None].to(windows.condition.device)
+    return net.config.schedule.denoise(windows.denoise, x, noise, sampler, steps)[0]

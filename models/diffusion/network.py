@@ -45,7 +45,7 @@ class MotionDiffusion(nn.Module):
         self.time = nn.Sequential(
             nn.Linear(config.dim, config.dim), nn.SiLU(), nn.Linear(config.dim, config.dim)
         )
-        self.stack = Transformer.of(config, config.layers, norm=config.norm)
+        self.stack = Transformer(config, config.layers, norm=config.norm)
         self.leave = nn.Linear(config.dim, motion_dim)
 
     def forward(self, noisy: Tensor, step: Tensor, text: Tensor, mask: Tensor, conditioned: Tensor) -> Tensor:

@@ -58,19 +58,15 @@ def _denoise(
     count, device = len(text), text.device
     noise = [torch.Generator().manual_seed(seed) for seed in seeds]
     x = torch.stack([torch.randn(frames, net.motion_dim, generator=g) for g in noise]).to(device)
-    scheduler = net.config.schedule.sampler(sampler, steps)
-    x = x * scheduler.init_noise_sigma
     guided = guidance != 1.0
     conditioned = torch.ones(count * (1 + guided), dtype=torch.bool, device=device)
     conditioned[count:] = False
     text = text.repeat(1 + guided, 1)
     mask = torch.ones(len(conditioned), frames, dtype=torch.bool, device=device)
-    extra = {} if sampler == "dpm++" else {"generator": noise}
-    for step in scheduler.timesteps:
-        given = scheduler.scale_model_input(x, step).repeat(1 + guided, 1, 1)
-        found = net(given, step.to(device).expand(len(conditioned)), text, mask, conditioned)
-        if guided:
-            found = found[count:] + guidance * (found[:count] - found[count:])
-        stepped: Tensor = scheduler.step(found, step, x, **extra).prev_sample
-        x = stepped
-    return x
+
+    def predict(given: Tensor, step: Tensor) -> Tensor:
+        given, steps = given.repeat(1 + guided, 1, 1), step.to(device).expand(len(conditioned))
+        found: Tensor = net(given, steps, text, mask, conditioned)
+        return found[count:] + guidance * (found[:count] - found[count:]) if guided else found
+
+    return net.config.schedule.denoise(predict, x, noise, sampler, steps)

@@ -6,8 +6,10 @@ starts without it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, Protocol
 
+import torch
 from pydantic import Field
 from torch import Tensor
 
@@ -86,3 +88,24 @@ class ScheduleConfig(Config):
             )
         made.set_timesteps(steps)
         return made
+
+    def denoise(
+        self,
+        predict: Callable[[Tensor, Tensor], Tensor],
+        x: Tensor,
+        noise: list[torch.Generator],
+        kind: Sampler,
+        steps: int,
+    ) -> Tensor:
+        """Motions [n, T, D] from standard normal x [n, T, D]; steps that draw do so from `noise`.
+
+        `predict` says what the network predicts of noisy motions [n, T, D] at a time step.
+        """
+        scheduler = self.sampler(kind, steps)
+        x = x * scheduler.init_noise_sigma
+        extra = {} if kind == "dpm++" else {"generator": noise}
+        for step in scheduler.timesteps:
+            found = predict(scheduler.scale_model_input(x, step), step)
+            stepped: Tensor = scheduler.step(found.to(x.dtype), step, x, **extra).prev_sample
+            x = stepped
+        return x

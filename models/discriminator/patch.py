@@ -57,7 +57,7 @@ class PatchDiscriminator(nn.Module):
         self.motion_dim = motion_dim
         self.patches = StridedEncoder(motion_dim, config.dim, width=config.dim, depth=config.depth)
         self.condition = nn.Linear(glob_dim, config.dim)
-        self.stack = Transformer.of(config, config.layers)
+        self.stack = Transformer(config, config.layers)
         self.score = nn.Linear(config.dim, 1)
         if config.spectral_norm:
             for layer in [m for m in self.modules() if isinstance(m, nn.Linear | nn.Conv1d)]:

@@ -1,4 +1,4 @@
-"""Drawing tokens: seeds, random numbers and filters that every sampler of token networks shares.
+"""Drawing tokens: seeds, random numbers, filters and the loop that all samplers of token networks share.
 
 Every sample owns a counter-based random stream (Philox) keyed by its own seed, and the draw of position i is
 the i-th number of that stream. Draws invert the cumulative distribution in float64.
@@ -8,16 +8,16 @@ Legend: B batch, V vocabulary, G groups, P slots of a group.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.token_network import TokenNetwork
-from motionloom.models.gpt.tokens import Codes
 
 
 @dataclass(frozen=True)
@@ -93,15 +93,6 @@ def uniform_numbers(seeds: Sequence[int], count: int, device: torch.device) -> T
     return torch.from_numpy(np.stack(rows)).to(device)
 
 
-def as_codes(network: TokenNetwork, tokens: Tensor, groups: Tensor) -> Codes:
-    """Tokens int64 [B, N, P] of `groups` [B] groups a row as streams; 0 after a shorter row."""
-    longest = int(groups.max()) if len(groups) else 0
-    inside = torch.arange(longest, device=tokens.device)[None, :, None] < groups[:, None, None]
-    rows = torch.where(inside, tokens[:, :longest], 0)
-    codes = {name: rows[:, :, network.slots == kind].flatten(1) for kind, name in enumerate(network.names)}
-    return Codes(codes, groups)
-
-
 def draw(
     logits: Tensor, uniform: Tensor, *, temperature: float = 1.0, top_k: int | None = None, top_p: float = 1.0
 ) -> Tensor:
@@ -162,3 +153,54 @@ def requested_groups(
         span = "1 or more" if limit is None else f"1 to {limit}"
         raise UserError(f"requested lengths must be {span} groups; got {low} to {high}")
     return found
+
+
+def decode(
+    network: TokenNetwork,
+    hidden: Callable[[int, Tensor], Tensor],
+    start: Tensor,
+    before: Tensor,
+    limit: Tensor,
+    *,
+    uniform: Tensor,
+    free: bool,
+    how: Drawing,
+    scale: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Draw tokens one by one; all of them int64 [B, N * P], those of `start` included, and the numbers of new
+    groups int64 [B].
+
+    Args:
+        hidden: The network's output at a position [B, 1, D] ([2B, 1, D] under guidance), given its number and
+            the tokens int64 [B, N * P] of which those before it are known. Called with ascending numbers.
+        start: Tokens [B, M * P] of `before` [B] groups a row; the others are drawn.
+        limit: New groups at which each row must stop, int64 [B].
+        uniform: Draws float64 [B, most new tokens] in [0, 1).
+        free: Whether rows may draw End before their limit.
+        scale: Each row's guidance [B]; None without.
+    """
+    batch, size = len(limit), len(network.pattern)
+    total = int((before + limit).max()) * size if batch else 0
+    tokens = functional.pad(start, (0, max(0, total - start.shape[1])))
+    counts = torch.zeros_like(limit)
+    ended = torch.zeros_like(limit, dtype=torch.bool)
+    no = torch.zeros_like(ended)
+    for step in range(int(before.min()) * size if batch else 0, total):
+        group, slot = divmod(step, size)
+        new = group >= before
+        alive = new & (group < before + limit) & ~ended
+        if slot == 0 and not bool((alive | ~new).any()):
+            break
+        # A motion is never empty, so its first group cannot be End.
+        may_end = alive & (group > before) if free and slot == 0 else no
+        index = (step - before * size).clamp(0, uniform.shape[1] - 1)
+        own = uniform.gather(1, index[:, None])[:, 0]
+        token = next_token(
+            network, hidden(step, tokens), slot, may_end=may_end, how=how, uniform=own, scale=scale
+        )
+        if slot == 0:
+            stops = alive & (token == network.ends[network.slots[0]])
+            ended, alive = ended | stops, alive & ~stops
+            counts = counts + alive
+        tokens[:, step] = torch.where(new, torch.where(alive, token, 0), tokens[:, step])
+    return tokens, counts

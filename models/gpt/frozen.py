@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-import torch
 from torch import nn
 
 M = TypeVar("M", bound=nn.Module)
@@ -12,12 +11,9 @@ M = TypeVar("M", bound=nn.Module)
 
 class Frozen(Generic[M]):
     """Holds a module out of reach of the module that owns this: not a child, hence not in its `state_dict`,
-    its parameters or its `.train()`. The held module is in evaluation mode and asks for no gradient;
-    gradients still flow *through* it to its inputs.
+    its parameters or its `.train()`, and on the device that it was loaded to. The held module is in
+    evaluation mode and asks for no gradient; gradients still flow *through* it to its inputs.
     """
 
     def __init__(self, module: M) -> None:
         self.module = module.eval().requires_grad_(False)
-
-    def to(self, device: torch.device) -> None:
-        self.module.to(device)

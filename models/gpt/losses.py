@@ -111,6 +111,32 @@ def soft_codes(
     return out
 
 
+def soft_motion(
+    net: TokenNetwork,
+    logits: Tensor,
+    tokens: Tensor,
+    kinds: Tensor,
+    *,
+    tokenizer: Tokenizer,
+    temperature: float,
+    sample: bool,
+    present: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Motion [B, T, dim] that logits [B, L, V] of `net` predict for clips of tokens and kinds [B, L], with a
+    gradient to the logits; and its lengths int64 [B] in frames, after which it is zero.
+
+    Args:
+        tokens: The clips' own tokens, which determine the number of groups.
+        temperature: Of the softmax that the one-hots are drawn from.
+        sample: Draw from the distribution; false takes the likeliest codes.
+        present: bool [B, dim], columns of the tokenizer that the clip has (None = all).
+    """
+    groups = group_counts(tokens, kinds, net.ends, len(net.pattern))
+    weights = soft_codes(net, logits, groups, temperature=temperature, sample=sample)
+    frames = groups * tokenizer.group_frames
+    return tokenizer.decode_soft(weights, frames, present), frames
+
+
 def align_loss(
     gpt: InterleavedGPT,
     logits: Tensor,
@@ -133,9 +159,15 @@ def align_loss(
     `present` bool [B, dim]: columns of the tokenizer that the clip holds (None = all). What it does not hold
     takes no part in decoding, and TMA reads the mean there, as it did in its own training.
     """
-    groups = group_counts(tokens, kinds, gpt.ends, len(gpt.pattern))
-    weights = soft_codes(gpt, logits, groups, temperature=gumbel_temperature, sample=sample)
-    frames = groups * tokenizer.group_frames
-    motion = tokenizer.decode_soft(weights, frames, present)
+    motion, frames = soft_motion(
+        gpt,
+        logits,
+        tokens,
+        kinds,
+        tokenizer=tokenizer,
+        temperature=gumbel_temperature,
+        sample=sample,
+        present=present,
+    )
     latent, _ = tma.encode_motion(motion, frames, present)
     return info_nce(text_latent, latent, sentence, temperature=temperature, threshold=threshold)

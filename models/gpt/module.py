@@ -49,11 +49,6 @@ class GptModule(StageModule):
         _check(net, tokenizer, tma)
         self.tokenizer, self.tma = Frozen(tokenizer), Frozen(tma)
 
-    def on_fit_start(self) -> None:
-        for frozen in (self.tokenizer, self.tma):
-            if frozen is not None:
-                frozen.to(self.device)
-
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch.
 

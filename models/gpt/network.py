@@ -77,7 +77,7 @@ class InterleavedGPT(TokenNetwork):
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
         self.embeddings = self._tables(config.dim)
         self.dropout = Dropout(config.dropout)
-        self.stack = Transformer.of(config, config.layers, attention_dropout=config.attention_dropout)
+        self.stack = Transformer(config, config.layers, attention_dropout=config.attention_dropout)
         self.heads = self._outputs(config.dim)
         self._start_tables()
 

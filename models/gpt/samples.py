@@ -26,6 +26,7 @@ from motionloom.models.tma.losses import false_negatives
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.training.distributed import gather_rows, masked_mean, rank
+from motionloom.models.training.stage_module import evaluating
 
 
 class Samples(NamedTuple):
@@ -87,12 +88,8 @@ def log_likelihood(
     lacking bool [B, streams]: streams that a caption's clip does not hold; nothing judges their codes.
     """
     tokens, kinds, _ = samples.sequence
-    was_training = gpt.training
-    gpt.eval()
-    try:
+    with evaluating(gpt):
         logits = gpt(tokens, kinds, samples.text)
-    finally:
-        gpt.train(was_training)
     # A sample never is empty: End is no choice at its first token.
     empty = torch.zeros(logits.shape[1:], dtype=torch.bool, device=logits.device)
     empty[0, gpt.ends[gpt.slots[0]]] = True

@@ -17,16 +17,10 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.drawing import (
-    Drawing,
-    as_codes,
-    next_token,
-    requested_groups,
-    seeds_of,
-    uniform_numbers,
-)
+from motionloom.models.gpt.drawing import Drawing, decode, requested_groups, seeds_of, uniform_numbers
 from motionloom.models.gpt.network import InterleavedGPT
-from motionloom.models.gpt.tokens import Codes
+from motionloom.models.gpt.tokens import Codes, as_codes
+from motionloom.models.training.stage_module import evaluating
 
 
 @torch.no_grad()
@@ -72,52 +66,22 @@ def generate(
         )
     size, most = len(gpt.pattern), int(limit.max()) if batch else 0
     uniform = uniform_numbers(seeds_of(seed, batch, "texts"), most * size, device)
-    was_training = gpt.training
-    gpt.eval()
-    try:
-        tokens, counts = _decode(gpt, text, limit, uniform, groups is None, how, cfg_scale)
-    finally:
-        gpt.train(was_training)
-    return as_codes(gpt, tokens.view(batch, most, size), counts)
+    scale = torch.full((batch,), cfg_scale, device=device) if cfg_scale != 1 else None
+    cache = gpt.stack.cache(max(1, most * size))
 
+    def hidden(step: int, tokens: Tensor) -> Tensor:
+        if step:
+            x = gpt.embed(tokens[:, step - 1 : step], gpt.slots[(step - 1) % size].expand(batch, 1))
+            x = x if scale is None else torch.cat([x, x])
+        else:
+            x = gpt.embed_text(text)
+            if scale is not None:
+                x = torch.cat([x, gpt.embed_text(text, torch.ones(batch, dtype=torch.bool, device=device))])
+        return gpt.hidden(x, cache)
 
-def _decode(
-    gpt: InterleavedGPT,
-    text: Tensor,
-    limit: Tensor,
-    uniform: Tensor,
-    free: bool,
-    how: Drawing,
-    cfg_scale: float,
-) -> tuple[Tensor, Tensor]:
-    """Tokens int64 [B, G * P] and group counts int64 [B]; `limit` [B] is where each sample must stop."""
-    batch, size, device = len(text), len(gpt.pattern), text.device
-    guided = cfg_scale != 1
-    scale = torch.full((batch,), cfg_scale, device=device) if guided else None
-    x = gpt.embed_text(text)
-    if guided:
-        x = torch.cat([x, gpt.embed_text(text, torch.ones(batch, dtype=torch.bool, device=device))])
-    cache = gpt.stack.cache(max(1, uniform.shape[1]))
-    tokens = torch.zeros(uniform.shape, dtype=torch.int64, device=device)
-    counts = torch.zeros(batch, dtype=torch.int64, device=device)
-    alive = limit > 0
-    no, yes = torch.zeros_like(alive), torch.ones_like(alive)
-    for step in range(uniform.shape[1]):
-        group, slot = divmod(step, size)
-        if slot == 0:
-            alive = alive & (group < limit)
-            if not bool(alive.any()):
-                break
-        # An empty motion is never a result, so the first group cannot be End.
-        may_end = yes if free and slot == 0 and group > 0 else no
-        hidden = gpt.hidden(x, cache)
-        token = next_token(gpt, hidden, slot, may_end=may_end, how=how, uniform=uniform[:, step], scale=scale)
-        if slot == 0:
-            alive = alive & (token != gpt.ends[gpt.slots[0]])
-            counts = counts + alive
-        token = torch.where(alive, token, 0)
-        tokens[:, step] = token
-        x = gpt.embed(token[:, None], gpt.slots[slot].expand(batch, 1))
-        if guided:
-            x = torch.cat([x, x])
-    return tokens, counts
+    start, before = torch.zeros(batch, 0, dtype=torch.int64, device=device), torch.zeros_like(limit)
+    with evaluating(gpt):
+        tokens, counts = decode(
+            gpt, hidden, start, before, limit, uniform=uniform, free=groups is None, how=how, scale=scale
+        )
+    return as_codes(tokens.view(batch, most, size), gpt.pattern, counts)

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 PAD = -1
 
@@ -71,6 +72,7 @@ def interleave(
     *,
     ends: Mapping[str, int] | None = None,
     groups: Tensor | None = None,
+    closed: Tensor | None = None,
 ) -> TokenSequence:
     """Code streams, each [B, G * per_group], -> one sequence.
 
@@ -80,14 +82,14 @@ def interleave(
         ends: End token per stream (its number of codes); None leaves the sequences open, for clips that were
             cropped.
         groups: Valid groups per clip, [B] (default: all G). Codes after them are ignored.
+        closed: Bool [B], rows that get their End tokens (default: all); the others are clips that go on.
 
     Raises:
-        ValueError: Streams disagree about the number of groups, or a code is not below its stream's End.
+        ValueError: Streams disagree about the number of groups.
     """
     names = stream_names(pattern)
     kinds_row = kind_of_slot(pattern)
-    first = codes[names[0]]
-    count = first.shape[1] // kinds_row.count(0)
+    count = codes[names[0]].shape[1] // kinds_row.count(0)
     slots: list[Tensor] = []
     seen = dict.fromkeys(names, 0)
     for name in pattern:
@@ -106,50 +108,28 @@ def interleave(
     kinds = torch.tensor(kinds_row, device=device).repeat(count).expand(batch, -1)
     length = groups * len(pattern)
     valid = torch.arange(body.shape[1], device=device)[None] < length[:, None]
+    tokens, kinds = torch.where(valid, body, PAD), torch.where(valid, kinds, 0)
     if ends is None:
-        return TokenSequence(torch.where(valid, body, PAD), torch.where(valid, kinds, 0), length)
-    limit = torch.tensor([ends[name] for name in names], device=device)
-    if bool((valid & ((body < 0) | (body >= limit[kinds]))).any()):
-        raise ValueError(f"a code is outside its stream's codebook; sizes are {dict(ends)}")
-    close = torch.arange(len(names), device=device)
-    tokens = torch.cat([torch.where(valid, body, PAD), body.new_full((batch, len(names)), PAD)], dim=1)
-    kinds = torch.cat([torch.where(valid, kinds, 0), kinds.new_zeros(batch, len(names))], dim=1)
-    at = length[:, None] + close
-    tokens = tokens.scatter(1, at, limit.expand(batch, -1))
-    kinds = kinds.scatter(1, at, close.expand(batch, -1))
-    return TokenSequence(tokens, kinds, length + len(names))
+        return TokenSequence(tokens, kinds, length)
+    if closed is None:
+        closed = torch.ones_like(groups, dtype=torch.bool)
+    order = torch.arange(len(names), device=device)
+    limits = torch.tensor([ends[name] for name in names], device=device)
+    at = length[:, None] + order  # after each row's own tokens
+    more = functional.pad(tokens, (0, len(names)), value=PAD), functional.pad(kinds, (0, len(names)))
+    tokens = more[0].scatter(1, at, torch.where(closed[:, None], limits, PAD))
+    kinds = more[1].scatter(1, at, torch.where(closed[:, None], order, 0))
+    return TokenSequence(tokens, kinds, torch.where(closed, length + len(names), length))
 
 
-def deinterleave(
-    tokens: Tensor,
-    pattern: Sequence[str],
-    *,
-    ends: Mapping[str, int] | None = None,
-    length: Tensor | None = None,
-) -> Codes:
-    """Inverse of `interleave`: tokens [B, L], open or closed, padded or not -> streams and numbers of groups.
-
-    `length` [B] bounds the tokens read; without it they end at the first `PAD`, or at the first End when
-    `ends` is given. An unfinished last group is dropped.
-    """
+def as_codes(tokens: Tensor, pattern: Sequence[str], groups: Tensor) -> Codes:
+    """Tokens int64 [B, N, P] of `groups` [B] groups a row as streams; 0 after a shorter row."""
+    longest = int(groups.max()) if len(groups) else 0
+    inside = torch.arange(longest, device=tokens.device)[None, :, None] < groups[:, None, None]
+    rows, kinds = torch.where(inside, tokens[:, :longest], 0), kind_of_slot(pattern)
     names = stream_names(pattern)
-    kinds_row = kind_of_slot(pattern)
-    size = len(pattern)
-    position = torch.arange(tokens.shape[1], device=tokens.device)[None]
-    stop = tokens == PAD
-    if length is not None:
-        stop = stop | (position >= length[:, None])
-    if ends is not None:
-        # End is legal at the first slot of a group only, so it is enough to look there.
-        stop = stop | ((position % size == 0) & (tokens == ends[names[0]]))
-    usable = (stop.cumsum(1) == 0).sum(1)
-    groups = usable // size
-    count = int(groups.max()) if len(groups) else 0
-    body = tokens[:, : count * size].view(len(tokens), count, size)
-    valid = torch.arange(count, device=tokens.device)[None, :, None] < groups[:, None, None]
-    body = torch.where(valid, body, 0)
-    slots = torch.tensor(kinds_row, device=tokens.device)
-    return Codes({name: body[:, :, slots == k].flatten(1) for k, name in enumerate(names)}, groups)
+    slots = {name: [slot for slot, kind in enumerate(kinds) if names[kind] == name] for name in names}
+    return Codes({name: rows[:, :, here].flatten(1) for name, here in slots.items()}, groups)
 
 
 def pad_sequences(rows: Sequence[TokenSequence]) -> TokenSequence:
@@ -157,7 +137,7 @@ def pad_sequences(rows: Sequence[TokenSequence]) -> TokenSequence:
     size = max(row.tokens.shape[1] for row in rows)
 
     def padded(x: Tensor, value: int) -> Tensor:
-        return torch.nn.functional.pad(x, (0, size - x.shape[1]), value=value)
+        return functional.pad(x, (0, size - x.shape[1]), value=value)
 
     return TokenSequence(
         torch.cat([padded(row.tokens, PAD) for row in rows]),

@@ -27,20 +27,20 @@ def frame_padding(valid: Tensor | None, frames: int, stride: int) -> Tensor | No
     return (position >= valid[:, None])[:, None]
 
 
-def _start(net: nn.Module) -> None:
-    """Fresh weights for an encoder or decoder."""
-    for layer in net.modules():
+@torch.no_grad()
+def start_weights(net: nn.Module, slope: float = 0.0) -> None:
+    """Fresh weights for an encoder or decoder whose (leaky) ReLUs have this slope below zero."""
+    for name, layer in net.named_modules():
         if isinstance(layer, nn.Conv1d):
-            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            nn.init.kaiming_normal_(layer.weight, a=slope, nonlinearity="leaky_relu")
             assert layer.bias is not None
             nn.init.zeros_(layer.bias)
-    with torch.no_grad():
-        for block in net.modules():
-            if isinstance(block, ResidualBlock):
-                block.mix.weight.mul_(0.1)
+            if name.endswith(".mix"):
+                layer.weight.mul_(0.1)
 
 
-def _zero(x: Tensor, padding: Tensor | None) -> Tensor:
+def zero_padded(x: Tensor, padding: Tensor | None) -> Tensor:
+    """x [B, C, T] with zeros where `padding` [B, 1, T]; None = nothing is padded."""
     return x if padding is None else x.masked_fill(padding, 0.0)
 
 
@@ -54,7 +54,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor, padding: Tensor | None) -> Tensor:
         """`padding` [B, 1, T] marks the positions to ignore."""
-        hidden = self.spread(_zero(functional.relu(x), padding))
+        hidden = self.spread(zero_padded(functional.relu(x), padding))
         mixed: Tensor = self.mix(functional.relu(hidden))
         return x + mixed
 
@@ -87,16 +87,16 @@ class ConvEncoder(nn.Module):
         self.down = nn.ModuleList(nn.Conv1d(width, width, 4, stride=2, padding=1) for _ in range(halvings))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(halvings))
         self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
-        _start(self)
+        start_weights(self)
 
     def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = frames that are not padding, a multiple of 2^halvings; T is a multiple of it too."""
         frames = x.shape[1]
         padding = [frame_padding(valid, frames, 2**i) for i in range(len(self.down) + 1)]
-        hidden = functional.relu(self.enter(_zero(x.transpose(1, 2), padding[0])))
+        hidden = functional.relu(self.enter(zero_padded(x.transpose(1, 2), padding[0])))
         for i, (down, stack) in enumerate(zip(self.down, self.stacks, strict=True)):
-            hidden = stack(down(_zero(hidden, padding[i])), padding[i + 1])
-        latents: Tensor = self.leave(_zero(hidden, padding[-1]))
+            hidden = stack(down(zero_padded(hidden, padding[i])), padding[i + 1])
+        latents: Tensor = self.leave(zero_padded(hidden, padding[-1]))
         return latents.transpose(1, 2)
 
 
@@ -115,7 +115,7 @@ class ConvDecoder(nn.Module):
         self.up = nn.ModuleList(nn.Conv1d(width, width, 3, padding=1) for _ in range(doublings))
         self.refine = nn.Conv1d(width, width, 3, padding=1)
         self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
-        _start(self)
+        start_weights(self)
         with torch.no_grad():
             self.leave.weight.mul_(0.1)  # near the mean pose, which is zero
 
@@ -124,13 +124,13 @@ class ConvDecoder(nn.Module):
         doublings = len(self.up)
         frames = z.shape[1] * 2**doublings
         padding = [frame_padding(valid, frames, 2**i) for i in range(doublings + 1)]
-        hidden = functional.relu(self.enter(_zero(z.transpose(1, 2), padding[-1])))
+        hidden = functional.relu(self.enter(zero_padded(z.transpose(1, 2), padding[-1])))
         for i, (stack, up) in enumerate(zip(self.stacks, self.up, strict=True)):
             level = doublings - i
             hidden = stack(hidden, padding[level]).repeat_interleave(2, dim=2)
-            hidden = up(_zero(hidden, padding[level - 1]))
-        hidden = functional.relu(self.refine(_zero(hidden, padding[0])))
-        return _zero(self.leave(_zero(hidden, padding[0])), padding[0]).transpose(1, 2)
+            hidden = up(zero_padded(hidden, padding[level - 1]))
+        hidden = functional.relu(self.refine(zero_padded(hidden, padding[0])))
+        return zero_padded(self.leave(zero_padded(hidden, padding[0])), padding[0]).transpose(1, 2)
 
     def needs(self, first: int, last: int) -> tuple[int, int]:
         """First and last of the latents that frames `first` to `last` are made of; no others play a role."""

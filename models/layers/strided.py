@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.layers.conv import ResidualStack, frame_padding
+from motionloom.models.layers.conv import ResidualStack, frame_padding, start_weights, zero_padded
 
 SLOPE = 0.2
 """Slope of the leaky ReLU below zero."""
@@ -22,22 +22,6 @@ SLOPE = 0.2
 
 def _active(x: Tensor) -> Tensor:
     return functional.leaky_relu(x, SLOPE)
-
-
-def _zero(x: Tensor, padding: Tensor | None) -> Tensor:
-    return x if padding is None else x.masked_fill(padding, 0.0)
-
-
-def _start(net: nn.Module) -> None:
-    """He's weights for the leaky ReLU; residual branches start small, as in `layers/conv.py`."""
-    for name, layer in net.named_modules():
-        if isinstance(layer, nn.Conv1d):
-            nn.init.kaiming_normal_(layer.weight, a=SLOPE, nonlinearity="leaky_relu")
-            assert layer.bias is not None
-            nn.init.zeros_(layer.bias)
-            if name.endswith(".mix"):
-                with torch.no_grad():
-                    layer.weight.mul_(0.1)
 
 
 class StridedEncoder(nn.Module):
@@ -49,15 +33,15 @@ class StridedEncoder(nn.Module):
         self.down = nn.ModuleList(nn.Conv1d(a, b, 4, stride=2, padding=1) for a, b in pairwise(widths))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(2))
         self.out = nn.Conv1d(width, out_dim, 3, padding=1)
-        _start(self)
+        start_weights(self, SLOPE)
 
     def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = frames that are not padding; T and `valid` are multiples of 4."""
         padding = [frame_padding(valid, x.shape[1], 2**i) for i in range(3)]
         hidden = x.transpose(1, 2)
         for i, (down, stack) in enumerate(zip(self.down, self.stacks, strict=True)):
-            hidden = stack(_active(down(_zero(hidden, padding[i]))), padding[i + 1])
-        latents: Tensor = self.out(_zero(hidden, padding[2]))
+            hidden = stack(_active(down(zero_padded(hidden, padding[i]))), padding[i + 1])
+        latents: Tensor = self.out(zero_padded(hidden, padding[2]))
         return latents.transpose(1, 2)
 
 
@@ -72,7 +56,7 @@ class StridedDecoder(nn.Module):
         self.up = nn.ModuleList(nn.Conv1d(a, b, 3, padding=1) for a, b in pairwise(widths))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(2))
         self.out = nn.Conv1d(width, out_dim, 3, padding=1)
-        _start(self)
+        start_weights(self, SLOPE)
         with torch.no_grad():
             self.out.weight.mul_(0.1)  # near the mean pose, which is zero
 
@@ -82,9 +66,9 @@ class StridedDecoder(nn.Module):
         hidden = z.transpose(1, 2)
         for i, (up, stack) in enumerate(zip(self.up, self.stacks, strict=True)):
             level = 1 - i
-            wide = _zero(hidden, padding[level + 1]).repeat_interleave(2, dim=2)
+            wide = zero_padded(hidden, padding[level + 1]).repeat_interleave(2, dim=2)
             hidden = stack(_active(up(wide)), padding[level])
-        return _zero(self.out(_zero(hidden, padding[0])), padding[0]).transpose(1, 2)
+        return zero_padded(self.out(zero_padded(hidden, padding[0])), padding[0]).transpose(1, 2)
 
     def needs(self, first: int, last: int) -> tuple[int, int]:
         """First and last of the latents that frames `first` to `last` are made of; no others play a role."""

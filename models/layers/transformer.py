@@ -176,19 +176,15 @@ class Transformer(nn.Module):
     """
 
     def __init__(
-        self,
-        layers: int,
-        dim: int,
-        heads: int,
-        ff: int,
-        *,
-        dropout: float = 0.1,
-        attention_dropout: float | None = None,
-        norm: Norm = "pre",
+        self, config: StackConfig, layers: int, *, attention_dropout: float | None = None, norm: Norm = "pre"
     ) -> None:
         super().__init__()
-        inner = dropout if attention_dropout is None else attention_dropout
-        self.blocks = nn.ModuleList(Block(dim, heads, ff, dropout, inner, norm) for _ in range(layers))
+        assert config.width is not None
+        dim, drop = config.width[1], config.dropout
+        inner = drop if attention_dropout is None else attention_dropout
+        self.blocks = nn.ModuleList(
+            Block(dim, config.heads, config.ff, drop, inner, norm) for _ in range(layers)
+        )
         self.norm = nn.LayerNorm(dim) if norm == "pre" else nn.Identity()
         self.checkpointed = False
         """Compute the inside of each block again in the backward pass instead of keeping it."""
@@ -199,21 +195,6 @@ class Transformer(nn.Module):
                 nn.init.normal_(parameter, std=std / math.sqrt(2 * layers) if residual else std)
             elif name.endswith("bias"):
                 nn.init.zeros_(parameter)
-
-    @classmethod
-    def of(
-        cls, config: StackConfig, layers: int, *, attention_dropout: float | None = None, norm: Norm = "pre"
-    ) -> Self:
-        assert config.width is not None
-        return cls(
-            layers,
-            config.width[1],
-            config.heads,
-            config.ff,
-            dropout=config.dropout,
-            attention_dropout=attention_dropout,
-            norm=norm,
-        )
 
     def forward(
         self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: KVCache | None = None

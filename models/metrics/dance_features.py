@@ -30,23 +30,11 @@ _HIPS = float(np.linalg.norm(np.subtract((0.0564076714, -0.323069185, 0.01091971
                                          (-0.0624834076, -0.331302464, 0.0150412619))))  # fmt: skip
 
 _NAMES = (
-    *(
-        "root",
-        "lhip",
-        "rhip",
-        "belly",
-        "lknee",
-        "rknee",
-        "spine",
-        "lankle",
-        "rankle",
-        "chest",
-        "ltoes",
-        "rtoes",
-    ),
-    *("neck", "linshoulder", "rinshoulder", "head", "lshoulder", "rshoulder", "lelbow", "relbow"),
-    *("lwrist", "rwrist"),
+    *("root", "lhip", "rhip", "belly", "lknee", "rknee", "spine", "lankle", "rankle"),
+    *("chest", "ltoes", "rtoes", "neck", "linshoulder", "rinshoulder", "head"),
+    *("lshoulder", "rshoulder", "lelbow", "relbow", "lwrist", "rwrist"),
 )
+"""The joints in the order of `smpl22`, by the names that the statements use."""
 
 
 def zero_start(joints: NDArray[np.floating]) -> Array:

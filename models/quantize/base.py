@@ -8,13 +8,15 @@ same rows as many that see its parts.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from pydantic import Field
+from torch import Tensor, nn
 
+from motionloom.datasets.schema import Config
 from motionloom.models.layers.random import hash32
-from motionloom.models.training.distributed import gather_rows, rank
+from motionloom.models.training.distributed import gather_rows, rank, sum_over_ranks
 
 _LAST = 2**62
 """Key of a row that must not be drawn; greater than every real key (at most 56 bits)."""
@@ -38,6 +40,17 @@ class QuantizerOutput(NamedTuple):
     Over the global batch while training, over this rank's otherwise."""
 
 
+class QuantizerConfig(Config):
+    """One learnt codebook."""
+
+    num_codes: int = Field(default=512, ge=2)
+    dim: int = Field(default=512, ge=1)
+    decay: float = Field(default=0.99, gt=0, lt=1)
+    """EMA constant lambda."""
+    reset_below: float = Field(default=1.0, gt=0)
+    """A code whose EMA count falls below this is reset (`EmaQuantizer`), or counted as dead."""
+
+
 class Codebook(Protocol):
     """One vocabulary: what a tokenizer's users need of a quantizer."""
 
@@ -50,6 +63,79 @@ class Codebook(Protocol):
 
     def freeze(self) -> None:
         """Stop updating for good, in training mode too."""
+
+
+class LearntCodebook(nn.Module):
+    """What codebooks learnt from data share: buffers, first codes drawn from a batch, freezing.
+
+    A vector that is not finite counts as padding: a float16 overflow costs the optimizer one step, which the
+    gradient scaler leaves out, and must not stay in the codebook for good.
+
+    Args:
+        codebook: First codes [K, d], a parameter where it is learnt by gradient.
+        initialised: False has the first training batch replace them.
+        salt: Number of this quantizer among those of one network (each draws its own random rows).
+    """
+
+    codebook: Tensor
+    ema_count: Tensor
+    initialised: Tensor
+    draws: Tensor
+
+    def __init__(self, config: QuantizerConfig, codebook: Tensor, *, initialised: bool, salt: int) -> None:
+        super().__init__()
+        self.config = config
+        self.salt = salt
+        self.frozen = False
+        if isinstance(codebook, nn.Parameter):
+            self.codebook = codebook
+        else:
+            self.register_buffer("codebook", codebook)
+        self.register_buffer("ema_count", torch.full((config.num_codes,), config.reset_below))
+        self.register_buffer("initialised", torch.tensor(initialised))
+        self.register_buffer("draws", torch.tensor(0))
+        # Mirror of `initialised`: reading the buffer at every step would wait for the device.
+        self._is_initialised = initialised
+
+    def freeze(self) -> None:
+        self.frozen = True
+        self.codebook.requires_grad_(False)
+
+    def _rows(self, full: Tensor, mask: Tensor | None, update: bool) -> tuple[Tensor, Tensor]:
+        """Vectors [n, d] of latents [B, L, d], 0 where they are not real, and which are, bool [n]; the codes
+        start from the first ones.
+        """
+        rows = full.detach().reshape(-1, full.shape[-1])
+        real = rows.isfinite().all(1)
+        if mask is not None:
+            real = real & mask.reshape(-1)
+        rows = rows.masked_fill(~real[:, None], 0.0)
+        if update and not self._is_initialised:
+            self._initialise(rows, real)
+        return rows, real
+
+    @torch.no_grad()
+    def _draw(self, rows: Tensor, mask: Tensor) -> Tensor:
+        drawn = draw_rows(rows, mask, self.config.num_codes, salt=self.salt, step=self.draws)
+        self.draws.add_(1)
+        return drawn
+
+    @torch.no_grad()
+    def _initialise(self, rows: Tensor, mask: Tensor) -> None:
+        drawn = sum_over_ranks(self._draw(rows, mask))
+        # Of a batch without vectors nothing is drawn; Code Reset then replaces the random codes one by one.
+        some = sum_over_ranks(mask.any().float()) > 0
+        self.codebook.copy_(torch.where(some, drawn.to(self.codebook.dtype), self.codebook))
+        self.initialised.fill_(True)
+        self._is_initialised = True
+
+    @torch.no_grad()
+    def _ages(self, resets: Tensor) -> dict[str, Tensor]:
+        return {"dead": (self.ema_count <= self.config.reset_below).sum().float(), "resets": resets}
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._is_initialised = bool(self.initialised)
 
 
 def usage_metrics(counts: Tensor, *, eps: float = 1e-7) -> dict[str, Tensor]:

@@ -17,27 +17,20 @@ batch, or most of the codebook is replaced at every step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Self, cast
+from typing import Self, cast
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.datasets.schema import Config
-from motionloom.models.quantize.base import QuantizerOutput, draw_rows, nearest, usage_metrics
+from motionloom.models.quantize.base import (
+    LearntCodebook,
+    QuantizerConfig,
+    QuantizerOutput,
+    nearest,
+    usage_metrics,
+)
 from motionloom.models.training.distributed import is_distributed, sum_over_ranks, world_size
-
-
-class QuantizerConfig(Config):
-    """One codebook."""
-
-    num_codes: int = Field(default=512, ge=2)
-    dim: int = Field(default=512, ge=1)
-    decay: float = Field(default=0.99, gt=0, lt=1)
-    """EMA constant lambda."""
-    reset_below: float = Field(default=1.0, gt=0)
-    """A code whose EMA count falls below this is reset."""
 
 
 def cluster_sums(z: Tensor, codes: Tensor, num_codes: int) -> Tensor:
@@ -48,42 +41,23 @@ def cluster_sums(z: Tensor, codes: Tensor, num_codes: int) -> Tensor:
     return sums.index_add_(0, codes, z)
 
 
-class EmaQuantizer(nn.Module):
+class EmaQuantizer(LearntCodebook):
     """Nearest code, straight-through; see the module docstring.
-
-    A vector that is not finite counts as padding: a float16 overflow costs the optimizer one step, which the
-    gradient scaler leaves out, and must not stay in the codebook for good.
 
     All state is in buffers (`codebook`, `ema_sum`, `ema_count`, `initialised`, `draws`) and is float32
     whatever the model is cast to; the arithmetic is float32 under autocast too.
 
     Args:
-        salt: Number of this quantizer among those of one network (each draws its own random rows).
+        salt: See `LearntCodebook`.
     """
 
-    codebook: Tensor
     ema_sum: Tensor
-    ema_count: Tensor
-    initialised: Tensor
-    draws: Tensor
 
     def __init__(self, config: QuantizerConfig, *, salt: int = 0) -> None:
-        super().__init__()
-        self.config = config
-        self.salt = salt
-        self.frozen = False
-        size = (config.num_codes, config.dim)
         # Random, so that an untrained tokenizer decodes to something; the first training batch replaces it.
-        self.register_buffer("codebook", torch.randn(size) * config.dim**-0.5)
-        self.register_buffer("ema_sum", self.codebook * config.reset_below)
-        self.register_buffer("ema_count", torch.full((config.num_codes,), config.reset_below))
-        self.register_buffer("initialised", torch.tensor(False))
-        self.register_buffer("draws", torch.tensor(0))
-        # Mirror of `initialised`: reading the buffer at every step would wait for the device.
-        self._is_initialised = False
-
-    def freeze(self) -> None:
-        self.frozen = True
+        codes = torch.randn(config.num_codes, config.dim) * config.dim**-0.5
+        super().__init__(config, codes, initialised=False, salt=salt)
+        self.register_buffer("ema_sum", codes * config.reset_below)
 
     def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
         """Quantize z [B, L, d].
@@ -96,13 +70,7 @@ class EmaQuantizer(nn.Module):
         update = update and self.training and not self.frozen
         with torch.autocast(z.device.type, enabled=False):
             full = z.float()
-            rows = full.detach().reshape(-1, full.shape[-1])
-            real = rows.isfinite().all(1)
-            if mask is not None:
-                real = real & mask.reshape(-1)
-            rows = rows.masked_fill(~real[:, None], 0.0)
-            if update and not self._is_initialised:
-                self._initialise(rows, real)
+            rows, real = self._rows(full, mask, update)
             codes = nearest(rows, self.codebook)
             chosen = functional.embedding(codes, self.codebook).view_as(full)
             error = full - chosen
@@ -115,7 +83,7 @@ class EmaQuantizer(nn.Module):
             number = counts.sum() * error.shape[-1] / (world_size() if update else 1)
             squares = error.square().masked_fill(~real.view(z.shape[:-1])[..., None], 0.0)
             penalty = squares.sum() / number.clamp(min=1)
-            metrics = {"penalty": penalty.detach(), **self._metrics(counts), "resets": resets}
+            metrics = {"penalty": penalty.detach(), **usage_metrics(counts), **self._ages(resets)}
             straight = full - error.detach()
         return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
 
@@ -123,21 +91,10 @@ class EmaQuantizer(nn.Module):
         return functional.embedding(codes, self.codebook)
 
     @torch.no_grad()
-    def _draw(self, rows: Tensor, mask: Tensor) -> Tensor:
-        drawn = draw_rows(rows, mask, self.config.num_codes, salt=self.salt, step=self.draws)
-        self.draws.add_(1)
-        return drawn
-
-    @torch.no_grad()
     def _initialise(self, rows: Tensor, mask: Tensor) -> None:
-        drawn = sum_over_ranks(self._draw(rows, mask))
-        # Of a batch without vectors nothing is drawn; Code Reset then replaces the random codes one by one.
-        some = sum_over_ranks(mask.any().float()) > 0
-        self.codebook.copy_(torch.where(some, drawn, self.codebook))
+        super()._initialise(rows, mask)
         self.ema_sum.copy_(self.codebook * self.config.reset_below)
         self.ema_count.fill_(self.config.reset_below)
-        self.initialised.fill_(True)
-        self._is_initialised = True
 
     @torch.no_grad()
     def _update(self, rows: Tensor, mask: Tensor, codes: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,10 +117,6 @@ class EmaQuantizer(nn.Module):
         self.codebook.copy_(torch.where(reset[:, None], fresh, self.ema_sum / self.ema_count[:, None]))
         return counts, reset.sum().float()
 
-    @torch.no_grad()
-    def _metrics(self, counts: Tensor) -> dict[str, Tensor]:
-        return {**usage_metrics(counts), "dead": (self.ema_count <= self.config.reset_below).sum().float()}
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Follow moves between devices, refuse casts: a bfloat16 EMA would stop moving."""
         kept = {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
@@ -173,10 +126,6 @@ class EmaQuantizer(nn.Module):
             if after.dtype != before.dtype:
                 setattr(self, name, before.to(after.device))
         return self
-
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        super()._load_from_state_dict(*args, **kwargs)
-        self._is_initialised = bool(self.initialised)
 
 
 class ResidualQuantizer(nn.Module):

@@ -13,21 +13,26 @@ Choices of ours:
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.datasets.schema import Config
-from motionloom.models.quantize.base import QuantizerOutput, draw_rows, nearest, usage_metrics
+from motionloom.models.quantize.base import (
+    LearntCodebook,
+    QuantizerConfig,
+    QuantizerOutput,
+    nearest,
+    usage_metrics,
+)
 from motionloom.models.training.distributed import sum_over_ranks, world_size
 
 Start = Literal["uniform", "data"]
 
 
-class GradientQuantizerConfig(Config):
+class GradientQuantizerConfig(QuantizerConfig):
     """One codebook; the defaults are UDE's (section 4.2)."""
 
     num_codes: int = Field(default=2048, ge=2)
@@ -38,42 +43,24 @@ class GradientQuantizerConfig(Config):
     """beta_2: how strongly latents are pulled to their codes."""
     start: Start = "uniform"
     """Where codes start: within +-1/K (public UDE), or on rows of the first batch [ours]."""
-    decay: float = Field(default=0.99, gt=0, lt=1)
-    """EMA constant of the count of uses."""
-    dead_below: float = Field(default=1.0, gt=0)
-    """A code whose EMA count is not above this counts as dead."""
 
 
-class GradientQuantizer(nn.Module):
+class GradientQuantizer(LearntCodebook):
     """Nearest code, straight-through; see the module docstring.
 
     The codebook is a parameter. It gets its gradient from the penalty alone: the output passes its gradient
-    on to z. A vector that is not finite counts as padding, as in `EmaQuantizer`.
+    on to z.
 
     Args:
-        salt: Number of this quantizer among those of one network, for the draws of `start: data`.
+        salt: See `LearntCodebook`.
     """
 
-    ema_count: Tensor
-    initialised: Tensor
-    draws: Tensor
+    config: GradientQuantizerConfig
 
     def __init__(self, config: GradientQuantizerConfig, *, salt: int = 0) -> None:
-        super().__init__()
-        self.config = config
-        self.salt = salt
-        self.frozen = False
         bound = 1 / config.num_codes
-        self.codebook = nn.Parameter(torch.empty(config.num_codes, config.dim).uniform_(-bound, bound))
-        self.register_buffer("ema_count", torch.full((config.num_codes,), config.dead_below))
-        self.register_buffer("initialised", torch.tensor(config.start == "uniform"))
-        self.register_buffer("draws", torch.tensor(0))
-        # Mirror of `initialised`: reading the buffer at every step would wait for the device.
-        self._is_initialised = config.start == "uniform"
-
-    def freeze(self) -> None:
-        self.frozen = True
-        self.codebook.requires_grad_(False)
+        codes = nn.Parameter(torch.empty(config.num_codes, config.dim).uniform_(-bound, bound))
+        super().__init__(config, codes, initialised=config.start == "uniform", salt=salt)
 
     def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
         """Quantize z [B, L, d].
@@ -89,13 +76,7 @@ class GradientQuantizer(nn.Module):
         update = update and self.training and not self.frozen
         with torch.autocast(z.device.type, enabled=False):
             full = z.to(torch.promote_types(z.dtype, torch.float32))
-            rows = full.detach().reshape(-1, full.shape[-1])
-            real = rows.isfinite().all(1)
-            if mask is not None:
-                real = real & mask.reshape(-1)
-            rows = rows.masked_fill(~real[:, None], 0.0)
-            if update and not self._is_initialised:
-                self._initialise(rows, real)
+            rows, real = self._rows(full, mask, update)
             codebook = self.codebook.to(full.dtype)
             codes = nearest(rows, codebook.detach())
             chosen = functional.embedding(codes, codebook).view_as(full)
@@ -120,8 +101,7 @@ class GradientQuantizer(nn.Module):
             metrics = {
                 "penalty": penalty.detach().float(),
                 **usage_metrics(counts, eps=1e-10),
-                "dead": (self.ema_count <= self.config.dead_below).sum().float(),
-                "resets": counts.new_zeros(()),
+                **self._ages(counts.new_zeros(())),
             }
             straight = full + (chosen - full).detach()
         return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
@@ -136,17 +116,3 @@ class GradientQuantizer(nn.Module):
         # A batch without vectors does not tell which codes are used.
         rate = torch.where(counts.sum() > 0, 1 - self.config.decay, 0.0).to(self.ema_count.dtype)
         self.ema_count.lerp_(counts.to(self.ema_count.dtype), rate)
-
-    @torch.no_grad()
-    def _initialise(self, rows: Tensor, mask: Tensor) -> None:
-        drawn = draw_rows(rows, mask, self.config.num_codes, salt=self.salt, step=self.draws)
-        self.draws.add_(1)
-        drawn = sum_over_ranks(drawn)
-        some = sum_over_ranks(mask.any().float()) > 0
-        self.codebook.copy_(torch.where(some, drawn.to(self.codebook.dtype), self.codebook))
-        self.initialised.fill_(True)
-        self._is_initialised = True
-
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        super()._load_from_state_dict(*args, **kwargs)
-        self._is_initialised = bool(self.initialised)

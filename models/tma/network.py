@@ -106,7 +106,7 @@ def noisy(tokens: Tensor, mask: Tensor, scale: float) -> Tensor:
 
 
 def _stack(config: TmaConfig) -> Transformer:
-    return Transformer.of(config, config.layers, attention_dropout=config.attention_dropout, norm=config.norm)
+    return Transformer(config, config.layers, attention_dropout=config.attention_dropout, norm=config.norm)
 
 
 class Tma(nn.Module):

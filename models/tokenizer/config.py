@@ -9,18 +9,10 @@ from pydantic import Field, field_validator
 
 from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import Config, UserError
-from motionloom.models.quantize.ema import QuantizerConfig
+from motionloom.models.quantize.base import QuantizerConfig
 from motionloom.models.quantize.gradient import GradientQuantizerConfig, Start
 
 Recon = Literal["l2", "smooth_l1"]
-
-
-class LossTerms(TypedDict):
-    """Keyword arguments of `losses.tokenizer_loss` that the config decides."""
-
-    alpha: float
-    recon: Recon
-    velocity_weight: float
 
 
 class ConvSizes(TypedDict):
@@ -55,10 +47,6 @@ class BaseTokenizerConfig(Config):
     def commitment(self) -> float:
         """Weight of the quantizers' penalty; 0 for quantizers without one."""
         return 0.0
-
-    def loss_terms(self) -> LossTerms:
-        """Keyword arguments of `TokenizerModule` and `tokenizer_loss`."""
-        return {"alpha": self.commitment(), "recon": self.recon, "velocity_weight": self.velocity_weight}
 
 
 class EmaTokenizerConfig(BaseTokenizerConfig):
@@ -152,20 +140,15 @@ class MqConfig(BaseTokenizerConfig):
         """Weight of the penalty; the gradient quantizer's is weighted already."""
         return 1.0 if self.quantizer == "gradient" else self.commitment_weight
 
-    def gradient_quantizer(self) -> GradientQuantizerConfig:
+    def codebook(self) -> GradientQuantizerConfig:
         return GradientQuantizerConfig(
             num_codes=self.num_codes,
             dim=self.code_dim,
+            decay=self.decay,
+            reset_below=self.reset_below,
             codebook_weight=self.codebook_weight,
             commitment_weight=self.commitment_weight,
             start=self.start,
-            decay=self.decay,
-            dead_below=self.reset_below,
-        )
-
-    def ema_quantizer(self) -> QuantizerConfig:
-        return QuantizerConfig(
-            num_codes=self.num_codes, dim=self.code_dim, decay=self.decay, reset_below=self.reset_below
         )
 
 

@@ -107,7 +107,7 @@ class MotionQuantizer(_OneCodebook):
         sizes, dim = config.conv_sizes(), config.code_dim
         self.encoder = StridedEncoder(self.dim, dim, **sizes)
         if config.quantizer == "gradient":
-            self.quantizer = GradientQuantizer(config.gradient_quantizer())
+            self.quantizer = GradientQuantizer(config.codebook())
         else:
-            self.quantizer = EmaQuantizer(config.ema_quantizer())
+            self.quantizer = EmaQuantizer(config.codebook())
         self.decoder = StridedDecoder(dim, self.dim, **sizes)

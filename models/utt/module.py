@@ -12,8 +12,6 @@ Notable choices [ours]:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import torch
 from torch import Tensor
 
@@ -21,36 +19,15 @@ from motionloom.models.condition.mate import Encoded, drop_conditions
 from motionloom.models.discriminator.losses import discriminator_loss, generator_loss, gradient_penalty
 from motionloom.models.discriminator.patch import PatchDiscriminator
 from motionloom.models.gpt.frozen import Frozen
-from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy
-from motionloom.models.gpt.tokens import PAD, TokenSequence, interleave, stream_names
+from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy, soft_motion
+from motionloom.models.gpt.tokens import TokenSequence, interleave
 from motionloom.models.layers import random
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
 from motionloom.models.training.stage_module import Batch
-from motionloom.models.utt.losses import SoftMotion, UttLossConfig, soft_motion
+from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.network import ConditionedUtt
-
-
-def closed_sequences(
-    codes: Mapping[str, Tensor],
-    groups: Tensor,
-    closed: Tensor,
-    pattern: Sequence[str],
-    ends: Mapping[str, int],
-) -> TokenSequence:
-    """One sequence a row, with its End tokens where `closed` [B]; open rows are clips that go on."""
-    names, batch, device = stream_names(pattern), len(groups), groups.device
-    tokens, kinds, length = interleave(codes, pattern, groups=groups)
-    tokens = torch.cat([tokens, tokens.new_full((batch, len(names)), PAD)], dim=1)
-    kinds = torch.cat([kinds, kinds.new_zeros(batch, len(names))], dim=1)
-    # The End tokens, after each row's own.
-    order = torch.arange(len(names), device=device)
-    limits = torch.tensor([ends[name] for name in names], device=device)
-    at = length[:, None] + order
-    tokens = tokens.scatter(1, at, torch.where(closed[:, None], limits, PAD))
-    kinds = kinds.scatter(1, at, torch.where(closed[:, None], order, 0))
-    return TokenSequence(tokens, kinds, torch.where(closed, length + len(names), length))
 
 
 class UttModule(PlayersModule):
@@ -76,9 +53,6 @@ class UttModule(PlayersModule):
             self.discriminator = PatchDiscriminator(
                 self.loss_config.discriminator, tokenizer.dim, net.mate.config.dim
             )
-
-    def on_fit_start(self) -> None:
-        self.tokenizer.to(self.device)
 
     def players(self) -> list[Player]:
         """The token model, then the discriminator of what it has made."""
@@ -111,7 +85,7 @@ class UttModule(PlayersModule):
         groups = (batch["length"] // GROUP_FRAMES).clamp(min=1)
         with torch.no_grad():
             codes = tokenizer.encode(batch["motion"], groups * GROUP_FRAMES, batch.get("present"))
-        return closed_sequences(codes, groups, batch["closed"], net.pattern, net.num_codes)
+        return interleave(codes, net.pattern, ends=net.num_codes, groups=groups, closed=batch["closed"])
 
     def _tokens(self, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         net, config = self.net.utt, self.net.utt.config
@@ -134,24 +108,21 @@ class UttModule(PlayersModule):
         weight = self.loss_config.weight(self.step)
         if self.discriminator is None or (weight == 0 and self.training):
             return values
-        fake = self._soft(batch, logits, tokens, kinds)
-        shared["motion"], shared["length"], shared["glob"] = fake.motion, fake.length, encoded.glob
-        values["adversarial"] = generator_loss(self.discriminator(fake.motion, encoded.glob, fake.length))
-        values["loss"] = ce + weight * values["adversarial"]
-        return values
-
-    def _soft(self, batch: Batch, logits: Tensor, tokens: Tensor, kinds: Tensor) -> SoftMotion:
-        config = self.loss_config.adversarial
-        return soft_motion(
-            self.net.utt,
+        how = self.loss_config.adversarial
+        fake, length = soft_motion(
+            net,
             logits,
             tokens,
             kinds,
             tokenizer=self.tokenizer.module,
-            gumbel_temperature=config.gumbel_temperature,
-            sample=config.sample and self.training,
+            temperature=how.gumbel_temperature,
+            sample=how.sample and self.training,
             present=batch.get("present"),
         )
+        shared |= {"motion": fake, "length": length, "glob": encoded.glob}
+        values["adversarial"] = generator_loss(self.discriminator(fake, encoded.glob, length))
+        values["loss"] = ce + weight * values["adversarial"]
+        return values
 
     def _critic(self, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         critic = self.discriminator

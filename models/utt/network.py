@@ -106,7 +106,7 @@ class Utt(TokenNetwork):
         self.dropout = random.Dropout(config.dropout)
         self.backbone: PrefixTransformer | PrefixGru
         if config.kind == "gpt":
-            stack = Transformer.of(config, config.layers, attention_dropout=config.attention_dropout)
+            stack = Transformer(config, config.layers, attention_dropout=config.attention_dropout)
             self.backbone = PrefixTransformer(stack)
         else:
             self.backbone = PrefixGru(config.layers, config.dim, dropout=config.dropout)

@@ -22,15 +22,9 @@ from torch.nn.functional import pad
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.drawing import (
-    Drawing,
-    as_codes,
-    next_token,
-    requested_groups,
-    seeds_of,
-    uniform_numbers,
-)
-from motionloom.models.gpt.tokens import Codes
+from motionloom.models.gpt.drawing import Drawing, decode, requested_groups, seeds_of, uniform_numbers
+from motionloom.models.gpt.tokens import Codes, as_codes
+from motionloom.models.training.stage_module import evaluating
 from motionloom.models.utt.backbone import State
 from motionloom.models.utt.continuing import last_groups, window_start
 from motionloom.models.utt.network import Utt
@@ -114,50 +108,12 @@ def generate(
     if guided and null is not None:
         condition = _stacked(condition, null)
         z = None if z is None else torch.cat([z, z])
-    was_training = utt.training
-    utt.eval()
-    try:
-        tokens, counts = _decode(utt, condition, z, given, before, limit, uniform, groups is None, how, scale)
-    finally:
-        utt.train(was_training)
-    longest = int(counts.max()) if batch else 0
-    at = before[:, None] * size + torch.arange(longest * size, device=device)
-    rows = tokens.gather(1, at.clamp(max=max(0, tokens.shape[1] - 1))).view(batch, longest, size)
-    return as_codes(utt, rows, counts)
-
-
-def _decode(
-    utt: Utt,
-    condition: Encoded,
-    z: Tensor | None,
-    given: Tensor,
-    before: Tensor,
-    limit: Tensor,
-    uniform: Tensor,
-    free: bool,
-    how: Drawing,
-    scale: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """All tokens int64 [B, N * P], `given` ones included, and the numbers of new groups int64 [B].
-
-    given [B, N * P] holds the tokens of `before` [B] groups a row; the others are drawn.
-    """
-    batch, size, device = len(limit), len(utt.pattern), limit.device
-    guided = scale is not None
-    total = int((before + limit).max()) * size if batch else 0
-    tokens = pad(given, (0, max(0, total - given.shape[1])))
-    counts = torch.zeros_like(limit)
-    ended = torch.zeros(batch, dtype=torch.bool, device=device)
-    no = torch.zeros_like(ended)
     frame_condition = utt.frame_condition(condition)
     state: State | None = None
     seen = opened = 0
-    for step in range(int(before.min()) * size if batch else 0, total):
-        group, slot = divmod(step, size)
-        new = group >= before
-        alive = new & (group < before + limit) & ~ended
-        if slot == 0 and not bool((alive | ~new).any()):
-            break
+
+    def hidden(step: int, tokens: Tensor) -> Tensor:
+        nonlocal state, seen, opened
         first = window_start(step, utt.config.block_size, size)
         fresh = state is None or first != opened
         if state is None or fresh:
@@ -166,19 +122,17 @@ def _decode(
         x = utt.embed(tokens[:, seen:step], kinds)
         at = 0 if fresh else seen - first + 1
         x = utt.motion_inputs(x.repeat(2, 1, 1) if guided else x, at, frame_condition, first=first)
-        hidden = utt.backbone.extend(x, state)[:, -1:]
         seen = step
-        # A segment is never empty, so its first group cannot be End.
-        may_end = alive & (group > before) if free and slot == 0 else no
-        index = (step - before * size).clamp(0, uniform.shape[1] - 1)
-        own = uniform.gather(1, index[:, None])[:, 0]
-        token = next_token(utt, hidden, slot, may_end=may_end, how=how, uniform=own, scale=scale)
-        if slot == 0:
-            stops = alive & (token == utt.ends[utt.slots[0]])
-            ended, alive = ended | stops, alive & ~stops
-            counts = counts + alive
-        tokens[:, step] = torch.where(new, torch.where(alive, token, 0), tokens[:, step])
-    return tokens, counts
+        return utt.backbone.extend(x, state)[:, -1:]
+
+    with evaluating(utt):
+        tokens, counts = decode(
+            utt, hidden, given, before, limit, uniform=uniform, free=groups is None, how=how, scale=scale
+        )
+    longest = int(counts.max()) if batch else 0
+    at = before[:, None] * size + torch.arange(longest * size, device=device)
+    rows = tokens.gather(1, at.clamp(max=max(0, tokens.shape[1] - 1))).view(batch, longest, size)
+    return as_codes(rows, utt.pattern, counts)
 
 
 def _stacked(condition: Encoded, null: Encoded) -> Encoded:

@@ -156,6 +156,14 @@ class TokenBatches(Dataset[dict[str, Any]]):
     """Which tokens of the clips were recorded; None = all. Batches then also hold "known" bool [B, L] and
     "present" bool [B, C]."""
 
+    def __post_init__(self) -> None:
+        for name, codes in self.store.codes.items():
+            if len(codes) and not 0 <= int(codes.min()) <= int(codes.max()) < self.ends[name]:
+                raise UserError(
+                    f"stream '{name}' holds tokens outside its {self.ends[name]} codes: another tokenizer "
+                    "made them; run the tokens stage again"
+                )
+
     @cached_property
     def _plan(self) -> BatchPlan:
         spans = [sum(caption.end - caption.first for caption in own) // len(own) for own in self.captions]

@@ -58,7 +58,7 @@ def tokenizer(config: AnyTokenizerConfig, handed: tuple[bool, ...] = ()) -> tupl
     net.basis.learn(
         np.zeros(net.dim), np.full(net.dim, 0.02)
     )  # independent noise in every column bends fingers wildly
-    module = TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS, **config.loss_terms())
+    module = TokenizerModule(net, OPTIM, seed=0, max_steps=STEPS)
     present = torch.ones(BATCH, net.dim, dtype=torch.bool)
     for row in (row for row, has in enumerate(handed) if not has):
         present[row, np.searchsorted(net.columns.numpy(), LAYOUT.part("hand"))] = False

@@ -128,7 +128,7 @@ def module_of(name: str, steps: int, *, dropout: float = 0.0) -> StageModule:
     given: dict[str, Any] = {"seed": 3, "max_steps": steps}
     torch.manual_seed(0)
     if name == "mq":
-        return TokenizerModule(build_tokenizer(MQ, LAYOUT), OPTIM, **given, **MQ.loss_terms())
+        return TokenizerModule(build_tokenizer(MQ, LAYOUT), OPTIM, **given)
     if name == "dmd":
         small = DmdConfig(
             dim=8, ff=8, encoder_layers=1, decoder_layers=1, heads=2, dropout=dropout, attention_dropout=0.0

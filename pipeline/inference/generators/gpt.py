@@ -15,9 +15,10 @@ from torch.nn import functional as F
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.drawing import Drawing, as_codes, sample_seeds
+from motionloom.models.gpt.drawing import Drawing, sample_seeds
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.streaming import TokenStream
+from motionloom.models.gpt.tokens import as_codes
 from motionloom.pipeline.contract.generation import FrameFlow, GenerationRequest, TokenFlow
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.inference.generators.frames import Frames
@@ -171,7 +172,7 @@ class GptFlow:
 
     def draw(self, left: int | None) -> Mapping[str, Tensor]:
         group = self._tokens.draw()
-        return as_codes(self._tokens.gpt, group[:, None], group.new_ones(1)).codes
+        return as_codes(group[:, None], self._tokens.gpt.pattern, group.new_ones(1)).codes
 
 
 def candidate_seeds(seeds: Sequence[int], count: int) -> list[int]:

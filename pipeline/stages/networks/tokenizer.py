@@ -177,7 +177,7 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
         from motionloom.models.tokenizer.module import TokenizerModule
 
         steps = config.train.steps
-        return TokenizerModule(net, config.optim, seed=seed, max_steps=steps, **config.net.loss_terms())
+        return TokenizerModule(net, config.optim, seed=seed, max_steps=steps)
 
     def batches(
         self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs, seed: int, log: Log

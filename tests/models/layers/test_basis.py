@@ -124,7 +124,7 @@ def test_the_loss_is_of_what_is_seen() -> None:
     config = H2VQConfig.model_validate({**SIZES, "root_gain": 3.0, "finger_gain": 2.0})
     net = build_tokenizer(config, LAYOUT)
     net.basis.learn(MEAN[LAYOUT.part("bodyhand")], STD[LAYOUT.part("bodyhand")])
-    module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms()).eval()
+    module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1).eval()
     x = torch.randn(2, 8, 313)
     present = torch.from_numpy(LAYOUT.present_columns[[3, 0]])[:, LAYOUT.part("bodyhand")]
     batch = {"motion": x, "length": torch.tensor([8, 8]), "present": present}

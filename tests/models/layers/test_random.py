@@ -12,10 +12,12 @@ import torch.nn.functional as F
 from scipy import stats
 from torch import Tensor
 
+from motionloom.models.diffusion.network import DiffusionConfig
 from motionloom.models.layers import random
 from motionloom.models.layers.transformer import Transformer
 
 M = 2**64 - 1
+STACK = DiffusionConfig(dim=8, heads=2, ff=16, dropout=0.3)
 GAMMA = 0x9E3779B97F4A7C15
 
 
@@ -221,7 +223,7 @@ def test_attention_without_dropout_is_torchs(masked: bool) -> None:
 
 def test_checkpointed_activations_draw_again_what_they_drew() -> None:
     torch.manual_seed(0)
-    stack = Transformer(2, 8, 2, 16, dropout=0.3).double()
+    stack = Transformer(STACK, 2).double()
     x = torch.randn(3, 5, 8, dtype=torch.float64)
     grads = []
     for stack.checkpointed in (False, True):
@@ -238,7 +240,7 @@ def test_checkpointed_activations_draw_again_what_they_drew() -> None:
 @pytest.mark.slow
 def test_compiled_draws_are_the_same_and_one_graph() -> None:
     torch.compiler.reset()
-    stack = Transformer(1, 8, 2, 16, dropout=0.3).double()
+    stack = Transformer(STACK, 1).double()
     x = torch.randn(4, 5, 8, dtype=torch.float64)
 
     def run(x: Tensor) -> tuple[Tensor, Tensor]:

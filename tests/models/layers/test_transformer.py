@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import nn
 
+from motionloom.models.diffusion.network import DiffusionConfig
 from motionloom.models.layers.transformer import Norm, Transformer, length_mask
-
-pytestmark = pytest.mark.numeric
 
 
 def theirs(ours: Transformer, norm: Norm, heads: int, ff: int) -> nn.TransformerEncoder:
@@ -41,7 +40,7 @@ def theirs(ours: Transformer, norm: Norm, heads: int, ff: int) -> nn.Transformer
 @pytest.mark.parametrize("norm", get_args(Norm))
 def test_equals_torchs(norm: Norm) -> None:
     torch.manual_seed(0)
-    net = Transformer(3, 16, 4, 40, dropout=0.0, norm=norm)
+    net = Transformer(DiffusionConfig(dim=16, heads=4, ff=40, dropout=0), 3, norm=norm)
     for name, parameter in net.named_parameters():
         if "norm" in name or name.endswith("bias"):
             nn.init.normal_(parameter, mean=1.0 if name.endswith("weight") else 0.0, std=0.3)
@@ -65,7 +64,7 @@ def theirs_of_other(net: Transformer, norm: Norm) -> nn.TransformerEncoder:
 @pytest.mark.parametrize("norm", get_args(Norm))
 def test_step_by_step_equals_at_once(norm: Norm) -> None:
     torch.manual_seed(0)
-    net = Transformer(2, 16, 2, 32, dropout=0.0, norm=norm).double().eval()
+    net = Transformer(DiffusionConfig(dim=16, heads=2, ff=32, dropout=0), 2, norm=norm).double().eval()
     x = torch.randn(2, 7, 16).double()
     cache = net.cache(7)
     with torch.no_grad():

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import nn
 
-from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, ResidualQuantizer
+from motionloom.models.quantize.base import QuantizerConfig
+from motionloom.models.quantize.ema import EmaQuantizer, ResidualQuantizer
 from motionloom.models.quantize.fsq import FsqQuantizer
 from motionloom.models.quantize.gradient import GradientQuantizer, GradientQuantizerConfig
 

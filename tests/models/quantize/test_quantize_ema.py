@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from motionloom.models.quantize.base import draw_rows, nearest
-from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig, ResidualQuantizer, cluster_sums
+from motionloom.models.quantize.base import QuantizerConfig, draw_rows, nearest
+from motionloom.models.quantize.ema import EmaQuantizer, ResidualQuantizer, cluster_sums
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ LENGTH = torch.tensor([16, 12, 16, 9])
 def module_of(config: AnyTokenizerConfig) -> TokenizerModule:
     torch.manual_seed(0)
     net = build_tokenizer(config, LAYOUT)
-    return TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms())
+    return TokenizerModule(net, OptimConfig(), seed=0, max_steps=1)
 
 
 def batch_of(columns: Tensor, present: list[int], garbage: float = 0.0) -> dict[str, Tensor]:

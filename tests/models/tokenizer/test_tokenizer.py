@@ -109,7 +109,7 @@ def test_sizes_of_udes_quantization() -> None:
     assert sum(p.numel() for p in net.decoder.parameters()) == up + 2 * block
     assert sum(p.numel() for p in net.quantizer.parameters()) == 2048 * 1024
     assert isinstance(config, MqConfig)
-    assert config.loss_terms()["alpha"] == 1
+    assert config.commitment() == 1
     assert (config.codebook_weight, config.commitment_weight) == (1, 1)
 
 

@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 import torch
 from plain_training import take_steps
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.tokenizer.base import TokenizerOutput
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import (
     AnyTokenizerConfig,
@@ -20,12 +21,7 @@ from motionloom.models.tokenizer.config import (
     RvqConfig,
     VqConfig,
 )
-from motionloom.models.tokenizer.module import (
-    TokenizerModule,
-    reconstruction_loss,
-    tokenizer_loss,
-    velocity_loss,
-)
+from motionloom.models.tokenizer.module import TokenizerModule, reconstruction_loss, velocity_loss
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 LAYOUT = MotionLayout.named("wholebody363")
@@ -59,10 +55,17 @@ def test_losses_equal_a_slow_reference(kind: Recon) -> None:
 
 def test_total_is_the_weighted_sum() -> None:
     a, b, penalty = torch.randn(2, 8, 3), torch.randn(2, 8, 3), torch.tensor(4.0)
-    terms = tokenizer_loss(a, b, penalty, None, alpha=0.5, recon="l2", velocity_weight=2.0)
+
+    def losses(**config: float) -> dict[str, Tensor]:
+        net = nn.Module()
+        net.config = VqConfig(**config)  # type: ignore[assignment, arg-type]
+        net.forward = lambda *_: TokenizerOutput(b, a, penalty, {}, {})
+        return TokenizerModule(net, OptimConfig(), seed=0, max_steps=1).losses({"motion": b, "length": None})
+
+    terms = losses(alpha=0.5, velocity_weight=2.0)
     assert set(terms) == {"loss", "recon", "commit", "velocity"}
     torch.testing.assert_close(terms["loss"], terms["recon"] + 2 * terms["velocity"] + 0.5 * penalty)
-    plain = tokenizer_loss(a, b, penalty, None, alpha=0.02, recon="l2", velocity_weight=0.0)
+    plain = losses(alpha=0.02)
     assert set(plain) == {"loss", "recon", "commit"}
     torch.testing.assert_close(plain["loss"], (a - b).square().mean() + 0.08)
 
@@ -100,7 +103,7 @@ def test_training_beats_the_mean(config: AnyTokenizerConfig) -> None:
     """120 steps leave under 5 % of the held-out variance unexplained (measured: 1.4 to 1.8 %)."""
     torch.manual_seed(0)
     net = build_tokenizer(config, LAYOUT)
-    module = TokenizerModule(net, OptimConfig(lr=2e-3), seed=1, max_steps=120, **config.loss_terms())
+    module = TokenizerModule(net, OptimConfig(lr=2e-3), seed=1, max_steps=120)
     waves = Waves(net.columns, 120, seed=1)
     take_steps(module, [waves[k] for k in range(120)])
     held_out = Waves(net.columns, 1, seed=2)[0]
@@ -123,7 +126,7 @@ def test_same_seed_same_weights() -> None:
     for _ in range(2):
         torch.manual_seed(0)
         net = build_tokenizer(config, LAYOUT)
-        module = TokenizerModule(net, OptimConfig(), seed=1, max_steps=5, **config.loss_terms())
+        module = TokenizerModule(net, OptimConfig(), seed=1, max_steps=5)
         waves = Waves(net.columns, 5, seed=1)
         take_steps(module, [waves[k] for k in range(5)])
         states.append(net.state_dict())

@@ -31,13 +31,12 @@ from motionloom.models.discriminator.patch import DiscriminatorConfig, PatchDisc
 from motionloom.models.evaluator.module import EvaluatorModule
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
 from motionloom.models.gpt.frozen import Frozen
-from motionloom.models.gpt.losses import cross_entropy
+from motionloom.models.gpt.losses import cross_entropy, soft_motion
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import MqConfig
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.utt.losses import soft_motion
 from motionloom.models.utt.network import Utt, UttConfig
 
 BATCH, GROUPS = 6, torch.tensor([5, 5, 4, 1, 2, 1])
@@ -78,17 +77,11 @@ class Generator(nn.Module):
         tokens, kinds = rows(tokens), rows(kinds)
         condition = self.mate(given)
         logits = self.utt(tokens, kinds, condition, rows(numbers(2)))
-        made = soft_motion(
-            self.utt,
-            logits.double(),
-            tokens,
-            kinds,
-            tokenizer=tokenizer,
-            gumbel_temperature=1.0,
-            sample=False,
+        made, length = soft_motion(
+            self.utt, logits.double(), tokens, kinds, tokenizer=tokenizer, temperature=1.0, sample=False
         )
         ce = cross_entropy(logits, tokens)
-        adversarial = generator_loss(critic(made.motion, condition.glob, made.length))
+        adversarial = generator_loss(critic(made, condition.glob, length))
         return {"loss": ce + adversarial, "ce": ce.clone(), "adversarial": adversarial.clone()}
 
 

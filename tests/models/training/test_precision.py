@@ -15,7 +15,8 @@ from plain_training import take_steps
 from rank_cases import CASES as CASES_OF_RANKS
 from torch import Tensor
 
-from motionloom.models.quantize.ema import EmaQuantizer, QuantizerConfig
+from motionloom.models.quantize.base import QuantizerConfig
+from motionloom.models.quantize.ema import EmaQuantizer
 from motionloom.models.quantize.fsq import FsqQuantizer
 from motionloom.models.tma.losses import info_nce, kl_four
 from motionloom.models.training.stage_module import StageModule

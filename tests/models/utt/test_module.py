@@ -19,7 +19,7 @@ from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, MqConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.utt.losses import UttLossConfig
-from motionloom.models.utt.module import UttModule, closed_sequences
+from motionloom.models.utt.module import UttModule
 from motionloom.models.utt.network import ConditionedUtt, UttConfig
 
 # ---- sequences
@@ -33,7 +33,7 @@ def test_sequences_are_those_of_each_row_alone(pattern: tuple[str, ...]) -> None
     groups, closed = [4, 4, 1, 2, 3, 1], [True, False, True, False, True, False]
     ends = {name: 5 + 2 * k for k, name in enumerate(stream_names(pattern))}
     codes = {n: torch.randint(end, (6, 4 * pattern.count(n)), generator=draws) for n, end in ends.items()}
-    found = closed_sequences(codes, torch.tensor(groups), torch.tensor(closed), pattern, ends)
+    found = interleave(codes, pattern, ends=ends, groups=torch.tensor(groups), closed=torch.tensor(closed))
     assert found.tokens.shape == found.kinds.shape == (6, 4 * len(pattern) + len(ends))
     for row, count in enumerate(groups):
         mine = {name: values[row : row + 1, : count * pattern.count(name)] for name, values in codes.items()}

@@ -80,7 +80,7 @@ def test_saved_bytes_of_a_known_network() -> None:
         mode = torch._subclasses.fake_tensor.FakeTensorMode(allow_non_fake_inputs=True)
         with mode if fake else torch.enable_grad():
             net = build_tokenizer(config, MotionLayout.named("body133"))
-            module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1, **config.loss_terms())
+            module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1)
             batch = {"motion": torch.zeros(4, 16, 133), "length": torch.full((4,), 16)}
             sizes.append(_saved_bytes(module, batch, None))
     assert sizes[0] == pytest.approx(sizes[1], rel=0.1)

@@ -17,7 +17,8 @@ from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
-from motionloom.models.gpt.tokens import deinterleave
+from motionloom.models.gpt.losses import group_counts
+from motionloom.models.gpt.tokens import as_codes
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import AnyTokenizerConfig, H2VQConfig, VqConfig
@@ -108,7 +109,9 @@ def test_a_caption_comes_with_its_own_tokens(tmp_path: Path, captions: list[Capt
     }
     for k in range(20):
         batch = batches[k]
-        read = deinterleave(batch["tokens"], net.pattern, ends=ends)
+        groups = group_counts(batch["tokens"], batch["kinds"], torch.tensor(list(ends.values())), 3)
+        rows = batch["tokens"][:, : 3 * int(groups.max())].unflatten(1, (-1, 3))
+        read = as_codes(rows, net.pattern, groups)
         assert torch.equal(batch["length"], 3 * read.groups + 2), "an End closes every sequence"
         for row, at in enumerate(batch["text"].argmax(1).tolist()):
             text, count = clips.texts[at], int(read.groups[row])
@@ -134,7 +137,8 @@ def test_a_long_stretch_is_cropped_inside(tmp_path: Path) -> None:
     for k in range(40):
         batch = batches_of(clips, net, most=5)[k]
         assert (batch["length"] == 15).all(), "no End: the motion goes on"
-        codes = deinterleave(batch["tokens"], net.pattern).codes["body"]
+        rows = batch["tokens"].unflatten(1, (-1, 3))
+        codes = as_codes(rows, net.pattern, batch["length"] // 3).codes["body"]
         for row in codes:
             begun |= {i for i in range(18) if torch.equal(row, body[2 * i : 2 * i + 10])}
     assert begun == set(allowed)
@@ -191,3 +195,10 @@ def test_a_tokenizer_without_a_hand_stream_needs_hands(tmp_path: Path) -> None:
     bare = dataset_of(tmp_path / "bare", Convert([[ALL]] * 2, present=(2, 2)))
     with pytest.raises(UserError, match="holds all that the tokenizer models"):
         clips_of(bare, config=VqConfig(width=8, depth=1, code_dim=8, num_codes=8, part="bodyhand"))
+
+
+def test_tokens_of_another_tokenizer_are_refused(tmp_path: Path) -> None:
+    clips, store, net = clips_of(dataset_of(tmp_path, Convert([[SITS]])))
+    store.codes["hand"][3] = 8
+    with pytest.raises(UserError, match=r"'hand'.*8 codes.*tokens stage"):
+        batches_of(clips, net)

@@ -70,7 +70,7 @@ def train_tokenizer(
     kind = H2VQConfig(width=8, depth=1, code_dim=8, velocity_weight=0.5)
     net = build_tokenizer(kind, MotionLayout.named("wholebody313"))
     optim = OptimConfig(lr=1e-3, warmup_steps=5, schedule="cosine", grad_clip=0.5)
-    module = TokenizerModule(net, optim, seed=5, max_steps=config.steps, **kind.loss_terms())
+    module = TokenizerModule(net, optim, seed=5, max_steps=config.steps)
     parts = config.accumulate
     fit(
         context(folder, Console(quiet=True)),
