@@ -19,7 +19,7 @@ def generate(
         list[str] | None, typer.Argument(help="What the person does; one motion each.")
     ] = None,
     face: Annotated[
-        list[str] | None, typer.Option("--face", help="What the face does, one for each caption.")
+        list[str] | None, typer.Option("--face", help="What the face does, for all captions or each.")
     ] = None,
     audio: Annotated[
         list[Path] | None,
@@ -43,12 +43,7 @@ def generate(
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
     sampling: Sampling = None,
-    rigid: Annotated[
-        bool, typer.Option(help="Show bones of constant length; without, the generated joints as they are.")
-    ] = True,
-    plant_feet: Annotated[
-        bool, typer.Option("--plant-feet", help="Hold feet still where they stand; says what that changes.")
-    ] = False,
+    plant_feet: Annotated[bool, typer.Option(help="Hold feet still where they stand.")] = True,
     body_model: Annotated[
         Path | None, typer.Option(help="Your SMPL-X model (.npz), for --format smplx.")
     ] = None,
@@ -58,7 +53,7 @@ def generate(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Motions from captions, music or a script of both, as npz, BVH and a page to watch; films on request.
+    """Motions from captions, music or a script of both, as numbers and a page; other files on request.
 
     Example: `motionloom generate synthetic "a person waves with the left hand"`
 
@@ -66,7 +61,7 @@ def generate(
 
     Example: `motionloom generate runs/ude-tiny --audio song.ogg --samples 3 -o dances`
 
-    Example: `motionloom generate runs/humantomato-tiny "a person bows" --format glb,html --plant-feet`
+    Example: `motionloom generate runs/humantomato-tiny "a person bows" --format glb,html`
 
     Example: `motionloom generate runs/humantomato-tiny --stream "a person walks" --seconds 60 -o walk.jsonl`
     """
@@ -89,12 +84,7 @@ def generate(
     from motionloom.pipeline.runs.generation import generate_motions
 
     files: dict[str, Any] = {} if formats is None else {"formats": formats}
-    files["figure"] = {
-        "rigid": rigid,
-        "plant_feet": plant_feet,
-        "body_model": body_model,
-        "arkit_bases": arkit_bases,
-    }
+    files["figure"] = {"plant_feet": plant_feet, "body_model": body_model, "arkit_bases": arkit_bases}
     folder = out or Path("motions")
     generate_motions(
         run_folder, captions or [], samples=samples, out=folder, console=make_console(), **files, **asked

@@ -16,11 +16,14 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.yaml import flatten, setting_text
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 FILE_NAME = "metrics.json"
 VERSION = 1
@@ -271,6 +274,18 @@ def _table(group: str, figures: Sequence[Figure]) -> TableRows:
     ]
     titles = [heading(one) for one in columns.values()]
     return "; ".join([group, *remarks(figures)]), ["", *titles], rows
+
+
+def print_tables(figures: Iterable[Figure], console: Console) -> None:
+    """The same on a terminal."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    for title, columns, rows in figure_tables(figures):
+        table = Table(*map(escape, columns), title=escape(title), title_justify="left")
+        for row in rows:
+            table.add_row(*map(escape, row))
+        console.print(table)
 
 
 def say_difference(protocols: Mapping[str, Protocol]) -> str:

@@ -4,13 +4,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
-from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
@@ -18,7 +16,15 @@ from motionloom.models.metrics.retrieval import RECALLS, Distance, recall
 from motionloom.pipeline.contract.lookup import finished_stages, stages_giving
 from motionloom.pipeline.contract.stage import ALIGNMENT, Finished, Role, StageCache
 from motionloom.pipeline.evaluation.estimate import plain
-from motionloom.pipeline.evaluation.figures import CHANCE, MODEL, Figure, FigureFile, Metric, group_figures
+from motionloom.pipeline.evaluation.figures import (
+    CHANCE,
+    MODEL,
+    Figure,
+    FigureFile,
+    Metric,
+    group_figures,
+    print_tables,
+)
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.truth import digest_of, truth_of
 from motionloom.pipeline.launch.hardware import choose_device
@@ -32,31 +38,11 @@ THRESHOLD = 0.9
 BATCHES = {"C": 256, "D": 32}
 
 
-@dataclass(frozen=True)
-class ProtocolResult:
-    """Recall@1/2/3/5/10 both ways under one protocol; fractions."""
-
-    protocol: str
-    meaning: str
-    size: int
-    """Candidates."""
-    figures: dict[str, float]
-    """"t2m/R@1" ..., "t2m/MedR", and the same for "m2t"."""
-
-
-@dataclass(frozen=True)
-class RetrievalResult:
-    """All protocols, and what tells this measurement from others."""
-
-    protocols: list[ProtocolResult]
-    facts: dict[str, Any]
-    """What judged which clips, as `retrieval.json` has it."""
-
-
 def retrieve(
     run: Path, stage: str | None = None, *, split: str | None = None, seed: int = 0, device: str = "auto"
-) -> RetrievalResult:
-    """All protocols for one judge of a run, on a split of its data; B where captions can be compared.
+) -> FigureFile:
+    """Recall@1/2/3/5/10 and the median rank both ways under each protocol, for one judge of a run on a split
+    of its data: figures `A.t2m/R@1`. Protocol B where captions can be compared.
 
     By default its stage `tma`, or else its first, on its test split or else another one held out. An
     evaluator's latents are compared by Euclidean distance, as its training and its figures have it; those
@@ -75,16 +61,16 @@ def retrieve(
             f"{run}: split '{dataset.split}' has {len(truths)} captioned clips; retrieval needs 2"
         )
     text, motion = judge.texts(truths), judge.recorded(truths)
-    rows = [_result("A", "whole split", recall(text, motion, distance=distance))]
+    found_by = {"A": ("whole split", recall(text, motion, distance=distance))}
     if "text" in inputs:
         sentence = torch.as_tensor(
             stage_cache.get(inputs["text"]).cache.similarity([t.caption for t in truths])
         )
         found_same = recall(text, motion, sentence=sentence, threshold=THRESHOLD, distance=distance)
-        rows.append(_result("B", f"same meaning counts (cosine {THRESHOLD:g})", found_same))
+        found_by["B"] = f"same meaning counts (cosine {THRESHOLD:g})", found_same
     for name, size in BATCHES.items():
         found_in = recall(text, motion, batch=size, seed=seed, distance=distance)
-        rows.append(_result(name, f"batches of {size}", found_in))
+        found_by[name] = f"batches of {size}", found_in
     facts = {
         "stage": found.name,
         "kind": found.kind.name,
@@ -99,7 +85,8 @@ def retrieve(
     }
     if isinstance(model, LoadedEvaluator):
         facts |= model.facts
-    return RetrievalResult(rows, facts)
+    figures = [one for name, by in found_by.items() for one in _figures(name, *by, facts)]
+    return FigureFile("retrieval", tuple(figures), facts)
 
 
 def _judge(model: Any, found: Finished, data: Any) -> tuple[Judge, Distance]:
@@ -152,35 +139,23 @@ def _sources(run: Path, found: Finished) -> dict[str, Finished]:
     return out
 
 
-def _result(protocol: str, meaning: str, figures: dict[str, float]) -> ProtocolResult:
-    size = int(figures.pop("size"))
-    return ProtocolResult(protocol, meaning, size, figures)
+_WAYS = {"t2m": "text to motion", "m2t": "motion to text"}
 
 
-def _figures(row: ProtocolResult, facts: dict[str, Any]) -> list[Figure]:
-    """Figures of one protocol, `A.t2m/R@1`, beside chance."""
-    names = {f"{row.protocol}.{name}": value for name, value in row.figures.items()}
-    guess = {name: min(1.0, int(name.partition("@")[2]) / row.size) for name in names if "/R@" in name}
-    metrics = [Metric(name, name.partition(".")[2], "higher" if "/R@" in name else "lower") for name in names]
+def _figures(name: str, meaning: str, values: dict[str, float], facts: dict[str, Any]) -> list[Figure]:
+    """Figures of one protocol beside chance, a table for each way."""
+    size = int(values["size"])
     protocol = {key: facts[key] for key in ("split", "clips", "clips_sha256", "distance", "threshold")}
-    protocol |= {"judge": facts["sha256"], "candidates": row.size}
-    rows = {MODEL: plain(names), CHANCE: plain(guess)}
-    return group_figures(f"Protocol {row.protocol}: {row.meaning}", metrics, rows, protocol)
-
-
-def retrieval_table(rows: list[ProtocolResult], title: str) -> Table:
-    """For a terminal: both ways, with what a guess would get."""
-    table = Table(title=title, title_justify="left")
-    for column in ("protocol", "", "among", "way", *(f"R@{k}" for k in RECALLS), "median rank"):
-        table.add_column(column)
-    for row in rows:
-        for way, title in (("t2m", "text to motion"), ("m2t", "motion to text")):
-            shares = [f"{100 * row.figures[f'{way}/R@{k}']:.1f} %" for k in RECALLS]
-            first = (row.protocol, row.meaning, str(row.size)) if way == "t2m" else ("", "", "")
-            table.add_row(*first, title, *shares, f"{row.figures[f'{way}/MedR']:.1f}")
-        guess = [f"{100 * min(1.0, k / row.size):.1f} %" for k in RECALLS]
-        table.add_row("", "", "", "[dim]a guess[/]", *(f"[dim]{g}[/]" for g in guess), "", end_section=True)
-    return table
+    protocol |= {"judge": facts["sha256"], "candidates": size}
+    out = []
+    for way, words in _WAYS.items():
+        shares = [Metric(f"{name}.{way}/R@{k}", f"R@{k}", "higher", "share") for k in RECALLS]
+        guess = {one.name: min(1.0, k / size) for one, k in zip(shares, RECALLS, strict=True)}
+        metrics = [*shares, Metric(f"{name}.{way}/MedR", "median rank", "lower")]
+        found = {one.name: values[one.name.removeprefix(f"{name}.")] for one in metrics}
+        rows = {MODEL: plain(found), CHANCE: plain(guess)}
+        out += group_figures(f"Protocol {name}, {words}: {meaning}", metrics, rows, protocol)
+    return out
 
 
 def retrieval_command(
@@ -196,11 +171,9 @@ def retrieval_command(
     RUN/retrieval-STAGE.json.
     """
     found = retrieve(run, stage, split=split, seed=seed, device=device)
-    main, stage = _judges(run)[0], found.facts["stage"]
-    title = "TMA retrieval" if stage == "tma" else f"Retrieval of stage {stage}"
-    console.print(retrieval_table(found.protocols, title))
-    path = run / ("retrieval.json" if stage == main else f"retrieval-{stage}.json")
-    figures = [figure for row in found.protocols for figure in _figures(row, found.facts)]
-    FigureFile("retrieval", tuple(figures), found.facts).write(path)
+    print_tables(found.figures, console)
+    stage = found.about["stage"]
+    path = run / ("retrieval.json" if stage == _judges(run)[0] else f"retrieval-{stage}.json")
+    found.write(path)
     console.print(str(path), markup=False, soft_wrap=True)
     return path

@@ -47,6 +47,12 @@ class GeneratedMotion:
         return self.prompt.words
 
     @property
+    def words(self) -> str:
+        """Both captions in one, for people."""
+        face = self.prompt.face_text
+        return f"{self.caption} (face: {face})".strip() if face and face != self.caption else self.caption
+
+    @property
     def fps(self) -> float:
         return self.layout.fps
 

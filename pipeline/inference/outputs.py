@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 
 from motionloom.datasets.audio.features import beats
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions, shown
@@ -16,10 +18,13 @@ from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.viewer import viewer_page
 from motionloom.pipeline.store.files import require_folder
 
+WRITTEN = ".motionloom"
+"""Names of the files that are beside it; the next motions take their place."""
 
-def file_stem(number: int, caption: str) -> str:
-    """A safe file name: number and the first words of the caption."""
-    words = re.sub(r"[^a-z0-9]+", "-", caption.lower()).strip("-")[:48].strip("-")
+
+def file_stem(number: int, name: str) -> str:
+    """A safe file name: number and the first words of a caption or a song, in any script."""
+    words = re.sub(r"[\W_]+", "-", unicodedata.normalize("NFKC", name).lower()).strip("-")[:48].strip("-")
     return f"{number:02d}-{words or 'motion'}"
 
 
@@ -32,15 +37,18 @@ def write_motions(
     note: str = "",
     seed: int,
     scores: Sequence[Score] | None = None,
+    names: Sequence[str] | None = None,
     figure: FigureOptions | None = None,
     say: Callable[[str], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
     """Write every motion in every format; the page holds all of them. Returns the paths.
 
-    `title` and `note` are the page's. `scores`, one for each motion: sound for the film and the page, beats
-    and segments for the page. Without them each motion comes with what drove it. `figure` says how the shown
-    figure follows the generated joints, and `say` is given a line a motion on how far it is from them.
+    What was written there before is removed. `title` and `note` are the page's. `scores`, one for each
+    motion: sound for the film and the page, beats and segments for the page. Without them each motion comes
+    with what drove it. `names` are what files are called after, instead of the captions. `figure` says how
+    the shown figure follows the generated joints, and `say` is given a line on each motion that it is far
+    from.
     `progress` is called with frames done and all frames of a film.
     """
     require_folder(folder)
@@ -53,13 +61,15 @@ def write_motions(
         if writer.needs_face and any(motion.face is None for motion in motions):
             raise UserError(f"this model makes no face: leave the format {name} out")
     folder.mkdir(parents=True, exist_ok=True)
+    _remove_written(folder)
     out: list[Path] = []
     clips: list[OutputClip] = []
+    names = [motion.caption for motion in motions] if names is None else names
     for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
-        name = file_stem(number, motion.caption)
+        name = file_stem(number, names[number])
         clips.append(OutputClip(shown(motion, options), score, options, seed, arkit="arkit" in formats))
-        if say is not None:
-            say(f"{name}: {clips[-1].shown.sentence}")
+        if say is not None and (remark := clips[-1].shown.remark):
+            say(f"{name}: {remark}")
         for _, writer in writers:
             if writer.alone:
                 out.append(folder / f"{name}{writer.suffix}")
@@ -68,7 +78,20 @@ def write_motions(
         if writer.together and (len(clips) > 1 or not writer.alone):
             out.append(folder / writer.together)
             writer.write(out[-1], Outputs(clips, title, note, progress))
+    write_text(folder / WRITTEN, "".join(f"{path.name}\n" for path in out))
     return out
+
+
+def _remove_written(folder: Path) -> None:
+    """Take away the files that motions before left here, and no other ones."""
+    written = folder / WRITTEN
+    known = {name for writer in WRITERS.values() for name in (writer.suffix, writer.together) if name}
+    if not written.is_file():
+        return
+    for name in written.read_text(encoding="utf-8").splitlines():
+        path = folder / name
+        if path.name == name and name.endswith(tuple(known)) and path.is_file():
+            path.unlink()
 
 
 def save(path: Path, motion: GeneratedMotion) -> None:

@@ -58,7 +58,9 @@ def prompts_of(
     sounds: Sequence[Sound | None] | None,
     conditions: Mapping[str, Sequence[object]] | None = None,
 ) -> list[Prompt]:
-    """One prompt a motion from lists of equal length; `conditions` adds modalities by name."""
+    """One prompt a motion from lists of equal length; `conditions` adds modalities by name. One face caption
+    alone is that of every motion.
+    """
     more = conditions or {}
     given: dict[str, Sequence[object] | None] = {"captions": captions, "sounds": sounds, **more}
     counts = {name: len(values) for name, values in given.items() if values is not None}
@@ -67,12 +69,12 @@ def prompts_of(
     if len(set(counts.values())) > 1:
         raise UserError(" but ".join(f"{count} {name}" for name, count in counts.items()))
     count = next(iter(counts.values()))
-    if faces is not None and len(faces) != count:
-        raise UserError(f"{count} captions but {len(faces)} face captions")
+    if faces is not None and len(faces) not in (1, count):
+        raise UserError(f"{count} captions but {len(faces)} face captions; give one, or one for each")
     return [
         Prompt(
             text=captions[row] if captions else "",
-            face_text=faces[row] if faces else "",
+            face_text=faces[row if len(faces) > 1 else 0] if faces else "",
             sound=sounds[row] if sounds else None,
             conditions={name: values[row] for name, values in more.items()},
         )

@@ -1,4 +1,4 @@
-"""The figure that all outputs show of a generated motion: one rigid skeleton, feet planted where asked for.
+"""The figure that all outputs show of a generated motion: one rigid skeleton, its feet planted.
 
 Page, film, pictures, BVH, GLB and npz take it from here, so they show the same. Evaluation and metrics never
 do: they read the features' own joints (`GeneratedMotion.joints`).
@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import model_validator
 
 from motionloom.datasets.motion.body.feet import FeetOptions, FeetReport, foot_contacts, plant_feet
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
@@ -19,16 +18,14 @@ from motionloom.datasets.motion.features.joints import rotations_of
 from motionloom.datasets.schema import Config
 from motionloom.pipeline.inference.motion import GeneratedMotion
 
+FAR_MM = 20.0
+"""A figure that is further from the generated joints, on average, is worth a word."""
+
 
 class FigureOptions(Config):
     """How the figure follows the generated joints."""
 
-    rigid: bool = True
-    """Show bones of constant length; without, page, film and npz show the generated joints as they are. BVH,
-    GLB and SMPL-X files have bones in any case."""
-    symmetric: bool = False
-    """Left and right bones of one length."""
-    plant_feet: bool = False
+    plant_feet: bool = True
     """Hold feet still where they stand (`datasets/motion/body/feet.py`)."""
     feet: FeetOptions = FeetOptions()
     body_model: Path | None = None
@@ -37,12 +34,6 @@ class FigureOptions(Config):
     """Your two bases (.npz with `source` and `arkit`), which expressions become ARKit weights by; without,
     expressions are those of the synthetic face."""
 
-    @model_validator(mode="after")
-    def _feet_on_bones(self) -> FigureOptions:
-        if self.plant_feet and not self.rigid:
-            raise ValueError("plant_feet moves the rigid figure: leave rigid on (--rigid)")
-        return self
-
 
 @dataclass(frozen=True)
 class ShownMotion:
@@ -50,32 +41,30 @@ class ShownMotion:
 
     motion: GeneratedMotion
     figure: RigidMotion
-    joints: NDArray[np.float64]
-    """What page, film and npz show [T, N, 3], metres: the figure's joints, or the generated ones."""
     feet: FeetReport | None = None
 
     @property
-    def rigid(self) -> RigidMotion | None:
-        """The figure, where it is what page, film and npz show."""
-        return self.figure if self.joints is self.figure.joints else None
+    def joints(self) -> NDArray[np.float64]:
+        """What page, film and npz show [T, N, 3], metres."""
+        return self.figure.joints
 
     @property
     def fps(self) -> float:
         return self.motion.layout.fps
 
     @property
-    def sentence(self) -> str:
-        """How far the figure is from the generated joints, in one line."""
-        feet = "" if self.feet is None else f"; {self.feet}"
-        return f"bones of constant length, {self.figure.error} from the generated joints{feet}"
+    def remark(self) -> str:
+        """How far the figure is from the generated joints, where that is far; else nothing."""
+        error = self.figure.error
+        return f"the figure is {error} from the generated joints" if error.mean_mm > FAR_MM else ""
 
     def facts(self) -> dict[str, object]:
-        """The same as numbers, for metadata."""
+        """How far it is from the generated joints, and what its feet did, for metadata."""
         error = self.figure.error
         out: dict[str, object] = {
-            "rigid": self.rigid is not None,
             "fit_mean_mm": round(error.mean_mm, 3),
             "fit_max_mm": round(error.max_mm, 3),
+            "feet_planted": self.feet is not None,
         }
         if self.feet is not None:
             out["fit_unplanted_mean_mm"] = round(self.feet.unplanted.mean_mm, 3)
@@ -89,18 +78,11 @@ def shown(motion: GeneratedMotion | ShownMotion, options: FigureOptions | None =
     """The figure of one motion; one that was made already stays what it is."""
     if isinstance(motion, ShownMotion):
         return motion
-    options = options or FigureOptions()
-    layout = motion.layout
-    figure = fit_rigid(
-        motion.joints,
-        layout.skeleton,
-        rotations=rotations_of(motion.features, layout),
-        symmetric=options.symmetric,
-    )
-    feet = None
-    if options.plant_feet:
-        # Only the h3d family has contact columns; others are judged by height and speed.
-        columns = motion.features if layout.family == "h3d" else None
-        contacts = foot_contacts(figure.joints, layout.skeleton, layout.fps, options.feet, columns, layout)
-        figure, feet = plant_feet(figure, motion.joints, contacts, layout.fps, options.feet)
-    return ShownMotion(motion, figure, figure.joints if options.rigid else motion.joints, feet)
+    options, layout = options or FigureOptions(), motion.layout
+    figure = fit_rigid(motion.joints, layout.skeleton, rotations=rotations_of(motion.features, layout))
+    if not options.plant_feet:
+        return ShownMotion(motion, figure)
+    # Only the h3d family has contact columns; others are judged by height and speed.
+    columns = motion.features if layout.family == "h3d" else None
+    contacts = foot_contacts(figure.joints, layout.skeleton, layout.fps, options.feet, columns, layout)
+    return ShownMotion(motion, *plant_feet(figure, motion.joints, contacts, layout.fps, options.feet))

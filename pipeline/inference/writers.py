@@ -155,7 +155,7 @@ def write_mp4(path: Path, outputs: Outputs) -> None:
         clip.shown.fps,
         clip.shown.motion.caption,
         sound=clip.score.sound,
-        figure=clip.shown.rigid,
+        figure=clip.shown.figure,
         face_controls=clip.controls,
         progress=outputs.progress,
     )
@@ -210,19 +210,19 @@ def cell_of(clip: OutputClip, label: str = "generated") -> ViewerMotion:
         fps=clip.shown.fps,
         parents=motion.layout.skeleton.parents,
         label=label,
-        caption=motion.caption,
+        caption=motion.words,
         face_controls=clip.controls,
         sound=clip.score.sound,
         beats=clip.score.beats,
         segments=clip.score.segments,
-        figure=clip.shown.rigid,
+        figure=clip.shown.figure,
     )
 
 
 _BYTES = "application/octet-stream"
 WRITERS: dict[str, Writer] = {
     "npz": Writer(".npz", _BYTES, "joints and features as numpy arrays", write_npz, default=True),
-    "bvh": Writer(".bvh", "text/plain; charset=utf-8", "bones for animation tools", write_bvh, default=True),
+    "bvh": Writer(".bvh", "text/plain; charset=utf-8", "bones for animation tools", write_bvh),
     "mp4": Writer(".mp4", "video/mp4", "a film", write_mp4, slow=True),
     "glb": Writer(".glb", "model/gltf-binary", "the skinned body for 3-D tools", write_glb, "motions.glb"),
     "smplx": Writer("_smplx.npz", _BYTES, "SMPL-X parameters", write_smplx),

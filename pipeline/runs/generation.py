@@ -144,7 +144,7 @@ def generate_motions(
         else:
             motions = bundle.generate(
                 [text for text in captions for _ in range(samples)] or None,
-                face=face and [text for text in face for _ in range(samples)],
+                face=face and (list(face) if len(face) == 1 else [t for t in face for _ in range(samples)]),
                 sounds=[sound for sound in sounds for _ in range(samples)] or None,
                 seconds=seconds,
                 seed=seed,
@@ -156,6 +156,7 @@ def generate_motions(
             _print_note(aside, unknown)
         title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
         note = page_note(len(motions), folder.resolve().name, seed)
+        named = [path.stem for path in audio for _ in range(samples)]
         with film_progress(aside) as progress:
             paths = write_motions(
                 out,
@@ -164,6 +165,7 @@ def generate_motions(
                 title=title,
                 note=note,
                 seed=seed,
+                names=None if captions or not named else named,
                 figure=posing,
                 say=lambda line: aside.print(line, soft_wrap=True, markup=False),
                 progress=progress,

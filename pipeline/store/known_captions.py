@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from motionloom.datasets.base.files import atomic_path, write_json
+from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Config, UserError
 
 KNOWN_FILES = ("known.json", "known.safetensors")
@@ -50,8 +52,9 @@ class Unknown:
 
     def __str__(self) -> str:
         known = "; ".join(f"'{text}'" for text in self.nearest)
+        said = shorten(printable(self.caption), 100, placeholder=" …")
         return (
-            f"'{self.caption}' is unlike all captions that this model was trained on, so the motion may show "
+            f"'{said}' is unlike all captions that this model was trained on, so the motion may show "
             f"something else. The nearest it knows: {known}"
         )
 

@@ -7,9 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.motion.features.joints import joints_of
@@ -19,7 +16,14 @@ from motionloom.pipeline.contract.showing import FigureTable, Showing
 from motionloom.pipeline.contract.stage import SHOWING, Finished, Inputs, StageContext, StageKind
 from motionloom.pipeline.contract.units import Arrays, even_slices
 from motionloom.pipeline.evaluation.details import detail_showings
-from motionloom.pipeline.evaluation.figures import FILE_NAME, Fact, FigureFile, facts, figure_tables
+from motionloom.pipeline.evaluation.figures import (
+    FILE_NAME,
+    Fact,
+    FigureFile,
+    facts,
+    figure_tables,
+    print_tables,
+)
 from motionloom.pipeline.evaluation.movement import FEATURE_FPS, Features, all_features
 from motionloom.pipeline.inference.bundle import Bundle
 
@@ -47,7 +51,7 @@ class EvaluationStage(StageKind):
         """Write `metrics.json` and print it as tables."""
         found = self.evaluation(context).measured()
         found.write(context.folder / FILE_NAME)
-        print_figures(context.console, found)
+        print_tables(found.figures, context.console)
         context.units.clear()
 
     def show(self, stage: Finished, given: Inputs) -> list[Showing]:
@@ -149,12 +153,3 @@ class Evaluation:
 def _joints(dataset: ClipDataset, index: int) -> Any:
     layout = dataset.layout
     return joints_of(np.asarray(dataset.motion(index))[:, layout.part("bodyhand")], layout)
-
-
-def print_figures(console: Console, found: FigureFile) -> None:
-    """The tables on the terminal."""
-    for title, columns, rows in figure_tables(found.figures):
-        table = Table(*map(escape, columns), title=escape(title), title_justify="left")
-        for row in rows:
-            table.add_row(*map(escape, row))
-        console.print(table)

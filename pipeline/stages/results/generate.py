@@ -49,7 +49,7 @@ class GenerateStage(StageKind):
     summary = "motions from captions and music"
     config = GenerateConfig
     takes = ("data", Every("generators", GENERATOR))
-    version = 5  # rigid figures
+    version = 6  # feet that stand
 
     def gives(self, config: Any) -> frozenset[str]:
         return frozenset({"motions"})

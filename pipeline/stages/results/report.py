@@ -40,6 +40,7 @@ from motionloom.pipeline.evaluation.truth import (
 )
 from motionloom.pipeline.inference.bundle import Bundle, bundle_driven_by
 from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.shown import shown
 from motionloom.pipeline.render.body.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.score import Score
@@ -79,7 +80,7 @@ class ReportStage(StageKind):
         Every("generators", GENERATOR),
         Every("shown", SHOWING),
     )
-    version = 4  # dances
+    version = 5  # feet that stand
 
     def gives(self, config: Any) -> frozenset[str]:
         return frozenset({"page"})
@@ -237,7 +238,7 @@ def _rows(
         rows.append(("reconstruction", joints_of(kept, layout), again))
     if made is not None:
         controls = None if made.face is None else synthetic_face_controls(made.face)
-        rows.append(("generated", made.joints, controls))
+        rows.append(("generated", shown(made).joints, controls))
     return [
         ViewerMotion(
             joints,

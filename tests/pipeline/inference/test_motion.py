@@ -112,7 +112,7 @@ def test_a_new_format_is_known_everywhere(walk: Callable[..., np.ndarray], tmp_p
 
 
 def test_formats_are_names_of_the_table() -> None:
-    assert default_formats() == ["npz", "bvh", "html"]  # a film only where it is asked for
+    assert default_formats() == ["npz", "html"]  # other files only where it is asked for
     with pytest.raises(UserError, match="formats"):
         GenerateConfig.parse({"formats": ["npz", "fbx"]}, "generate")
     for name in ("mp4", "fbx"):  # a server does not film

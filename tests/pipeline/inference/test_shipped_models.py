@@ -104,7 +104,7 @@ def test_the_readmes_first_line_waves_with_the_left_hand(
     assert made.code == 0, made.err
     assert "synthetic: the model that comes with motionloom" in made.err and "note:" not in made.err
     assert f"watch it in a browser: {tmp_path / 'motions/index.html'}" in made.err.splitlines()[-1]
-    assert [Path(line).suffix for line in made.out.split()] == [".npz", ".bvh", ".html"]
+    assert [Path(line).suffix for line in made.out.split()] == [".npz", ".html"]
     with np.load(made.out.split()[0], allow_pickle=False) as file:
         joints, facts = file["joints"].astype(np.float64), json.loads(str(file["metadata"]))
     assert facts["caption"] == CAPTION and len(joints) >= facts["fps"]

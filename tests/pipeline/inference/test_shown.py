@@ -25,7 +25,7 @@ from motionloom.datasets.synth.face import APEX, BASIS
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import write_motions
-from motionloom.pipeline.inference.shown import FigureOptions, shown
+from motionloom.pipeline.inference.shown import FAR_MM, FigureOptions, shown
 
 LAYOUT = MotionLayout.named("wholebody363")
 
@@ -75,7 +75,6 @@ def test_all_files_show_one_figure_of_constant_bones(motions: list[GeneratedMoti
         "01-a-person-waves.glb", "01-a-person-waves_smplx.npz", "motions.glb", "index.html",
     ]  # fmt: skip
     assert all(path.is_file() for path in paths)
-    assert [line.split(":")[0] for line in said] == ["00-a-person-walks", "01-a-person-waves"]
     parents = list(LAYOUT.skeleton.parents[1:])
     for number, motion in enumerate(motions):
         with np.load(paths[4 * number], allow_pickle=False) as file:
@@ -84,10 +83,10 @@ def test_all_files_show_one_figure_of_constant_bones(motions: list[GeneratedMoti
         lengths = np.linalg.norm(joints[:, 1:] - joints[:, parents], axis=-1)
         assert np.ptp(lengths, axis=0).max() < 1e-5  # float32
         away = np.linalg.norm(joints - motion.joints, axis=-1) * 1000
-        assert facts["figure"]["rigid"] is True
         assert facts["figure"]["fit_mean_mm"] == pytest.approx(away.mean(), abs=1e-2)
         assert facts["figure"]["fit_max_mm"] == pytest.approx(away.max(), abs=1e-2)
-        assert f"{away.mean():.1f} mm on average" in said[number]
+        far = away.mean() > FAR_MM
+        assert far == any(f"{away.mean():.1f} mm on average" in line for line in said)
         bvh = read_bvh(paths[4 * number + 1])
         order = [bvh.joints.index(name) for name in LAYOUT.skeleton.joints]
         np.testing.assert_allclose(bvh.positions()[:, order] / 100, joints, atol=2e-5)
@@ -101,15 +100,16 @@ def test_all_files_show_one_figure_of_constant_bones(motions: list[GeneratedMoti
     assert ["weights" in found for found in paths_of] == [True, False]
 
 
-def test_without_rigid_page_and_npz_show_the_generated_joints(
-    motions: list[GeneratedMotion], tmp_path: Path
-) -> None:
-    paths, _ = write(tmp_path / "out", motions[:1], rigid=False)
-    assert "motions.glb" not in [path.name for path in paths]  # one motion has its own file alone
-    with np.load(paths[0], allow_pickle=False) as file:
-        np.testing.assert_allclose(file["joints"], motions[0].joints, atol=1e-6)
-        assert json.loads(str(file["metadata"]))["figure"]["rigid"] is False
-    np.testing.assert_allclose(page_joints(paths[-1], 0), motions[0].joints, atol=1e-4)
+def test_new_motions_take_the_place_of_old_ones(motions: list[GeneratedMotion], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, motions)
+    (out / "notes.txt").write_text("mine")
+    (out / "mine.npz").write_text("mine")
+    names = ["歩く ひと", "шаг_вперёд"]
+    paths = write_motions(out, motions, ["npz", "html"], title="t", seed=0, names=names)
+    assert [path.name for path in paths] == ["00-歩く-ひと.npz", "01-шаг-вперёд.npz", "index.html"]
+    left = {path.name for path in out.iterdir() if not path.name.startswith(".")}
+    assert left == {"notes.txt", "mine.npz", *(path.name for path in paths)}
 
 
 def test_faces_are_written_as_arkit_weights_by_the_users_bases(
@@ -137,12 +137,12 @@ def test_faces_are_written_as_arkit_weights_by_the_users_bases(
 def test_planted_feet_say_what_they_cost(motions: list[GeneratedMotion]) -> None:
     # Trembling bones make the feet of these walks fast: they stand by a looser rule.
     feet = FeetOptions(height=0.1, speed=2.0)
-    plain, planted = shown(motions[0]), shown(motions[0], FigureOptions(plant_feet=True, feet=feet))
+    plain = shown(motions[0], FigureOptions(plant_feet=False))
+    planted = shown(motions[0], FigureOptions(feet=feet))
     assert planted.feet is not None and plain.feet is None
     facts = planted.facts()
     assert facts["slide_after_cm_s"] < facts["slide_before_cm_s"]
     assert facts["fit_unplanted_mean_mm"] == plain.facts()["fit_mean_mm"] < facts["fit_mean_mm"]
-    assert "feet slide" in planted.sentence and "feet" not in plain.sentence
     assert motions[0].joints is planted.motion.joints  # what is measured stays as it was
 
 
@@ -152,16 +152,11 @@ def test_every_family_of_layouts_has_a_figure(name: str, count: int) -> None:
     layout = MotionLayout.named(name)
     features = 0.1 * np.random.default_rng(3).normal(size=(12, layout.dim)).astype(np.float32)
     motion = GeneratedMotion(Prompt("x"), features, joints_of(features, layout), None, layout)
-    figure = shown(motion, FigureOptions(plant_feet=True))
+    figure = shown(motion)
     assert figure.joints.shape == (12, count, 3) and np.isfinite(figure.joints).all()
-    plain = shown(motion)
+    plain = shown(motion, FigureOptions(plant_feet=False))
     if layout.family == "raw":
         assert plain.figure.error.max_mm < 1e-3
         known = rotations_of(features, layout)
         assert known is not None
         np.testing.assert_allclose(plain.figure.rotations, known, atol=1e-5)
-
-
-def test_feet_cannot_be_planted_without_bones() -> None:
-    with pytest.raises(UserError, match="leave rigid on"):
-        FigureOptions.parse({"rigid": False, "plant_feet": True}, "figure")

@@ -152,8 +152,9 @@ def test_an_evaluation_is_judged_by_it(judge: Path, call: Callable[..., Any], tm
     judge_ = Judge.evaluator(evaluator)
     text, motion = judge_.texts(truths), judge_.recorded(truths)
     closest = torch.cdist(text.double(), motion.double()).argmin(1) == torch.arange(len(truths))
-    assert retrieved.protocols[0].figures["t2m/R@1"] == pytest.approx(closest.double().mean().item())
-    assert retrieved.facts["sha256"] == weights and retrieved.facts["clips"] == len(truths) == 60
+    first = retrieved.of("A.t2m/R@1")
+    assert first is not None and first.value == pytest.approx(closest.double().mean().item())
+    assert retrieved.about["sha256"] == weights and retrieved.about["clips"] == len(truths) == 60
 
 
 @pytest.mark.slow
