@@ -60,8 +60,9 @@ def synth(
 
 @data_app.command()
 def check(
-    path: Annotated[
-        Path, typer.Argument(help="Folder with manifest.json; or one source file, or a folder of such files.")
+    paths: Annotated[
+        list[Path],
+        typer.Argument(help="Folders with manifest.json; or source files, or folders of such files."),
     ],
     layout: Annotated[
         str | None,
@@ -84,7 +85,8 @@ def check(
 ) -> None:
     """Checksums, schema, finite values, ranges, people on a floor, duplicates, leaks. Exit code 1 and a list.
 
-    Without manifest.json, single files are checked: .tar, .npy, .npz, .pkl, .bvh, .wav, .txt.
+    Without manifest.json, single files are checked: .tar, .npy, .npz, .pkl, .bvh, .wav, .txt. Several data
+    sets are also compared with each other: no clip of one may be in another split of the next.
 
     Example: `motionloom data check shards`
 
@@ -92,6 +94,25 @@ def check(
     """
     rules = {"layout": layout, "fps": fps, "texts": texts, "seconds": seconds}
     console = make_console(aside=as_json)
+    if len(paths) == 1:
+        count, found = _check_one(paths[0], rules, every, strict, console)
+    else:
+        count, each, sets = 0, [], []
+        for path in paths:
+            problems, one = _check_one(path, rules, every, strict, console)
+            count += problems
+            each.append(one)
+            sets += [path] if "files" not in one else []
+        leaks = _leaks(sets, console)
+        count, found = count + len(leaks), {"paths": each, "problems": count + len(leaks), "leaks": leaks}
+    if as_json:
+        print_json(found)
+    raise typer.Exit(1 if count else 0)
+
+
+def _check_one(
+    path: Path, rules: Mapping[str, Any], every: bool, strict: bool, console: Console
+) -> tuple[int, dict[str, object]]:
     if not path.exists():
         raise UserError(f"{path}: no such folder or file")
     files = path.is_file() or _holds_files(path)
@@ -107,9 +128,19 @@ def check(
     if strict:
         count += warned
     console.print(f"{path}: {count} problems" if count else f"{path}: no problems", markup=False)
-    if as_json:
-        print_json({"path": path, "problems": count, **found})
-    raise typer.Exit(1 if count else 0)
+    return count, {"path": path, "problems": count, **found}
+
+
+def _leaks(folders: list[Path], console: Console) -> list[str]:
+    """Clips that data sets have in different splits, said."""
+    from motionloom.datasets.check.leaks import leaks_across
+
+    found = leaks_across(folders)
+    for leak in found:
+        say(console, f"leak: {leak}")
+    if len(folders) > 1:
+        console.print(f"{len(found) or 'no'} clips of one data set are in another split of the next")
+    return found
 
 
 @data_app.command()

@@ -9,22 +9,12 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
-from motionloom.datasets.convert.bvh.plan import (
-    SUFFIX,
-    BvhClip,
-    BvhConfig,
-    JointMaps,
-    guess_maps,
-    map_name,
-    plan_bvh,
-)
-from motionloom.datasets.convert.captions.options import digest_of
+from motionloom.datasets.convert.bvh.plan import SUFFIX, BvhClip, BvhConfig, JointMaps, load_maps, plan_bvh
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.feature_step import FeatureBatch, FeatureStep
 from motionloom.datasets.convert.common.features import features_of
@@ -32,7 +22,6 @@ from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
-from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Dropped, UserError
@@ -54,28 +43,19 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     def __init__(self, config: BvhConfig) -> None:
         super().__init__(config)
-        given = None
-        if config.joint_map != "auto":  # a wrong map should fail before the long part
-            given = JointMap.load(config.joint_map, target=config.mapped_skeleton().name)
-        self.maps = JointMaps(given, {})
+        self.given = load_maps(config.joint_map, config.mapped_skeleton())  # a wrong one fails here
+        self.maps = JointMaps({})
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[BvhClip]:
-        plan = plan_bvh(self.config, settings)
-        if self.maps.given is None:
-            plan, self.maps = _guessed(self.config, plan, settings.maps)
+        plan, self.maps = plan_bvh(self.config, self.given, settings)
         return plan
 
     def depends_on(self, clip: BvhClip) -> list[object]:
         return [clip.id, clip.found.sha256, [caption.dump() for caption in clip.texts]]
 
     def options(self) -> dict[str, object]:
-        path = self.config.joint_map
-        if path == "auto":
-            sources = {key: joint_map.sources for key, joint_map in self.maps.guessed.items()}
-            used = {"file": "auto", "sha256": sha256_of_json(sources)}
-        else:
-            used = digest_of(path)
-        return super().options() | {"joint_map": used}
+        maps = {key: [one.sources, one.unit, one.up] for key, one in self.maps.by_skeleton.items()}
+        return super().options() | {"joint_maps": sha256_of_json(maps)}
 
     def subset(self, clip: BvhClip) -> str:
         return clip.subset
@@ -120,7 +100,8 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         """Features [T', D] of one file; `label` names it in errors."""
         config = self.config
         motion = read_bvh(data, name=label)
-        joints = self.maps.of(motion).apply(motion, unit=config.unit, up=config.up)
+        joint_map = self.maps.of(motion)
+        joints = joint_map.apply(motion, unit=config.unit, up=config.up)
         try:
             if len(self.layout.skeleton) > joints.shape[1]:
                 joints = with_resting_hands(joints)
@@ -128,7 +109,8 @@ class Bvh(Converter[BvhConfig, BvhClip]):
                 joints, config.source_fps or motion.fps, self.layout, same_bones=config.retarget
             )
         except UserError as error:
-            raise UserError(f"{label}: {error} (read with unit '{config.unit}', up '{config.up}')") from None
+            unit, up = joint_map.unit or config.unit, joint_map.up or config.up
+            raise UserError(f"{label}: {error} (read with unit '{unit}', up '{up}')") from None
 
     def _read(self, clip: BvhClip) -> bytes:
         batch = clip.batch
@@ -166,17 +148,3 @@ class Bvh(Converter[BvhConfig, BvhClip]):
             for label in labels:
                 if label in waiting:
                     yield label, drop(label, error)
-
-
-def _guessed(
-    config: BvhConfig, plan: ConversionPlan[BvhClip], folder: Path | None
-) -> tuple[ConversionPlan[BvhClip], JointMaps]:
-    clips = ((clip.batch, clip.label(), clip.found.skeleton) for _, clip in plan.items)
-    guesses = guess_maps(clips, config.mapped_skeleton(), config.source, folder)
-    notes = [
-        f"{map_name(number)}: guessed from {guess.source}; {guess.summary()}"
-        for number, guess in enumerate(guesses.values(), start=1)
-    ]
-    maps = {key: guess.joint_map(f"the guess from {guess.source}") for key, guess in guesses.items()}
-    plan.notes += notes
-    return plan, JointMaps(None, maps)

@@ -7,8 +7,7 @@ order of their work change nothing.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -16,7 +15,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from motionloom.datasets.base.files import sha256_of_json, write_text
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
 from motionloom.datasets.convert.captions.options import CaptionConfig, CaptionedPlan, settle_captions
 from motionloom.datasets.convert.common.converter import PlanSettings
@@ -24,7 +23,7 @@ from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.scan import Batch, BatchScan, FoundFile, list_batches, scan_batches
-from motionloom.datasets.motion.bvh.joint_map import JointMap, Unit, Up
+from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy
 from motionloom.datasets.motion.layout import MotionLayout
@@ -34,73 +33,107 @@ from motionloom.datasets.schema import Caption, Split, UserError
 MapChoice = Annotated[
     Path | Literal["auto"], BeforeValidator(lambda given: "auto" if str(given) == "auto" else given)
 ]
-"""A map file, or `auto` (from the command line also as a path) for one that is guessed."""
+"""A map file or a folder of them, or `auto` (from the command line also as a path) for guesses."""
 
 SUFFIX = ".bvh"
+MAPS_FOLDER = "joint_maps"
+"""In the folder of the shards: the maps that were guessed, one for each skeleton."""
 
 
 @dataclass(frozen=True)
 class JointMaps:
     """The joint maps of a conversion."""
 
-    given: JointMap | None
-    """The user's, for every clip."""
-    guessed: Mapping[str, JointMap]
-    """By `skeleton_key`, where none is given."""
+    by_skeleton: Mapping[str, JointMap]
+    """By `skeleton_key`."""
 
     def of(self, motion: BvhMotion) -> JointMap:
-        if self.given is not None:
-            return self.given
         try:
-            return self.guessed[skeleton_key(motion.joints, motion.parents)]
+            return self.by_skeleton[skeleton_key(motion.joints, motion.parents)]
         except KeyError:
-            raise UserError(
-                f"{motion.name}: its skeleton was not there when the source was planned"
-            ) from None
+            raise UserError(f"{motion.name}: its skeleton has no joint map") from None
 
 
-def skeleton_key(joints: Sequence[str], parents: Sequence[int]) -> str:
-    """What clips with one skeleton share."""
-    return sha256_of_json([list(joints), list(parents)])[:16]
+def load_maps(choice: Path | str, target: Skeleton) -> list[JointMap]:
+    """The maps of a file, or of the .json files of a folder that hold any for `target`; none for `auto`."""
+    if not isinstance(choice, Path):
+        return []
+    if not choice.is_dir():
+        return [JointMap.load(choice, target=target.name)]
+    found = []
+    for path in sorted(choice.glob("*.json")):
+        with suppress(UnfinishedMapError):  # its skeleton is left out, and said
+            found.append(JointMap.load(path, target=target.name))
+    if not found:
+        raise UserError(f"{choice}: no finished joint map (.json) in it")
+    return found
 
 
-def guess_maps(
-    clips: Iterable[tuple[Batch, str, str]], target: Skeleton, source: Path, folder: Path | None
-) -> dict[str, JointGuess]:
-    """A certain guess for every skeleton of the planned clips (batch, label, skeleton's key).
+def choose_maps(
+    config: BvhConfig,
+    given: Sequence[JointMap],
+    plan: ConversionPlan[BvhClip],
+    joints: Mapping[str, tuple[str, ...]],
+    folder: Path | None,
+) -> JointMaps:
+    """A map for every skeleton (`joints` of each) of the planned clips: a given one, else a certain guess.
 
-    With `folder` each is written there as a map file. `UserError` when one is not certain, or when another
-    map lies there already: it may have been corrected by hand.
+    Clips of other skeletons leave the plan. Guesses are written into `folder`, where there is one, to be
+    completed. `UserError` when no skeleton has a map, and when a given map fits none.
     """
+    target = config.mapped_skeleton()
+    maps: dict[str, JointMap] = {}
+    doubts: dict[str, str] = {}
+    misfits: dict[str, str] = {}
+    skeletons = {clip.found.skeleton: clip.label() for _, clip in reversed(plan.items) if clip.found.skeleton}
+    for key, label in skeletons.items():
+        for one in given:
+            if one.skeleton in ("", key) and key not in maps:
+                try:
+                    one.require_fit(joints[key], label)
+                    maps[key] = one
+                except UserError as error:
+                    misfits.setdefault(one.where, str(error))
+    for key, motion in _first_clips(plan, skeletons.keys() - maps.keys()).items():
+        guess = guess_joint_map(motion, target)
+        written = _written(guess, key, folder)
+        if guess.certain:
+            maps[key] = guess.joint_map(f"the guess from {guess.source}")
+            plan.notes.append(f"joint map guessed from {guess.source}; {guess.summary()}")
+        else:
+            doubts[key] = f"the joint map of {guess.source} is not certain: {guess.doubts()}; {written}"
+    used = {one.where for one in maps.values()}
+    for one in given:
+        if one.where not in used and (len(given) == 1 or one.where in misfits):
+            raise UserError(misfits.get(one.where, f"{one.where}: no file has its skeleton '{one.skeleton}'"))
+    left = [clip for _, clip in plan.items if clip.found.skeleton in doubts]
+    if left and len(left) == len(plan.items):
+        raise UserError(f"{config.source}: {next(iter(doubts.values()))}")
+    plan.items = [item for item in plan.items if item[1].found.skeleton not in doubts]
+    plan.notes += doubts.values()
+    for clip in left:
+        plan.reject(clip.label(), f"no certain joint map for its skeleton ({doubts[clip.found.skeleton]})")
+    return JointMaps(maps)
+
+
+def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str, BvhMotion]:
+    """The first readable clip of each of the skeletons."""
     wanted: dict[Batch, dict[str, str]] = {}
-    for batch, label, key in clips:
-        wanted.setdefault(batch, {})[label] = key
-    guesses: dict[str, JointGuess] = {}
+    for _, clip in plan.items:
+        if clip.found.skeleton in skeletons:
+            wanted.setdefault(clip.batch, {})[clip.label()] = clip.found.skeleton
+    found: dict[str, BvhMotion] = {}
     for batch, labels in wanted.items():
-        missing = {key for key in labels.values() if key} - set(guesses)
+        missing = set(labels.values()) - set(found)
         with suppress(UserError):  # a damaged archive; its clips are reported when they are converted
             for file in batch.read(SUFFIX) if missing else ():
-                if labels.get(file.label) not in missing:
-                    continue
-                with suppress(UserError):  # likewise; the next clip of this skeleton may be whole
-                    guess = guess_joint_map(read_bvh(file.data, name=file.label), target)
-                    guesses[labels[file.label]] = guess
-                    missing.remove(labels[file.label])
+                if labels.get(file.label) in missing:
+                    with suppress(UserError):  # likewise; the next clip of this skeleton may be whole
+                        found[labels[file.label]] = read_bvh(file.data, name=file.label)
+                        missing.remove(labels[file.label])
                 if not missing:
                     break
-    written = {key: _written(guess, number, folder) for number, (key, guess) in enumerate(guesses.items(), 1)}
-    for key, guess in guesses.items():
-        if not guess.certain:
-            which = f" (skeleton of {guess.source})" if len(guesses) > 1 else ""
-            raise UserError(
-                f"{source}: the joint map{which} is not certain: {guess.doubts()}; {written[key]}"
-            )
-    return guesses
-
-
-def map_name(number: int) -> str:
-    """File name of the map of the n-th skeleton of a source."""
-    return "joint_map.json" if number == 1 else f"joint_map-{number}.json"
+    return found
 
 
 def guess_source(source: Path, target: Skeleton) -> JointGuess:
@@ -114,23 +147,18 @@ def guess_source(source: Path, target: Skeleton) -> JointGuess:
     raise UserError(f"{source}: no {SUFFIX} file in it")
 
 
-def _written(guess: JointGuess, number: int, folder: Path | None) -> str:
+def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
+    """Write the map of a guess, and say what to do with it."""
     if folder is None:
         return f"`motionloom data joints {guess.source} -o joint_map.json` writes a map to complete"
-    path = folder / map_name(number)
-    name = guess.target.name
-    if path.exists():
-        try:
-            rows = json.loads(path.read_text(encoding="utf-8-sig")).get(name)
-        except (OSError, ValueError, AttributeError):
-            rows = None
-        if rows != json.loads(guess.text())[name]:
-            raise UserError(
-                f"{path}: not the joint map that is guessed; use it with --joint-map {path}, or delete it"
-            )
-    else:
-        write_text(path, guess.text())
-    return f"complete {path} and pass it with --joint-map {path}"
+    path = folder / MAPS_FOLDER / f"skeleton-{key}.json"
+    if not path.exists():
+        write_text(path, guess.text(key))
+    elif path.read_text(encoding="utf-8") != guess.text(key) and guess.certain:
+        raise UserError(
+            f"{path}: not the joint map that is guessed; use it with --joint-map {path.parent}, or delete it"
+        )
+    return f"complete {path} and pass the folder with --joint-map {path.parent}"
 
 
 class BvhConfig(CaptionConfig):
@@ -139,7 +167,8 @@ class BvhConfig(CaptionConfig):
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""
     joint_map: MapChoice = "auto"
-    """`auto`, or a JSON file that says which joints of the files stand for ours (docs/sources.md)."""
+    """A JSON file that says which joints of the files stand for ours, or a folder of such files, each for its
+    own skeleton (docs/sources.md). Where none fits, and with `auto`, the map is guessed from the names."""
     name: str = "bvh"
     """Name of the data set; part of the shards' file names."""
     licence: str
@@ -195,23 +224,35 @@ class BvhClip:
         return self.found.label
 
 
-def plan_bvh(config: BvhConfig, settings: PlanSettings) -> ConversionPlan[BvhClip]:
-    """Find every clip and decide what becomes of it, without converting anything."""
+def plan_bvh(
+    config: BvhConfig, given: Sequence[JointMap], settings: PlanSettings
+) -> tuple[ConversionPlan[BvhClip], JointMaps]:
+    """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
     batches = list_batches(config.source, SUFFIX)
     scans = scan_batches(
         batches, SUFFIX, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
     )
-    return _decide(config, batches, scans)
+    draft = _decide(config, batches, scans)
+    joints = {key: names for scan in scans for key, names in scan.joints.items()}
+    maps = choose_maps(config, given, draft, joints, settings.maps)
+    draft.limit(lambda clip: clip.id)
+    layout = config.motion_layout()
+    draft.finish(
+        found=sum(len(scan.files) for scan in scans),
+        frames=lambda clip: frames_after(clip.found.frames, config.source_fps or clip.found.fps, layout),
+        licence=lambda clip: config.licence,
+    )
+    return draft, maps
 
 
-def _header(data: bytes, label: str) -> tuple[int, float, str]:
+def _header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
     text, where = load_text(data, label)
     section = find_motion(text, where)
-    key = ""
+    key, names = "", tuple[str, ...]()
     with suppress(UserError):  # a broken hierarchy is reported when the clip is converted
         joints = parse_hierarchy(text[: section.start], where)
-        key = skeleton_key(joints.names, joints.parents)
-    return section.frames, section.fps, key
+        key, names = skeleton_key(joints.names, joints.parents), tuple(joints.names)
+    return section.frames, section.fps, key, names
 
 
 def _decide(config: BvhConfig, batches: list[Batch], scans: list[BatchScan]) -> ConversionPlan[BvhClip]:
@@ -251,11 +292,5 @@ def _decide(config: BvhConfig, batches: list[Batch], scans: list[BatchScan]) -> 
         draft.notes.append(
             f"{other_rate} captions state another frame rate than their file; the file's counts"
         )
-    draft.limit(lambda clip: clip.id)
     settle_captions(config, draft, listing)
-    layout = config.motion_layout()
-    return draft.finish(
-        found=len(found),
-        frames=lambda clip: frames_after(clip.found.frames, config.source_fps or clip.found.fps, layout),
-        licence=lambda clip: config.licence,
-    )
+    return draft

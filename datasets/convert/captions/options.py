@@ -180,11 +180,10 @@ class CaptionConfig(ConvertConfig):
 
 
 def digest_of(path: Path) -> dict[str, str]:
-    """A file by its name and checksum; a folder by its name and those of its .txt files."""
+    """A file by its name and checksum; a folder by its name and those of its .txt and .json files."""
     if path.is_dir():
-        inside = {
-            p.relative_to(path).as_posix(): sha256_of(p) for p in sorted(path.rglob("*.txt")) if p.is_file()
-        }
+        files = (p for p in sorted(path.rglob("*")) if p.suffix in (".txt", ".json") and p.is_file())
+        inside = {p.relative_to(path).as_posix(): sha256_of(p) for p in files}
         return {"file": path.name, "sha256": sha256_of_json(inside)}
     return {"file": path.name, "sha256": sha256_of(path)}
 

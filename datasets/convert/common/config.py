@@ -41,6 +41,10 @@ class ConvertConfig(Config):
     """Clips of every subset to read and measure first; 0 for none. A source that then shows no people
     standing on a floor is refused."""
 
+    most_rejected: float = Field(default=0.5, ge=0, le=1, json_schema_extra={"runtime": True})
+    """Share of the clips that may turn out unreadable or unfit; a conversion that loses more fails, although
+    what is left of it is written."""
+
     def motion_layout(self) -> MotionLayout:
         return MotionLayout.named(self.layout, fps=self.fps)
 

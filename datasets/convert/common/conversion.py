@@ -21,6 +21,7 @@ from motionloom.datasets.convert.common.feature_step import FeatureStep
 from motionloom.datasets.convert.common.look import Look, look_at
 from motionloom.datasets.convert.common.plan import C, ConversionPlan, limited
 from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped
 from motionloom.datasets.shards.options import DatasetFacts, Part, WriteOptions
 from motionloom.datasets.shards.tasks import Convert
 from motionloom.datasets.shards.writer import dataset_writer
@@ -178,4 +179,21 @@ def run_conversion(
                     say(f"warning: {warning}")
         if features is not None:
             convert = features.make(writer.pending(), writer.work_folder, writer.pool, how, say)
-        return writer.write(convert)
+        manifest = writer.write(convert)
+    if part is None:
+        _require_most(conversion, manifest, out)
+    return manifest
+
+
+def _require_most(conversion: Conversion[C], manifest: Manifest, out: Path) -> None:
+    """`UserError` when most of a source could not be converted: a wrong map or unit rather than bad clips."""
+    plan = conversion.plan
+    # Of a few chosen clips (`limit`) those count that were tried.
+    before = [] if conversion.config.limit else [*plan.broken, *plan.rejected]
+    lost = [*before, *manifest.dropped[len(plan.left_out()) :]]
+    clips = len(plan.items) + len(before)
+    if len(lost) > conversion.config.most_rejected * clips:
+        raise UserError(
+            f"{out}: {len(lost)} of {clips} clips cannot be used ({grouped(lost)[0]}); the rest is "
+            f"converted; all reasons are in {out / LEFT_OUT_FILE}; to accept them: --set most_rejected=1"
+        )

@@ -60,6 +60,8 @@ class ConversionPlan(Generic[C]):
     """In the source, without captions."""
     dropped: list[Dropped] = field(default_factory=list)
     """In the source and readable, but left out."""
+    rejected: list[Dropped] = field(default_factory=list)
+    """In the source and readable, but nothing says how they are to be read as a person's motion."""
     broken: list[Dropped] = field(default_factory=list)
     """In the source, but cannot be read."""
     notes: list[str] = field(default_factory=list)
@@ -91,6 +93,10 @@ class ConversionPlan(Generic[C]):
     def miss(self, source: str, reason: str) -> None:
         """This one is listed somewhere, but not in the source."""
         self.missing.append(Dropped(source=source, reason=reason))
+
+    def reject(self, source: str, reason: str) -> None:
+        """This one was meant to become a sample, and cannot."""
+        self.rejected.append(Dropped(source=source, reason=reason))
 
     def fail(self, source: str, error: Exception) -> None:
         """This one cannot be read."""
@@ -126,7 +132,11 @@ class ConversionPlan(Generic[C]):
         if self.uncaptioned:
             some = escape(_some(self.uncaptioned))
             table.add_row("without captions", str(len(self.uncaptioned)), "", some)
-        kinds = (("missing files", self.missing), ("left out", self.dropped), ("broken", self.broken))
+        kinds = (
+            ("missing files", self.missing),
+            ("left out", [*self.rejected, *self.dropped]),
+            ("broken", self.broken),
+        )
         for title, drops in kinds:
             table.add_row(title, str(len(drops)), "", escape(_some(grouped(drops))))
         for licence, count in sorted(self.licences.items()):
@@ -145,7 +155,8 @@ class ConversionPlan(Generic[C]):
         left: dict[str, list[dict[str, str]]] = {
             name: [{"source": drop.source, "reason": drop.reason} for drop in drops]
             for name, drops in (
-                ("missing", self.missing), ("rejected", self.dropped), ("unreadable", self.broken)
+                ("missing", self.missing), ("rejected", [*self.rejected, *self.dropped]),
+                ("unreadable", self.broken),
             )
         }  # fmt: skip
         return {
@@ -166,6 +177,7 @@ class ConversionPlan(Generic[C]):
         return [
             *(drop.model_copy(update={"kind": "missing"}) for drop in self.missing),
             *(drop.model_copy(update={"kind": "unreadable"}) for drop in self.broken),
+            *self.rejected,
             *self.dropped,
         ]
 

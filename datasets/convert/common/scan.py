@@ -144,10 +144,12 @@ class BatchScan(Config):
 
     files: list[FoundFile]
     problem: Dropped | None
+    joints: dict[str, tuple[str, ...]]
+    """Names of the joints of each skeleton."""
 
 
-Header = Callable[[bytes, str], tuple[int, float, str]]
-"""(content, label) -> frames, frame rate and skeleton; `UserError` when the file cannot be read."""
+Header = Callable[[bytes, str], tuple[int, float, str, tuple[str, ...]]]
+"""(content, label) -> frames, frame rate, skeleton, its joints; `UserError` when the file cannot be read."""
 
 
 class _Memory(Config):
@@ -202,6 +204,7 @@ def _save(path: Path | None, batches: dict[str, BatchScan]) -> None:
 def _scan(suffix: str, header: Header, batch: Batch) -> tuple[BatchScan, bool]:
     """What a batch holds, and whether that depends on the files alone (and not on a right to read them)."""
     files: list[FoundFile] = []
+    joints: dict[str, tuple[str, ...]] = {}
     certain = True
     try:
         for file in batch.read(suffix):
@@ -209,7 +212,8 @@ def _scan(suffix: str, header: Header, batch: Batch) -> tuple[BatchScan, bool]:
             certain = certain and not file.error
             try:
                 if not problem:
-                    frames, fps, skeleton = header(file.data, file.label)
+                    frames, fps, skeleton, names = header(file.data, file.label)
+                    joints.setdefault(skeleton, names)
             except UserError as error:
                 problem = str(error)
             sha256 = hashlib.sha256(file.data).hexdigest()
@@ -225,5 +229,5 @@ def _scan(suffix: str, header: Header, batch: Batch) -> tuple[BatchScan, bool]:
                 )
             )
     except UserError as error:
-        return BatchScan(files=files, problem=drop(batch.label, error)), False
-    return BatchScan(files=files, problem=None), certain
+        return BatchScan(files=files, problem=drop(batch.label, error), joints=joints), False
+    return BatchScan(files=files, problem=None, joints=joints), certain

@@ -2,8 +2,9 @@
 
 A map file is JSON: one key named after the target skeleton holds rows `[index, target joint, source]`, where
 `source` is a joint name or a list of names whose mean position is taken (a pair is the midpoint, a repeated
-name weighs more); `null` is a row still to be filled in. `note` and `unmapped` (joints left out on purpose)
-are optional. Only positions cross the map: rest poses and bone axes of the two skeletons differ.
+name weighs more); `null` is a row still to be filled in. Optional are `note`, `unmapped` (joints left out on
+purpose), `unit` and `up` of the files it is for, and `skeleton`: a map with this key is for files of that
+skeleton alone. Only positions cross the map: rest poses and bone axes of the two skeletons differ.
 Guessed ones come from `convert/bvh/joint_guess`.
 """
 
@@ -21,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import Config, UserError
 
 Unit = Literal["m", "cm", "mm", "inch"]
 Up = Literal["y", "z"]
@@ -31,6 +33,21 @@ Up = Literal["y", "z"]
 METRES: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 
 _ROWS = TypeAdapter(list[tuple[int, str, str | list[str] | None]])
+
+
+class UnfinishedMapError(UserError):
+    """A map file has rows that are still to be filled in."""
+
+
+class _About(Config):
+    skeleton: str = ""
+    unit: Unit | None = None
+    up: Up | None = None
+
+
+def skeleton_key(joints: Sequence[str], parents: Sequence[int]) -> str:
+    """What clips with one skeleton share: names and parents of their joints. Bone lengths may differ."""
+    return sha256_of_json([list(joints), list(parents)])[:16]
 
 
 @dataclass(frozen=True)
@@ -42,6 +59,11 @@ class JointMap:
     sources: tuple[tuple[str, ...], ...]
     """Per target joint the source names whose mean is taken."""
     unmapped: tuple[str, ...] = ()
+    skeleton: str = ""
+    """`skeleton_key` of the only files that it is for; empty for all that have its joints."""
+    unit: Unit | None = None
+    up: Up | None = None
+    """What its files are measured in, where it says so."""
 
     @staticmethod
     def load(path: Path, *, target: str = "smpl22") -> JointMap:
@@ -68,7 +90,9 @@ class JointMap:
         sources: dict[int, tuple[str, ...]] = {}
         empty = [name for _, name, source in rows if source is None]
         if empty:
-            raise UserError(f"{path}: {target} rows still to be filled in (null): {', '.join(empty)}")
+            raise UnfinishedMapError(
+                f"{path}: {target} rows still to be filled in (null): {', '.join(empty)}"
+            )
         for index, name, source in rows:
             assert source is not None
             names = (source,) if isinstance(source, str) else tuple(source)
@@ -84,23 +108,28 @@ class JointMap:
         if missing:
             raise UserError(f"{path}: {target} has no row for {', '.join(missing)}")
         unmapped = tuple(str(name) for name in data.get("unmapped", []))
-        return JointMap(str(path), skeleton, tuple(sources[i] for i in range(len(skeleton))), unmapped)
+        about = _About.parse({key: data[key] for key in _About.model_fields if key in data}, str(path))
+        rows_in_order = tuple(sources[i] for i in range(len(skeleton)))
+        return JointMap(str(path), skeleton, rows_in_order, unmapped, about.skeleton, about.unit, about.up)
+
+    def require_fit(self, joints: Sequence[str], clip: str) -> None:
+        """`UserError` naming `clip` and the first joint of the map that is not among `joints`, or twice."""
+        counts = Counter(joints)
+        for name in dict.fromkeys(name for names in self.sources for name in names):
+            if counts[name] == 0:
+                near = difflib.get_close_matches(name, joints, n=1, cutoff=0.5)
+                hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(joints[:30])}"
+                raise UserError(f"{clip}: no joint '{name}', which {self.where} names; {hint}")
+            if counts[name] > 1:
+                raise UserError(f"{clip}: joint '{name}' appears {counts[name]} times; the map is ambiguous")
 
     def apply(self, motion: BvhMotion, *, unit: Unit = "cm", up: Up = "y") -> NDArray[np.float64]:
         """World positions of the target's joints [T, N, 3] in metres, Y up.
 
-        `unit` and `up` describe the file, which does not say them itself.
+        `unit` and `up` describe the file, which does not say them itself; the map's own count before them.
         """
-        counts = Counter(motion.joints)
-        for name in dict.fromkeys(name for names in self.sources for name in names):
-            if counts[name] == 0:
-                near = difflib.get_close_matches(name, motion.joints, n=1, cutoff=0.5)
-                hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(motion.joints[:30])}"
-                raise UserError(f"{motion.name}: no joint '{name}', which {self.where} names; {hint}")
-            if counts[name] > 1:
-                raise UserError(
-                    f"{motion.name}: joint '{name}' appears {counts[name]} times; the map is ambiguous"
-                )
+        self.require_fit(motion.joints, motion.name)
+        unit, up = self.unit or unit, self.up or up
         world = motion.positions()
         index = {name: i for i, name in enumerate(motion.joints)}
         joints = world[:, [index[names[0]] for names in self.sources]]

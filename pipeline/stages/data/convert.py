@@ -68,7 +68,7 @@ def source_facts(config: ConvertConfig) -> dict[str, Any]:
         path = path.expanduser()
         if path.is_file():
             steering[name] = sha256_of(path)
-        elif path.is_dir() and any(path.rglob("*.txt")):  # captions and split files
+        elif path.is_dir() and any(p.suffix in (".txt", ".json") for p in path.rglob("*")):  # texts, maps
             steering[name] = digest_of(path)["sha256"]
     return {"files": files, "steering": steering}
 

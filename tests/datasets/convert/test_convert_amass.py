@@ -267,7 +267,7 @@ def test_captions_splits_and_missing_clips(amass: ModuleType, tmp_path: Path) ->
     options = {"captions": captions, "splits": tmp_path / "splits", "uncaptioned": "keep"}
     manifest = amass.make(source, tmp_path / "out2", **options)
     assert list(amass.features(tmp_path / "out2")) == ["KIT/3/c_poses"]
-    assert amass.reasons(manifest)["lost.npz"] == "clip 'lost' is listed, but not here"
+    assert "'lost' is listed" in amass.reasons(manifest)["lost"]
     assert amass.reasons(manifest)["KIT/3/a_poses.npz (first)"] == "in no split file"
 
 

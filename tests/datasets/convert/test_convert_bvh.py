@@ -301,7 +301,7 @@ def test_archive_members_are_labels_never_paths(clips: Path, tmp_path: Path) -> 
         link.type, link.linkname = tarfile.SYMTYPE, "/etc/hostname"
         archive.addfile(link)
         add(archive, "./good.bvh", other)
-    given = config(clips, source=source, captions=None)
+    given = config(clips, source=source, captions=None, most_rejected=1)
     manifest = convert(given, tmp_path / "out")
     assert sum(s.samples for s in manifest.shards) == 1
     assert Counter("plain relative name" in d.reason for d in manifest.dropped) == {True: 2}

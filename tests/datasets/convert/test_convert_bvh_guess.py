@@ -73,12 +73,8 @@ def test_one_folder_of_every_tool(tmp_path: Path) -> None:
     for clip_id, joints in expected.items():
         # Features are float32, and the root's path is a sum of 21 steps: 1e-4 m is some hundred roundings.
         np.testing.assert_allclose(found[clip_id], joints, atol=1e-4, err_msg=clip_id)
-    assert len([note for note in manifest.notes if "guessed from" in note]) == len(FOREIGN)
-    assert manifest.options["joint_map"]["file"] == "auto"
-    for number, spec in enumerate(FOREIGN, start=1):
-        path = tmp_path / "out" / ("joint_map.json" if number == 1 else f"joint_map-{number}.json")
-        rows = JointMap.load(path)
-        assert rows.sources == tuple(build(spec).ours[joint] for joint in rows.target.joints)
+    written = {JointMap.load(path).sources for path in (tmp_path / "out/joint_maps").iterdir()}
+    assert written == {tuple(build(spec).ours[joint] for joint in layout.skeleton.joints) for spec in FOREIGN}
 
 
 @pytest.mark.parametrize("tool", ["BONES, SOMA 77", "Mixamo"])
@@ -108,25 +104,60 @@ def toeless(folder: Path) -> Path:
 
 def test_what_is_not_certain_is_refused_with_a_map_to_complete(tmp_path: Path) -> None:
     source, out = toeless(tmp_path / "mocap"), tmp_path / "out"
-    path = out / "joint_map.json"
-    with pytest.raises(UserError) as caught:
+    with pytest.raises(UserError, match=r"left_foot \(LeftA or LeftB\?\).*; complete .* --joint-map") as e:
         convert(source, out)
-    assert str(caught.value) == (
-        f"{source}: the joint map is not certain: no certain joint for left_foot (LeftA or LeftB?), "
-        f"right_foot (RightA or RightB?); complete {path} and pass it with --joint-map {path}"
-    )
-    assert [p.name for p in sorted(out.iterdir())] == [".scan.json", "joint_map.json"]
+    (path,) = (out / "joint_maps").iterdir()
+    assert f"complete {path} and pass the folder with --joint-map {path.parent}" in str(e.value)
     with pytest.raises(UserError, match="still to be filled in"):
         convert(source, out, joint_map=path)
+    fill_in(path)
+    with pytest.raises(UserError, match="is not certain"):
+        convert(source, out)
+    assert not convert(source, out, joint_map=path).dropped, "what a hand has filled in stays"
+
+
+def fill_in(path: Path) -> None:
     data = json.loads(path.read_text())
     for row, name in ((10, "LeftA"), (11, "RightA")):
         assert data["smpl22"][row][2] is None
         data["smpl22"][row][2] = name
     path.write_text(json.dumps(data))
-    with pytest.raises(UserError, match=r"joint_map.json: not the joint map that is guessed; use it with"):
+
+
+def test_maps_are_for_their_own_skeletons(tmp_path: Path) -> None:
+    """Certain and uncertain skeletons in one folder: a completed map leaves the others alone."""
+    source, out = toeless(tmp_path / "mocap"), tmp_path / "out"
+    for tool in ("Mixamo", "LAFAN1", "Rokoko"):
+        write_figure(source / f"{tool}.bvh", build(BY_TOOL[tool]), frames=66)
+    manifest = convert(source, out)
+    assert [(d.source, d.reason.split(" (")[0]) for d in manifest.dropped] == [
+        ("a.bvh", "no certain joint map for its skeleton")
+    ]
+    assert any("a.bvh is not certain" in note for note in manifest.notes)
+    (path,) = (path for path in (out / "joint_maps").iterdir() if "null" in path.read_text())
+    assert len(list(path.parent.iterdir())) == 4
+    fill_in(path)
+    for number, given in enumerate((path, path.parent)):
+        assert not convert(source, tmp_path / f"out-{number}", joint_map=given).dropped
+    metres = json.loads(path.read_text()) | {"unit": "m"}
+    path.write_text(json.dumps(metres))
+    (drop,) = convert(source, tmp_path / "out-2", joint_map=path, look=0).dropped
+    assert drop.source == "a.bvh" and "read with unit 'm'" in drop.reason
+    (source / "a.bvh").unlink()
+    with pytest.raises(UserError, match="no file has its skeleton"):
+        convert(source, tmp_path / "out-3", joint_map=path)
+
+
+def test_a_source_that_is_mostly_rejected_fails(tmp_path: Path) -> None:
+    source, out = toeless(tmp_path / "mocap"), tmp_path / "out"
+    text = (source / "a.bvh").read_text()
+    for take in range(3):
+        (source / f"b{take}.bvh").write_text(text + "\n" * take)
+    write_figure(source / "good.bvh", build(LAFAN1), frames=66)
+    with pytest.raises(UserError, match=r"3 of 4 clips cannot be used .*left-out\.txt.*most_rejected=1"):
         convert(source, out)
-    assert json.loads(path.read_text()) == data, "what a hand has filled in stays"
-    assert not convert(source, out, joint_map=path).dropped
+    assert Manifest.load_json(out / "manifest.json").shards
+    assert convert(source, out, most_rejected=1).shards
 
 
 def test_swapped_sides_are_refused(tmp_path: Path) -> None:

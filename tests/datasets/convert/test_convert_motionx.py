@@ -258,7 +258,7 @@ def test_dirty_clips_are_dropped_with_reasons(copy: Path, shared: Path, tmp_path
     rewrite(copy / MOTION / f"{MUG}.npy", lambda values: values[:, :321])
     shutil.copy(shared / "data/broken/npy/truncated.npy", copy / MOTION / f"{CHAT}.npy")
     shutil.copy(shared / "data/broken/npy/object_dtype.npy", copy / MOTION / f"{TURN}.npy")
-    manifest = convert(copy, tmp_path / "out")
+    manifest = convert(copy, tmp_path / "out", most_rejected=1)
     reasons = {Path(d.source).stem: d.reason for d in manifest.dropped}
     assert len(reasons) == 5
     assert "nan at frame 7, column 40" in reasons[Path(WAVE).name]

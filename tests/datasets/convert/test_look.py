@@ -156,11 +156,8 @@ def test_joints_without_a_row_and_unreadable_clips_are_told(source: Path, tmp_pa
     assert seen.remarks == ("joints that no row of the map names: joint_Root (2 of 2 clips)",)
     assert any(line.startswith("note: joints that no row") for line in seen.lines())
     wrong = with_map(source, tmp_path, lambda rows: rows[0].__setitem__(2, "Pelvis"))
-    none = look(source, joint_map=wrong)
-    assert none.clips == 0 and len(none.problems) == 1
-    assert re.search(
-        r"none could be read: 6 x no joint 'Pelvis', which .* \(the first: one/", none.problems[0]
-    )
+    with pytest.raises(UserError, match=r"one/.*: no joint 'Pelvis', which .* names"):
+        look(source, joint_map=wrong)
 
 
 def test_a_floating_source_is_refused_and_a_floating_set_fails_the_check(

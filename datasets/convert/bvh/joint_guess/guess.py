@@ -89,14 +89,15 @@ class JointGuess:
         shown = ", ".join(rows[:8]) + (f" and {len(rows) - 8} more" if len(rows) > 8 else "")
         return "; ".join([*self.problems, *([f"no certain joint for {shown}"] if rows else [])])
 
-    def text(self) -> str:
+    def text(self, skeleton: str = "") -> str:
+        """The map file; with `skeleton` it is for files of that one alone."""
         note = f"guessed from {self.source}: {self.summary()}"
         if not self.certain:
             todo = "Fill in the rows that say null" if self.open_rows else "Correct the rows"
             note += f". NOT CERTAIN: {self.doubts()}. {todo}"
         sources: list[tuple[str, ...] | None] = [row.sources or None for row in self.rows]
         candidates = {row.joint: list(row.candidates) for row in self.open_rows if row.candidates}
-        more: dict[str, object] = {"candidates": candidates} if candidates else {}
+        more = {key: value for key, value in (("skeleton", skeleton), ("candidates", candidates)) if value}
         return map_text(self.target, sources, note=note, unmapped=self.unmapped, **more)
 
 
