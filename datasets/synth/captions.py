@@ -2,7 +2,8 @@
 
 Three vocabularies of `captions.json`: `few`, two or three words for each thing in sentences of one form;
 `many`, a dozen verbs as statements, requests, headings or with the hands first, for models that have to
-understand other words too; `dances`, the style of the legs, the genre and the tempo of dances to songs.
+understand other words too (as `everyday` wordings one caption of a clip leaves side, number, speed and hands
+unsaid, as people do); `dances`, the style of the legs, the genre and the tempo of dances to songs.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from motionloom.datasets.schema import Config
-from motionloom.datasets.synth.actions.truth import Truth
+from motionloom.datasets.synth.actions.truth import Truth, takes_part
 from motionloom.datasets.synth.dances import DanceTruth
 from motionloom.datasets.synth.genres import GENRES
 
-Wordings = Literal["few", "many"]
+Wordings = Literal["few", "many", "everyday"]
 Phrases = dict[str, tuple[str, ...]]
 
 _GENDERED = ("a man", "a woman")
@@ -33,6 +35,7 @@ class Vocabulary(Config):
 
     who: tuple[str, ...]
     actions: Phrases
+    bare: Phrases = Field(default_factory=dict)
     times: dict[int, tuple[str, ...]]
     speed: Phrases
     hands: Phrases
@@ -75,6 +78,9 @@ def body_captions(
         return _different(lambda: _dance(truth, rng), number)
     if wordings == "many":
         return _different(lambda: _varied(truth, rng, hands), number)
+    if wordings == "everyday":
+        said = _different(lambda: _varied(truth, rng, hands), max(number - 1, 1))
+        return [*said, *_different(lambda: _varied(truth, rng, False, bare=True), number - len(said))]
     return _different(lambda: _plain(truth, rng, hands), number)
 
 
@@ -91,7 +97,7 @@ def face_captions(
     others of the same clip say "a man" the face is a person's. With many wordings they name nobody in
     particular.
     """
-    if wordings == "many" and not isinstance(truth, DanceTruth):
+    if wordings != "few" and not isinstance(truth, DanceTruth):
         faces = words().many.faces[truth.face]
         return _different(
             lambda: _written(f"{_pick(rng, _NOBODY)} {_third_person(_pick(rng, faces))}", rng), number
@@ -105,46 +111,61 @@ def face_captions(
 
 def _plain(truth: Truth, rng: np.random.Generator, hands: bool) -> str:
     table = words().few
-    phrase = _pick(rng, table.actions[_key(truth)])
-    text = phrase.format(
-        v=f" {_pick(rng, table.speed[truth.speed])}" if truth.speed else "",
-        n=f" {_pick(rng, table.times[truth.count])}" if truth.count else "",
-        s=_plain_limb(truth, rng),
-        b=truth.bpm,
-        t=_tempo(truth),
-    )
+
+    def said(part: Truth) -> str:
+        return _pick(rng, table.actions[_key(part)]).format(
+            v=f" {_pick(rng, table.speed[part.speed])}" if part.speed else "",
+            n=f" {_pick(rng, table.times[part.count])}" if part.count else "",
+            s=_plain_limb(part, rng),
+            b=part.bpm,
+            t=_tempo(part),
+        )
+
+    text = " and then ".join(said(part) for part in truth.parts or (truth,))
     phrases = _hand_phrases(truth, rng, table.hands, 1, ("both hands",)) if hands else []
     return ", ".join([f"{_pick(rng, table.who)} {text}", *phrases[:1]]) + "".join(
         f" and {phrase}" for phrase in phrases[1:]
     )
 
 
-def _varied(truth: Truth, rng: np.random.Generator, hands: bool) -> str:
+def _varied(truth: Truth, rng: np.random.Generator, hands: bool, bare: bool = False) -> str:
     table = words().many
-    phrase = _pick(rng, table.actions[_key(truth)]).format(
-        s=truth.side,
-        h=_varied_limb(truth, rng),
-        n=f" {_pick(rng, table.times[truth.count])}" if truth.count else "",
-        v=f" {_pick(rng, table.speed[truth.speed])}" if truth.speed else "",
-        b=truth.bpm,
+
+    def said(part: Truth) -> str:
+        phrases = table.actions[_key(part)]
+        return _pick(rng, table.bare.get(_key(part), phrases) if bare else phrases).format(
+            s=part.side,
+            h=_varied_limb(part, rng),
+            n=f" {_pick(rng, table.times[part.count])}" if part.count else "",
+            v=f" {_pick(rng, table.speed[part.speed])}" if part.speed else "",
+            b=part.bpm,
+        )
+
+    phrases = [said(part) for part in truth.parts or (truth,)]
+    link = (
+        _pick(rng, (", then ", " and then ", ", and after that ", " and afterwards ")) if truth.parts else ""
     )
+
+    def inflected(verb: Callable[[str], str]) -> str:
+        return link.join(verb(phrase) for phrase in phrases)
+
     form, who = int(rng.integers(8)), _pick(rng, table.who)
     if form < 3:
-        text = f"{who} {_third_person(phrase, who)}"
+        text = f"{who} {inflected(lambda phrase: _third_person(phrase, who))}"
     elif form < 5:
-        text = f"{who} {'are' if who in _PLURAL else 'is'} {_gerund(phrase)}"
+        text = f"{who} {'are' if who in _PLURAL else 'is'} {inflected(_gerund)}"
     elif form == 5:
-        text = _gerund(phrase)
+        text = inflected(_gerund)
     elif form == 6:
-        text = phrase.replace("|", "")
+        text = inflected(lambda phrase: phrase.replace("|", ""))
     else:
         seen = _pick(rng, ("this is", "we see", "one can see", "watch"))
-        text = f"{seen} {_OBJECTS.get(who, who)} {_gerund(phrase)}"
+        text = f"{seen} {_OBJECTS.get(who, who)} {inflected(_gerund)}"
     both = ("both hands", "each hand", "the left and the right hand")
-    phrases = _hand_phrases(truth, rng, table.hands, 2, both) if hands else []
-    if not phrases:
+    shapes = _hand_phrases(truth, rng, table.hands, 2, both) if hands else []
+    if not shapes:
         return _written(text, rng)
-    together = _pick(rng, (" and ", ", ")).join(phrases)
+    together = _pick(rng, (" and ", ", ")).join(shapes)
     if rng.random() < 0.25:
         return _written(f"{together}, {text}", rng)
     return _written(f"{text}, {together}", rng)
@@ -197,11 +218,10 @@ def _hand_phrases(
 
     The first `plural_forms` phrases of each shape can be put into the plural, for one of the words `both`.
     """
-    implied = {"punch": "fist", "wave": "spread"}.get(truth.action)
     shapes = [
         (name, shape)
         for name, shape in (("left", truth.left_hand), ("right", truth.right_hand))
-        if shape != "relaxed" and not (shape == implied and truth.side in (name, "both"))
+        if shape != "relaxed" and not takes_part(truth.action, truth.side, name)
     ]
     if len(shapes) == 2 and shapes[0][1] == shapes[1][1]:
         phrase = _pick(rng, doing[shapes[0][1]][:plural_forms])

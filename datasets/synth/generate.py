@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from motionloom.datasets.audio.features import VERSION as AUDIO_VERSION
 from motionloom.datasets.audio.lineup import settings_at
@@ -26,10 +26,20 @@ from motionloom.datasets.schema import Caption, Config, Manifest, Split
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
-from motionloom.datasets.synth.actions import arms, legs, locomotion
+from motionloom.datasets.synth.actions import arms, floor, legs, locomotion
+from motionloom.datasets.synth.actions.chain import animate_in_turn
 from motionloom.datasets.synth.actions.maths import Array, rot_y
 from motionloom.datasets.synth.actions.pose import Track
-from motionloom.datasets.synth.actions.truth import ACTIONS, HANDS, Record, Span, Truth, draw, require_known
+from motionloom.datasets.synth.actions.truth import (
+    ACTIONS,
+    BASIC,
+    HANDS,
+    Record,
+    Span,
+    Truth,
+    draw,
+    require_known,
+)
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions
 from motionloom.datasets.synth.dances import (
     Dance,
@@ -67,6 +77,11 @@ ANIMATORS: dict[str, Animator] = {
     "reach": arms.reach,
     "bow": legs.bow,
     "dance": dance,
+    "point": arms.reach,
+    "hop": legs.jump,
+    "lie": floor.lie,
+    "crawl": floor.crawl,
+    "stretch": arms.lift,
 }
 
 
@@ -78,8 +93,9 @@ class SynthConfig(Config):
     layout: Literal["body133", "wholebody313", "wholebody363", "smpl75"] = "wholebody363"
     fps: float | None = Field(None, gt=4, le=240)
     """None = the layout's usual frame rate (30 for whole body, 20 for body only and SMPL)."""
-    actions: list[str] | None = None
-    """None = all; otherwise names of `truth.ACTIONS`."""
+    actions: list[str] | Literal["basic", "all"] = "basic"
+    """Names of `truth.ACTIONS`, or all of them, or the basic ones: all but pointing, hopping, lying down,
+    crawling, stretching and two actions in turn."""
     hand_shapes: list[str] | None = None
     """What hands that are free do besides being relaxed. None = all; otherwise names of `truth.HANDS`."""
     min_seconds: float = Field(2.0, ge=1.0)
@@ -101,11 +117,14 @@ class SynthConfig(Config):
     dances: DanceConfig | None = None
     """Dances to songs of several genres, each with its own way of dancing. None = dances without music."""
 
-    @field_validator("actions", "hand_shapes")
+    @field_validator("actions")
     @classmethod
-    def _known(cls, names: list[str] | None, info: ValidationInfo) -> list[str] | None:
-        if info.field_name == "actions":
-            return require_known(names, ACTIONS, "action")
+    def _known_actions(cls, names: list[str] | str) -> list[str] | str | None:
+        return names if isinstance(names, str) else require_known(names, ACTIONS, "action")
+
+    @field_validator("hand_shapes")
+    @classmethod
+    def _known_shapes(cls, names: list[str] | None) -> list[str] | None:
         return require_known(names, HANDS[1:], "hand shape")
 
     @field_validator("hold_out", "hold_out_val")
@@ -128,7 +147,7 @@ class SynthConfig(Config):
         return self
 
     def _check_dances(self, dances: DanceConfig) -> None:
-        danced = self.actions is None or "dance" in self.actions
+        danced = "dance" in self.action_names
         if not danced and dances.share is None:
             raise ValueError("`dances` is given but `actions` has no dance; add it, or give dances.share")
         if dances.share is not None and dances.share < 1 and not self.other_actions:
@@ -137,8 +156,16 @@ class SynthConfig(Config):
             raise ValueError("dances.song_seconds is below min_seconds: no clip fits into a song")
 
     @property
+    def action_names(self) -> list[str]:
+        return (
+            self.actions
+            if isinstance(self.actions, list)
+            else list(BASIC if self.actions == "basic" else ACTIONS)
+        )
+
+    @property
     def other_actions(self) -> list[str]:
-        return [action for action in self.actions or ACTIONS if action != "dance"]
+        return [action for action in self.action_names if action != "dance"]
 
     @property
     def motion_layout(self) -> MotionLayout:
@@ -177,10 +204,10 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
         track = choreograph(planned.song, begin, planned.frames, layout.fps, motion)
     else:
         span = Span(config.min_seconds, config.max_seconds)
-        track = ANIMATORS[truth.action](truth, span, layout.fps, motion)
+        track = animate(truth, span, layout.fps, motion)
     if hands and planned:
         track.fingers = dancing_hands(planned.song, begin, track.t, shape)
-    elif hands:
+    elif hands and not truth.parts:
         track.fingers = np.stack([shape_hand(truth.hand(side), track.t, shape) for side in (0, 1)])
     solved = track.solve()
     size = float(np.clip(1 + config.size_spread * shape.standard_normal(), 0.8, 1.2))
@@ -204,6 +231,13 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
         audio=audio,
         smpl=smpl,
     )
+
+
+def animate(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
+    """The body of one action, or of two in turn."""
+    if truth.parts is None:
+        return ANIMATORS[truth.action](truth, span, fps, rng)
+    return animate_in_turn(truth.parts, animate, span, fps, rng)
 
 
 def _smpl75(rotations: Array, joints: Array) -> NDArray[np.float32]:
@@ -265,7 +299,7 @@ def truth_of(index: int, config: SynthConfig) -> Truth:
 
 def _action_of(index: int, config: SynthConfig) -> tuple[str, int]:
     """Action of clip `index`, and which round of the actions (for a dance: which dance) it is."""
-    actions, rank = config.actions or list(ACTIONS), index
+    actions, rank = config.action_names, index
     share = config.dances.share if config.dances else None
     if share is not None:
         before = int(np.floor(index * share + 1e-9))

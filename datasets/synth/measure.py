@@ -31,6 +31,14 @@ from motionloom.datasets.synth.signals import Signals, rise_time, runs, signals_
 CIRCLE = 4.0
 """Net turn (radians) of a walk from which it is a circle."""
 TURN = 0.6
+LYING = 0.62
+"""Metres that the root falls of somebody who lies down, at least."""
+ASIDE = 0.22
+"""Lean (radians) to a side from which somebody stretches there."""
+STILL = 0.5
+"""Metres per second below which every joint is of somebody who stands still."""
+UPRIGHT = 0.055
+"""Change of lean to the side (radians) below which somebody stands upright all the time; twice forward."""
 _ATTRIBUTES = ("direction", "side", "count", "speed", "bpm")
 
 
@@ -62,6 +70,8 @@ def measure(joints: NDArray[np.floating], fps: float) -> Measured:
     """Recognise what joints [T, 22 or 52, 3] (metres, Y up) do."""
     signals = signals_of(joints, fps)
     action = _action(signals)
+    if action != "dance" and _in_turn(joints, signals):
+        action = "then"
     found = _attributes(signals, action)
     hands = [hand_shape(joints, side, fps) if joints.shape[1] >= 52 else None for side in (0, 1)]
     return Measured(
@@ -90,8 +100,10 @@ def agrees(
     """
     if "action" not in truth:
         raise UserError("truth has no 'action'; judge only clips of the synthetic source")
-    signals = signals_of(joints, fps)
     claimed = str(truth["action"])
+    if claimed == "then":
+        return _agrees_in_turn(truth, joints, face, fps)
+    signals = signals_of(joints, fps)
     out = {"action": _action(signals) == claimed}
     found = _attributes(signals, claimed)
     for name in _ATTRIBUTES:
@@ -110,16 +122,43 @@ def agrees(
         for side, name in enumerate(SIDES):
             if truth.get(f"{name}_hand") is not None:
                 out[f"{name}_hand"] = hand_shape(joints, side, fps) == truth[f"{name}_hand"]
-    if face is not None and truth.get("face") is not None:
-        out["face"] = faces.read(face) == truth["face"]
-    return out
+    return out | _face(truth, face)
+
+
+def _face(truth: Mapping[str, Any], face: NDArray[np.floating] | None) -> dict[str, bool]:
+    return {} if face is None or truth.get("face") is None else {"face": faces.read(face) == truth["face"]}
+
+
+def _agrees_in_turn(
+    truth: Mapping[str, Any], joints: NDArray[np.floating], face: NDArray[np.floating] | None, fps: float
+) -> dict[str, bool]:
+    """Both parts, cut where most of what is said of them is true."""
+    found: list[dict[str, bool]] = []
+    for cut in _cuts(len(joints), fps):
+        halves = (joints[:cut, :22], joints[cut:, :22])
+        verdicts = [agrees(part, half, None, fps) for part, half in zip(truth["parts"], halves, strict=True)]
+        names = dict.fromkeys(name for verdict in verdicts for name in verdict)
+        found.append({name: all(verdict.get(name, True) for verdict in verdicts) for name in names})
+    return max(found, key=lambda one: (one["action"], sum(one.values()))) | _face(truth, face)
+
+
+def _cuts(frames: int, fps: float) -> range:
+    """Frames at which a motion of two actions may change from one to the other."""
+    least = min(max(4, round(fps)), frames // 2)
+    return range(least, frames - least + 1, max(1, round(fps / 10)))
 
 
 def _action(s: Signals) -> str:
     moved, turned = abs(float(s.travel[-1])), abs(_turned(s))
+    if np.percentile(s.drop, 10) > 0.3 and np.median(s.trunk) > 0.9:
+        return "crawl"
+    if s.drop.max() > LYING:
+        return "lie"
     flights = len(_flights(s))
     if _pace(s) > 1.6 and (flights >= 2 or s.balls.max() > 0.13):
         return "run"
+    if flights and max(_hops(s)):
+        return "hop"
     if flights and s.drop.min() < -0.05:
         return "jump"
     if moved > 0.3 and s.balls.max() < 0.4:
@@ -140,19 +179,44 @@ def _action(s: Signals) -> str:
     return _arm_action(s)
 
 
+def _in_turn(joints: NDArray[np.floating], s: Signals) -> bool:
+    """Whether somebody stands still, arms down, between two different actions."""
+    from scipy.signal import find_peaks
+
+    speed = np.linalg.norm(np.gradient(s.joints[:, :22], 1 / s.fps, axis=0), axis=-1).max(1)
+    rests = (s.wrists[:, :, 1].max(0) < -0.75) & (s.drop < 0.08) & (s.balls.max(0) < 0.08) & (speed < STILL)
+    for cut in find_peaks(-speed)[0]:
+        if not rests[cut] or min(cut, len(speed) - cut) < 0.9 * s.fps:
+            continue
+        halves = slice(cut), slice(cut, None)
+        if all(speed[half].max() > 1.2 for half in halves):
+            first, second = (_action(signals_of(joints[half], s.fps)) for half in halves)
+            if first != second:
+                return True
+    return False
+
+
 def _arm_action(s: Signals) -> str:
     waves, tops = [_waves(s, side) for side in (0, 1)], s.wrists[:, :, 1].max(1)
     if max(waves) >= 3:
         return "wave"
+    if tops.min() > 0.35 and (np.abs(s.aside).max() > ASIDE or s.drop.min() < -0.03):
+        return "stretch"
     if tops.max() > 0.6:
         hand = int(np.argmax(tops))
         top = int(np.argmax(s.wrists[hand, :, 1]))
-        return "raise" if s.wrists[hand, top, 2] < 0.28 else "reach"
+        return "raise" if s.wrists[hand, top, 2] < 0.28 else _reach_or_point(s)
     hand, direction = _reach(s)
     forward = s.wrists[hand, :, 2]
     if direction == "forward" and forward.max() > 0.78 and s.longest(forward > 0.85 * forward.max()) < 0.5:
         return "punch"
-    return "clap" if _claps(s) >= 1 else "reach"
+    return "clap" if _claps(s) >= 1 else _reach_or_point(s)
+
+
+def _reach_or_point(s: Signals) -> str:
+    """Who points keeps the body upright and the feet flat."""
+    upright = np.ptp(s.trunk) < 2 * UPRIGHT and np.ptp(s.aside) < UPRIGHT
+    return "point" if upright and s.drop.min() > -0.012 else "reach"
 
 
 def _attributes(s: Signals, action: str) -> Record:
@@ -188,7 +252,16 @@ def _attributes(s: Signals, action: str) -> Record:
         return {"side": _both(s.wrists[:, :, 1].max(1) > 0.6)}
     if action == "clap":
         return {"count": _claps(s)}
-    if action == "reach":
+    if action == "hop":
+        hops = _hops(s)
+        leg = int(np.argmax(hops))
+        return {"side": SIDES[leg], "count": hops[leg]}
+    if action == "stretch":
+        lean = float(s.aside[int(np.argmax(np.abs(s.aside)))])
+        return {"direction": "up" if abs(lean) < ASIDE else SIDES[0] if lean > 0 else SIDES[1]}
+    if action == "crawl":
+        return {"direction": "forward" if s.travel[-1] > 0 else "backward"}
+    if action in ("reach", "point"):
         hand, direction = _reach(s)
         return {"side": SIDES[hand], "direction": direction}
     return {"bpm": tempo(s)} if action == "dance" else {}
@@ -224,6 +297,18 @@ def _claps(s: Signals) -> int:
 def _flights(s: Signals) -> list[tuple[int, int]]:
     """Runs of frames in which both feet are off the floor."""
     return [r for r in runs(s.balls.min(0) > 0.04) if (r[1] - r[0]) / s.fps >= 0.06]
+
+
+def _hops(s: Signals) -> list[int]:
+    """Flights of each leg while the other foot stays up from before to after them."""
+    out = []
+    for leg in (0, 1):
+        found = 0
+        for start, end in runs(s.balls[1 - leg] > 0.08):
+            inside = [f for f in _flights(s) if f[0] > start + 0.12 * s.fps and f[1] < end]
+            found = max(found, len(inside))
+        out.append(found)
+    return out
 
 
 def _turned(s: Signals) -> float:

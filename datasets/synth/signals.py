@@ -41,6 +41,8 @@ class Signals:
     """[2, T] height of the balls of the feet."""
     trunk: Array
     """[T] forward lean of pelvis to neck, radians."""
+    aside: Array
+    """[T] lean of pelvis to neck to the left, radians."""
     wrists: Array
     """[2, T, 3] shoulder to wrist over arm length: outwards, up, forwards."""
     wrist_height: Array
@@ -103,6 +105,7 @@ def signals_of(joints: NDArray[np.floating], fps: float) -> Signals:
         behind=(away * forward).sum(-1),
         balls=x[:, _BALLS, 1].T,
         trunk=np.arctan2((spine[:, [0, 2]] * forward).sum(-1), spine[:, 1]),
+        aside=np.arctan2((spine[:, [0, 2]] * left).sum(-1), np.linalg.norm(spine[:, 1:], axis=-1)),
         wrists=np.stack(arms),
         wrist_height=x[:, _WRISTS, 1].T,
         apart=np.linalg.norm(x[:, 20] - x[:, 21], axis=-1),

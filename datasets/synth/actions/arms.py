@@ -101,7 +101,7 @@ def wave(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     track = Track.standing(seconds, fps, rng)
     up = rng.uniform(0.5, 0.75) * min(1.0, seconds / 2.5)
     begin = rng.uniform(0.05, 0.2 * seconds)
-    stays = rng.random() < 0.4
+    stays = rng.random() < 0.4 and not span.returns
     down = seconds + 5 if stays else seconds - up - rng.uniform(0.02, 0.15)
     rate = rng.uniform(1.4, 2.3)
     high, wide = rng.uniform(0.5, 1.0), rng.uniform(0.35, 0.6)
@@ -165,18 +165,23 @@ def clap(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
 
 
 def lift(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
-    """Raise an arm (or both) straight overhead, through the front or through the side, and hold it."""
+    """Raise an arm (or both) straight overhead, through the front or through the side, and hold it.
+
+    To stretch is to raise both through the sides and then to go on the toes or to bend to one side.
+    """
+    stretches = truth.action == "stretch"
+    sides = "both" if stretches else truth.side
     seconds = span.pick(rng)
-    up = rng.uniform(0.6, 0.95) * min(1.0, seconds / 2.5)
+    up = rng.uniform(0.6, 0.95) * min(1.0, seconds / 2.5) * (1.25 if stretches else 1.0)
     begin = rng.uniform(0.05, 0.15 * seconds)
-    stays = rng.random() < 0.35
+    stays = rng.random() < 0.35 and not span.returns
     down = seconds + 5 if stays else seconds - up - rng.uniform(0.02, 0.1)
     track = Track.standing(seconds, fps, rng)
     half: Vec = (0.15, 0.0, 1.0) if truth.style == "front" else (1.0, 0.0, 0.15)
     top: Vec = (rng.uniform(0.0, 0.22), 1.0, rng.uniform(-0.02, 0.05))
     bends: tuple[Vec, Vec] = ((-0.6, 0.6, 0.2), (-1.0, 0.0, 0.3))
     for side in (0, 1):
-        if truth.side not in (("left", "right")[side], "both"):
+        if sides not in (("left", "right")[side], "both"):
             continue
         arm = track.arms[side]
         rest = unit(arm.direction.mean(0))
@@ -190,14 +195,35 @@ def lift(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
         bend = np.stack([unit(arm.bend.mean(0)), *(unit(np.array(b)) for b in bends)])
         arm.bend = keys(rise, [0.0, 0.5, 1.0], bend)
         arm.reach += (0.975 - arm.reach) * rise
-        if truth.side != "both":
+        if sides != "both":
             track.spine[:, 2] += (-1 if side else 1) * 0.05 * rise
+    if stretches:
+        _strain(track, truth.direction or "up", ease((rise - 0.5) / 0.5), rng)
     track.lower_to_reach()
     return track
 
 
+def _strain(track: Track, direction: str, on: Array, rng: np.random.Generator) -> None:
+    """On the toes and a little backwards, or bent to one side, as `on` [T] says."""
+    if direction == "up":
+        track.foot_pitch += rng.uniform(0.4, 0.55) * on
+        track.root[:, 1] += rng.uniform(0.07, 0.09) * on
+        track.spine[:, 0] -= rng.uniform(0.1, 0.25) * on
+        track.head[:, 0] -= 0.35 * on
+        return
+    sign = 1.0 if direction == "left" else -1.0
+    bend = sign * rng.uniform(0.55, 0.8) * on
+    track.spine[:, 2] -= bend
+    track.pelvis[:, 2] -= 0.15 * bend
+    track.root[:, 0] -= 0.07 * bend
+
+
 def reach(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
-    """Stretch one hand forward, up, down to the floor or out to its side, hold it there, come back."""
+    """Stretch one hand forward, up, down to the floor or out to its side, hold it there, come back.
+
+    Who points does the same with the arm alone: the body stays upright, the feet stay flat.
+    """
+    body = 0.0 if truth.action == "point" else 1.0
     hand = 0 if truth.side == "left" else 1
     sign = 1.0 if hand == 0 else -1.0
     seconds = span.pick(rng)
@@ -211,17 +237,17 @@ def reach(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     via: list[Hold] = []
     if truth.direction == "forward":
         to, bend = (rng.uniform(-0.2, 0.0), rng.uniform(-0.15, 0.12), 1.0), (0.0, 1.0, 0.0)
-        track.spine[:, 0] += rng.uniform(0.12, 0.25) * go
-        track.pelvis[:, 0] += 0.1 * go
-        track.spine[:, 1] -= sign * 0.35 * go
-        track.root[:, 2] += 0.03 * go
+        track.spine[:, 0] += body * rng.uniform(0.12, 0.25) * go
+        track.pelvis[:, 0] += body * 0.1 * go
+        track.spine[:, 1] -= body * sign * 0.35 * go
+        track.root[:, 2] += body * 0.03 * go
     elif truth.direction == "up":
         # Up and forward, as to a shelf: on the toes, eyes on the hand. Raising an arm goes straight overhead.
         to, bend = (rng.uniform(-0.1, 0.1), 1.0, rng.uniform(0.6, 0.85)), (-0.6, 0.8, 0.0)
-        track.foot_pitch += rng.uniform(0.25, 0.45) * go
-        track.root[:, 1] += 0.06 * go
+        track.foot_pitch += body * rng.uniform(0.25, 0.45) * go
+        track.root[:, 1] += body * 0.06 * go
         track.head[:, 0] -= 0.4 * go
-        track.spine[:, 2] += sign * 0.1 * go
+        track.spine[:, 2] += body * sign * 0.1 * go
         via = [(begin + 0.5 * out, (0.1, -0.1, 1.0), 0.85, (0.0, 1.0, 0.2))]
     elif truth.direction == "down":
         to, bend = (rng.uniform(-0.05, 0.1), rng.uniform(-0.35, -0.1), 1.0), (0.0, 0.6, 0.4)
@@ -235,9 +261,9 @@ def reach(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
         track.knee_out += 0.12 * go
     else:
         to, bend = (1.0, rng.uniform(-0.1, 0.2), rng.uniform(0.0, 0.15)), (0.0, 0.3, 1.0)
-        track.spine[:, 2] -= sign * rng.uniform(0.12, 0.25) * go
+        track.spine[:, 2] -= body * sign * rng.uniform(0.12, 0.25) * go
         track.head[:, 1] += sign * 0.5 * go
-        track.root[:, 0] += sign * 0.05 * go
+        track.root[:, 0] += body * sign * 0.05 * go
     holds: list[Hold] = [(begin, None, 0.0, None), *via, (begin + out, to, reached, bend)]
     holds += [(max(back, begin + out + 0.01), to, reached, bend), (seconds, None, 0.0, None)]
     play(track, hand, holds)

@@ -15,25 +15,31 @@ GRAVITY = 9.81
 
 
 def jump(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
-    """Crouch, push off, fly on a ballistic path, land softly; `count` times, on the spot or forward."""
-    count = truth.count or 1
-    height = rng.uniform(0.14, 0.3) * (0.8 if count == 3 else 1.0)
+    """Crouch, push off, fly on a ballistic path, land softly; `count` times, on the spot or forward.
+
+    A hop is lower, and the leg of the other side stays up from before the first to after the last.
+    """
+    count, hops = truth.count or 1, truth.action == "hop"
+    height = rng.uniform(0.14, 0.3) * (0.8 if count == 3 else 1.0) * (0.5 if hops else 1.0)
     flight = 2 * math.sqrt(2 * height / GRAVITY)
     dip, rise, absorb, rest = 0.32, 0.2, 0.2, 0.34
     period = dip + rise + flight + absorb + rest
     seconds = span.pick(rng, at_least=count * period + 0.5, at_most=count * period + 2.2)
-    squeeze = min(1.0, (seconds - 0.35 - count * flight) / (count * (period - flight)))
+    still = 0.95 if hops else 0.35
+    squeeze = min(1.0, (seconds - still - count * flight) / (count * (period - flight)))
     dip, rise, absorb, rest = (x * squeeze for x in (dip, rise, absorb, rest))
     period = dip + rise + flight + absorb + rest
-    begin = rng.uniform(0.15, max(0.16, seconds - count * period - 0.15))
+    early = 0.45 if hops else 0.15
+    begin = rng.uniform(early, max(early + 0.01, seconds - count * period - early))
     track = Track.standing(seconds, fps, rng)
-    t, low = track.t, -rng.uniform(0.2, 0.28)
-    top, land = 0.045, -0.16
+    t, low = track.t, -rng.uniform(0.2, 0.28) * (0.5 if hops else 1.0)
+    top, land = 0.045, -0.08 if hops else -0.16
     speed = math.sqrt(2 * GRAVITY * height)
     y = np.zeros(len(t))
     air = np.zeros(len(t))
     pitch, crouch, travel = np.zeros(len(t)), np.zeros(len(t)), np.zeros(len(t))
     swing: list[tuple[float, Vec]] = []
+    back, front = (-0.4, (0.25, -0.4, 0.9)) if hops else (-0.75, (0.25, 0.35, 1.0))
     leap = rng.uniform(0.25, 0.5) if truth.direction == "forward" else 0.0
     for k in range(count):
         a = begin + k * period
@@ -49,7 +55,7 @@ def jump(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
         pitch += keys(t, [b + 0.3 * rise, c, d - 0.02, d + 0.09], [0.0, 0.75, 0.35, 0.0])
         crouch += keys(t, [a, b, c, d, e, e + rest], [0.0, 1.0, 0.0, 0.25, 0.7, 0.0])
         travel += leap * np.clip((t - c) / flight, 0.0, 1.0)
-        swing += [(a, HANG_KEY), (b, (0.25, -1.0, -0.75)), (c + 0.3 * flight, (0.25, 0.35, 1.0))]
+        swing += [(a, HANG_KEY), (b, (0.25, -1.0, back)), (c + 0.3 * flight, front)]
         swing += [(d + 0.3 * absorb, (0.4, -0.55, 0.7))]
     swing.append((begin + count * period, HANG_KEY))
     track.root[:, 1] += y
@@ -64,8 +70,21 @@ def jump(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     track.head[:, 0] -= 0.35 * crouch
     for side in (0, 1):
         play(track, side, [(at, d, 0.92, (0.0, 0.3, 1.0)) for at, d in swing])
+    if hops:
+        up = ease((t - begin + 0.4) / 0.4) * ease((begin + count * period + 0.35 - t) / 0.4)
+        _on_one_leg(track, 0 if truth.side == "left" else 1, up, rng)
     track.lower_to_reach(1 / fps)
     return track
+
+
+def _on_one_leg(track: Track, leg: int, up: Array, rng: np.random.Generator) -> None:
+    """Stand on `leg` and hold the other foot behind, as `up` [T] says."""
+    sign = 1.0 if leg == 0 else -1.0
+    track.root[:, 0] += sign * 0.07 * up
+    track.pelvis[:, 2] -= sign * 0.04 * up
+    track.ball[1 - leg, :, 1] += rng.uniform(0.2, 0.28) * up
+    track.ball[1 - leg, :, 2] -= rng.uniform(0.25, 0.35) * up
+    track.foot_pitch[1 - leg] += 0.9 * up
 
 
 HANG_KEY = (0.22, -1.0, 0.08)

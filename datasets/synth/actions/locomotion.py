@@ -31,7 +31,7 @@ def walk(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
         seconds = span.pick(rng, at_least=min(5.0, span.high))
         angle = rng.uniform(1.5, 1.95) * np.pi * (-1 if truth.direction == "clockwise" else 1)
         return _walk(rng, fps, seconds, speed, angle, backward=False)
-    return _walk(rng, fps, span.pick(rng), speed, 0.0, backward=backward)
+    return _walk(rng, fps, span.pick(rng), speed, 0.0, backward=backward, stands=span.returns)
 
 
 def turn(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
@@ -99,6 +99,7 @@ def _walk(
     angle: float,
     backward: bool = False,
     corner: bool = False,
+    stands: bool = False,
 ) -> Track:
     pace = abs(speed) * (1.35 if backward else 1.0)
     stride = Stride(
@@ -116,7 +117,7 @@ def _walk(
         toe_out=rng.uniform(0.03, 0.16),
         width=rng.uniform(-0.04, 0.0),
     )
-    lead_in = rng.uniform(0.15, 0.45) if angle or rng.random() < 0.5 else 0.0
+    lead_in = rng.uniform(0.15, 0.45) if angle or rng.random() < 0.5 or stands else 0.0
     return _along(rng, fps, seconds, stride, -speed if backward else speed, angle, lead_in, corner)
 
 

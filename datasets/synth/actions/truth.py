@@ -2,38 +2,71 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
-ACTIONS = (
-    "walk",
-    "turn",
-    "run",
-    "jump",
-    "squat",
-    "sit",
-    "kick",
-    "punch",
-    "wave",
-    "clap",
-    "raise",
-    "reach",
-    "bow",
-    "dance",
-)
 HANDS = ("relaxed", "fist", "point", "spread", "pinch", "wave_fingers")
 FACES = ("neutral", "happy", "sad", "angry", "surprised")
-SIDES = ("left", "right")
-COUNT_LIMITS = {"jump": 3, "squat": 3, "kick": 2, "punch": 3, "clap": 5}
-"""Actions that are counted, and how often at most."""
 TEMPI = tuple(range(80, 141, 5))
 
 T = TypeVar("T")
 Record = dict[str, Any]
 """Truth of a clip as plain JSON (`ClipMeta.truth`)."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """What clips of one action draw from; None stands for what is left unsaid."""
+
+    side: tuple[str, ...] = ()
+    direction: tuple[str, ...] = ()
+    speed: tuple[str | None, ...] = ()
+    style: tuple[str, ...] = ()
+    most: int = 0
+    """How often at most; 0 where it is not counted."""
+    hand: str | None = None
+    """Shape of the hands that take part, which captions need not state."""
+    chains: tuple[str, ...] | None = None
+    """Its directions as one of two actions in turn, for those that begin and end standing."""
+
+
+SIDES = ("left", "right")
+OWN = "own"
+"""The direction that is the side's."""
+_PACES = ("slowly", None, "quickly")
+ACTIONS = {
+    "walk": Action(
+        direction=("forward", "forward", "backward", "clockwise", "counterclockwise"),
+        speed=("slowly", None, None, "quickly"),
+        chains=("forward", "backward"),
+    ),
+    "turn": Action(direction=SIDES, style=("place", "around", "walking"), chains=SIDES),
+    "run": Action(direction=("forward",)),
+    "jump": Action(direction=("up", "up", "forward"), most=3, chains=("up", "forward")),
+    "squat": Action(speed=_PACES, most=3, chains=()),
+    "sit": Action(),
+    "kick": Action(side=SIDES, most=2, chains=()),
+    "punch": Action(side=SIDES, most=3, hand="fist", chains=()),
+    "wave": Action(side=(*SIDES, *SIDES, "both"), hand="spread", chains=()),
+    "clap": Action(most=5, hand="relaxed", chains=()),
+    "raise": Action(side=(*SIDES, *SIDES, "both"), style=("front", "side"), chains=()),
+    "reach": Action(side=SIDES, direction=("forward", "up", "down", OWN)),
+    "bow": Action(speed=_PACES, chains=()),
+    "dance": Action(style=("step", "bounce", "sway")),
+    "point": Action(
+        side=SIDES, direction=("forward", "up", OWN), hand="point", chains=("forward", "up", OWN)
+    ),
+    "hop": Action(side=SIDES, most=3, chains=()),
+    "lie": Action(),
+    "crawl": Action(direction=("forward",), hand="relaxed"),
+    "stretch": Action(direction=("up", *SIDES), chains=("up", *SIDES)),
+    "then": Action(hand="relaxed"),
+}
+BASIC = tuple(ACTIONS)[:14]
+"""The actions of a config that asks for none; the others are for models that shall know more."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +83,8 @@ class Truth:
     face: str = "neutral"
     bpm: int | None = None
     style: str | None = None
+    parts: tuple[Truth, Truth] | None = None
+    """Of "then": the two actions in turn."""
 
     def hand(self, side: int) -> str:
         return self.right_hand if side else self.left_hand
@@ -57,7 +92,15 @@ class Truth:
     def record(self, *, hands: bool, face: bool) -> Record:
         """Plain JSON form for `ClipMeta.truth`; hand and face entries only where the layout holds them."""
         data = asdict(self)
-        if not hands:
+        if self.parts is None:
+            del data["parts"]
+        else:
+            data["parts"] = [
+                {name: v for name, v in asdict(part).items() if v is not None} for part in self.parts
+            ]
+            for part in data["parts"]:
+                del part["left_hand"], part["right_hand"], part["face"]
+        if not hands or self.parts:  # hands change from part to part
             del data["left_hand"], data["right_hand"]
         if not face:
             del data["face"]
@@ -70,6 +113,8 @@ class Span:
 
     low: float
     high: float
+    returns: bool = False
+    """Whether the clip has to begin and end with somebody who stands, arms down."""
 
     def pick(self, rng: np.random.Generator, at_least: float = 0.0, at_most: float = 1e9) -> float:
         """A length within the limits, and within those of the action where they leave room."""
@@ -78,7 +123,7 @@ class Span:
         return float(rng.uniform(low, high))
 
 
-def require_known(names: list[str] | None, known: Sequence[str], what: str) -> list[str] | None:
+def require_known(names: list[str] | None, known: Collection[str], what: str) -> list[str] | None:
     """`names` of a config field; `ValueError` for an empty list and for names that are not known."""
     wrong = sorted(set(names or []) - set(known))
     if wrong or names == []:
@@ -88,61 +133,60 @@ def require_known(names: list[str] | None, known: Sequence[str], what: str) -> l
 
 def draw(action: str, rng: np.random.Generator, hand_shapes: Sequence[str] = HANDS[1:]) -> Truth:
     """Truth of one clip of `action`; hands that are free take one of `hand_shapes` now and then."""
-    direction: str | None = None
-    side: str | None = None
-    speed: str | None = None
-    style: str | None = None
-    bpm: int | None = None
-    count = int(rng.integers(1, COUNT_LIMITS[action] + 1)) if action in COUNT_LIMITS else None
-    if action == "walk":
-        direction = _one(rng, ("forward", "forward", "backward", "clockwise", "counterclockwise"))
-        speed = _one(rng, ("slowly", None, None, "quickly"))
-        if direction in ("clockwise", "counterclockwise") and speed == "slowly":
-            speed = None
-    elif action == "turn":
-        direction = _one(rng, SIDES)
-        style = _one(rng, ("place", "around", "walking"))
-    elif action == "run":
-        direction = "forward"
-    elif action == "jump":
-        direction = _one(rng, ("up", "up", "forward"))
-    elif action in ("kick", "punch"):
-        side = _one(rng, SIDES)
-    elif action in ("wave", "raise"):
-        side = _one(rng, (*SIDES, *SIDES, "both"))
-        style = _one(rng, ("front", "side")) if action == "raise" else None
-    elif action == "reach":
-        side = _one(rng, SIDES)
-        direction = _one(rng, ("forward", "up", "down", side))
-    elif action == "clap":
-        count = int(rng.integers(2, COUNT_LIMITS["clap"] + 1))
-    elif action == "dance":
-        bpm = int(rng.choice(TEMPI))
-        style = _one(rng, ("step", "bounce", "sway"))
-    if action in ("squat", "bow"):
-        speed = _one(rng, ("slowly", None, "quickly"))
+    kind = ACTIONS[action]
+    count = int(rng.integers(1, kind.most + 1)) if kind.most else None
+    side = _one(rng, kind.side)
+    direction = _one(rng, tuple(str(side) if way == OWN else way for way in kind.direction))
+    speed = _one(rng, kind.speed)
+    if direction in ("clockwise", "counterclockwise") and speed == "slowly":
+        speed = None
+    bpm = int(rng.choice(TEMPI)) if action == "dance" else None
+    style = _one(rng, kind.style)
+    if action == "clap":
+        count = int(rng.integers(2, kind.most + 1))
     if action == "squat" and count is not None:
         # As many as fit into five seconds without changing the pace.
         count = min(count, {"slowly": 1, None: 2, "quickly": 3}[speed])
+    parts = _chain(rng) if action == "then" else None
     left, right = _hands(action, side, rng, hand_shapes)
-    return Truth(action, direction, side, count, speed, left, right, str(rng.choice(FACES)), bpm, style)
+    face = str(rng.choice(FACES))
+    return Truth(action, direction, side, count, speed, left, right, face, bpm, style, parts)
 
 
-def _one(rng: np.random.Generator, options: tuple[T, ...]) -> T:
+def _chain(rng: np.random.Generator) -> tuple[Truth, Truth]:
+    """Two different actions that begin and end standing, each once and at its usual pace."""
+    able = [name for name, kind in ACTIONS.items() if kind.chains is not None]
+    first, second = (_link(able[int(k)], rng) for k in rng.permutation(len(able))[:2])
+    return first, second
+
+
+def _link(action: str, rng: np.random.Generator) -> Truth:
+    kind = ACTIONS[action]
+    side = _one(rng, kind.side)
+    direction = _one(rng, tuple(str(side) if way == OWN else way for way in kind.chains or ()))
+    style = _one(rng, tuple(style for style in kind.style if style != "walking"))
+    left, right = _hands(action, side, rng, ("relaxed",))
+    return Truth(action, direction, side, left_hand=left, right_hand=right, style=style)
+
+
+def _one(rng: np.random.Generator, options: Sequence[T]) -> T | None:
+    """One of the options; None of none, and the only one without a draw."""
+    if len(options) < 2:
+        return options[0] if options else None
     return options[int(rng.integers(len(options)))]
 
 
 def _hands(action: str, side: str | None, rng: np.random.Generator, free: Sequence[str]) -> tuple[str, str]:
-    """A shape for each hand; a punch needs a fist, a clap and a wave need open hands."""
+    """A shape for each hand; some actions need a fist, an open or a pointing hand."""
     shapes = [str(rng.choice(free)) if rng.random() < 0.4 else "relaxed" for _ in range(2)]
     if rng.random() < 0.12:
         shapes[1] = shapes[0]
     for index, name in enumerate(SIDES):
-        busy = side in (name, "both")
-        if action == "clap":
-            shapes[index] = "relaxed"
-        elif action == "punch" and busy:
-            shapes[index] = "fist"
-        elif action == "wave" and busy:
-            shapes[index] = "spread"
+        if takes_part(action, side, name):
+            shapes[index] = ACTIONS[action].hand or shapes[index]
     return shapes[0], shapes[1]
+
+
+def takes_part(action: str, side: str | None, hand: str) -> bool:
+    """Whether an action with `side` gives the left or right `hand` its shape."""
+    return ACTIONS[action].hand is not None and side in (hand, "both", None)

@@ -14,7 +14,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.actions.truth import ACTIONS, HANDS, draw
+from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, HANDS, draw
 from motionloom.datasets.synth.generate import (
     Clip,
     SynthConfig,
@@ -27,7 +27,7 @@ from motionloom.datasets.synth.generate import (
 from motionloom.datasets.synth.measure import agrees, measure
 
 FPS = 30.0
-CONFIG = SynthConfig(seed=2024)
+CONFIG = SynthConfig(seed=2024, actions="all")
 CLIPS = 280
 
 
@@ -41,6 +41,10 @@ def verdicts(clips: list[Clip]) -> list[dict[str, bool]]:
     return [agrees(clip.truth, clip.joints, clip.face, FPS) for clip in clips]
 
 
+def actions_of(clip: Clip) -> list[str]:
+    return [part["action"] for part in clip.truth.get("parts", [clip.truth])]
+
+
 def test_captions_are_true(clips: list[Clip], verdicts: list[dict[str, bool]]) -> None:
     right: dict[tuple[str, str], list[bool]] = defaultdict(list)
     for clip, verdict in zip(clips, verdicts, strict=True):
@@ -51,7 +55,7 @@ def test_captions_are_true(clips: list[Clip], verdicts: list[dict[str, bool]]) -
         right[clip.truth["action"], "everything"].append(all(verdict.values()))
     assert {action for action, _ in right} == {*ACTIONS, "all"}
     rates = {key: float(np.mean(values)) for key, values in right.items()}
-    wrong = {key: rate for key, rate in rates.items() if rate < (0.98 if key[0] == "all" else 0.95)}
+    wrong = {key: rate for key, rate in rates.items() if rate < (0.99 if key[0] == "all" else 0.92)}
     assert not wrong
 
 
@@ -96,14 +100,14 @@ def test_lies_are_found_out(clips: list[Clip]) -> None:
     lies = believed = 0
     for clip in clips:
         for attribute in ("direction", "side", "count", "left_hand", "face", "bpm", "action"):
-            value = clip.truth[attribute]
+            value = clip.truth.get(attribute)
             if value is None:
                 continue
             lie: object
             if attribute in ("count", "bpm"):
                 lie = value + (1 if attribute == "count" else 15)
             elif attribute == "action":
-                lie = "walk" if value != "walk" else "jump"
+                lie = "crawl" if value != "crawl" else "jump"
             elif attribute == "face":
                 lie = faces[value]
             elif attribute == "left_hand":
@@ -135,7 +139,7 @@ def test_circles_and_turns_by_plain_geometry(clips: list[Clip]) -> None:
             facing_x = -hips[2] if clip.truth["style"] != "around" else None
             if facing_x is not None:
                 assert (facing_x > 0) == (direction == "left")
-    assert seen >= 35
+    assert seen >= 25
 
 
 def test_feet_stay_where_they_stand(clips: list[Clip]) -> None:
@@ -155,11 +159,12 @@ def test_only_runs_and_jumps_leave_the_floor(clips: list[Clip]) -> None:
     for clip in clips:
         lowest = clip.joints[..., 1].min(axis=1)
         assert lowest.min() == pytest.approx(0.0, abs=1e-9)
-        if clip.truth["action"] in ("jump", "run"):
+        if any(action in ("jump", "run", "hop") for action in actions_of(clip)):
             both_up = clip.joints[:, (10, 11), 1].min(axis=1) > 0.02
             assert both_up.mean() > 0.03, clip.texts[0]
         else:
-            assert lowest.max() < 0.03, clip.texts[0]
+            # Joints have some flesh between them and a floor that somebody lies or crawls on.
+            assert lowest.max() < (0.12 if clip.truth["action"] in ("lie", "crawl") else 0.03), clip.texts[0]
 
 
 def test_joints_bend_the_right_way(clips: list[Clip]) -> None:
@@ -221,7 +226,7 @@ def test_a_clip_depends_on_nothing_but_seed_and_index() -> None:
 def test_actions_are_balanced_and_splits_have_their_shares() -> None:
     config = SynthConfig(seed=1)
     names = [truth_of(index, config).action for index in range(14 * 20)]
-    assert {names.count(action) for action in ACTIONS} == {20}
+    assert {action: names.count(action) for action in names} == dict.fromkeys(BASIC, 20)
     splits = [split_of(index, config) for index in range(1000)]
     assert abs(splits.count("test") - 150) <= 3
     assert abs(splits.count("val") - 50) <= 3
