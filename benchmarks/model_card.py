@@ -23,7 +23,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from motionloom.datasets.motion.features.codec import face_of
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.synth.actions.truth import ACTIONS, FACES, HANDS
+from motionloom.datasets.synth.actions.truth import FACES, HANDS, takes_part
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.evaluation.truth import Truth
@@ -48,8 +48,6 @@ RECIPE = "humantomato-synthetic"
 KINDS = ("held out", "other")
 
 WORDS = Path(__file__).with_name("synthetic_wordings.json")
-IMPLIED = {"punch": "fist", "wave": "spread"}
-"""Shapes that an action gives the hand it takes, which nobody says."""
 FAMILIAR, OTHER, GUESS = "as in training", "other words", "another clip's motion"
 
 CARD = Path(__file__).with_suffix(".md")
@@ -61,30 +59,33 @@ def words_of(truth: Mapping[str, Any], words: Mapping[str, Any], rng: np.random.
     def pick(choices: Sequence[str]) -> str:
         return choices[int(rng.integers(len(choices)))]
 
-    parts = [
-        truth["action"],
-        truth.get("direction"),
-        truth.get("style") if truth["action"] == "turn" else None,
-    ]
-    said = pick(words["actions"][" ".join(part for part in parts if part)])
-    count, speed, side = truth.get("count"), truth.get("speed"), truth.get("side")
-    limb = {"wave": "hand", "raise": "arm"}.get(truth["action"])
-    named = f"both {limb}s" if side == "both" else f"the {side} {limb}" if limb else side
-    body = said.format(
-        s=named,
-        n=pick(words["times"][str(count)]) if count else "",
-        v=pick(words["speed"][speed]) if speed else "",
-    )
+    body = " and next ".join(_said(part, words, pick) for part in truth.get("parts", [truth]))
     shapes = {hand: truth.get(f"{hand}_hand", "relaxed") for hand in ("left", "right")}
-    implied = IMPLIED.get(truth["action"])
     hands = [
         pick(words["hands"][shape]).format(h=f"the {hand} hand")
         for hand, shape in shapes.items()
-        if shape != "relaxed" and not (shape == implied and side in (hand, "both"))
+        if shape != "relaxed" and not takes_part(truth["action"], truth.get("side"), hand)
     ]
     face = pick(words["faces"][truth["face"]]) if truth.get("face") else ""
     who = pick(words["who"])
     return ", ".join([f"{who} {body}", *hands]), f"{who} {face}" if face else ""
+
+
+def _said(truth: Mapping[str, Any], words: Mapping[str, Any], pick: Callable[[Sequence[str]], str]) -> str:
+    """One action in other words."""
+    style = truth.get("style") if truth["action"] == "turn" else None
+    said = pick(
+        words["actions"][" ".join(part for part in (truth["action"], truth.get("direction"), style) if part)]
+    )
+    count, speed, side = truth.get("count"), truth.get("speed"), truth.get("side")
+    limb = {"wave": "hand", "raise": "arm"}.get(truth["action"])
+    named = f"both {limb}s" if side == "both" else f"the {side} {limb}" if limb else side
+    return said.format(
+        s=named,
+        n=pick(words["times"][str(count)]) if count else "",
+        v=pick(words["speed"][speed]) if speed else "",
+        b=truth.get("bpm"),
+    )
 
 
 def rows_of(shares: Mapping[str, Shares]) -> list[list[str]]:
@@ -148,6 +149,9 @@ def main() -> None:
     parser.add_argument("model", type=Path, help="an exported folder, or the name of a model of the package")
     parser.add_argument("--write", action="store_true", help="write the card into the model's folder")
     parser.add_argument("--recipe", help=f"what it was made by; default: as the card says, or {RECIPE}")
+    parser.add_argument(
+        "--set", action="append", help="a setting of the recipe, as for `run`; default: as the card says"
+    )
     parser.add_argument("--name", help="what the card calls it; default: the folder's name, or the card's")
     parser.add_argument("--clips", type=int, help="test clips, at most; default: as the card says, or all")
     parser.add_argument("--top-p", type=float, help="default: as the card says, or the export")
@@ -158,7 +162,8 @@ def main() -> None:
     args = parser.parse_args()
     model, console = model_folder(args.model), Console()
     before = noted(model)
-    recipe = load_recipe(args.recipe or before.get("recipe", RECIPE), strict=False)
+    settings = before.get("settings", []) if args.set is None else args.set
+    recipe = load_recipe(args.recipe or before.get("recipe", RECIPE), settings, strict=False)
     most = args.clips or before.get("clips", 1_000_000)
     seed = before.get("seed", 0) if args.seed is None else args.seed
     words = json.loads(WORDS.read_text(encoding="utf-8"))
@@ -197,6 +202,7 @@ def main() -> None:
         "name": args.name or before.get("name", args.model.resolve().name),
         "description": recipe.description,
         "recipe": args.recipe or before.get("recipe", RECIPE),
+        "settings": settings,
         "clips": len(truths),
         "apart": sum(apart(truth, hold_out) for truth in truths),
         "sampling": sampling.model_dump(mode="json", exclude_unset=True),
@@ -224,8 +230,8 @@ def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """One line: how far the figures are from those of the card."""
     if not before:
         return "no card here to compare with; --write makes one"
-    if any(before.get(key) != now[key] for key in ("clips", "seed", "sampling", "recipe")):
-        return "not comparable with the card: other clips, seed, sampling or recipe"
+    if any(before.get(key) != now.get(key) for key in ("clips", "seed", "sampling", "recipe", "settings")):
+        return "not comparable with the card: other clips, seed, sampling, recipe or settings"
     gaps = {
         f"{name}, {title}, {kind}": 100 * abs(value - before["right"][title][kind][name])
         for title, kinds in now["right"].items()
@@ -269,6 +275,7 @@ def card_of(
     options = "".join(f" --{name.replace('_', '-')} {value}" for name, value in sampling.items())
     recommended = bundle.recommended.model_dump(mode="json", exclude_unset=True)
     recipe_file = figures["recipe"]
+    settings = "".join(f" --set '{one}'" for one in figures["settings"])
     return CARD.read_text(encoding="utf-8").format(
         licence=licence,
         name=figures["name"],
@@ -279,7 +286,7 @@ def card_of(
         fps=bundle.layout.fps,
         bytes=size,
         clips=f"{sum(split_of(k, data) == 'train' for k in range(data.clips)):,}",
-        actions="Actions: " + ", ".join(data.actions or ACTIONS),
+        actions="Actions: " + ", ".join(data.action_names),
         hands=", ".join(data.hand_shapes or HANDS[1:]),
         faces=", ".join(FACES),
         count=figures["clips"],
@@ -290,9 +297,9 @@ def card_of(
         chosen=choice(sampling),
         single=single_draws(figures["single draws"]),
         unknown=f"{strange[OTHER]} of these captions and {strange[FAMILIAR]} of the usual it calls unknown.",
-        commands=f"motionloom run {recipe_file}\n"
+        commands=f"motionloom run {recipe_file}{settings}\n"
         f"motionloom export runs/{recipe.name} -o {figures['name']} --half{options}\n"
-        f"python benchmarks/model_card.py {figures['name']} --recipe {recipe_file} --write",
+        f"python benchmarks/model_card.py {figures['name']} --recipe {recipe_file}{settings} --write",
         recipe_seed=recipe.seed,
         digests="\n".join(f"- `{path}` `{digest}`" for path, digest in digests(model).items()),
     )
