@@ -42,32 +42,24 @@ REQUIRED = declared(PROJECT["dependencies"])
 OPTIONAL = {name for extra in PROJECT["optional-dependencies"].values() for name in declared(extra)}
 
 
-class Imports(ast.NodeVisitor):
-    """Top-level names that a file imports, at once (False) or inside a function (True)."""
+def imports(tree: ast.Module) -> set[tuple[str, bool]]:
+    """Top-level names that a file imports, at once (False) or inside a function (True).
 
-    def __init__(self) -> None:
-        self.found: set[tuple[str, bool]] = set()
-        self._depth = 0
-
-    def _function(self, node: ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) -> None:
-        self._depth += 1
-        self.generic_visit(node)
-        self._depth -= 1
-
-    visit_FunctionDef = visit_AsyncFunctionDef = visit_Lambda = _function  # noqa: N815
-
-    def visit_Import(self, node: ast.Import) -> None:
-        self.found.update((alias.name.split(".")[0], self._depth > 0) for alias in node.names)
-
-    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
-        self.found.add(((node.module or "").split(".")[0], self._depth > 0))
-
-    def visit_Call(self, node: ast.Call) -> None:
-        """`find_spec("x")` looks for a package's files without importing it."""
-        called = getattr(node.func, "id", getattr(node.func, "attr", ""))
-        if called in ("find_spec", "import_module") and node.args and isinstance(node.args[0], ast.Constant):
-            self.found.add((str(node.args[0].value).split(".")[0], True))
-        self.generic_visit(node)
+    `find_spec("x")` looks for a package's files without importing it.
+    """
+    functions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
+    inner = {id(n) for one in ast.walk(tree) if isinstance(one, functions) for n in ast.walk(one)}
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {(alias.name.split(".")[0], id(node) in inner) for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(((node.module or "").split(".")[0], id(node) in inner))
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            called = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            asked = {"find_spec", "import_module"} & {called}
+            found |= {(str(node.args[0].value).split(".")[0], True) for _ in asked}
+    return found
 
 
 BEHIND_AN_EXTRA = ("pipeline/serve",)
@@ -79,10 +71,8 @@ def uses() -> dict[tuple[str, bool], set[str]]:
     owners = packages_distributions()
     found: dict[tuple[str, bool], set[str]] = {}
     for path in sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
-        visitor = Imports()
-        visitor.visit(ast.parse(path.read_text(encoding="utf-8")))
         behind = path.parent.relative_to(ROOT).as_posix() in BEHIND_AN_EXTRA
-        for name, own in visitor.found:
+        for name, own in imports(ast.parse(path.read_text(encoding="utf-8"))):
             inside = own or behind
             if name == "motionloom" or name in sys.stdlib_module_names:
                 continue

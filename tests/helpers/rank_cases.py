@@ -13,6 +13,8 @@ from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.evaluator.module import EvaluatorModule
+from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
@@ -182,6 +184,23 @@ class Undrawn(DiffusionModule):
             torch.randint, torch.randn_like = randint, randn_like
 
 
+class Pairs(EvaluatorModule):
+    """The evaluator's autoencoder and its pairs, which share no gradient, in one loss."""
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        values = super().losses(batch)
+        return values | {"loss": values["movement_loss"] + values["matching_loss"]}
+
+
+def evaluator() -> tuple[StageModule, Batches]:
+    sizes = EvaluatorConfig(
+        movement_hidden=8, movement=8, motion_hidden=8, text_hidden=8, latent=4, dropout=0
+    )
+    net = Evaluator(sizes, MotionLayout.named("body133"), TEXT, FRAMES)
+    module = Pairs(net, OPTIM, seed=0, max_steps=STEPS, movement_optim=OPTIM, movement_steps=1)
+    return module.double().eval(), lambda step: motion(step, 133) | captions(step)
+
+
 CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
     "h2vq, one rank without hands": lambda: tokenizer(H2VQConfig(**BOOK), (True, False, True) + 3 * (False,)),
@@ -195,6 +214,7 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "gpt, compiled": gpt,
     "gpt, samples": gpt_samples,
     "diffusion": diffusion,
+    "evaluator": evaluator,
 }
 
 

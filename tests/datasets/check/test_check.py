@@ -20,6 +20,7 @@ from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.shards import sample as sample_module
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
@@ -144,6 +145,15 @@ def test_absurd_values_are_errors(tmp_path: Path, name: str, value: float, word:
     report = report_on(tmp_path, Made("a", motion=motion), Made("b", motion=features(1)))
     assert word in str(report.errors[0]) and "wrong unit, scale or layout" in str(report.errors[0])
     assert "'000000-00000" in report.errors[0].where
+
+
+def test_numbers_that_are_none_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The writer refuses them too, so here it looks away."""
+    motion = features(1)
+    motion[7, 3] = np.nan
+    monkeypatch.setattr(sample_module, "require_finite", lambda *_: None)
+    report = report_on(tmp_path, Made("a"), Made("b", motion=motion))
+    assert "NaN or infinity in row 7" in " ".join(map(str, report.errors))
 
 
 def test_glitches_are_warnings(tmp_path: Path) -> None:

@@ -137,17 +137,10 @@ def test_top_k_and_top_p() -> None:
 
 def test_bad_settings_are_refused(gpt: InterleavedGPT) -> None:
     text = torch.randn(2, 6)
-    for settings, message in (
-        ({"temperature": -1.0}, "temperature"),
-        ({"top_k": 0}, "top_k"),
-        ({"top_p": 0.0}, "top_p"),
-        ({"seed": [1]}, "1 seeds were given for 2 texts"),
-    ):
-        with pytest.raises(UserError, match=message):
-            generate(gpt, text, **settings)
-    plain = toy_gpt(condition_dropout=0.0)
+    with pytest.raises(UserError, match="1 seeds were given for 2 texts"):
+        generate(gpt, text, seed=[1])
     with pytest.raises(UserError, match="condition_dropout"):
-        generate(plain, text, cfg_scale=2.0)
+        generate(toy_gpt(condition_dropout=0.0), text, cfg_scale=2.0)
 
 
 def grammar(word: int, length: int) -> tuple[list[int], list[int]]:

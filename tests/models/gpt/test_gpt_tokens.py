@@ -69,10 +69,17 @@ def test_interleave_equals_reference_and_inverts(
             valid = count * per_group
             assert torch.equal(back.codes[name][row, :valid], codes[name][row, :valid])
             assert (back.codes[name][row, valid:] == 0).all()
+    closed = torch.arange(len(groups)) % 2 == seed % 2  # the other rows are clips that go on
+    some = interleave(codes, pattern, ends=ends, groups=torch.tensor(groups), closed=closed)
+    assert some.length.tolist() == [
+        size if closed[row] else size - len(ends) for row, size in enumerate(out.length.tolist())
+    ]
+    for row, size in enumerate(some.length.tolist()):
+        assert torch.equal(some.tokens[row, :size], out.tokens[row, :size])
+        assert torch.equal(some.kinds[row, :size], out.kinds[row, :size])
+        assert (some.tokens[row, size:] == PAD).all() and (some.kinds[row, size:] == 0).all()
     opened = interleave(codes, pattern, groups=torch.tensor(groups))
-    for row, size in enumerate(opened.length.tolist()):
-        assert torch.equal(opened.tokens[row, :size], out.tokens[row, :size])
-        assert (opened.tokens[row, size:] == PAD).all()
+    assert torch.equal(opened.length + len(ends), out.length)
 
 
 def test_paper_length() -> None:

@@ -1,4 +1,4 @@
-"""Training of MATE and UTT: sequences, the adversarial weight, both players, gradients, what is learnt."""
+"""Training of MATE and UTT: the adversarial weight, both players, gradients, what is learnt."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.discriminator.losses import AdversarialConfig, generator_loss
 from motionloom.models.discriminator.patch import DiscriminatorConfig
-from motionloom.models.gpt.tokens import interleave, stream_names
+from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, MqConfig
@@ -21,29 +21,6 @@ from motionloom.models.training.optim import OptimConfig
 from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.module import UttModule
 from motionloom.models.utt.network import ConditionedUtt, UttConfig
-
-# ---- sequences
-
-
-@pytest.mark.parametrize(
-    "pattern", [("code",), ("hand", "body", "hand"), ("a", "b", "a", "c", "b")], ids="-".join
-)
-def test_sequences_are_those_of_each_row_alone(pattern: tuple[str, ...]) -> None:
-    draws = torch.Generator().manual_seed(0)
-    groups, closed = [4, 4, 1, 2, 3, 1], [True, False, True, False, True, False]
-    ends = {name: 5 + 2 * k for k, name in enumerate(stream_names(pattern))}
-    codes = {n: torch.randint(end, (6, 4 * pattern.count(n)), generator=draws) for n, end in ends.items()}
-    found = interleave(codes, pattern, ends=ends, groups=torch.tensor(groups), closed=torch.tensor(closed))
-    assert found.tokens.shape == found.kinds.shape == (6, 4 * len(pattern) + len(ends))
-    for row, count in enumerate(groups):
-        mine = {name: values[row : row + 1, : count * pattern.count(name)] for name, values in codes.items()}
-        alone = interleave(mine, pattern, ends=ends if closed[row] else None)
-        size = int(alone.length)
-        assert found.length[row] == size
-        assert torch.equal(found.tokens[row, :size], alone.tokens[0])
-        assert torch.equal(found.kinds[row, :size], alone.kinds[0])
-        assert (found.tokens[row, size:] == -1).all() and (found.kinds[row, size:] == 0).all()
-
 
 # ---- the weight
 
