@@ -41,10 +41,6 @@ class TrainConfig(Config):
     codebook is updated with every part (an average and resets over smaller batches). More processes instead
     of more parts change neither.
     """
-    draws: Literal["rank", "sample"] = "rank"
-    """What dropout, noise and latents of a step depend on: the rank (torch's generators; other numbers of
-    processes draw otherwise) or each sample of the global batch (elastic: any number of processes, and of
-    parts, draws the same; slower, with dropout of attention weights much slower)."""
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
     strategy: Literal["ddp", "fsdp"] = Field("ddp", json_schema_extra=RUNTIME)
     """What several processes hold: each the whole network (`ddp`), or each a part of the weights, gradients
@@ -66,8 +62,6 @@ class TrainConfig(Config):
     """Also keep, for ever, each checkpoint whose step is a multiple of this; 0 keeps none of them."""
     validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
     """Steps between validations, rounded up to checkpoints; 0 turns them off."""
-    on_not_finite: Literal["stop", "continue"] = Field("stop", json_schema_extra=RUNTIME)
-    """What to do if a loss or gradient is not finite; the batch of that step is saved either way."""
 
     def local_batch(self, world: int) -> int:
         """Items a process reads at once; the global batch must divide evenly."""
@@ -93,11 +87,6 @@ class TrainedStageConfig(StageConfig):
         """The global batch must divide over the processes, and FSDP suit the network and the arithmetic."""
         self.train.local_batch(hardware.world())
         require_loggers(hardware.loggers)
-        if self.train.draws == "sample" and self.train.compile and self.train.checkpoint_activations:
-            raise UserError(
-                "train.checkpoint_activations repeats draws by sample in the backward pass, which "
-                "train.compile cannot do; set train.draws: rank, or one of them to false"
-            )
         if self.train.strategy == "fsdp":
             self._require_shardable()
 

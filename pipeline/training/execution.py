@@ -32,7 +32,6 @@ from motionloom.pipeline.training.preemption import unsignalled
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
     """Apply the settings that concern how the network computes."""
     module.fused = config.precision != "16-mixed"
-    module.draw_by_sample = config.draws == "sample"
     module.accumulate = config.accumulate
     for part in module.modules():
         if isinstance(part, Transformer):

@@ -100,27 +100,23 @@ class FailureGuard:
         module: StageModule,
         data: TrainingData,
         console: Console,
-        *,
-        stop: bool,
     ) -> None:
         self.name, self.folder, self.module, self.data = name, folder, module, data
-        self.console, self.stop = console, stop
-        self._reported = False
+        self.console = console
 
     def check(self, *, scaled: bool) -> None:
         """All ranks call this at the same steps.
 
         Raises:
-            NotFiniteError: In the lead, if any rank has failed and the training stops for it.
+            NotFiniteError: In the lead, if any rank has failed.
             TeamError: In the other ranks.
         """
         failure = first_failure(self.module, scaled=scaled)
         orders = all_ranks([math.inf if failure is None else failure.order], self.module.device)[
             :, 0
         ].tolist()
-        if not math.isfinite(min(orders)) or self._reported:
+        if not math.isfinite(min(orders)):
             return
-        self._reported = True
         first, text = orders.index(min(orders)), [""]
         if first == rank():
             assert failure is not None
@@ -128,12 +124,9 @@ class FailureGuard:
             text = [f"{sentence}; {self._save(failure.step, sentence)}"]
         if world_size() > 1:
             dist.broadcast_object_list(text, src=first)
-        if not self.stop:
-            self.console.print(f"[yellow]    {escape(text[0])}[/]", soft_wrap=True)
-        elif rank() == 0:
+        if rank() == 0:
             raise NotFiniteError(text[0])
-        else:
-            raise TeamError(text[0])
+        raise TeamError(text[0])
 
     def due(self, step: int) -> bool:
         """Whether to check after a step: reading a figure waits for a GPU, and ranks for each other."""

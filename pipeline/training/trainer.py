@@ -136,9 +136,7 @@ class Training:
         )
         self._saved, self._writing = module.step if resume.checkpoint else -1, False
         self.telemetry = Telemetry(context.folder, hardware.flight_rows, module, config.batch_size)
-        self.failures = FailureGuard(
-            name, context.folder, module, data, console, stop=config.on_not_finite == "stop"
-        )
+        self.failures = FailureGuard(name, context.folder, module, data, console)
         self.stall = StallTimer(
             context.folder / CRASHES / f"stalled_rank_{rank()}.txt", hardware.stall_seconds
         )

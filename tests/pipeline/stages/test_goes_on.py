@@ -45,17 +45,6 @@ def test_killed_twice_equals_undisturbed(settings: dict[str, Any], tmp_path: Pat
     assert_same_stage(tmp_path / "whole", tmp_path / "killed", whole, again)
 
 
-def test_draws_by_sample_are_the_same_in_parts(tmp_path: Path) -> None:
-    """Of two optimizers that take turns; draws by rank are not."""
-    bound = {"rtol": 0, "atol": 1e-12}
-    for draws in ("sample", "rank"):
-        settings = {"steps": 8, "validate_every": 0, "dtype": torch.float64, "draws": draws}
-        whole = train(tmp_path / f"{draws}-whole", **settings).state_dict()
-        parts = train(tmp_path / f"{draws}-parts", accumulate=4, **settings).state_dict()
-        same = all(torch.allclose(whole[name], parts[name], **bound) for name in whole)
-        assert same == (draws == "sample")
-
-
 def test_killed_behind_the_last_step_hands_over_the_average(tmp_path: Path) -> None:
     first = train(tmp_path, ema=0.9)
     again = train(tmp_path, ema=0.9)
@@ -80,12 +69,6 @@ def test_the_average_is_that_of_the_weights(tmp_path: Path) -> None:
     rows = [read_training_log(tmp_path / name) for name in ("plain", "watched")]
     for one, two in zip(*rows, strict=True):
         assert (one == two) == ("train/loss" in one)
-
-
-def test_draws_by_sample_are_not_repeated_by_a_compiled_graph() -> None:
-    train = TrainConfig(draws="sample", compile=True, checkpoint_activations=True)
-    with pytest.raises(UserError, match=r"set train\.draws: rank, or one of them to false"):
-        GptStageConfig(train=train).require_fit(Hardware(accelerator="cpu", devices=1))
 
 
 def test_an_average_of_cut_weights_is_refused() -> None:

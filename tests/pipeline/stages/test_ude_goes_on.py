@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -62,15 +61,8 @@ PAIRS = {"mq": torch.float64, "utt": torch.float32, "dmd": torch.float64}
 BOUND = 1e-5
 
 
-ELASTIC = {"utt": torch.float32, "dmd": torch.float64}
-DRAWN: dict[str, Any] = {"dropout": 0.2, "draws": "sample"}
-
-
 def worker(out: Path) -> None:
     torch.set_num_threads(1)
-    for name, dtype in ELASTIC.items():  # from one process's checkpoint at step 4, killed again
-        with pytest.raises(ConnectionResetError):
-            train(name, out / f"elastic-{name}", dtype=dtype, devices=2, dies_at=13, **DRAWN)
     for name, dtype in PAIRS.items():
         module = train(name, out / name, dtype=dtype, devices=2)
         torch.save(module.state_dict(), out / f"{name}-{os.environ['RANK']}.pt")
@@ -82,9 +74,6 @@ def worker(out: Path) -> None:
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders of the trainings on two ranks."""
     folder = tmp_path_factory.mktemp("pair")
-    for name, dtype in ELASTIC.items():
-        with pytest.raises(ConnectionResetError):
-            train(name, folder / f"elastic-{name}", dtype=dtype, dies_at=5, **DRAWN)
     run_two_ranks(__file__, folder)
     return folder
 
@@ -115,21 +104,6 @@ def test_two_ranks_equal_one(name: str, pair: Path, tmp_path: Path) -> None:
     assert [sorted(row) for row in rows[0]] == [sorted(row) for row in rows[1]]
     for row, other in zip(*rows, strict=True):
         assert other == pytest.approx(row, rel=1e-5, abs=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(240)
-@pytest.mark.parametrize("name", list(ELASTIC))
-def test_killed_and_gone_on_by_two_ranks_and_by_one_again(name: str, pair: Path, tmp_path: Path) -> None:
-    """Everything is drawn, by sample: the log is that of one process that nothing happened to."""
-    train(name, tmp_path, dtype=ELASTIC[name], **DRAWN)
-    assert newest(pair / f"elastic-{name}")["global_step"] == 12
-    train(name, pair / f"elastic-{name}", dtype=ELASTIC[name], **DRAWN)
-    rows = [read_training_log(folder) for folder in (tmp_path, pair / f"elastic-{name}")]
-    assert [row["step"] for row in rows[0]] == [8, 10, 16]
-    bound = 1e-6 if ELASTIC[name] == torch.float64 else 1e-5
-    for row, other in zip(*rows, strict=True):
-        assert other == pytest.approx(row, rel=bound, abs=bound)
 
 
 if __name__ == "__main__":

@@ -51,14 +51,6 @@ def test_an_error_in_a_step_leaves_its_traceback(call: Callable[..., Any], recip
     assert "in losses" in (folder / "error.txt").read_text() and (folder / "batch.safetensors").is_file()
 
 
-def test_it_continues_where_the_recipe_says_so(recipe: Path) -> None:
-    run, console = recipe.parent / "on", Console(width=999, record=True)
-    sets = [f"toy.fails_at={FAILS}", "toy.train.on_not_finite=continue"]
-    run_recipe(recipe, run, overrides=sets, console=console)
-    assert console.export_text().count("is not finite") == 1
-    assert (run / "stages/toy/model.safetensors").is_file()
-
-
 def figures(step: int, **values: float) -> StepFigures:
     return StepFigures(step, tuple(values), torch.tensor(list(values.values())))
 
