@@ -128,12 +128,6 @@ def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]
     return {role: finished(name) for role, name in stage.inputs.items()}
 
 
-def begin(run: Path, row: PlannedStage) -> None:
-    """Mark a stage of a plan as begun, so that parts of it can be made before it is run."""
-    with _lock(run, needed=True):
-        _prepare(stage_folder(run, row.stage.name), row)
-
-
 def _prepare(folder: Path, row: PlannedStage) -> None:
     request = None if row.request is None else row.request.id
     started = Started(fingerprint=row.fingerprint, extendable=row.extendable, request=request)

@@ -17,16 +17,12 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, field_validator, model_validator
 from rich.table import Table
 
-from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.registry import converter_named
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.runs.recipe import Recipe
 
 Need = Literal["cpu", "gpu", "all"]
 """One process without a GPU; one process with one; as many processes on all nodes as there are GPUs."""
-
-PARTS_MODULE = "motionloom.pipeline.runs.convert_part"
 
 
 def _one_line(text: str) -> str:
@@ -65,8 +61,6 @@ class SlurmOptions(Config):
     """CPU cores, and processes of a conversion, in a group of one process."""
     light_memory_gb: float = Field(32, gt=0)
     """Memory of a group of one process."""
-    parts: int = Field(8, ge=1)
-    """Tasks of the array that a conversion at the beginning is cut into; 1 for a plain job."""
     warn_seconds: int = Field(120, ge=60)
     """How long before its time limit a job is queued again."""
     requeues: int = Field(100, ge=0)
@@ -121,15 +115,6 @@ class Machines:
 
 
 @dataclass(frozen=True)
-class Parts:
-    """A conversion's step that several machines make at once."""
-
-    stage: str
-    step: Literal["features", "shards"]
-    count: int
-
-
-@dataclass(frozen=True)
 class Group:
     """Stages that run as one job, after the group before."""
 
@@ -144,7 +129,6 @@ class Group:
     """Settings of `hardware`, as `--set` takes them."""
     after: str | None = None
     """Name of the group that must be done before."""
-    parts: Parts | None = None
 
 
 @dataclass(frozen=True)
@@ -166,27 +150,17 @@ class LaunchPlan:
 
     def command(self, group: Group, recipe: str, program: Sequence[str]) -> list[str]:
         """The words that run a group: `program` is `motionloom`, `recipe` the file of an own recipe."""
-        sets = [word for setting in (*self._overrides, *group.settings) for word in ("--set", setting)]
+        overrides = self.overrides if self.given else ()  # a resolved recipe has them
+        sets = [word for setting in (*overrides, *group.settings) for word in ("--set", setting)]
         return [*program, "run", self.given or recipe, "-o", self.out, "--until", ",".join(group.last), *sets]
-
-    def part_command(self, parts: Parts, recipe: str, python: Sequence[str]) -> list[str]:
-        """The words that make one part of a conversion, whose number is in SLURM's variable."""
-        where = [self.given or recipe, self.out, parts.stage, parts.step, str(parts.count)]
-        return [*python, "-m", PARTS_MODULE, *where, *self._overrides]
-
-    @property
-    def _overrides(self) -> tuple[str, ...]:
-        return self.overrides if self.given else ()  # a resolved recipe has them
 
     def table(self) -> Table:
         table = Table(title=f"{self.recipe.name}: {len(self.groups)} groups", title_justify="left")
         for column in ("group", "stages", "machines", "limit", "after"):
             table.add_column(column, overflow="fold")
         for group in self.groups:
-            stages = ", ".join(group.stages)
-            if group.parts is not None:
-                stages += f" ({group.parts.step} in {group.parts.count} parts)"
             limit = f"{group.machines.minutes} min"
+            stages = ", ".join(group.stages)
             table.add_row(group.name, stages, _say_machines(group), limit, group.after or "")
         return table
 
@@ -201,58 +175,50 @@ def make_launch_plan(
     nodes: int,
     gpus_per_node: int,
 ) -> LaunchPlan:
-    """Cut a recipe into groups, and conversions at its beginning into parts."""
+    """Cut a recipe into groups."""
     if nodes < 1 or gpus_per_node < 0:
         raise UserError(
             f"--nodes {nodes} --gpus-per-node {gpus_per_node}: take 1 node or more and no negative count"
         )
-    settings = _Settings(options, nodes, gpus_per_node)
     groups: list[Group] = []
     for need, stages in _cut(recipe, gpus_per_node):
-        for one in [] if groups else _parts_of(stages, options.parts):
-            name = f"{len(groups) + 1}-{_word(one.stage, 12)}-{one.step}"
-            groups.append(settings.group(name, "cpu", (one.stage,), groups, one))
         names = tuple(stage.name for stage in stages)
         read = {name for stage in stages for name in stage.inputs.values()}
-        last = tuple(name for name in names if name not in read)
         label = "train" if any(stage.kind.trains for stage in stages) else _word(names[0], 12)
-        groups.append(settings.group(f"{len(groups) + 1}-{label}", need, names, groups, last=last))
+        machines = _machines(options, need, nodes, gpus_per_node)
+        groups.append(
+            Group(
+                name=f"{len(groups) + 1}-{label}",
+                need=need,
+                stages=names,
+                last=tuple(name for name in names if name not in read),
+                machines=machines,
+                settings=_settings(options, need, machines),
+                after=groups[-1].name if groups else None,
+            )
+        )
     _require_fit(recipe, groups)
     word = options.name or _word(recipe.name, 30)
     name = word if word[:1].isalpha() else f"run-{word}"
     return LaunchPlan(name, recipe, given, tuple(overrides), str(out), tuple(groups))
 
 
-@dataclass(frozen=True)
-class _Settings:
-    options: SlurmOptions
-    nodes: int
-    gpus: int
+def _machines(options: SlurmOptions, need: Need, nodes: int, gpus: int) -> Machines:
+    if need != "all":
+        light = options.light_cpus, options.light_memory_gb, options.light_minutes
+        return Machines(1, 1, int(need == "gpu"), *light)
+    each = max(gpus, 1)
+    cpus, memory = options.cpus_per_gpu * each, options.memory_gb_per_gpu * each
+    return Machines(nodes, each, gpus, cpus, memory, options.time_minutes)
 
-    def group(
-        self,
-        name: str,
-        need: Need,
-        stages: tuple[str, ...],
-        before: Sequence[Group],
-        parts: Parts | None = None,
-        last: tuple[str, ...] = (),
-    ) -> Group:
-        options, each = self.options, max(self.gpus, 1)
-        if need == "all":
-            cpus, memory = options.cpus_per_gpu * each, options.memory_gb_per_gpu * each
-            machines = Machines(self.nodes, each, self.gpus, cpus, memory, options.time_minutes)
-        else:
-            machines = Machines(
-                1, 1, int(need == "gpu"), options.light_cpus, options.light_memory_gb, options.light_minutes
-            )
-        fields = [f"nodes={machines.nodes}", f"devices={machines.processes}"]
-        if need != "all":
-            fields.append(f"convert_workers={options.light_cpus}")
-        # A node whose driver is broken must not do a GPU's work on its CPU.
-        fields.append("accelerator=cpu" if need == "cpu" or self.gpus == 0 else "accelerator=gpu")
-        hardware = tuple(f"hardware.{field}" for field in fields)
-        return Group(name, need, stages, last, machines, hardware, before[-1].name if before else None, parts)
+
+def _settings(options: SlurmOptions, need: Need, machines: Machines) -> tuple[str, ...]:
+    fields = [f"nodes={machines.nodes}", f"devices={machines.processes}"]
+    if need != "all":
+        fields.append(f"convert_workers={options.light_cpus}")
+    # A node whose driver is broken must not do a GPU's work on its CPU.
+    fields.append(f"accelerator={'gpu' if machines.gpus else 'cpu'}")
+    return tuple(f"hardware.{field}" for field in fields)
 
 
 def _cut(recipe: Recipe, gpus: int) -> list[tuple[Need, list[Stage]]]:
@@ -288,18 +254,6 @@ def _needs(recipe: Recipe, gpus: int) -> dict[str, Need]:
         else:
             needs[stage.name] = "cpu"
     return needs
-
-
-def _parts_of(stages: Sequence[Stage], count: int) -> list[Parts]:
-    """The conversions among the stages as parts: the steps of all that come first, then the shards."""
-    if count == 1:
-        return []
-    found = [stage for stage in stages if isinstance(stage.config, ConvertConfig)]
-    first = [stage for stage in found if converter_named(stage.kind.name).features_first]
-    return [
-        *(Parts(stage.name, "features", count) for stage in first),
-        *(Parts(stage.name, "shards", count) for stage in found),
-    ]
 
 
 def _require_fit(recipe: Recipe, groups: Sequence[Group]) -> None:

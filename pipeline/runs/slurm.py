@@ -34,10 +34,8 @@ from motionloom.pipeline.store.files import require_folder
 LOG_FOLDER = ".slurm"
 """Inside the run folder: scripts and logs of the jobs. May be deleted when all is over."""
 
-PYTHON = (sys.executable, "-P")
-"""This Python, which must lie under the same path on every node."""
-
-PROGRAM = (*PYTHON, "-m", "motionloom.pipeline.cli.main")
+PROGRAM = (sys.executable, "-P", "-m", "motionloom.pipeline.cli.main")
+"""By this Python, which must lie under the same path on every node."""
 
 RECIPE_FILE = "recipe.yaml"
 """The resolved recipe of a launch, next to its scripts."""
@@ -77,13 +75,13 @@ done
 # {saved}: a training is saved. 138: the warning ended a command that has nothing to save.
 # A job that was cancelled is not RUNNING any more; queued again it would come back.
 again=
-state=$(squeue --noheader --jobs={job} --format=%T 2> /dev/null) || state=
+state=$(squeue --noheader --jobs="$SLURM_JOB_ID" --format=%T 2> /dev/null) || state=
 if [ -n "$warned" ] && [ "${{state:-RUNNING}}" = RUNNING ]; then
   if [ "$code" -eq {saved} ] || [ "$code" -eq 138 ]; then again="the time limit is near"; fi
 elif [ "$code" -eq {saved} ] && [ "$state" = RUNNING ]; then
   again="asked to end"  # the grace time of a preemption
 fi
-if [ -n "$again" ] && scontrol requeue {job}; then
+if [ -n "$again" ] && scontrol requeue "$SLURM_JOB_ID"; then
   echo "$again: queued again, goes on from there"
   trap - TERM
   sleep 3600  # SLURM ends this try
@@ -208,21 +206,18 @@ def _new_folder(parent: Path) -> Path:
 
 def _text(plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, cwd: Path) -> str:
     lines = ["#!/bin/bash", *(_directive(*one) for one in _options(plan, group, options, folder, cwd))]
-    job = '"$SLURM_JOB_ID"'
-    if group.parts is not None:
-        job = '"${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"'
     lines += [_SIGNALS.format(requeues=options.requeues).rstrip()]
     lines += [f"{shlex.join(_command(plan, group, folder))} &"]
-    lines += [_WAIT.format(job=job, saved=SAVED).rstrip()]
+    lines += [_WAIT.format(saved=SAVED).rstrip()]
     return "\n".join(lines) + "\n"
 
 
 def _options(
     plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, cwd: Path
 ) -> list[tuple[str, str | None]]:
-    machines, parts = group.machines, group.parts
+    machines = group.machines
     partition = options.partition if machines.gpus else options.light_partition or options.partition
-    log = f"{str(folder / group.name).replace('%', '%%')}-{'%A_%a' if parts else '%j'}.log"
+    log = f"{str(folder / group.name).replace('%', '%%')}-%j.log"
     asked: list[tuple[str, str | None]] = [
         ("job-name", plan.job(group)),
         ("partition", partition),
@@ -234,7 +229,6 @@ def _options(
         ("gpus-per-node", str(machines.gpus) if machines.gpus else None),
         ("mem", f"{max(1, round(machines.memory_gb * 1024))}M"),
         ("time", str(machines.minutes)),
-        ("array", f"0-{parts.count - 1}" if parts else None),
         ("chdir", str(cwd)),
         ("output", log),
         ("open-mode", "append"),
@@ -255,10 +249,7 @@ def _directive(name: str, value: str | None) -> str:
 
 
 def _command(plan: LaunchPlan, group: Group, folder: Path) -> Sequence[str]:
-    recipe = str(folder / RECIPE_FILE)
-    if group.parts is not None:
-        return plan.part_command(group.parts, recipe, PYTHON)
-    command, machines = plan.command(group, recipe, PROGRAM), group.machines
+    command, machines = plan.command(group, str(folder / RECIPE_FILE), PROGRAM), group.machines
     if machines.nodes * machines.processes == 1:
         return command
     asked = [f"--nodes={machines.nodes}", f"--ntasks-per-node={machines.processes}"]

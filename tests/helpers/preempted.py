@@ -44,7 +44,7 @@ SPLITS = ("train", "train", "train", "train", "val", "test")
 TRAINED = ("tokenizer", "evaluate")
 """What is made anew under preemption."""
 
-GROUPS = ("1-data-features", "2-data-shards", "3-data", "4-train")
+GROUPS = ("1-data", "2-train")
 """What a launch makes of it."""
 
 ASKED = ("partition=main", "light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=1", "memory_gb_per_gpu=1")

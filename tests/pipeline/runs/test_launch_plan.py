@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.runs.launch_plan import LaunchPlan, SlurmOptions, make_launch_plan
 from motionloom.pipeline.runs.plan import Selection, selected
@@ -15,9 +14,9 @@ from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.resolve import shipped_recipes
 
 
-def plan_of(name: str | Path, *overrides: str, nodes: int = 1, gpus: int = 1, parts: int = 1) -> LaunchPlan:
+def plan_of(name: str | Path, *overrides: str, nodes: int = 1, gpus: int = 1) -> LaunchPlan:
     return make_launch_plan(
-        load_recipe(name, overrides), SlurmOptions(parts=parts), given=str(name), overrides=overrides,
+        load_recipe(name, overrides), SlurmOptions(), given=str(name), overrides=overrides,
         out=Path("/runs/x"), nodes=nodes, gpus_per_node=gpus,
     )  # fmt: skip
 
@@ -60,21 +59,6 @@ def test_the_paper_waits_in_three_queues() -> None:
     assert "hardware.accelerator=cpu" in first.settings and "hardware.accelerator=cpu" not in third.settings
     words = plan.command(second, "unused.yaml", ["motionloom"])
     assert words[:7] == ["motionloom", "run", "humantomato-paper", "-o", "/runs/x", "--until", "evaluate"]
-
-
-def test_a_conversion_at_the_beginning_is_made_in_parts() -> None:
-    plan = plan_of("bvh-body", parts=3)
-    steps = [(group.parts.step, group.parts.count) for group in plan.groups if group.parts]
-    assert steps == [("features", 3), ("shards", 3)]
-    assert stages(plan)[:3] == [("data",), ("data",), ("data", "stats", "text")]
-    python = ["python", "-P"]
-    parts = plan.groups[0].parts
-    assert parts is not None
-    assert plan.part_command(parts, "r.yaml", python)[2:] == [
-        *("-m", "motionloom.pipeline.runs.convert_part", "bvh-body", "/runs/x", "data", "features", "3")
-    ]
-    assert plan_of("bvh-body").groups[0].parts is None
-    assert [kind.name for kind in converters() if kind.features_first] == ["bvh"]
 
 
 def test_without_gpus_all_is_for_cpus() -> None:
