@@ -17,11 +17,7 @@ from pydantic import Field
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.launch.process import local_rank
 
-LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow", "trackio"]
-
-
-SERVERS: tuple[LoggerName, ...] = ("wandb", "mlflow", "trackio")
-"""Loggers that send what they get to a server."""
+LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
 
 
 class Hardware(Config):

@@ -25,19 +25,11 @@ READER = "reader.json"
 MIX = "mix.json"
 
 
-class DataPart(Config):
-    """One data set of a mix."""
-
-    path: str
-    """Folder with `manifest.json`, or a URL (`s3://`, `https://`, `http://`)."""
-    weight: float = Field(gt=0, allow_inf_nan=False)
-    """Share of the batches, relative to the other data sets."""
-
-
 class Reference(Config):
     """`reference.json` of a data stage whose shards lie elsewhere."""
 
-    parts: list[DataPart]
+    path: str
+    """Folder with `manifest.json`, or a URL (`s3://`, `https://`, `http://`)."""
     order: Literal["global", "streamed"]
     shards_per_group: int
 
@@ -77,23 +69,12 @@ def open_split(folder: Path, split: str, *, training: bool = False) -> ClipDatas
     """
     if _is_plain(folder):
         return ShardDataset.open(folder / SHARDS, split)
-    opened = _opened(folder, split, training)
-    return opened[0][0] if len(opened) == 1 else MixedDataset(opened)
-
-
-def _opened(folder: Path, split: str, training: bool) -> list[tuple[ClipDataset, float]]:
-    """The data sets of a data stage that hold clips of a split, and their weights."""
     if (folder / MIX).is_file():
-        opened, mix = [], Mix.load_json(folder / MIX)
-        for mixed, place in zip(mix.parts, mix.folders(folder), strict=True):
-            inner = _opened(place, split, training)
-            # Whatever weights a stage has for its own data sets, they share the stage's.
-            whole = sum(weight for _, weight in inner)
-            opened += [(dataset, mixed.weight * weight / whole) for dataset, weight in inner]
-        return opened
-    if _is_plain(folder):
-        there = split in _filled(_manifests(folder)[0])
-        return [(ShardDataset.open(folder / SHARDS, split), 1.0)] if there else []
+        mix = Mix.load_json(folder / MIX)
+        pairs = zip(mix.folders(folder), mix.parts, strict=True)
+        holding = [(place, part.weight) for place, part in pairs if split in splits_of(place)]
+        opened = [(open_split(place, split, training=training), weight) for place, weight in holding]
+        return opened[0][0] if len(opened) == 1 else MixedDataset(opened)
     reference = Reference.load_json(folder / REFERENCE)
     reader = Reader.load_json(folder / READER)
     reading = Reading(
@@ -102,11 +83,7 @@ def _opened(folder: Path, split: str, training: bool) -> list[tuple[ClipDataset,
         shards_per_group=reference.shards_per_group,
         cache=reader.cache,
     )
-    return [
-        (ShardDataset.open(part.path, split, reading=reading), part.weight)
-        for part, manifest in zip(reference.parts, _manifests(folder), strict=True)
-        if split in _filled(manifest)
-    ]
+    return ShardDataset.open(reference.path, split, reading=reading)
 
 
 def _is_plain(folder: Path) -> bool:
@@ -116,7 +93,8 @@ def _is_plain(folder: Path) -> bool:
 
 def splits_of(folder: Path) -> list[str]:
     """Splits that hold at least one clip, of any data set."""
-    filled = set().union(*map(_filled, _manifests(folder)))
+    shards = [shard for _, manifest in _sources(folder) for shard in manifest.shards]
+    filled = {shard.split for shard in shards if shard.samples}
     return [split for split in ("train", "val", "test") if split in filled]
 
 
@@ -142,25 +120,17 @@ def local_shards(folder: Path) -> list[LocalShard]:
     ]
 
 
-def _manifests(folder: Path) -> list[Manifest]:
-    return [manifest for _, manifest in _sources(folder)]
-
-
 def _sources(folder: Path) -> list[tuple[Store, Manifest]]:
     if (folder / MIX).is_file():
         places = Mix.load_json(folder / MIX).folders(folder)
         return [source for place in places for source in _sources(place)]
     if _is_plain(folder):
-        stores = [open_store(folder / SHARDS)]
+        store = open_store(folder / SHARDS)
     else:
-        cache = Reader.load_json(folder / READER).cache
-        parts = Reference.load_json(folder / REFERENCE).parts
-        stores = [open_store(part.path, cache) for part in parts]
-    return [(store, read_manifest(store)[0]) for store in stores]
-
-
-def _filled(manifest: Manifest) -> set[str]:
-    return {shard.split for shard in manifest.shards if shard.samples}
+        store = open_store(
+            Reference.load_json(folder / REFERENCE).path, Reader.load_json(folder / READER).cache
+        )
+    return [(store, read_manifest(store)[0])]
 
 
 @dataclass(frozen=True)

@@ -74,8 +74,8 @@ class LogState(TypedDict):
 class MetricLog:
     """`metrics.jsonl`: one row every 10 steps and one per validation; the loggers get the same rows.
 
-    Rows are in the checkpoint, and the file gets those of a checkpoint that is on disk, so after a kill the
-    log holds each step once. Loggers also get learning rates, gradient norms and times; the file is an output
+    Rows are in the checkpoint; file and loggers get those of a checkpoint that is on disk, so after a kill
+    each step is there once. Loggers also get learning rates, gradient norms and times; the file is an output
     of the stage, and equal runs have equal ones.
     """
 
@@ -86,7 +86,7 @@ class MetricLog:
         self._texts: list[tuple[str, str]] = []
         """Each row and what only the loggers get, as JSON: a checkpoint takes the text as it is."""
         self._written = 0
-        """Rows in the file."""
+        """Rows in the file and in the loggers."""
 
     def state_dict(self) -> LogState:
         """Rows so far, as text (plain types only in checkpoints)."""
@@ -98,11 +98,10 @@ class MetricLog:
         pairs = zip(self.rows, gauges, strict=True)
         self._texts = [(json.dumps(row), json.dumps(more)) for row, more in pairs]
 
-    def open(self, step: int) -> None:
+    def open(self) -> None:
         """Open the loggers and the file with the rows up to the checkpoint."""
         if rank() == 0:
-            gauges = (json.loads(more) for _, more in self._texts)
-            self.loggers.open(step, [row | more for row, more in zip(self.rows, gauges, strict=True)])
+            self.loggers.open(self._logged(0, len(self.rows)))
             if self.rows or self.path.is_file():
                 self._write()
 
@@ -112,30 +111,30 @@ class MetricLog:
             return
         self.rows.append({"step": step, **figures})
         self._texts.append((json.dumps(self.rows[-1]), json.dumps(gauges)))
-        if rank() == 0:
-            self.loggers.take({**self.rows[-1], **gauges})
 
     def saved(self, step: int) -> None:
-        """Bring the file up to a checkpoint that is on disk; only the lead has one."""
+        """Bring file and loggers up to a checkpoint that is on disk; only the lead has one."""
         count = len(self.rows)
         while count > self._written and self.rows[count - 1]["step"] > step:
             count -= 1
         self.path.parent.mkdir(parents=True, exist_ok=True)
         _append(self.path, self._lines(self._written, count).encode())
+        self.loggers.take(self._logged(self._written, count))
         self._written = count
-        self.loggers.save(step)
 
-    def finish(self, step: int) -> None:
+    def finish(self) -> None:
         """The training is over: write the file as a whole, as an output is complete or absent."""
         if rank() == 0:
             self._write()
-            self.loggers.save(step)
             self.loggers.close("success")
 
     def fail(self) -> None:
         """Close the loggers; rows that no checkpoint holds come again when the run is resumed."""
         if rank() == 0:
             self.loggers.close("failed")
+
+    def _logged(self, first: int, last: int) -> list[Row]:
+        return [json.loads(row) | json.loads(gauges) for row, gauges in self._texts[first:last]]
 
     def _lines(self, first: int, last: int) -> str:
         return "".join(json.dumps(row, sort_keys=True) + "\n" for row in self.rows[first:last])

@@ -147,7 +147,7 @@ class Training:
             )
 
     def run(self) -> None:
-        self.log.open(self.module.step)
+        self.log.open()
         self.progress = StepProgress(
             self.context.name, self.module.step, self.config.steps, self.context.console
         )
@@ -188,7 +188,7 @@ class Training:
             self._answer(self.agreement.now() if border else self.agreement.after_step())
         self._finish_writing()
         self._answer(self.agreement.now())
-        self.log.finish(module.step)
+        self.log.finish()
 
     def _step(self, batches: Iterator[Batch]) -> None:
         self.telemetry.begin_step()

@@ -1,7 +1,7 @@
 """Several data stages of a recipe as one: captioned clips beside dances, say.
 
 Nothing is copied. The stage writes down which stages it mixes, of its run or of others, so a run that is
-moved still works; data sets that no run has made are mixed by `shards` (`mix:`).
+moved still works; data sets that no run has made become stages by `shards`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Annotated
 import torch
 from pydantic import Field
 
-from motionloom.datasets.check.leaks import Splits
+from motionloom.datasets.check.leaks import Splits, find_leaks
 from motionloom.datasets.motion.layout import MotionLayout, require_layout
 from motionloom.datasets.schema import SPLITS, UserError
 from motionloom.pipeline.contract.stage import (
@@ -26,7 +26,6 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
     register,
 )
-from motionloom.pipeline.stages.data.data import refuse_leaks
 from motionloom.pipeline.store.data import MIX, Data, DataPreview, Mix, MixedStage
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.run_folder import place_from
@@ -77,14 +76,15 @@ class MixStage(StageKind[MixStageConfig]):
     def run(self, context: StageContext) -> None:
         sources = context.every(_INPUTS.name)
         _one_layout({stage.name: context.stage_cache.get(stage).layout for stage in sources})
-        splits = {stage.name: _splits(context.stage_cache.get(stage)) for stage in sources}
-        refuse_leaks(splits, allowed=context.config.allow_leaks)
+        if not context.config.allow_leaks:
+            _refuse_leaks({stage.name: context.stage_cache.get(stage) for stage in sources})
         weights = context.config.weights
         parts = [_part(context, stage, weights.get(stage.name, 1.0)) for stage in sources]
         write_json(context.folder / MIX, Mix(parts=parts).model_dump(mode="json", exclude_none=True))
         total = sum(part.weight for part in parts)
         for stage, part in zip(sources, parts, strict=True):
-            clips = len(context.stage_cache.get(stage).split("train"))
+            data = context.stage_cache.get(stage)
+            clips = len(data.split("train")) if "train" in data.splits else 0
             context.console.print(
                 f"    {stage.name}: {clips} training clips, {100 * part.weight / total:.0f} % of the draws"
             )
@@ -102,8 +102,17 @@ def _part(context: StageContext, stage: Finished, weight: float) -> MixedStage:
     return MixedStage(stage=stage.folder.name, folder=folder, weight=weight)
 
 
-def _splits(data: Data) -> Splits:
-    return {split: data.split(split) for split in SPLITS if split in data.splits}
+def _refuse_leaks(sources: Mapping[str, Data]) -> None:
+    """`UserError` when the mix would be tested on clips that it is trained on."""
+    splits: dict[str, Splits] = {
+        name: {split: data.split(split) for split in SPLITS if split in data.splits}
+        for name, data in sources.items()
+    }
+    if leaks := find_leaks(splits):
+        raise UserError(
+            f"{len(leaks)} clips are in two splits of a mix, such as {leaks[0]}; convert both sources "
+            f"with the same split files, or set allow_leaks: true"
+        )
 
 
 def _one_layout(layouts: Mapping[str, MotionLayout]) -> MotionLayout:

@@ -47,12 +47,9 @@ RECIPE = """
 name: leaky
 hardware: {{accelerator: cpu, convert_workers: 1}}
 stages:
-  data:
-    kind: shards
-    allow_leaks: {allowed}
-    mix:
-      - {{path: {folder}/one, weight: 1}}
-      - {{path: {folder}/two, weight: 1}}
+  one: {{kind: shards, path: {folder}/one}}
+  two: {{kind: shards, path: {folder}/two}}
+  data: {{kind: mix, allow_leaks: {allowed}}}
 """
 
 

@@ -16,7 +16,7 @@ from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.contract.lookup import preview_of
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.store.data import Data, open_split, splits_of
+from motionloom.pipeline.store.data import Data, open_split
 
 RECIPE = """
 name: mixed
@@ -97,31 +97,6 @@ stages:
     for name in ("run", "more"):
         (tmp_path / name).rename(tmp_path / "both" / name)
     assert len(open_split(stage(tmp_path / "both/more", "data"), "train")) == len(wanted)
-
-
-def test_shards_that_lie_elsewhere_share_the_weight_of_their_stage(tmp_path: Path) -> None:
-    """One of them has test clips alone, so the training weight of its stage goes to the other."""
-    for seed, split in ((1, 0.0), (2, 0.4), (3, 0.0)):
-        config = SynthConfig(
-            clips=5, seed=seed, layout="body133", actions=["wave"], val_fraction=0.0, test_fraction=split
-        )
-        synthesize(config, tmp_path / f"set{seed}", progress=False)
-    text = f"""
-name: outside
-hardware: {{accelerator: cpu}}
-stages:
-  near: {{kind: shards, path: {tmp_path}/set3}}
-  far:
-    kind: shards
-    mix: [{{path: {tmp_path}/set1, weight: 1}}, {{path: {tmp_path}/set2, weight: 3}}]
-  data: {{kind: mix, weights: {{near: 1, far: 2}}, inputs: {{data: [near, far]}}}}
-"""
-    run = run_recipe(write(tmp_path, text), tmp_path / "run", console=Console(quiet=True))
-    folder = stage(run, "data")
-    assert splits_of(folder) == ["train", "test"]
-    weights = [source.weight for source in open_split(folder, "train").sources()]
-    assert weights == pytest.approx([1.0, 0.5, 1.5])
-    assert open_split(folder, "test").where == open_split(stage(run, "far"), "test").where
 
 
 def test_its_layout_is_known_before_it_runs(tmp_path: Path) -> None:

@@ -147,24 +147,10 @@ def test_reader_and_cache_may_change_without_training_again(
         assert "5 of 5 stages would run" in plan.out and "changed: " in plan.out, plan.out
 
 
-def test_a_mix_of_a_folder_and_a_server_trains(
-    shards: Path, loopback: ModuleType, tmp_path: Path, call: Callable[..., Any]
-) -> None:
-    with loopback.web(shards) as (url, _):
-        mix = [{"path": str(shards), "weight": 3}, {"path": url, "weight": 1}]
-        path = recipe(tmp_path, "mix", {"mix": mix, "cache": {"folder": str(tmp_path / "cache")}})
-        done = call("run", path, "--out", tmp_path / "run", "--until", "tokenizer")
-    assert done.code == 0, done.out + done.err
-    assert f"{url}: 60 clips" in " ".join(done.out.split()) or url in done.out
-
-
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        ({}, "give either path"),
-        ({"path": "x", "mix": [{"path": "y", "weight": 1}]}, "give either path"),
-        ({"mix": [{"path": "y", "weight": 1}, {"path": "y", "weight": 2}]}, "names a data set twice"),
-        ({"mix": [{"path": "y", "weight": 0}]}, "greater than 0"),
+        ({}, "key 'path' is required"),
         ({"path": "x", "mode": "streamed"}, "needs order: streamed"),
         ({"path": "x", "cache": {"gigabyte": 3}}, "did you mean 'gigabytes'"),
         ({"path": "pipe:touch PWNED"}, "not from 'pipe:'"),
