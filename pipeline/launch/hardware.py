@@ -45,8 +45,6 @@ class Hardware(Config):
     been compared in this run as they are now, all each time a stage starts, or none."""
     loggers: tuple[LoggerName, ...] = ("csv",)
     """Where the figures of trainings go, besides `metrics.jsonl`; all but csv are extras of these names."""
-    flight_rows: int = Field(1000, ge=0)
-    """Rows of each process's flight log, one every 10 steps; older ones are thinned out. 0: no log."""
     profile: int = Field(0, ge=0)
     """Steps of each training that torch's profiler looks at; 0 = none."""
 

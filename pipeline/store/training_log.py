@@ -1,8 +1,6 @@
 """What a training leaves behind beside its network: `metrics.jsonl`, `flight/rank_N.jsonl`, `crash/`.
 
-The flight logs hold times and are no output. A log stays below a number of rows: where it would have more,
-every second row of the older half goes, so the latest steps are always there in full and the beginning in
-outline.
+The flight logs hold times and are no output.
 """
 
 from __future__ import annotations
@@ -10,7 +8,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 
 FILE_NAME = "metrics.jsonl"
@@ -18,6 +15,7 @@ FLIGHT = "flight"
 """Folder of the flight logs, in a stage's."""
 CRASHES = "crash"
 """Folder of what failed steps have read, in a stage's."""
+_DRAWN = 1000
 
 
 def read_training_log(folder: Path) -> list[dict[str, float]]:
@@ -39,36 +37,6 @@ def read_training_log(folder: Path) -> list[dict[str, float]]:
     return rows
 
 
-class FlightLog:
-    """The flight log of one process; `most` rows at any time."""
-
-    def __init__(self, path: Path, most: int) -> None:
-        self.path, self.most = path, most
-        self._lines: list[str] = []
-
-    def begin(self, step: int) -> None:
-        """Continue after step `step`: rows of later steps, which come again, are dropped."""
-        self._lines = [_line(row) for row in read_rows(self.path) if row["step"] <= step]
-        self._rewrite()
-
-    def append(self, row: dict[str, float]) -> None:
-        self._lines.append(_line(row))
-        if len(self._lines) > self.most:
-            half = len(self._lines) // 2
-            self._lines = self._lines[:half:2] + self._lines[half:]
-            self._rewrite()
-            return
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(self._lines[-1])
-
-    def _rewrite(self) -> None:
-        write_text(self.path, "".join(self._lines))
-
-
-def _line(row: dict[str, float]) -> str:
-    return json.dumps(row) + "\n"
-
-
 def read_rows(path: Path) -> list[dict[str, float]]:
     """Rows of a flight log; none where there is no file. A line that a kill has cut short is left out."""
     if not path.is_file():
@@ -85,10 +53,10 @@ def read_rows(path: Path) -> list[dict[str, float]]:
 
 
 def read_flight(folder: Path) -> dict[int, list[dict[str, float]]]:
-    """The flight logs in a stage's folder, by rank."""
+    """The flight logs in a stage's folder, by rank; of a long one about `_DRAWN` rows, evenly."""
     found = {}
     for path in sorted((folder / FLIGHT).glob("rank_*.jsonl")):
         rank = path.stem.removeprefix("rank_")
         if rank.isdecimal() and (rows := read_rows(path)):
-            found[int(rank)] = rows
+            found[int(rank)] = rows[:: -(-len(rows) // _DRAWN)]
     return found

@@ -1,7 +1,4 @@
-"""Checkpoints of a training: what they hold, and their files, in which every flipped bit is found before use.
-
-Weights and optimizers are stored whole, in the format of one process, also by FSDP: a training may be resumed
-with another strategy or number of processes.
+"""Checkpoint files: written beside the training, and in them every flipped bit is found before use.
 
 A file is what `torch.save` writes, followed by a *seal* of 84 bytes, so that no kill, copy or deletion can
 part a checkpoint from its checksum:
@@ -16,128 +13,20 @@ from __future__ import annotations
 
 import hashlib
 import re
+import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any, BinaryIO, TypedDict, cast
+from typing import IO, BinaryIO, cast
 
 import torch
-import torch.distributed as dist
-from torch import Tensor, nn
-from torch.distributed.checkpoint.state_dict import (
-    StateDictOptions,
-    get_model_state_dict,
-    get_optimizer_state_dict,
-    set_model_state_dict,
-    set_optimizer_state_dict,
-)
-from torch.distributed.tensor import DTensor
-from torch.optim import Optimizer
+from torch import Tensor
 
-from motionloom.datasets.base.files import HashingFile, atomic_file
+from motionloom.datasets.base.files import HashingFile, atomic_file, sync_folder
 from motionloom.datasets.schema import UserError
-from motionloom.models.training.averaging import AverageState
-from motionloom.models.training.distributed import rank, world_size
-from motionloom.models.training.stage_module import Means, StageModule
-from motionloom.pipeline.training.progress import LogState
+from motionloom.pipeline.training.checkpoint_state import Checkpoint
 
-OptimizerState = dict[str, Any]
-"""As `Optimizer.state_dict` gives it."""
-
-
-class Checkpoint(TypedDict):
-    """Everything a training needs to continue after a step."""
-
-    global_step: int
-    steps: int
-    """Steps of the training that wrote it."""
-    state_dict: dict[str, Tensor]
-    optimizer_states: list[OptimizerState]
-    scaler: dict[str, object]
-    average: AverageState | None
-    log: LogState
-    row: list[list[Means]]
-    """Means of the log's next row so far, of each rank."""
-    validate: bool
-    """Whether a signal cut the validation of this step short: the resumed training begins with it."""
-
-
-def weights_of(module: StageModule) -> dict[str, Tensor]:
-    """Weights and buffers; of FSDP gathered on rank 0, a collective."""
-    if _is_sharded(module):
-        return cast(dict[str, Tensor], get_model_state_dict(module, options=_WHOLE))
-    return dict(module.state_dict())
-
-
-def load_weights(module: StageModule, state: dict[str, Tensor]) -> None:
-    """Undo `weights_of`."""
-    if _is_sharded(module):
-        set_model_state_dict(
-            module, cast(dict[str, Any], state), options=StateDictOptions(full_state_dict=True)
-        )
-    else:
-        module.load_state_dict(state)
-
-
-def optimizer_state(module: StageModule, optimizer: Optimizer) -> OptimizerState:
-    """State with parameters by number; of FSDP gathered on rank 0, a collective."""
-    if not _is_sharded(module):
-        return optimizer.state_dict()
-    whole = cast(OptimizerState, get_optimizer_state_dict(module, optimizer, options=_WHOLE))
-    if not whole:
-        return {}
-    return _renamed(whole, {name: number for number, name in enumerate(_names(module, optimizer))})
-
-
-def load_optimizer(module: StageModule, optimizer: Optimizer, state: OptimizerState) -> None:
-    """Undo `optimizer_state`."""
-    if not _is_sharded(module):
-        optimizer.load_state_dict(state)
-        return
-    named = _renamed(state, dict(enumerate(_names(module, optimizer))))
-    set_optimizer_state_dict(module, optimizer, named, options=StateDictOptions(full_state_dict=True))
-
-
-def _renamed(state: OptimizerState, names: Mapping[str, int] | Mapping[int, str]) -> OptimizerState:
-    """The state with other keys for its parameters."""
-    groups = [{**one, "params": [names[key] for key in one["params"]]} for one in state["param_groups"]]
-    return {"state": {names[key]: values for key, values in state["state"].items()}, "param_groups": groups}
-
-
-def rows_of_ranks(module: StageModule) -> list[list[Means]]:
-    """What each rank has added to the next row of the log; a collective."""
-    rows = [module.row_state()] * world_size()
-    if world_size() > 1:
-        dist.all_gather_object(rows, module.row_state())
-    return rows
-
-
-def load_row(module: StageModule, rows: Sequence[list[Means]]) -> None:
-    """Continue the log's row; with another number of ranks each takes the mean of all."""
-    if len(rows) == world_size():
-        module.load_row(rows[rank()])
-        return
-    module.load_row(
-        [
-            {**means, "sums": torch.stack([row[place]["sums"] for row in rows]).mean(0)}
-            for place, means in enumerate(rows[0])
-        ]
-    )
-
-
-_WHOLE = StateDictOptions(full_state_dict=True, cpu_offload=True)
-
-
-def _is_sharded(module: nn.Module) -> bool:
-    return any(isinstance(param, DTensor) for param in module.parameters())
-
-
-def _names(module: nn.Module, optimizer: Optimizer) -> list[str]:
-    """Names of an optimizer's parameters, in its order."""
-    names = {id(param): name for name, param in module.named_parameters()}
-    return [names[id(param)] for group in optimizer.param_groups for param in group["params"]]
-
-
+_NAME = re.compile(r"step=(\d+)\.ckpt")
 _SEAL = re.compile(rb"\nmotionloom sha256 ([0-9a-f]{64})\n")
 _SEAL_BYTES = 84
 _BLOCK = 1 << 20
@@ -147,8 +36,79 @@ class DamagedError(Exception):
     """A checkpoint that must not be used; the message is the reason."""
 
 
-def write_checkpoint(checkpoint: object, path: Path) -> int:
-    """Write `checkpoint` and its seal: hashed on the way, synced, then renamed into place; the file's size.
+def name_of(step: int) -> str:
+    """File name of a checkpoint."""
+    return f"step={step:08d}.ckpt"
+
+
+def step_of(path: Path) -> int | None:
+    """Step of a checkpoint's file name; None of any other file."""
+    found = _NAME.fullmatch(path.name)
+    return int(found[1]) if found else None
+
+
+class BackgroundWriter:
+    """Writes the checkpoints of one training in a thread, one at a time, and deletes those not kept any more.
+
+    The state is copied when `write` is called. An older file is deleted only once the newer one is on disk.
+    An error of the thread is raised by the next call of any method.
+    """
+
+    def __init__(self, *, keep: int, keep_every: int = 0) -> None:
+        self.keep, self.keep_every = keep, keep_every
+        self._thread: threading.Thread | None = None
+        self._error: BaseException | None = None
+
+    def write(self, state: object, path: Path) -> None:
+        """Copy the state now and write it meanwhile; waits for the one before."""
+        self.finish()
+        # No daemon: a process that ends by itself finishes the file.
+        self._thread = threading.Thread(target=self._run, args=(snapshot(state), path), name="checkpoint")
+        self._thread.start()
+
+    @property
+    def busy(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def finish(self) -> None:
+        """Wait until what is being written is on disk.
+
+        Raises:
+            UserError: It could not be written.
+        """
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _run(self, state: object, path: Path) -> None:
+        try:
+            write_checkpoint(state, path)
+            # What lies behind the newest is written again when training gets there.
+            older = sorted(old for old in path.parent.iterdir() if _NAME.fullmatch(old.name) and old <= path)
+            for old in older[: -self.keep]:
+                if not self.keep_every or (step_of(old) or 0) % self.keep_every:
+                    old.unlink(missing_ok=True)
+            sync_folder(path.parent)
+        except BaseException as error:  # raised again where the training sees it
+            self._error = error
+
+
+def snapshot(value: object) -> object:
+    """Plain containers and tensors, copied to the memory of the host."""
+    if isinstance(value, Tensor):
+        return value.detach().to("cpu", copy=True)
+    if isinstance(value, dict):
+        return {key: snapshot(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(snapshot(inner) for inner in value)
+    return value
+
+
+def write_checkpoint(checkpoint: object, path: Path) -> None:
+    """Write `checkpoint` and its seal: hashed on the way, synced, then renamed into place.
 
     Raises:
         UserError: The file could not be written (a full disk, most often); nothing half-written stays.
@@ -162,39 +122,15 @@ def write_checkpoint(checkpoint: object, path: Path) -> int:
             finally:
                 failure = sink.failure
             file.write(b"\nmotionloom sha256 %s\n" % sink.hexdigest.encode())
-            return file.tell()
     except (OSError, RuntimeError) as error:
         # torch answers a failed write with an error about its own position in the file.
         cause = error if isinstance(error, OSError) else failure
         if cause is None:
             raise
-        raise UserError(_unwritten(path, cause.strerror or str(cause))) from error
-
-
-def require_written(path: Path, size: int) -> None:
-    """Refuse a file that was written without an error and yet is not there with its length and its seal.
-
-    A network file system may lose what it has taken. The bytes between are compared before they are used.
-
-    Raises:
-        UserError: It is not there, or shorter, or ends in something else.
-    """
-    try:
-        with path.open("rb") as file:
-            sound = file.seek(0, 2) == size
-            file.seek(max(0, size - _SEAL_BYTES))
-            sound = sound and _SEAL.fullmatch(file.read()) is not None
-    except OSError as error:
-        raise UserError(_unwritten(path, error.strerror or str(error))) from error
-    if not sound:
-        raise UserError(_unwritten(path, "what was written is not there when it is read"))
-
-
-def _unwritten(path: Path, why: str) -> str:
-    return (
-        f"{path}: the checkpoint cannot be written ({why}); those before it are intact: make room, and start "
-        f"the same command again to go on from the newest"
-    )
+        raise UserError(
+            f"{path}: the checkpoint cannot be written ({cause.strerror or cause}); those before it are "
+            f"intact: make room, and start the same command again to go on from the newest"
+        ) from error
 
 
 def read_checkpoint(path: Path) -> Checkpoint:

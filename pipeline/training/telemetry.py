@@ -5,6 +5,7 @@ A row every ten steps goes into `flight/rank_N.jsonl` of the stage's folder, whi
 
 from __future__ import annotations
 
+import json
 import resource
 import statistics
 import sys
@@ -19,9 +20,10 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from motionloom.datasets.base.files import write_text
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
-from motionloom.pipeline.store.training_log import FLIGHT, FlightLog
+from motionloom.pipeline.store.training_log import FLIGHT, read_rows
 
 
 @dataclass
@@ -63,17 +65,12 @@ class WaitTimes:
 
 
 class Telemetry:
-    """Measures the steps of one process.
+    """Measures the steps of one process; `folder` is the stage's."""
 
-    Args:
-        folder: The stage's.
-        rows: Most rows of the log; 0 writes none.
-    """
-
-    def __init__(self, folder: Path, rows: int, module: StageModule, batch_size: int) -> None:
+    def __init__(self, folder: Path, module: StageModule, batch_size: int) -> None:
         self.module, self.batch_size = module, batch_size
         self.waits = WaitTimes()
-        self._log = FlightLog(folder / FLIGHT / f"rank_{rank()}.jsonl", rows) if rows else None
+        self._log = folder / FLIGHT / f"rank_{rank()}.jsonl"
         self._first = module.step
         self._start = self._step_start = time.perf_counter()
         self._row_start = replace(self.waits)
@@ -84,8 +81,9 @@ class Telemetry:
         self._latest: deque[float] = deque(maxlen=100)
         self._lengths: list[Tensor] = []
         self._units, self._unit = 0.0, ""
-        if self._log is not None:
-            self._log.begin(module.step)
+        # Rows of later steps, which come again, are dropped.
+        kept = [row for row in read_rows(self._log) if row["step"] <= module.step]
+        write_text(self._log, "".join(json.dumps(row) + "\n" for row in kept))
 
     def batch(self, batch: Batch) -> None:
         """A batch has been read: count its frames or tokens."""
@@ -123,8 +121,8 @@ class Telemetry:
             row[f"{self._unit}_per_second"] = units * world_size() / max(waited.wall, 1e-9)
         if self.module.device.type == "cuda":
             row["cuda_peak_mib"] = torch.cuda.max_memory_allocated(self.module.device) / 2**20
-        if self._log is not None:
-            self._log.append({"step": self.module.step, **row})
+        with self._log.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"step": self.module.step, **row}) + "\n")
         return {f"flight/{name}": value for name, value in row.items()}
 
     def summary(self) -> str:

@@ -31,18 +31,16 @@ from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.process import Interrupted, TeamError
 from motionloom.pipeline.launch.team import lead_finds
 from motionloom.pipeline.store.training_log import CRASHES
-from motionloom.pipeline.training.background import BackgroundWriter, name_of, step_of
-from motionloom.pipeline.training.checkpointing import (
+from motionloom.pipeline.training.checkpoint_state import (
     Checkpoint,
     load_optimizer,
     load_row,
     load_weights,
     optimizer_state,
-    read_checkpoint,
-    readable,
     rows_of_ranks,
     weights_of,
 )
+from motionloom.pipeline.training.checkpointing import BackgroundWriter, name_of, read_checkpoint, readable
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
 from motionloom.pipeline.training.execution import TrainingData, execution, launch, prepare_module
 from motionloom.pipeline.training.failures import FailureGuard, StallTimer
@@ -130,12 +128,9 @@ class Training:
         self.validation_is_due = False
         if resume.checkpoint is not None:
             self._load(read_checkpoint(resume.checkpoint), longer=resume.longer)
-        since = step_of(resume.checkpoint) if resume.checkpoint else None
-        self.writer = BackgroundWriter(
-            keep=config.keep_checkpoints, keep_every=config.keep_every, since=since
-        )
+        self.writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every)
         self._saved, self._writing = module.step if resume.checkpoint else -1, False
-        self.telemetry = Telemetry(context.folder, hardware.flight_rows, module, config.batch_size)
+        self.telemetry = Telemetry(context.folder, module, config.batch_size)
         self.failures = FailureGuard(name, context.folder, module, data, console)
         self.stall = StallTimer(
             context.folder / CRASHES / f"stalled_rank_{rank()}.txt", hardware.stall_seconds
@@ -331,13 +326,17 @@ def _at_least_float32(value: Tensor) -> Tensor:
 
 
 def _find_resume_point(context: StageContext, config: TrainConfig) -> ResumePoint:
-    """Done by the lead, once what a killed run was writing is gone."""
+    """Done by the lead, once what a killed run was writing is gone; damaged checkpoints go too."""
     folder = context.folder / "checkpoints"
     if folder.is_dir():
         remove_temporaries(folder)
-    return resume_point(
+    found = resume_point(
         folder, config, partial(context.console.print, style="yellow", markup=False, soft_wrap=True)
     )
+    for path in folder.glob("*.ckpt") if found.checkpoint is not None else ():
+        if path.name > found.checkpoint.name:
+            path.unlink()  # passed over
+    return found
 
 
 def resume_point(
