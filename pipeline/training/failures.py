@@ -94,12 +94,7 @@ class FailureGuard:
     """Finds what is not finite, on all ranks at the same steps, and saves what a failed step has read."""
 
     def __init__(
-        self,
-        name: str,
-        folder: Path,
-        module: StageModule,
-        data: TrainingData,
-        console: Console,
+        self, name: str, folder: Path, module: StageModule, data: TrainingData, console: Console
     ) -> None:
         self.name, self.folder, self.module, self.data = name, folder, module, data
         self.console = console

@@ -26,15 +26,7 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
     register,
 )
-from motionloom.pipeline.store.data import (
-    READER,
-    REFERENCE,
-    SHARDS,
-    Data,
-    DataPreview,
-    Reader,
-    Reference,
-)
+from motionloom.pipeline.store.data import READER, REFERENCE, SHARDS, Data, DataPreview, Reader, Reference
 from motionloom.pipeline.store.files import write_json
 
 

@@ -113,12 +113,7 @@ def test_an_error_comes_out_where_the_training_asks_next(
     ],
 )
 def test_what_is_kept(
-    keep: int,
-    every: int,
-    found: tuple[int, ...],
-    steps: tuple[int, ...],
-    expected: set[int],
-    tmp_path: Path,
+    keep: int, every: int, found: tuple[int, ...], steps: tuple[int, ...], expected: set[int], tmp_path: Path
 ) -> None:
     for step in found:
         (tmp_path / name_of(step)).write_bytes(b"")
