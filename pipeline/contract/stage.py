@@ -203,6 +203,8 @@ class StageKind(ABC, Generic[C]):
     version: int = 1
     """Raised when the same config makes something else than before."""
     trains: bool = False
+    curves: tuple[Curve, ...] = ()
+    """Of its training log, those that are worth drawing."""
     shares: bool = False
     """Whether all processes of a run take part by `share` before the first of them runs the stage."""
 
@@ -268,10 +270,6 @@ class StageKind(ABC, Generic[C]):
     def estimate(self, config: C, given: Inputs, hardware: Hardware) -> ModelCard | None:
         """Sizes of a kind that trains; None for the others."""
         return None
-
-    def curves(self, config: C) -> tuple[Curve, ...]:
-        """Curves of the training log that are worth drawing."""
-        return ()
 
     def show(self, stage: Finished, given: Inputs) -> list[Showing]:
         """Figures of the finished stage for the report, beside its curves."""

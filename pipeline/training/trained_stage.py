@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
 import torch
 from torch import nn
 
-from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.models.training.distributed import rank
 from motionloom.models.training.lora import trained_share
 from motionloom.pipeline.contract.showing import ModelCard
@@ -50,18 +49,6 @@ class Example(NamedTuple):
     batch: Batch
     note: str = ""
     """What its tokens are."""
-
-
-def caption_example(batch: int, frames: int, dim: int, width: int) -> Example:
-    """Clips of `frames` frames and `dim` columns with captions of `width` features."""
-    return Example(
-        {
-            "motion": torch.empty(batch, frames, dim),
-            "length": torch.full((batch,), frames),
-            "conditions": {"text": MODALITIES["text"].example(batch, frames, width)},
-            "similarity": torch.empty(batch, width),
-        }
-    )
 
 
 class TrainedStage(StageKind[C], Generic[C, I, N]):

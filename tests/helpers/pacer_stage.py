@@ -202,6 +202,7 @@ class PacerStage(TrainedStage[PacerConfig, PacerInputs, Pacer]):
     summary = "motion paced by music"
     config = PacerConfig
     inputs = PacerInputs
+    curves = (Curve("pacer_distance"), Curve("critic_margin", "margin of the critic"))
 
     def gives(self, config: PacerConfig) -> frozenset[str]:
         """Motion, beside the curves of every trained stage."""
@@ -244,10 +245,6 @@ class PacerStage(TrainedStage[PacerConfig, PacerInputs, Pacer]):
     def exported(self, config: PacerConfig) -> tuple[str, ...]:
         """Stages that an export takes along."""
         return ("stats", "audio")
-
-    def curves(self, config: PacerConfig) -> tuple[Curve, ...]:
-        """For the report."""
-        return (Curve("pacer_distance"), Curve("critic_margin", "margin of the critic"))
 
 
 register(PacerStage())

@@ -5,33 +5,33 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 import torch
-from pydantic import Field, field_validator
+from pydantic import field_validator
 
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
 from motionloom.pipeline.inference.generators.diffusion import DiffusionFace
-from motionloom.pipeline.stages.networks.tma import CaptionInputs, caption_batches, part_columns
+from motionloom.pipeline.stages.networks.captions import (
+    CaptionInputs,
+    CaptionStage,
+    CaptionStageConfig,
+    part_columns,
+)
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
-from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
-from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage, caption_example
+from motionloom.pipeline.training.config import TrainConfig
 
 if TYPE_CHECKING:
     from motionloom.models.diffusion.module import DiffusionModule
 
 
-class DiffusionStageConfig(TrainedStageConfig):
+class DiffusionStageConfig(CaptionStageConfig):
     """A denoiser of motions, conditioned on a sentence embedding."""
 
     net: DiffusionConfig = DiffusionConfig()
     train: TrainConfig = TrainConfig(steps=200_000, batch_size=64)
     part: Literal["face"] = "face"
     """What is denoised: the face, conditioned on the face captions."""
-    max_frames: int = Field(196, ge=8)
-    """Longer clips are cropped at random."""
-    min_frames: int = Field(16, ge=1)
-    """Shorter clips are left out."""
 
     @field_validator("part", mode="before")
     @classmethod
@@ -41,13 +41,14 @@ class DiffusionStageConfig(TrainedStageConfig):
         return part
 
 
-class DiffusionStage(TrainedStage[DiffusionStageConfig, CaptionInputs, MotionDiffusion]):
+class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDiffusion]):
     """A denoiser, trained on whole clips and their captions."""
 
     name = "diffusion"
     summary = "motion diffusion"
     config = DiffusionStageConfig
     inputs = CaptionInputs
+    curves = (Curve("loss"),)
 
     def gives(self, config: DiffusionStageConfig) -> frozenset[str]:
         return super().gives(config) | {GENERATOR}
@@ -72,28 +73,9 @@ class DiffusionStage(TrainedStage[DiffusionStageConfig, CaptionInputs, MotionDif
 
         return DiffusionModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
-    def batches(
-        self, config: DiffusionStageConfig, net: MotionDiffusion, inputs: CaptionInputs, seed: int, log: Log
-    ) -> Batches:
-        return caption_batches(
-            inputs, seed, part=config.part, max_frames=config.max_frames, min_frames=config.min_frames
-        )
-
-    def example(
-        self, config: DiffusionStageConfig, net: MotionDiffusion, inputs: CaptionInputs, batch: int
-    ) -> Example:
-        width = len(part_columns(inputs.data.layout, config.part))
-        return caption_example(batch, config.max_frames, width, inputs.text.dim)
-
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
         layout = given["stats"].layout
         return DiffusionFace(self.load(stage, given, device), layout, given)
-
-    def exported(self, config: DiffusionStageConfig) -> tuple[str, ...]:
-        return ("stats", "text")
-
-    def curves(self, config: DiffusionStageConfig) -> tuple[Curve, ...]:
-        return (Curve("loss"),)
 
 
 register(DiffusionStage())

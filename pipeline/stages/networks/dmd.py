@@ -48,6 +48,7 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
     summary = "diffusion decoder of motion tokens"
     config = DmdStageConfig
     inputs = DmdInputs
+    curves = (Curve("loss"),)
 
     def gives(self, config: DmdStageConfig) -> frozenset[str]:
         return super().gives(config) | {"decoder"}
@@ -96,9 +97,6 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
 
     def exported(self, config: DmdStageConfig) -> tuple[str, ...]:
         return ("tokenizer",)
-
-    def curves(self, config: DmdStageConfig) -> tuple[Curve, ...]:
-        return (Curve("loss"),)
 
 
 register(DmdStage())

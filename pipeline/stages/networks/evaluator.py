@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 
-from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.evaluator.losses import MATCHING, MOVEMENT, EvaluatorLossConfig
 from motionloom.models.evaluator.network import PART, UNIT, Evaluator, EvaluatorConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import register
-from motionloom.pipeline.stages.networks.tma import CaptionInputs, caption_batches
+from motionloom.pipeline.stages.networks.captions import CaptionInputs, CaptionStage, CaptionStageConfig
 from motionloom.pipeline.store.evaluator import LoadedEvaluator, StageWords
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
-from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
-from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage, caption_example
+from motionloom.pipeline.training.config import TrainConfig
 
 if TYPE_CHECKING:
     from motionloom.models.evaluator.module import EvaluatorModule
 
 
-class EvaluatorStageConfig(TrainedStageConfig):
+class EvaluatorStageConfig(CaptionStageConfig):
     """The evaluator that the field's FID and R-Precision are measured with, for this run's data.
 
     Losses, sizes and optimizer are the published ones. Batches are whole clips for the autoencoder too, and
     the number of its steps is ours, as the published code counts epochs over windows.
     """
 
-    part: ClassVar[Part] = PART
+    part: Literal["bodyhand"] = PART
 
     net: EvaluatorConfig = EvaluatorConfig()
     loss: EvaluatorLossConfig = EvaluatorLossConfig()
@@ -62,13 +61,19 @@ class EvaluatorStageConfig(TrainedStageConfig):
         return self
 
 
-class EvaluatorStage(TrainedStage[EvaluatorStageConfig, CaptionInputs, Evaluator]):
+class EvaluatorStage(CaptionStage[EvaluatorStageConfig, CaptionInputs, Evaluator]):
     """A judge of text and motion that no generator is trained with."""
 
     name = "evaluator"
     summary = "text-motion evaluator"
     config = EvaluatorStageConfig
     inputs = CaptionInputs
+    curves = (
+        Curve(f"{MOVEMENT}_reconstruction", "error of the movement autoencoder"),
+        Curve(f"{MATCHING}_loss", "margin loss"),
+        Curve(f"{MATCHING}_own", "distance of a caption from its motion"),
+        Curve(f"{MATCHING}_other", "distance of a caption from other motions"),
+    )
 
     def facts(self, config: EvaluatorStageConfig, inputs: CaptionInputs) -> ModelFacts:
         text = inputs.text
@@ -100,18 +105,6 @@ class EvaluatorStage(TrainedStage[EvaluatorStageConfig, CaptionInputs, Evaluator
             loss=config.loss,
         )
 
-    def batches(
-        self, config: EvaluatorStageConfig, net: Evaluator, inputs: CaptionInputs, seed: int, log: Log
-    ) -> Batches:
-        return caption_batches(
-            inputs, seed, part=config.part, max_frames=config.max_frames, min_frames=config.min_frames
-        )
-
-    def example(
-        self, config: EvaluatorStageConfig, net: Evaluator, inputs: CaptionInputs, batch: int
-    ) -> Example:
-        return caption_example(batch, config.max_frames, net.motion_dim, net.text_dim)
-
     def loaded(self, net: Evaluator, facts: ModelFacts, inputs: CaptionInputs) -> LoadedEvaluator:
         layout: MotionLayout = facts.layout.layout()
         stats = inputs.stats
@@ -122,17 +115,6 @@ class EvaluatorStage(TrainedStage[EvaluatorStageConfig, CaptionInputs, Evaluator
             )
         words = StageWords(inputs.text, facts.fact("encoder", str), facts.where)
         return LoadedEvaluator(net, layout, stats, words)
-
-    def exported(self, config: EvaluatorStageConfig) -> tuple[str, ...]:
-        return ("stats", "text")
-
-    def curves(self, config: EvaluatorStageConfig) -> tuple[Curve, ...]:
-        return (
-            Curve(f"{MOVEMENT}_reconstruction", "error of the movement autoencoder"),
-            Curve(f"{MATCHING}_loss", "margin loss"),
-            Curve(f"{MATCHING}_own", "distance of a caption from its motion"),
-            Curve(f"{MATCHING}_other", "distance of a caption from other motions"),
-        )
 
 
 register(EvaluatorStage())

@@ -103,6 +103,7 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
     summary = "GPT over motion tokens"
     config = GptStageConfig
     inputs = GptInputs
+    curves = (Curve("ce"), Curve("accuracy"), Curve("align"))
 
     def gives(self, config: GptStageConfig) -> frozenset[str]:
         return super().gives(config) | {GENERATOR}
@@ -240,9 +241,6 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
 
     def exported(self, config: GptStageConfig) -> tuple[str, ...]:
         return ("tokenizer", "text", "tma") if config.prior == "tma" else ("tokenizer", "text")
-
-    def curves(self, config: GptStageConfig) -> tuple[Curve, ...]:
-        return (Curve("ce"), Curve("accuracy"), Curve("align"))
 
 
 _SIZES = ("layers", "dim", "heads", "ff", "block_size")

@@ -5,17 +5,12 @@ B.5.1, D).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Literal, cast, get_args
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from pydantic import Field, model_validator
-from torch.utils.data import Dataset
+from pydantic import model_validator
 
-from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
-from motionloom.datasets.loading.feature_stats import FeatureStats
-from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.reword import Rewordings
 from motionloom.models.tma.losses import TmaLossConfig
@@ -33,12 +28,15 @@ from motionloom.pipeline.contract.stage import (
     register,
 )
 from motionloom.pipeline.inference.generators.vae import VaeMotion
-from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.stages.networks.captions import (
+    CaptionInputs,
+    CaptionStage,
+    CaptionStageConfig,
+    part_columns,
+)
 from motionloom.pipeline.store.networks import LoadedTma
-from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
-from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
-from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage, caption_example
+from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.warm_start import (
     START,
     require_same_start,
@@ -53,16 +51,12 @@ _FREE = frozenset({"dropout", "attention_dropout", "text_dropout", "text_noise"}
 """Settings that are of the training and not of the network: another one may go on with others."""
 
 
-class TmaStageConfig(TrainedStageConfig):
+class TmaStageConfig(CaptionStageConfig):
     """Motion and text encoders in one latent space."""
 
     net: TmaConfig = TmaConfig()
     loss: TmaLossConfig = TmaLossConfig()
     train: TrainConfig = TrainConfig(steps=50_000, batch_size=256)
-    max_frames: int = Field(196, ge=8)
-    """Longer clips are cropped at random."""
-    min_frames: int = Field(16, ge=1)
-    """Shorter clips are left out."""
     part: Literal["bodyhand", "face"] = "bodyhand"
     """What is aligned; `face` takes the face captions. Without InfoNCE (`loss.contrastive: 0`) it is TEMOS,
     or, of the face, the paper's facial cVAE (B.5.1)."""
@@ -74,21 +68,6 @@ class TmaStageConfig(TrainedStageConfig):
         return self
 
 
-def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:
-    """Columns of one part of a layout, which must have it."""
-    if not layout.has_part(part):
-        raise UserError(f"layout {layout.name} has no {part} columns; choose another part or data set")
-    return layout.part(part)
-
-
-class CaptionInputs(Inputs):
-    """What a stage takes that trains on whole clips with captions."""
-
-    data: Data
-    stats: FeatureStats
-    text: TextSource
-
-
 class TmaInputs(CaptionInputs):
     """What it takes."""
 
@@ -96,13 +75,14 @@ class TmaInputs(CaptionInputs):
     start: LoadedTma | None = filled_by("tma")
 
 
-class TmaStage(TrainedStage[TmaStageConfig, TmaInputs, Tma]):
+class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
     """Motion and text encoders, trained on whole clips and their captions."""
 
     name = "tma"
     summary = "text-motion alignment"
     config = TmaStageConfig
     inputs = TmaInputs
+    curves = (Curve("contrastive"), Curve("loss"))
 
     def gives(self, config: TmaStageConfig) -> frozenset[str]:
         """One space for text and motion, or for text and faces; without InfoNCE motion of text: the facial
@@ -153,31 +133,12 @@ class TmaStage(TrainedStage[TmaStageConfig, TmaInputs, Tma]):
 
         return TmaModule(net, config.optim, seed=seed, max_steps=config.train.steps, loss=config.loss)
 
-    def batches(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs, seed: int, log: Log) -> Batches:
-        return caption_batches(
-            inputs,
-            seed,
-            part=config.part,
-            max_frames=config.max_frames,
-            min_frames=config.min_frames,
-            rewordings=inputs.rewordings,
-        )
-
-    def example(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs, batch: int) -> Example:
-        return caption_example(batch, config.max_frames, net.motion_dim, net.text_dim)
-
     def loaded(self, net: Tma, facts: ModelFacts, inputs: TmaInputs) -> LoadedTma:
         frames, part = facts.fact("max_frames", int), _part(facts)
         return LoadedTma(net, facts.layout.layout(), frames, part, inputs)
 
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
         return VaeMotion(self.load(stage, given, device))
-
-    def exported(self, config: TmaStageConfig) -> tuple[str, ...]:
-        return ("stats", "text")
-
-    def curves(self, config: TmaStageConfig) -> tuple[Curve, ...]:
-        return (Curve("contrastive"), Curve("loss"))
 
 
 def _part(facts: ModelFacts) -> Part:
@@ -187,36 +148,6 @@ def _part(facts: ModelFacts) -> Part:
             f"{facts.where}: key 'extra.part' = {part!r} is no part; run or export the stage again"
         )
     return cast(Part, part)
-
-
-def caption_batches(
-    inputs: CaptionInputs,
-    seed: int,
-    *,
-    part: Part,
-    max_frames: int,
-    min_frames: int,
-    rewordings: Rewordings | None = None,
-) -> Batches:
-    """Captioned clips of one part."""
-    data, stats, readers = inputs.data, inputs.stats, {"text": inputs.text.cache}
-    dataset = data.split("train", training=True)
-    clips: dict[str, Any] = {"max_frames": max_frames, "min_frames": min_frames}
-    clips |= {
-        "columns": part_columns(dataset.layout, part),
-        "captioned": "face" if part == "face" else "body",
-    }
-
-    def train(batch: int, rank: int, world: int) -> Dataset[object]:
-        return ConditionBatches(
-            dataset, stats, readers, batch_size=batch, seed=seed, rank=rank, world=world,
-            rewordings=rewordings, **clips,
-        )  # fmt: skip
-
-    def validation() -> Dataset[object]:
-        return EvalBatches(data.held_out(), stats, readers, batch_size=32, **clips)
-
-    return Batches(train, validation)
 
 
 register(TmaStage())

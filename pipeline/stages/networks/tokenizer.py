@@ -142,6 +142,7 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
     """A tokenizer, trained on windows of the training split."""
 
     inputs = TokenizerInputs
+    curves = tuple(Curve(name) for name in ("recon", "perplexity", "usage", "dead", "resets"))
 
     def __init__(self, name: str, summary: str, config: type[TokenizerStageConfig]) -> None:
         self.name, self.summary, self.config = name, summary, config
@@ -203,9 +204,6 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
 
     def exported(self, config: TokenizerStageConfig) -> tuple[str, ...]:
         return ("stats",)
-
-    def curves(self, config: TokenizerStageConfig) -> tuple[Curve, ...]:
-        return tuple(Curve(name) for name in ("recon", "perplexity", "usage", "dead", "resets"))
 
 
 def window_batches(

@@ -77,6 +77,10 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
     summary = "conditions to motion tokens"
     config = UttStageConfig
     inputs = UttInputs
+    curves = tuple(
+        Curve(name)
+        for name in ("tokens_ce", "tokens_accuracy", "tokens_adversarial", "critic_loss", "critic_accuracy")
+    )
 
     def roles(self) -> tuple[Role | Every, ...]:
         return (*super().roles(), *(Role(name, True, name) for name in MODALITIES))
@@ -191,10 +195,6 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
 
     def exported(self, config: UttStageConfig) -> tuple[str, ...]:
         return ("tokenizer", *config.modalities)
-
-    def curves(self, config: UttStageConfig) -> tuple[Curve, ...]:
-        names = ("tokens_ce", "tokens_accuracy", "tokens_adversarial", "critic_loss", "critic_accuracy")
-        return tuple(Curve(name) for name in names)
 
 
 register(UttStage())

@@ -81,7 +81,7 @@ def draw_curves(page: Page, stages: Sequence[Finished]) -> None:
     for stage in stages:
         rows = read_training_log(stage.folder)
         keys = sorted({k.partition("/")[2] for row in rows for k in row if "/" in k})
-        for curve in stage.kind.curves(stage.config):
+        for curve in stage.kind.curves:
             lines = [
                 line
                 for key in keys

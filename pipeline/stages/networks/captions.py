@@ -1,0 +1,94 @@
+"""What stages share that train on whole clips with their captions."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import nn
+from torch.utils.data import Dataset
+
+from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
+from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.stage import Inputs
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.text import TextSource
+from motionloom.pipeline.training.config import TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+
+
+class CaptionStageConfig(TrainedStageConfig):
+    """Clips of these lengths, and the columns of them."""
+
+    max_frames: int = Field(196, ge=8)
+    """Longer clips are cropped at random."""
+    min_frames: int = Field(16, ge=1)
+    """Shorter clips are left out."""
+    part: Part = "bodyhand"
+    """Columns of the layout; `face` takes the face captions."""
+
+
+class CaptionInputs(Inputs):
+    """What such a stage takes."""
+
+    data: Data
+    stats: FeatureStats
+    text: TextSource
+
+
+C = TypeVar("C", bound=CaptionStageConfig)
+I = TypeVar("I", bound=CaptionInputs)  # noqa: E741
+N = TypeVar("N", bound=nn.Module)
+
+
+class CaptionStage(TrainedStage[C, I, N]):
+    """A stage that trains on one part of whole clips and what is said of it."""
+
+    def batches(self, config: C, net: N, inputs: I, seed: int, log: Log) -> Batches:
+        data, stats, readers = inputs.data, inputs.stats, {"text": inputs.text.cache}
+        dataset = data.split("train", training=True)
+        clips: dict[str, Any] = {
+            "max_frames": config.max_frames,
+            "min_frames": config.min_frames,
+            "columns": part_columns(dataset.layout, config.part),
+            "captioned": "face" if config.part == "face" else "body",
+        }
+
+        def train(batch: int, rank: int, world: int) -> Dataset[object]:
+            return ConditionBatches(
+                dataset, stats, readers, batch_size=batch, seed=seed, rank=rank, world=world,
+                rewordings=inputs.get("rewordings"), **clips,
+            )  # fmt: skip
+
+        def validation() -> Dataset[object]:
+            return EvalBatches(data.held_out(), stats, readers, batch_size=32, **clips)
+
+        return Batches(train, validation)
+
+    def example(self, config: C, net: N, inputs: I, batch: int) -> Example:
+        frames, width = config.max_frames, inputs.text.dim
+        dim = len(part_columns(inputs.data.layout, config.part))
+        return Example(
+            {
+                "motion": torch.empty(batch, frames, dim),
+                "length": torch.full((batch,), frames),
+                "conditions": {"text": MODALITIES["text"].example(batch, frames, width)},
+                "similarity": torch.empty(batch, width),
+            }
+        )
+
+    def exported(self, config: C) -> tuple[str, ...]:
+        return ("stats", "text")
+
+
+def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:
+    """Columns of one part of a layout, which must have it."""
+    if not layout.has_part(part):
+        raise UserError(f"layout {layout.name} has no {part} columns; choose another part or data set")
+    return layout.part(part)
