@@ -7,6 +7,9 @@ import json
 import os
 import re
 import secrets
+import shutil
+import stat
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -37,8 +40,15 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     Parent folders are made. The temporary name starts with a dot and ends in a random number, so no worker,
     of an earlier run or on another machine, can rename another's half-written file into place. An error of
-    the system names `path`, never the temporary file.
+    the system names `path`, never the temporary file. What exists and is no plain file (a device, a pipe) is
+    never replaced: the content is written into it.
     """
+    if _takes_bytes(path):
+        with tempfile.TemporaryDirectory() as folder:
+            yield Path(folder, path.name)
+            with Path(folder, path.name).open("rb") as file, path.open("wb") as into:
+                shutil.copyfileobj(file, into)
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
@@ -54,6 +64,16 @@ def atomic_path(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # the error that ended the block says more
             temporary.unlink(missing_ok=True)
+
+
+def _takes_bytes(path: Path) -> bool:
+    """Whether a path is a device or a pipe, or, as /dev/stdout is, a name for an open file."""
+    try:
+        kind = path.stat().st_mode
+    except OSError:
+        return False
+    named = path.is_symlink() and str(path.readlink()).startswith("/proc/")
+    return named or not (stat.S_ISREG(kind) or stat.S_ISDIR(kind))
 
 
 @contextmanager

@@ -75,7 +75,7 @@ def folder_lock(out: Path, *, shared: bool = False) -> Iterator[None]:
 def _locked(path: Path, operation: int) -> int:
     """An open, locked handle of `path`; `BlockingIOError` when it is taken."""
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(handle, operation)
         except OSError:

@@ -25,16 +25,20 @@ class LocalShard(NamedTuple):
     info: ShardInfo
 
     def state(self) -> list[int]:
-        """What changes when somebody writes to the file or puts another in its place; empty: none is there.
+        return state_of(self.path)
 
-        The time of the last change of any kind (ctime) is the system's own: a copy that restores the time of
-        the last write, as rsync does, is seen, and so are files of two machines that lie under one path.
-        """
-        try:
-            found = self.path.stat()
-        except OSError:
-            return []
-        return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
+
+def state_of(path: Path) -> list[int]:
+    """What changes when somebody writes to a file or puts another in its place; empty: none is there.
+
+    The time of the last change of any kind (ctime) is the system's own: a copy that restores the time of the
+    last write, as rsync does, is seen, and so are files of two machines that lie under one path.
+    """
+    try:
+        found = path.stat()
+    except OSError:
+        return []
+    return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
 
 
 def require_intact(shard: LocalShard, *, content: bool = True) -> None:

@@ -38,6 +38,7 @@ from motionloom.pipeline.contract.inputs import filled_by as filled_by
 from motionloom.pipeline.contract.showing import Curve, ModelCard, Showing
 from motionloom.pipeline.contract.units import WORK, Units
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.store.checksums import require_unchanged
 
 CPU = torch.device("cpu")
 
@@ -127,6 +128,7 @@ class StageCache:
 
     def get(self, stage: Finished) -> Any:
         if stage.folder not in self._loaded:
+            require_unchanged(stage.folder)
             self._loaded[stage.folder] = stage.kind.load(stage, self.given_to(stage), self.device)
         return self._loaded[stage.folder]
 
@@ -139,6 +141,7 @@ class StageCache:
         return Inputs({**{role: partial(_refuse, said) for role, said in stage.gone.items()}, **makers})
 
     def generator(self, stage: Finished) -> MotionGenerator:
+        require_unchanged(stage.folder)
         return stage.kind.generator(stage, self.given_to(stage), self.device)
 
 

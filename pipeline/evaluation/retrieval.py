@@ -30,6 +30,7 @@ from motionloom.pipeline.evaluation.truth import digest_of, truth_of
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.artifact import fingerprint_now, require_consistent
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
+from motionloom.pipeline.store.run_folder import require_own
 from motionloom.pipeline.store.weights import MODEL_FILES
 
 THRESHOLD = 0.9
@@ -170,6 +171,7 @@ def retrieval_command(
     """Print the table and write RUN/retrieval.json; of a `stage` other than the default,
     RUN/retrieval-STAGE.json.
     """
+    require_own(run)
     found = retrieve(run, stage, split=split, seed=seed, device=device)
     print_tables(found.figures, console)
     stage = found.about["stage"]

@@ -15,6 +15,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.requests import require_used
+from motionloom.pipeline.store.checksums import require_unchanged
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 from motionloom.pipeline.store.weights import LayoutFacts, halve_weights
@@ -51,6 +52,7 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
     (out / BUNDLE_FILE).unlink(missing_ok=True)
     for folder, stage in needed.items():
         name = names[folder]
+        require_unchanged(folder)
         try:
             stage.kind.export(stage, out / name)
             if half and (weights := out / name / "model.safetensors").is_file():

@@ -34,7 +34,7 @@ from motionloom.pipeline.runs.plan import Selection, make_plan, require_fit, sel
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
-from motionloom.pipeline.store.run_folder import owner_of, require_run, stage_folder
+from motionloom.pipeline.store.run_folder import owner_of, require_own, require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, run_state
 
 
@@ -121,6 +121,7 @@ def _stages_again(
     With `state` they get those of their inputs that are finished, else all must be.
     """
     require_run(folder)
+    require_own(folder)
     recipe = load_recipe(folder / "recipe.yaml", strict=False)
     team = Team.start(recipe.hardware) if share and device == "auto" else Team()
     stage_cache = StageCache(recipe.hardware.device() if device == "auto" else choose_device(device))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.runs.verify_shards import verify_shards
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import remove_tree, write_json
-from motionloom.pipeline.store.run_folder import identity_of, place_from, stage_folder
+from motionloom.pipeline.store.run_folder import identity_of, place_from, require_own, stage_folder
 
 
 def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
@@ -174,10 +173,10 @@ def _lock(run: Path, needed: bool) -> Iterator[None]:
         yield
         return
     run.mkdir(parents=True, exist_ok=True)
+    require_own(run)
     with file_lock(run / ".lock", wait=False) as mine:
         if not mine:
             raise UserError(
                 f"{run}: another motionloom process is working on this run; wait for it or stop it"
             )
-        (run / ".lock").write_text(str(os.getpid()))
         yield

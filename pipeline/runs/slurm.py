@@ -30,6 +30,7 @@ from motionloom.pipeline.runs.launch_plan import Group, LaunchPlan, SlurmOptions
 from motionloom.pipeline.runs.plan import make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.files import require_folder
+from motionloom.pipeline.store.run_folder import require_own
 
 LOG_FOLDER = ".slurm"
 """Inside the run folder: scripts and logs of the jobs. May be deleted when all is over."""
@@ -167,6 +168,7 @@ def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> lis
     """Write the scripts into the run folder and submit them; the job ids."""
     if shutil.which("sbatch") is None:
         raise UserError("no sbatch here: start this where jobs are submitted, or look with --dry-run")
+    require_own(Path(plan.out))
     folder = _new_folder(Path(plan.out) / LOG_FOLDER)
     if plan.given is None:
         write_text(folder / RECIPE_FILE, plan.recipe.to_yaml())

@@ -15,49 +15,18 @@ from pathlib import Path
 from rich.console import Console
 
 from motionloom.datasets.base.progress import Meter, duration
-from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.shards.checksums import LocalShard, problems
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.hardware import usable_cores
 from motionloom.pipeline.launch.process import JointError
 from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.store.checksums import NOTE, Compared, ComparedFile, State
 from motionloom.pipeline.store.data import local_shards
-from motionloom.pipeline.store.files import write_json
 
-FILE_NAME = ".compared.json"
 _THREADS = 4
 """At most, in a process: more read no disk faster."""
 _WORTH_A_LINE = 5.0
 """Seconds."""
-
-State = list[int]
-
-
-class ComparedFile(Config):
-    """A file that had its sha256 when it was compared."""
-
-    sha256: str
-    states: list[State]
-    """What it was like (`LocalShard.state`): one on a shared file system, else one for each machine."""
-
-
-class Compared(Config):
-    """`.compared.json`: files by their path."""
-
-    files: dict[str, ComparedFile]
-
-    @staticmethod
-    def read(path: Path) -> Compared:
-        """What is noted; nothing where there is no such note, or none that can be read."""
-        try:
-            return Compared.load_json(path)
-        except UserError:
-            return Compared(files={})
-
-    def knows(self, shard: LocalShard, state: State) -> bool:
-        """Whether the file has been compared as it is."""
-        known = self.files.get(str(shard.path))
-        return known is not None and known.sha256 == shard.info.sha256 and state in known.states
 
 
 def verify_shards(context: StageContext, team: Team, run: Path) -> None:
@@ -76,7 +45,7 @@ def verify_shards(context: StageContext, team: Team, run: Path) -> None:
     if not shards:
         return
     begin = time.monotonic()
-    size = compare_shards(shards, run / FILE_NAME, team, context.console, again=how == "always")
+    size = compare_shards(shards, run / NOTE, team, context.console, again=how == "always")
     seconds = time.monotonic() - begin
     if size and seconds > _WORTH_A_LINE:
         context.console.print(
@@ -102,7 +71,9 @@ def compare_shards(
     missing = 0
     for seen in {str(seen): seen for seen, _ in seen_by}.values():
         alike = [rank for rank, (theirs, _) in enumerate(seen_by) if theirs == seen]
-        pending = [shard for shard, state in zip(shards, seen, strict=True) if not known.knows(shard, state)]
+        pending = [
+            shard for shard, state in zip(shards, seen, strict=True) if not _known(known, shard, state)
+        ]
         missing += len(pending)
         if team.rank in alike:
             todo = pending[alike.index(team.rank) :: len(alike)]
@@ -120,10 +91,14 @@ def compare_shards(
     return size
 
 
+def _known(known: Compared, shard: LocalShard, state: State) -> bool:
+    return known.knows(str(shard.path), shard.info.sha256, state)
+
+
 def _note(record: Path, known: Compared, shards: Sequence[LocalShard], seen: Sequence[list[State]]) -> None:
     """Write down what the files of all machines are like now that they have been compared."""
-    files = dict(known.files)
+    compared = {}
     for place, shard in enumerate(shards):
         states = list({str(own[place]): own[place] for own in seen}.values())
-        files[str(shard.path)] = ComparedFile(sha256=shard.info.sha256, states=states)
-    write_json(record, Compared(files=files).dump())
+        compared[str(shard.path)] = ComparedFile(sha256=shard.info.sha256, states=states)
+    known.write(record, compared)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO, Any
 
 from motionloom.datasets.base import files
 from motionloom.datasets.schema import UserError
@@ -81,6 +83,18 @@ def new_folder(folder: Path) -> Iterator[Path]:
         raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def open_own(path: Path, mode: str) -> IO[Any]:
+    """Open a file of a run for writing; a link in its place is not followed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+    def opener(name: str, flags: int) -> int:
+        return os.open(name, flags | os.O_NOFOLLOW, 0o666)
+
+    if "b" in mode:
+        return open(path, mode, buffering=0, opener=opener)
+    return open(path, mode, encoding="utf-8", opener=opener)
 
 
 def copy_files(source: Path, target: Path, names: Iterable[str]) -> None:

@@ -115,6 +115,27 @@ def stages_of(run: Path) -> dict[str, dict[str, Any]]:
     return stages
 
 
+def require_own(run: Path) -> None:
+    """Refuse a run folder in which a link leads out of it: what is written there would land elsewhere.
+
+    Only plain files and folders are in a run. One that does not exist yet is no matter.
+    """
+    home = run.resolve()
+    todo = [run]
+    while todo:
+        folder = todo.pop()
+        for entry in os.scandir(folder) if folder.is_dir() else ():
+            if entry.is_symlink():
+                if not Path(entry.path).resolve().is_relative_to(home):
+                    raise UserError(
+                        f"{entry.path}: is a link out of its run folder; put what it names in its place"
+                    )
+            elif entry.is_dir():
+                todo.append(Path(entry.path))
+            elif not entry.is_file():
+                raise UserError(f"{entry.path}: is neither a file nor a folder; remove it")
+
+
 def require_run(folder: Path) -> None:
     """Refuse what is no run folder, and say what it is instead."""
     if (folder / "recipe.yaml").is_file():

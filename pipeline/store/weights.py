@@ -91,7 +91,11 @@ def load_weights(folder: Path, net: torch.nn.Module) -> None:
     """Fill `net`; a file that does not fit is refused by name."""
     path = folder / "model.safetensors"
     try:
-        net.load_state_dict(load_file(path))
+        state = load_file(path)
+        for name, value in state.items():
+            if value.is_floating_point() and not bool(value.isfinite().all()):
+                raise UserError(f"{path}: '{name}' holds numbers that are not finite; run its stage again")
+        net.load_state_dict(state)
     except (FileNotFoundError, SafetensorError, RuntimeError) as error:
         why = " ".join(str(error).split())[:300]
         raise UserError(

@@ -29,6 +29,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, StageModule
 from motionloom.pipeline.launch.process import TeamError
+from motionloom.pipeline.store.files import open_own
 from motionloom.pipeline.store.training_log import CRASHES
 from motionloom.pipeline.training.execution import TrainingData
 from motionloom.pipeline.training.telemetry import all_ranks
@@ -179,8 +180,7 @@ class StallTimer:
         if not self.seconds:
             yield
             return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("w") as self._file:
+        with open_own(self.path, "w") as self._file:
             try:
                 self.progress()
                 yield

@@ -17,6 +17,7 @@ from torch import Tensor
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.progress import Pace, bar
 from motionloom.models.training.distributed import rank
+from motionloom.pipeline.store.files import open_own
 from motionloom.pipeline.store.training_log import FILE_NAME
 from motionloom.pipeline.training.loggers import Loggers
 
@@ -117,7 +118,6 @@ class MetricLog:
         count = len(self.rows)
         while count > self._written and self.rows[count - 1]["step"] > step:
             count -= 1
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         _append(self.path, self._lines(self._written, count).encode())
         self.loggers.take(self._logged(self._written, count))
         self._written = count
@@ -146,7 +146,7 @@ class MetricLog:
 
 def _append(path: Path, lines: bytes) -> None:
     """All of them or none, for whoever reads meanwhile."""
-    with path.open("ab", buffering=0) as file:
+    with open_own(path, "ab") as file:
         size = file.seek(0, 2)
         if file.write(lines) != len(lines):
             file.truncate(size)

@@ -23,6 +23,7 @@ from torch import Tensor
 from motionloom.datasets.base.files import write_text
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
+from motionloom.pipeline.store.files import open_own
 from motionloom.pipeline.store.training_log import FLIGHT, read_rows
 
 
@@ -121,7 +122,7 @@ class Telemetry:
             row[f"{self._unit}_per_second"] = units * world_size() / max(waited.wall, 1e-9)
         if self.module.device.type == "cuda":
             row["cuda_peak_mib"] = torch.cuda.max_memory_allocated(self.module.device) / 2**20
-        with self._log.open("a", encoding="utf-8") as file:
+        with open_own(self._log, "a") as file:
             file.write(json.dumps({"step": self.module.step, **row}) + "\n")
         return {f"flight/{name}": value for name, value in row.items()}
 

@@ -24,7 +24,7 @@ from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs import verify_shards as sound
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
-from motionloom.pipeline.runs.verify_shards import FILE_NAME, compare_shards, verify_shards
+from motionloom.pipeline.runs.verify_shards import NOTE, compare_shards, verify_shards
 
 QUIET = Console(quiet=True)
 
@@ -63,7 +63,7 @@ def flip(path: Path, place: int, bit: int = 0) -> None:
 
 def test_every_flipped_bit_is_found(shards: list[LocalShard], tmp_path: Path) -> None:
     """Each behind a comparison that found all well; the file's time of writing is set back."""
-    path, record = shards[2].path, tmp_path / FILE_NAME
+    path, record = shards[2].path, tmp_path / NOTE
     for place, bit in np.random.default_rng(1).integers((3002, 8), size=(25, 2)).tolist():
         compare_shards(shards, record, Team(), QUIET)
         before = path.stat()
@@ -77,7 +77,7 @@ def test_every_flipped_bit_is_found(shards: list[LocalShard], tmp_path: Path) ->
 def test_what_has_not_changed_is_compared_once(
     shards: list[LocalShard], tmp_path: Path, compared: list[tuple[str, list[str]]]
 ) -> None:
-    record = tmp_path / FILE_NAME
+    record = tmp_path / NOTE
     assert compare_shards(shards, record, Team(), QUIET) == sum(shard.info.bytes for shard in shards)
     assert compare_shards(shards, record, Team(), QUIET) == 0
     shards[3].path.touch()
@@ -98,8 +98,8 @@ def test_missing_and_short_shards_are_named_with_how_many_there_are(
     shards[1].path.unlink()
     shards[4].path.write_bytes(b"x")
     with pytest.raises(JointError, match=r"000001\.tar: the shard is missing.*\(2 such shards"):
-        compare_shards(shards, tmp_path / FILE_NAME, Team(), QUIET)
-    assert not (tmp_path / FILE_NAME).exists()
+        compare_shards(shards, tmp_path / NOTE, Team(), QUIET)
+    assert not (tmp_path / NOTE).exists()
 
 
 class Threads(Team):
@@ -135,7 +135,7 @@ def together(
         def rank(number: int) -> int | str:
             threading.current_thread().name = str(number)
             try:
-                return compare_shards(shards, tmp_path / FILE_NAME, kind(number, 3), QUIET)
+                return compare_shards(shards, tmp_path / NOTE, kind(number, 3), QUIET)
             except JointError as error:
                 return str(error)
 
@@ -194,7 +194,7 @@ def test_a_stage_does_not_begin_on_damaged_shards(tmp_path: Path) -> None:
     recipe.write_text(RECIPE)
     run_recipe(recipe, run, console=QUIET)
     path = next((run / "stages/data/shards").glob("*-train-*.tar"))
-    assert str(path) in json.loads((run / FILE_NAME).read_text())["files"]
+    assert str(path) in json.loads((run / NOTE).read_text())["files"]
     flip(path, path.stat().st_size // 2)
     again = Selection(first="stats")
     with pytest.raises(UserError, match=f"{path.name}: the sha256 is not the manifest's"):

@@ -1,0 +1,82 @@
+"""Files compared with the sha256 that is written down of them, once as long as they do not change.
+
+What has been compared is noted in `.compared.json` of the run, so whoever opens a file next only looks
+whether it is as it was: same size, times and number on the disk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.shards.checksums import state_of
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.run_folder import owner_of
+
+NOTE = ".compared.json"
+
+State = list[int]
+
+
+class ComparedFile(Config):
+    """A file that had its sha256 when it was compared."""
+
+    sha256: str
+    states: list[State]
+    """What it was like (`state_of`): one on a shared file system, else one for each machine."""
+
+
+class Compared(Config):
+    """`.compared.json`: shards by their path, files of stages by their path in the run."""
+
+    files: dict[str, ComparedFile]
+
+    @staticmethod
+    def read(path: Path) -> Compared:
+        """What is noted; nothing where there is no such note, or none that can be read."""
+        try:
+            return Compared.load_json(path)
+        except (UserError, OSError):
+            return Compared(files={})
+
+    def knows(self, name: str, sha256: str, state: State) -> bool:
+        """Whether the file has been compared as it is."""
+        known = self.files.get(name)
+        return known is not None and known.sha256 == sha256 and state in known.states
+
+    def write(self, path: Path, compared: Mapping[str, ComparedFile]) -> None:
+        write_json(path, Compared(files=self.files | dict(compared)).dump())
+
+
+def require_unchanged(folder: Path, *, again: bool = False) -> int:
+    """Refuse a finished stage one of whose files is not the one that it made; how many were read.
+
+    Shards are left to whoever reads them (`verify_shards.py`), unless `again` has all compared once more.
+    """
+    artifact, run = Artifact.find(folder), owner_of(folder)
+    if artifact is None:
+        return 0
+    known = Compared(files={}) if again else Compared.read(run / NOTE)
+    compared: dict[str, ComparedFile] = {}
+    for name, info in artifact.outputs.items():
+        path = folder / name
+        if name.endswith(".tar") and not again:
+            continue
+        key, state = f"stages/{folder.name}/{name}", state_of(path)
+        if known.knows(key, info.sha256, state):
+            continue
+        if not state or state[0] != info.bytes or sha256_of(path) != info.sha256:
+            what = "is not the file that its stage made (another sha256)" if state else "is gone"
+            raise UserError(
+                f"{path}: {what}; copy it back, or make it again: motionloom run {run / 'recipe.yaml'} -o "
+                f"{run} --from {folder.name}"
+            )
+        compared[key] = ComparedFile(sha256=info.sha256, states=[state])
+    if compared:
+        with suppress(OSError):  # a run that may only be read
+            Compared.read(run / NOTE).write(run / NOTE, compared)
+    return len(compared)
