@@ -120,6 +120,9 @@ def run(
             help="Go on in this folder even where that replaces finished trainings, or another recipe's run.",
         ),
     ] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="First compare all files of finished stages with their sha256.")
+    ] = False,
     profile: Annotated[
         int, typer.Option("--profile", metavar="STEPS", min=0, help="Profile so many steps of each training.")
     ] = 0,
@@ -156,6 +159,7 @@ def run(
         select=Selection(first, until, only, force),
         dry_run=dry_run,
         replace=replace,
+        verify=verify,
         profile=profile,
         console=make_console(),
     )

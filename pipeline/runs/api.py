@@ -33,6 +33,7 @@ from motionloom.pipeline.runs.execute import context_of, execute, perform, stage
 from motionloom.pipeline.runs.plan import Selection, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.checksums import require_unchanged
 from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import owner_of, require_own, require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, run_state
@@ -46,12 +47,14 @@ def run_recipe(
     select: Selection | None = None,
     dry_run: bool = False,
     replace: bool = False,
+    verify: bool = False,
     profile: int = 0,
     console: Console | None = None,
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
 
-    `profile` steps of each training are profiled.
+    With `verify` all files of finished stages are compared with their checksums first. `profile` steps
+    of each training are profiled.
 
     Without `replace`, a run that would replace finished work that took long (`dry_run.py`), or that would
     write into the folder of another recipe's run, is refused.
@@ -59,6 +62,10 @@ def run_recipe(
     console = console or make_console()
     loaded = load_recipe(recipe, [*overrides, f"hardware.profile={profile}"] if profile else overrides)
     run = out or Path("runs") / loaded.name
+    if verify:
+        folders = [stage_folder(run, stage.name) for stage in loaded.stages]
+        count = sum(require_unchanged(folder, again=True) for folder in folders)
+        console.print(f"{run}: {count} files have the sha256 that their stages noted", markup=False)
     try:
         plan = make_plan(loaded, run, select)
     except UserError:

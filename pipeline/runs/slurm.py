@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import subprocess
@@ -121,8 +122,11 @@ def launch_recipe(
     `options` are `KEY=VALUE` words of `SlurmOptions`.
     """
     loaded, asked = load_recipe(recipe, overrides), SlurmOptions.from_words(options)
-    run = out or Path("runs") / loaded.name
+    run = Path(os.path.abspath(out or Path("runs") / loaded.name))  # noqa: PTH100 - links stay as they are
     require_folder(run)
+    for what, place in (("--out", run), ("the current folder", Path.cwd())):
+        if not str(place).isprintable():  # a batch script must not get another line
+            raise UserError(f"{what} {str(place)!r}: has characters that are not printable; choose another")
     if (run / "recipe.yaml").is_file():
         refusal = explain_replacements(run, loaded.name, replaced_stages(run, make_plan(loaded, run)))
         if refusal is not None:
@@ -132,7 +136,7 @@ def launch_recipe(
         asked,
         given=None if Path(recipe).suffix in {".yaml", ".yml"} else str(recipe),
         overrides=overrides,
-        out=run.absolute(),
+        out=run,
         nodes=nodes,
         gpus_per_node=gpus_per_node,
     )

@@ -73,20 +73,45 @@ _Dumper.add_representer(str, _text)
 _Loader.add_constructor("tag:yaml.org,2002:int", _int)
 
 
+_MOST_BYTES, _MOST_VALUES = 100_000, 20_000
+"""Of a file, and of what its aliases make of it; resolved, the longest recipe of the package has 15,000 bytes."""
+
+
 def load_yaml(text: str, where: str) -> Any:
     """Plain data from YAML; a `UserError` names `where` (a file or an option)."""
+    if len(text) > _MOST_BYTES:
+        raise UserError(f"{where}: longer than {_MOST_BYTES:,} characters, which no recipe needs; shorten it")
     try:
-        return yaml.load(text, Loader=_Loader)
+        data = yaml.load(text, Loader=_Loader)
     # ValueError: a value that its explicit tag does not allow. RecursionError: thousands of nested brackets.
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split()).replace('in "<unicode string>", ', "at ")
         raise UserError(f"{where}: not valid YAML: {reason}") from None
+    _require_few(data, where)
+    return data
+
+
+def _require_few(data: object, where: str) -> None:
+    """Refuse aliases of aliases, which stand for more values than fit in memory."""
+    todo, count = [data], 0
+    while todo:
+        value = todo.pop()
+        count += 1
+        if count > _MOST_VALUES:
+            raise UserError(
+                f"{where}: holds more than {_MOST_VALUES:,} values; write fewer stages or aliases"
+            )
+        if isinstance(value, dict | list):
+            todo += value.values() if isinstance(value, dict) else value
 
 
 def read_yaml(path: Path) -> Any:
     """Plain data from a YAML file."""
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path}: is no plain file")
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open(encoding="utf-8") as file:
+            text = file.read(_MOST_BYTES + 1)
     except UnicodeDecodeError as error:
         raise UserError(f"{path}: not valid YAML: {error}") from None
     except OSError as error:

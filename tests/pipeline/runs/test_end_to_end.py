@@ -236,6 +236,11 @@ def test_retrieval_by_another_alignment_stage(
     weights = load_file(run / "stages/temos/model.safetensors")
     weights["text_encoder.project.weight"] *= -1
     save_file(weights, run / "stages/temos/model.safetensors")
+    damaged = call("retrieval", run, "--stage", "temos")
+    assert damaged.code == 2 and "temos/model.safetensors: is not the file" in damaged.err
+    artifact = Artifact.find(run / "stages/temos")
+    assert artifact is not None
+    artifact.finish(run / "stages/temos")
     assert call("retrieval", run).code == 0
     other = call("retrieval", run, "--stage", "temos")
     assert other.code == 0 and "Retrieval of stage temos" in other.out

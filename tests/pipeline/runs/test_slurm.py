@@ -126,6 +126,15 @@ def test_without_a_cluster_in_a_dry_run_or_in_anothers_folder_nothing_is_written
         launch_recipe("humantomato-tiny", gpus_per_node=1, out=tmp_path, dry_run=True, console=console())
 
 
+def test_a_folder_with_a_line_break_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a\n#SBATCH --wrap=x").mkdir()
+    with pytest.raises(UserError, match=r"--out .*not printable"):
+        launch_recipe("humantomato-tiny", out=tmp_path / "a\nb", dry_run=True, console=console())
+    monkeypatch.chdir(tmp_path / "a\n#SBATCH --wrap=x")
+    with pytest.raises(UserError, match="not printable"):
+        launch_recipe("humantomato-tiny", out=tmp_path, dry_run=True, console=console())
+
+
 @pytest.fixture
 def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Starts a script of one process as SLURM would, with a command and a `scontrol` of ours."""
