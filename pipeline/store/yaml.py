@@ -74,7 +74,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _int)
 
 
 _MOST_BYTES, _MOST_VALUES = 100_000, 20_000
-"""Of a file, and of what its aliases make of it; resolved, the longest recipe of the package has 15,000 bytes."""
+"""Of a file, and of what its aliases make of it; the longest recipe, resolved, has 15,000 bytes."""
 
 
 def load_yaml(text: str, where: str) -> Any:
