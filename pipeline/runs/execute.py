@@ -129,7 +129,9 @@ def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]
 
 def _prepare(folder: Path, row: PlannedStage) -> None:
     request = None if row.request is None else row.request.id
-    started = Started(fingerprint=row.fingerprint, extendable=row.extendable, request=request)
+    started = Started(
+        fingerprint=row.fingerprint, extendable=row.extendable, request=request, lengthened=row.lengthened
+    )
     if row.action == "run":
         remove_tree(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -147,6 +149,7 @@ def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[Plann
         fingerprint=row.fingerprint,
         seed=recipe.seed_of(stage),
         config=stage.config.dump(),
+        lengthened=row.lengthened,
         inputs={role: _input(recipe, run, row, rows, name) for role, name in stage.inputs.items()},
     )
 

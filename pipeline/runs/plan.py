@@ -8,7 +8,7 @@ fingerprint and runs too.
 A training of which only `train.steps` was raised goes on from its last checkpoint: `started.json` holds,
 next to the fingerprint, a digest of all that the fingerprint covers except the number of steps. Where that
 is the same and no learning-rate schedule ends with the training, what has been trained is the beginning of
-what is wanted.
+what is wanted. A schedule that ends with it is lengthened, which is said, and noted in the artifact.
 
 `--from` and `--force` run stages again. Until all of them are done the run folder keeps a note of that
 request, and each stage a note that it was begun for it, so the same command after a kill goes on instead of
@@ -70,6 +70,8 @@ class Started(Config):
     """A training's steps, and the digest of everything else."""
     request: str | None = None
     """The request for which the stage is run again."""
+    lengthened: tuple[int, ...] = ()
+    """Where learning-rate schedules ended that have been lengthened since."""
 
     @staticmethod
     def find(folder: Path) -> Started | None:
@@ -94,6 +96,8 @@ class PlannedStage:
     """The request for which the stage is run again."""
     identities: Mapping[str, str] = field(default_factory=dict)
     """What its inputs from outside were when the plan was made."""
+    lengthened: tuple[int, ...] = ()
+    """Where schedules ended that this training, which goes on, has lengthened."""
 
 
 def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
@@ -115,15 +119,17 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
             action, reason = _decide_again(stage, fingerprint, run, again, select)
         else:
             action, reason = _decide(recipe, stage, fingerprint, run, rows, forced)
-        if action == "run" and again is None:
-            longer = extension(stage, others, stage_folder(run, stage.name))
+        started = Started.find(stage_folder(run, stage.name))
+        lengthened = () if started is None or action != "resume" else started.lengthened
+        if action == "run" and again is None and started is not None:
+            longer = extension(stage, others, started, stage_folder(run, stage.name))
             if longer is not None:
-                action, reason = ("resume" if longer[0] else "run"), longer[1]
+                action, (reason, lengthened) = "resume", longer
         if stage.name not in wanted and action != "skip":
             action, reason = "leave", "not selected"
         identities = {n: _fingerprint(recipe, n, rows) for n in stage.inputs.values() if n in recipe.outside}
         rows[stage.name] = PlannedStage(
-            stage, fingerprint, action, reason, again is not None, others, again, identities
+            stage, fingerprint, action, reason, again is not None, others, again, identities, lengthened
         )
         plan.append(rows[stage.name])
     if select.only:
@@ -292,22 +298,23 @@ def extendable(stage: Stage, facts: Tree) -> dict[str, int | str] | None:
     return {"steps": stage.config.train.steps, "others": fingerprint_of({**facts, "config": fields})}
 
 
-def extension(stage: Stage, wanted: Mapping[str, int | str] | None, folder: Path) -> tuple[bool, str] | None:
-    """Whether a stage whose fingerprint has changed goes on from its checkpoints, and why (not).
+def extension(
+    stage: Stage, wanted: Mapping[str, int | str] | None, started: Started, folder: Path
+) -> tuple[str, tuple[int, ...]] | None:
+    """Why a stage whose fingerprint has changed goes on from its checkpoints, and its lengthened schedules.
 
     None where more than its steps has changed, or they became fewer, or nothing is there to go on from.
     """
-    started = Started.find(folder)
-    before = None if started is None else started.extendable
+    before = started.extendable
     if wanted is None or before is None or before["others"] != wanted["others"]:
         return None
-    if int(before["steps"]) >= int(wanted["steps"]):
+    old, new = int(before["steps"]), int(wanted["steps"])
+    if old >= new or not any((folder / "checkpoints").glob("*.ckpt")):
         return None
-    steps = f"train.steps {before['steps']} -> {wanted['steps']}"
+    said = f"train.steps {old} -> {new}: goes on from its last checkpoint"
     assert isinstance(stage.config, TrainedStageConfig)
     schedule = stage.config.schedule_of_length()
-    if schedule is not None:
-        return False, f"changed: {steps}, and {schedule} depends on it"
-    if not any((folder / "checkpoints").glob("*.ckpt")):
-        return None
-    return True, f"{steps}: goes on from its last checkpoint"
+    if schedule is None:
+        return said, started.lengthened
+    said += f"; {schedule} is lengthened, which is not the same as {new} steps at once"
+    return said, (*started.lengthened, old)

@@ -70,6 +70,8 @@ class Artifact(Config):
     fingerprint: str
     seed: int
     config: dict[str, object]
+    lengthened: tuple[int, ...] = ()
+    """Steps at which learning-rate schedules ended that were lengthened when more steps were asked for."""
     inputs: dict[str, InputStage]
     outputs: dict[str, OutputFile] = Field(default_factory=dict)
 

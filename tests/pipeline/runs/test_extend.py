@@ -61,6 +61,7 @@ def kinds(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def recipe(folder: Path, *overrides: str) -> Recipe:
+    folder.mkdir(exist_ok=True)
     path = folder / "toy.yaml"
     path.write_text(
         "name: toy\nhardware: {accelerator: cpu, devices: 1, threads: 1, loggers: []}\n"
@@ -157,11 +158,19 @@ def test_what_differs_in_more_or_has_nothing_to_go_on_from_begins_anew(tmp_path:
     assert planned(LONG)[0] == "resume"
     shutil.rmtree(folder / "checkpoints")
     assert planned(LONG)[0] == "run"
-    # A schedule of that length.
-    go(tmp_path, COSINE)
-    action, reason, said = go(tmp_path, COSINE, LONG)
-    assert (action, reason) == (
-        "run",
-        "changed: train.steps 12 -> 24, and critic.schedule cosine depends on it",
-    )
-    assert "goes on" not in said
+
+
+def test_a_schedule_of_that_length_is_lengthened_and_noted(tmp_path: Path) -> None:
+    """Killed on the way it goes on as if nothing had been; begun at 24 steps it is another training."""
+    once = tmp_path / "once"
+    for folder, killed in ((tmp_path, False), (once, True)):
+        go(folder, COSINE)
+        if killed:
+            DIES_AT.append(20)
+            with pytest.raises(ConnectionResetError):
+                go(folder, COSINE, LONG)
+        action, reason, _ = go(folder, COSINE, LONG)
+        assert action == "resume" and (killed or "critic.schedule cosine is lengthened" in reason)
+    assert outcome(tmp_path) == outcome(once) and outcome(tmp_path)["lengthened"] == [12]
+    go(tmp_path / "whole", COSINE, LONG)
+    assert outcome(tmp_path / "whole") != outcome(once)
