@@ -91,7 +91,7 @@ def test_a_second_run_does_nothing_and_says_so(small_run: Any, call: Callable[..
     ("change", "below"),
     [
         ("tma.optim.lr=0.001", {"tma", "gpt", "generate", "evaluate", "report"}),
-        ("face_gpt.train.steps=9", {"face_gpt", "generate", "evaluate", "report"}),
+        ("face_gpt.optim.lr=0.002", {"face_gpt", "generate", "evaluate", "report"}),
         ("evaluate.repeats=2", {"evaluate", "report"}),
         ("gpt.train.checkpoint_every=7", set()),
         ("hardware.threads=2", set()),
