@@ -243,7 +243,7 @@ def test_retrieval_by_another_alignment_stage(
     artifact.finish(run / "stages/temos")
     assert call("retrieval", run).code == 0
     other = call("retrieval", run, "--stage", "temos")
-    assert other.code == 0 and "Retrieval of stage temos" in other.out
+    assert other.code == 0
     ours, theirs = (json.loads((run / f"retrieval{x}.json").read_text()) for x in ("", "-temos"))
     assert ours["about"]["stage"] == "tma" and theirs["about"]["stage"] == "temos"
     assert len(ours["figures"]) == len(theirs["figures"]) and ours["figures"] != theirs["figures"]
