@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import stat
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -33,6 +34,22 @@ class UserError(Exception):
     """A mistake the user can fix. The command line prints the sentence alone, never a traceback."""
 
 
+MOST_JSON_BYTES = 2**28
+"""Larger JSON files are refused unread: the manifest of a million clips has a few megabytes."""
+
+
+def read_plain(path: Path, most: int = MOST_JSON_BYTES) -> bytes:
+    """Content of a plain file of at most `most` bytes; `UserError` for anything else, such as a device or a
+    pipe, which would be read without end. `FileNotFoundError` when there is none.
+    """
+    about = path.stat()
+    if not stat.S_ISREG(about.st_mode):
+        raise UserError(f"{path}: not a plain file")
+    if about.st_size > most:
+        raise UserError(f"{path}: {about.st_size:,} bytes; at most {most:,} are read")
+    return path.read_bytes()
+
+
 class Config(BaseModel):
     """Base of every config class and record: unknown keys and wrong types are refused, values are frozen."""
 
@@ -50,10 +67,10 @@ class Config(BaseModel):
     def load_json(cls, path: Path) -> Self:
         """Read one record from a JSON file."""
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = json.loads(read_plain(path).decode("utf-8"))
         except FileNotFoundError:
             raise UserError(f"{path}: no such file") from None
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        except (ValueError, RecursionError, OSError) as error:
             raise UserError(f"{path}: not valid JSON ({error})") from None
         return cls.parse(data, str(path))
 

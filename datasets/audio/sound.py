@@ -26,8 +26,12 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.schema import UserError
 
-MAX_SAMPLES = 2**28
-"""Longest sound that is read: 93 minutes at 48 kHz, 1 GiB of memory."""
+MAX_SECONDS = 3600
+"""Longest sound that is read."""
+MAX_RATE = 48_000
+"""Sound of higher sample rates is brought to this one while it is read, unless another is asked for."""
+_SAMPLES_A_BYTE = 200
+"""No music is packed so tightly (speech at 8 kbit/s has 48); beyond a minute of it, a file is a bomb."""
 
 MAX_PEAK = 8.0
 """Float sound may overshoot 1; beyond this it is in another unit (integers stored as floats)."""
@@ -97,6 +101,7 @@ def read_sound(
 ) -> tuple[NDArray[np.float32], int]:
     """A sound file -> (mono samples [n] in [-1, 1], rate in Hz): its own rate, or resampled to `rate`.
 
+    A rate above `MAX_RATE` becomes that while it is read, unless `rate` is given.
     Resampled sound may overshoot a little. `UserError` naming the file for sound that is missing, cut short,
     empty, not what its name says, without a sample rate, or that holds NaN or infinity. `name` stands for the
     path in errors.
@@ -105,7 +110,8 @@ def read_sound(
     wanted, found = _length(path, name)
     with _opened(path, name) as file:
         blocks = _mono(file, name, wanted)
-        if rate is None or rate == found:
+        rate = rate or min(found, MAX_RATE)
+        if rate == found:
             made = list(blocks)
         else:
             wanted = resampled_length(wanted, found, rate)
@@ -113,7 +119,7 @@ def read_sound(
     samples = np.concatenate(made)
     if len(samples) < wanted:
         raise UserError(f"{name}: cut short: {len(samples)} samples of {wanted}")
-    return samples[:wanted], rate or found
+    return samples[:wanted], rate
 
 
 def require_audible(samples: NDArray[np.float32], path: Path | str, *, quietest: float = 1e-4) -> None:
@@ -161,8 +167,8 @@ def resampled_length(samples: int, rate_in: int, rate_out: int) -> int:
 
 def _mono(file: Any, name: str, count: int) -> Iterator[NDArray[np.float32]]:
     """The first `count` samples as mono blocks [n], checked and clipped; tags after them are not decoded."""
-    at = 0
-    while len(block := file.read(min(_BLOCK, count - at), dtype="float32", always_2d=True)):
+    at, most = 0, max(1, _BLOCK // file.channels)
+    while len(block := file.read(min(most, count - at), dtype="float32", always_2d=True)):
         samples = block.mean(axis=1)
         finite = np.isfinite(samples)
         if not finite.all():
@@ -193,13 +199,17 @@ def _length(path: Path, name: str) -> tuple[int, int]:
     with _opened(path, name) as file:
         samples, rate = int(file.frames), int(file.samplerate)
         if samples == _UNKNOWN:
-            samples = sum(len(block) for block in _mono(file, name, MAX_SAMPLES + 1))
+            samples = sum(len(block) for block in _mono(file, name, MAX_SECONDS * rate + 1))
     if rate <= 0:
         raise UserError(f"{name}: sample rate {rate}")
     if samples <= 0:
         raise UserError(f"{name}: no sound in it, or cut short (0 samples)")
-    if samples > MAX_SAMPLES:
-        raise UserError(f"{name}: {samples} samples; the longest sound read is {MAX_SAMPLES}")
+    if samples > MAX_SECONDS * rate:
+        raise UserError(f"{name}: {samples / rate:.0f} s; the longest sound read is {MAX_SECONDS} s; cut it")
+    if samples > _SAMPLES_A_BYTE * path.stat().st_size + 60 * MAX_RATE:
+        raise UserError(
+            f"{name}: {samples} samples in {path.stat().st_size} bytes; no music is packed like that"
+        )
     return samples, rate
 
 

@@ -87,6 +87,8 @@ class MotionLayout:
         if name not in _KNOWN:
             raise UserError(f"no motion layout '{name}'; known: {', '.join(_KNOWN)}")
         skeleton, usual_fps, usual_family, fields = _KNOWN[name]
+        if fps is not None and not 0 < fps <= 1000:
+            raise UserError(f"{fps:g} frames a second: no motion has such a rate; give one up to 1000")
         layout = MotionLayout(name, skeleton, usual_fps, usual_family, fields)
         return replace(layout, fps=fps or layout.fps, family=family or layout.family)
 

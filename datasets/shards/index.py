@@ -19,7 +19,6 @@ Arrays, n clips of a split and M = `len(MEMBERS)`:
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from motionloom.datasets.base.files import write_with
-from motionloom.datasets.motion.npz import read_npy_header
+from motionloom.datasets.motion.npz import NpzFile, read_npy_header
 from motionloom.datasets.schema import INDEX_FILE, PRESENT_ALL, Config, Dropped, ShardInfo, Split, UserError
 from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.tar import TarClip, scan_tar
@@ -45,6 +44,8 @@ _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "id_ends": (np.int64, 1),
     "id_bytes": (np.uint8, 1),
 }
+_MOST_ID_BYTES = 4096
+"""Of one clip's id."""
 _STORED_AS = {"present": "held"}
 """Names that files have kept since the first data sets."""
 
@@ -187,14 +188,19 @@ def load_index(root: Path, split: Split, shards: list[ShardInfo]) -> SplitIndex:
 def read_index(file: BinaryIO, where: str, split: Split, shards: list[ShardInfo]) -> SplitIndex:
     """The arrays of one split, checked against the manifest's rows for it.
 
-    Every offset is checked to lie inside its shard here, once for all clips, so reading a clip needs no
-    checks.
+    Sizes are compared with the manifest before an array is read. Every offset is checked to lie inside its
+    shard here, once for all clips, so reading a clip needs no checks.
     """
+    clips = sum(shard.samples for shard in shards)
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[_stored_name(split, name)] for name in _ARRAYS}
-    except (KeyError, ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise UserError(f"{where}: not a readable index ({error}); convert the dataset again") from None
+        with NpzFile(file, where) as stored:
+            limits = {"id_bytes": _MOST_ID_BYTES, "offsets": 8 * len(MEMBERS), "sizes": 4 * len(MEMBERS)}
+            arrays = {
+                name: stored.array(_stored_name(split, name), limit=clips * limits.get(name, 8) + 4096)
+                for name in _ARRAYS
+            }
+    except UserError as error:
+        raise UserError(f"{error}; not a readable index: convert the dataset again") from None
     for name in ("offsets", "sizes"):  # a data set may be older than a modality that was added
         missing = len(MEMBERS) - arrays[name].shape[-1]
         if arrays[name].ndim == 2 and 0 < missing < len(MEMBERS):

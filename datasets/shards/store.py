@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
-from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, UserError
+from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, UserError, read_plain
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 
 SCHEMES = ("file", "http", "https", "s3")
@@ -74,8 +74,13 @@ class LocalStore:
 
     def read_manifest(self, digest: str | None = None) -> bytes:
         """Content of `manifest.json`; with `digest` (sha256, hex) that content or a `UserError`."""
-        with self._open(MANIFEST_FILE) as file:
-            return _as_before(file.read(), digest, self.where(MANIFEST_FILE))
+        where = self.where(MANIFEST_FILE)
+        try:
+            return _as_before(read_plain(self.root / MANIFEST_FILE), digest, where)
+        except FileNotFoundError:
+            raise MissingFileError(f"{where}: no such file") from None
+        except OSError as error:
+            raise UserError(f"{where}: cannot be read ({error})") from None
 
     def open_index(self, digest: str) -> BinaryIO:
         """`index.npz` of the manifest with that sha256, seekable."""
@@ -87,6 +92,8 @@ class LocalStore:
 
     def _open(self, name: str) -> BinaryIO:
         try:
+            if (self.root / name).exists() and not (self.root / name).is_file():  # a pipe would be waited for
+                raise UserError(f"{self.where(name)}: not a plain file")
             return (self.root / name).open("rb")
         except FileNotFoundError:
             raise MissingFileError(f"{self.where(name)}: no such file") from None

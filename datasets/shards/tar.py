@@ -19,7 +19,7 @@ from motionloom.datasets.motion.npz import read_npy_header
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import MEMBERS
 
-MOST_CLIPS = 20_000
+MOST_CLIPS = 10_000
 """Clips of one shard; a directory of more is a bomb."""
 
 

@@ -31,6 +31,7 @@ from motionloom.datasets.schema import MANIFEST_FILE, SPLITS, Manifest, ShardInf
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
+from motionloom.datasets.shards.tar import MOST_CLIPS
 from motionloom.datasets.shards.tasks import (
     Convert,
     Result,
@@ -184,9 +185,10 @@ class DatasetWriter(Generic[T]):
 def _check_arguments(facts: DatasetFacts, how: WriteOptions) -> None:
     if not _NAME.fullmatch(facts.name):
         raise UserError(f"dataset name '{facts.name}': use letters, digits, '-' and '_' only")
-    if how.workers < 1 or how.clips_per_shard < 1:
+    if how.workers < 1 or not 1 <= how.clips_per_shard <= MOST_CLIPS:
         raise UserError(
-            f"workers ({how.workers}) and clips per shard ({how.clips_per_shard}) must be at least 1"
+            f"workers ({how.workers}) must be at least 1, clips per shard ({how.clips_per_shard}) 1 to "
+            f"{MOST_CLIPS}"
         )
     try:
         json.dumps(facts.options, allow_nan=False)

@@ -57,6 +57,9 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         maps = {key: [one.sources, one.unit, one.up] for key, one in self.maps.by_skeleton.items()}
         return super().options() | {"joint_maps": sha256_of_json(maps)}
 
+    def licence(self, plan: ConversionPlan[BvhClip]) -> str:
+        return self.config.licence or ""
+
     def subset(self, clip: BvhClip) -> str:
         return clip.subset
 

@@ -25,7 +25,7 @@ from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.scan import Batch, BatchScan, FoundFile, list_batches, scan_batches
 from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
-from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy
+from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy, require_all_frames
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Split, UserError
@@ -171,8 +171,8 @@ class BvhConfig(CaptionConfig):
     own skeleton (docs/sources.md). Where none fits, and with `auto`, the map is guessed from the names."""
     name: str = "bvh"
     """Name of the data set; part of the shards' file names."""
-    licence: str
-    """Licence of the clips, kept in every sample."""
+    licence: str | None = None
+    """Licence of the clips, kept in every sample; needed for a conversion, not for its plan."""
     layout: str = "body133"
     """Feature layout of the shards: body133, h3d263, or one with hands and a face."""
     fps: float = Field(default=20.0, gt=0, le=240)
@@ -240,7 +240,7 @@ def plan_bvh(
     draft.finish(
         found=sum(len(scan.files) for scan in scans),
         frames=lambda clip: frames_after(clip.found.frames, config.source_fps or clip.found.fps, layout),
-        licence=lambda clip: config.licence,
+        licence=lambda clip: config.licence or "not stated yet",
     )
     return draft, maps
 
@@ -248,6 +248,7 @@ def plan_bvh(
 def _header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
     text, where = load_text(data, label)
     section = find_motion(text, where)
+    require_all_frames(text, section, where)
     key, names = "", tuple[str, ...]()
     with suppress(UserError):  # a broken hierarchy is reported when the clip is converted
         joints = parse_hierarchy(text[: section.start], where)
@@ -257,7 +258,7 @@ def _header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
 
 def _decide(config: BvhConfig, batches: list[Batch], scans: list[BatchScan]) -> ConversionPlan[BvhClip]:
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
-    refused = config.licence_problem(config.licence)
+    refused = config.licence_problem(config.licence) if config.licence else ""
     listing = config.listing([file.path for _, file in found])
     broken = [scan.problem for scan in scans if scan.problem is not None]
     draft = CaptionedPlan[BvhClip](config, broken=broken, notes=listing.notes)

@@ -84,6 +84,6 @@ def _seconds(field: str, what: str) -> float:
         raise UserError(f"{what} '{text[:20]}' is not a number of seconds") from None
     if math.isnan(value):
         return 0.0
-    if not math.isfinite(value) or value < 0:
+    if not 0 <= value < 1e6:
         raise UserError(f"{what} {text[:20]} s is not a time in the clip")
     return value

@@ -118,6 +118,9 @@ def list_clips(
             raise UserError(
                 f"'{name}' in {split}.txt means {path}, which is in {splits[path]}.txt too; that leaks"
             )
+    for split in dict.fromkeys((listed or {}).values()):
+        if split not in splits.values():
+            raise UserError(f"{split}.txt: none of its clips is in the source, so the split would be empty")
     free = tuple(path for path in paths if path not in found)
     return Listing(found, None if listed is None else splits, missing, unused, free, notes)
 

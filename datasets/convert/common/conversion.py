@@ -162,6 +162,8 @@ def run_conversion(
     plan, features = conversion.plan, conversion.features
     convert: Convert[C] = conversion.converter.convert
     plan.require_settled()
+    if plan.items and not conversion.converter.licence(plan):
+        raise UserError(f"{plan.name}: say under which licence the clips are: --licence CC-BY-4.0 (licence)")
     if strict:
         plan.require_whole()
     if features is None and how.features_only:

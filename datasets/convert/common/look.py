@@ -20,6 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.motion.bvh.joint_map import METRES
 from motionloom.datasets.motion.layout import BODY_JOINTS
@@ -211,7 +212,7 @@ class Look:
             head = f"{seen.upright} of {seen.clips}, along {seen.head} of the files"
             back = f", {seen.backwards} backwards" if seen.backwards else ""
             table.add_row(
-                escape(seen.name) or ".",
+                escape(printable(seen.name)) or ".",
                 str(seen.clips) + (f", {seen.unreadable} unreadable" if seen.unreadable else ""),
                 "" if seen.height is None else f"{seen.height:.3g} m",
                 head if seen.clips else "",

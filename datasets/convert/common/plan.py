@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import Look
 from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
@@ -146,7 +147,7 @@ class ConversionPlan(Generic[C]):
         if self.seconds_needed is not None:
             table.add_row("time", "", "", _duration(self.seconds_needed))
         for note in self.notes:
-            table.add_row("note", "", "", escape(note))
+            table.add_row("note", "", "", escape(printable(note)))
         if self.stop:
             table.add_row("stops here", "", "", escape(self.stop))
         return table
@@ -216,4 +217,4 @@ def _duration(seconds: float) -> str:
 
 def _some(lines: Sequence[object], limit: int = 5) -> str:
     more = [f"... and {len(lines) - limit} more"] if len(lines) > limit else []
-    return "\n".join([*map(str, lines[:limit]), *more])
+    return "\n".join([*(printable(str(line)) for line in lines[:limit]), *more])

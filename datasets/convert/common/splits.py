@@ -126,6 +126,8 @@ def join_splits(
     for split, path in files:
         ids, repeated = read_ids(path, suffixes)
         notes += repeated
+        if not ids:
+            raise UserError(f"{path}: no ids in it; delete the file if there is to be no split '{split}'")
         for clip_id, number in ids.items():
             if splits.setdefault(clip_id, split) != split:
                 where = f"{path}:{number}"

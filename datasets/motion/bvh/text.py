@@ -20,6 +20,10 @@ from motionloom.datasets.schema import UserError
 Floats = NDArray[np.float64]
 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
+MOST_JOINTS, MOST_NAME = 1000, 200
+"""Joints of one figure, and characters of a joint's name. The richest rigs have hundreds of joints."""
+LARGEST = 1e7
+"""No length in millimetres and no angle in degrees is larger."""
 _CANONICAL = {name.lower(): name for name in CHANNELS}
 _MOTION = re.compile(rb"^[ \t]*MOTION[ \t]*$", re.IGNORECASE | re.MULTILINE)
 _HEADER = re.compile(
@@ -142,7 +146,7 @@ def read_values(data: bytes, start: int, frames: int, width: int, where: str) ->
     if len(counts) != frames:
         raise UserError(f"{where}: the header says {frames} frames, {len(counts)} found")
     values = _parse_numbers(body)
-    if len(values) != frames * width or not np.isfinite(values).all():
+    if len(values) != frames * width or not (np.abs(values) <= LARGEST).all():  # false for NaN
         raise _bad_word(body, lines, width, where)
     return values.reshape(frames, width)
 
@@ -159,11 +163,11 @@ def _parse_numbers(body: bytes) -> Floats:
 
 def _bad_word(body: bytes, lines: NDArray[np.int64], width: int, where: str) -> UserError:
     for at, word in enumerate(body.split()):
-        if not _NUMBER.fullmatch(word) or not np.isfinite(float(word)):
+        if not _NUMBER.fullmatch(word) or not abs(float(word)) <= LARGEST:
             row, column = divmod(at, width)
             return UserError(
                 f"{where}: line {lines[row]}: frame {row}, channel {column} (from 0): "
-                f"'{_shown(word)}' is not a finite number"
+                f"'{_shown(word)}' is not a finite number up to {LARGEST:g}"
             )
     return UserError(f"{where}: the motion block holds characters that are not numbers")
 
@@ -183,6 +187,16 @@ def parse_hierarchy(text: bytes, where: str) -> Hierarchy:
 @lru_cache(maxsize=8)
 def _parse_hierarchy(text: bytes) -> Hierarchy:
     return _HierarchyParser("").parse(text)
+
+
+def require_all_frames(data: bytes, section: MotionSection, where: str) -> None:
+    """`UserError` when there are not as many lines of values as the header says; the values are not read."""
+    body = data[section.body :].strip()
+    lines = body.count(b"\n") + bool(body)
+    if lines != section.frames:  # blank lines count for nothing
+        lines = sum(bool(line.strip()) for line in body.split(b"\n"))
+    if lines != section.frames:
+        raise UserError(f"{where}: the header says {section.frames} frames, {lines} found")
 
 
 class _HierarchyParser:
@@ -266,7 +280,11 @@ class _HierarchyParser:
             ) from None
 
     def _add(self, piece: str, parent: int) -> int:
-        self.out.names.append(piece.split(None, 1)[1].strip())  # a name may hold spaces
+        name = piece.split(None, 1)[1].strip()  # a name may hold spaces
+        if len(name) > MOST_NAME or len(self.out.names) >= MOST_JOINTS:
+            long = f"a name of {len(name)} characters; at most {MOST_NAME} are read"
+            raise self._error(long if len(name) > MOST_NAME else f"more than {MOST_JOINTS} joints")
+        self.out.names.append(name)
         self.out.parents.append(parent)
         return len(self.out.names) - 1
 
@@ -275,7 +293,7 @@ class _HierarchyParser:
             values = [float(word) for word in words[1:]]
         except ValueError:
             values = []
-        if len(values) != 3 or not np.isfinite(values).all():
+        if len(values) != 3 or not (np.abs(values) <= LARGEST).all():
             raise self._error(f"'{' '.join(words)[:60]}' must be OFFSET and three finite numbers")
         return values
 

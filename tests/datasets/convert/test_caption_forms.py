@@ -237,6 +237,10 @@ def test_split_files_name_clips_as_captions_do(source: Path, tmp_path: Path) -> 
         "sub/turn": "train",
         "jump": "val",
     }
+    for content, said in (("", "no ids in it"), ("hop\n", "none of its clips is in the source")):
+        (tmp_path / "val.txt").write_text(content)
+        with pytest.raises(UserError, match=rf"val\.txt: {said}"):
+            plan(source, None, splits=tmp_path)
     (tmp_path / "val.txt").write_text("jump\nsub/turn\nhop\n")
     with pytest.raises(
         UserError, match=r"'sub/turn' in val\.txt means sub/turn\.bvh, which is in train\.txt too"

@@ -220,3 +220,11 @@ def test_a_map_without_fingers_is_refused_where_fingers_are_recorded(clips: Path
     with pytest.raises(UserError, match="'smplx52'; found smpl22"):
         convert(clips, tmp_path / "out", layout="wholebody313", joint_map=path, look=0)
     convert(clips, tmp_path / "out", layout="wholebody313", joint_map=path, fingers="resting", look=0)
+
+
+def test_a_plan_needs_no_licence_and_a_conversion_does(clips: Path, tmp_path: Path) -> None:
+    config = BvhConfig(source=clips)
+    prepared = prepare(config, out=tmp_path / "out")
+    assert prepared.plan.items
+    with pytest.raises(UserError, match="--licence"):
+        run_conversion(prepared, tmp_path / "out", progress=False)

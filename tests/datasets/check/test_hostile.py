@@ -1,0 +1,137 @@
+"""Files that ask for memory or time without end: each is refused with one sentence before it is read.
+
+A test that hangs or is killed for its memory is how these fail.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tarfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from shard_samples import write
+
+from motionloom.datasets.audio.sound import MAX_RATE, read_sound
+from motionloom.datasets.check.dataset import examine
+from motionloom.datasets.check.files import check_file
+from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.bvh.motion import read_bvh
+from motionloom.datasets.schema import Manifest, ShardInfo, UserError
+from motionloom.datasets.shards.index import read_index
+from motionloom.datasets.shards.reader import ShardDataset, load_manifest
+from motionloom.datasets.shards.tar import MOST_CLIPS, scan_tar
+
+HEAD = "HIERARCHY\nROOT {name}\n{{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
+MOTION = "MOTION\nFrames: 1\nFrame Time: 0.05\n{}\n"
+
+
+def nested(count: int) -> str:
+    joint = "JOINT j\n{\nOFFSET 0 1 0\nCHANNELS 0\n"
+    return HEAD.format(name="r") + joint * count + "}\n" * (count + 1) + MOTION.format("0 0 0")
+
+
+def index_of(shape: tuple[int, ...]) -> io.BytesIO:
+    """An index whose first array declares a shape, well packed."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<i4", "fortran_order": False, "shape": shape})
+    raw = io.BytesIO()
+    with zipfile.ZipFile(raw, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("train.frames.npy", header.getvalue() + bytes(4 * shape[0]))
+    return raw
+
+
+def pipe(path: Path) -> Path:
+    os.mkfifo(path)
+    return path
+
+
+def huge(path: Path) -> Path:
+    with path.open("wb") as file:
+        file.truncate(2**40)
+    return path
+
+
+def tar_of(path: Path, clips: int) -> Path:
+    with tarfile.open(path, "w") as archive:
+        for number in range(clips):
+            for member in ("motion.npy", "meta.json"):
+                archive.addfile(tarfile.TarInfo(f"{number:06d}.{member}"))
+    return path
+
+
+def device(folder: Path) -> Path:
+    (folder / "manifest.json").symlink_to("/dev/zero")
+    return folder
+
+
+ONE = [ShardInfo(name="x-train-000000.tar", split="train", samples=1, frames=9, bytes=9, sha256="0")]
+HOSTILE: dict[str, Callable[[Path], object]] = {
+    "an index that declares 64 MiB for one clip": lambda f: read_index(index_of((2**24,)), "i", "train", ONE),
+    "a manifest that is a device": lambda f: load_manifest(device(f)),
+    "a manifest that is a pipe": lambda f: load_manifest(pipe(f / "manifest.json").parent),
+    "a manifest of a terabyte": lambda f: load_manifest(huge(f / "manifest.json").parent),
+    "a shard's index that is a pipe": lambda f: Manifest.load_json(pipe(f / "x.index.json")),
+    "a shard that is a pipe": lambda f: check_or_raise(pipe(f / "x.tar")),
+    "a shard of too many clips": lambda f: scan_tar(tar_of(f / "x.tar", MOST_CLIPS + 1)),
+    "a shard of more clips than its manifest has": lambda f: scan_tar(tar_of(f / "x.tar", 9), most=8),
+    "3,000 nested joints": lambda f: read_bvh(nested(3_000)),
+    "100,000 nested joints": lambda f: read_bvh(nested(100_000)),
+    "a joint's name of a megabyte": lambda f: read_bvh(nested(1).replace("JOINT j", "JOINT " + "j" * 2**20)),
+    "a place of 1e308": lambda f: read_bvh(nested(1).replace("0 0 0\n", "1e308 0 0\n")),
+    "an angle of 1e308": lambda f: read_bvh(HEAD.format(name="r") + "}\n" + MOTION.format("0 1e308 0")),
+    "much silence in a few kilobytes": lambda f: read_sound(silence(f / "x.flac", 900, 48_000)),
+    "more than an hour": lambda f: read_sound(silence(f / "x.wav", 3700, 100)),
+}
+
+
+def check_or_raise(path: Path) -> None:
+    verdict = check_file(path)
+    if not verdict.ok:
+        raise UserError(str(verdict))
+
+
+def silence(path: Path, seconds: int, rate: int) -> Path:
+    with soundfile.SoundFile(path, "w", samplerate=rate, channels=1) as file:
+        for _ in range(seconds):
+            file.write(np.zeros(rate, np.int16))
+    return path
+
+
+@pytest.mark.parametrize("read", HOSTILE.values(), ids=HOSTILE.keys())
+def test_endless_files_are_refused_in_one_sentence(read: Callable[[Path], object], tmp_path: Path) -> None:
+    with pytest.raises(UserError) as caught:
+        read(tmp_path)
+    assert len(str(caught.value)) < 500 and "\n" not in str(caught.value)
+
+
+def test_sound_of_a_high_rate_is_brought_down_while_it_is_read(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    soundfile.write(tmp_path / "x.flac", rng.uniform(-0.5, 0.5, 655_350), 655_350)
+    samples, rate = read_sound(tmp_path / "x.flac")
+    assert rate == MAX_RATE and abs(len(samples) - rate) <= 1
+    assert read_sound(tmp_path / "x.flac", rate=96_000)[1] == 96_000
+
+
+def test_a_check_looks_at_every_number(tmp_path: Path) -> None:
+    """A manifest with a frame rate that no motion has, and a tar of another tool with 1e308 in it."""
+    write(tmp_path / "set")
+    data = json.loads((tmp_path / "set/manifest.json").read_text())
+    (tmp_path / "set/manifest.json").write_text(json.dumps(data | {"fps": 1e308}))
+    assert examine(tmp_path / "set").errors
+    with pytest.raises(UserError, match="frames a second"):
+        ShardDataset.open(tmp_path / "set", "train")
+
+
+def test_the_plan_sees_cut_files(tmp_path: Path) -> None:
+    text = HEAD.format(name="r") + "}\n" + "MOTION\nFrames: 3\nFrame Time: 0.5\n" + "0 0 0\n" * 2
+    (tmp_path / "a.bvh").write_text(text)
+    plan = prepare(BvhConfig(source=tmp_path, licence="CC0")).plan
+    assert [drop.reason for drop in plan.broken] == ["the header says 3 frames, 2 found"]
