@@ -167,7 +167,6 @@ def dmd_loss(
     step: Tensor,
     noise: Tensor,
     *,
-    absent: Mapping[str, Tensor] | None = None,
     hidden: Tensor | None = None,
     present: Tensor | None = None,
 ) -> Tensor:
@@ -183,7 +182,7 @@ def dmd_loss(
         noise: [B, T, D], standard normal.
         present: bool [B, D], columns that count (None = all).
     """
-    found = net(noiser.add_noise(motion, noise, step), step, codes, length, absent, hidden)
+    found = net(noiser.add_noise(motion, noise, step), step, codes, length, None, hidden)
     target = motion if net.config.schedule.predicts == "sample" else noise
     error = found - target.to(found.dtype)
     loss = masked_mean(error.square(), length_mask(length, motion.shape[1]), present)

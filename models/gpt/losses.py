@@ -16,12 +16,9 @@ from pydantic import Field
 from torch import Tensor
 
 from motionloom.datasets.schema import Config
-from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import PAD
 from motionloom.models.layers import random
-from motionloom.models.tma.losses import info_nce
-from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.training.distributed import masked_mean
 
@@ -135,39 +132,3 @@ def soft_motion(
     weights = soft_codes(net, logits, groups, temperature=temperature, sample=sample)
     frames = groups * tokenizer.group_frames
     return tokenizer.decode_soft(weights, frames, present), frames
-
-
-def align_loss(
-    gpt: InterleavedGPT,
-    logits: Tensor,
-    tokens: Tensor,
-    kinds: Tensor,
-    text_latent: Tensor,
-    sentence: Tensor | None,
-    *,
-    tokenizer: Tokenizer,
-    tma: Tma,
-    gumbel_temperature: float,
-    temperature: float,
-    threshold: float | None,
-    sample: bool,
-    present: Tensor | None = None,
-) -> Tensor:
-    """L_align of one batch: logits [B, L, V], text_latent [B, Z] (TMA's text mean), sentence [B, S] for the
-    filter of negatives.
-
-    `present` bool [B, dim]: columns of the tokenizer that the clip holds (None = all). What it does not hold
-    takes no part in decoding, and TMA reads the mean there, as it did in its own training.
-    """
-    motion, frames = soft_motion(
-        gpt,
-        logits,
-        tokens,
-        kinds,
-        tokenizer=tokenizer,
-        temperature=gumbel_temperature,
-        sample=sample,
-        present=present,
-    )
-    latent, _ = tma.encode_motion(motion, frames, present)
-    return info_nce(text_latent, latent, sentence, temperature=temperature, threshold=threshold)

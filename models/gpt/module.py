@@ -4,17 +4,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.frozen import Frozen
-from motionloom.models.gpt.losses import GptLossConfig, accuracy, align_loss, corrupt, cross_entropy
+from motionloom.models.gpt.losses import GptLossConfig, accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.samples import log_likelihood, policy_loss, rewards, sample
 from motionloom.models.layers import random
+from motionloom.models.tma.losses import info_nce
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
@@ -79,44 +78,48 @@ class GptModule(StageModule):
     def _align(
         self, batch: Batch, logits: Tensor, drop: Tensor | None, tokenizer: Tokenizer, tma: Tma
     ) -> Tensor:
-        config, similarity = self.loss_config, batch.get("similarity")
+        config = self.loss_config
         latent: Tensor = batch["tma_text"] if "tma_text" in batch else batch["text"]
         if latent.shape[-1] != tma.config.latent:
             raise UserError(
                 f"L_align compares TMA latents of width {tma.config.latent} and the text prior has "
                 f"{latent.shape[-1]}; give TMA's text means as 'tma_text' or set align_weight: 0"
             )
-        judge: dict[str, Any] = {
-            "tokenizer": tokenizer,
-            "tma": tma,
-            "temperature": config.temperature,
-            "threshold": config.threshold,
-            "present": batch.get("present"),
-        }
         if config.align_on == "samples":
-            return self._align_samples(batch, latent, similarity, judge)
+            return self._align_samples(batch, latent, tokenizer, tma)
         if drop is not None:
             # A motion predicted without its text cannot follow it: to the others it is a negative, no more.
             logits = torch.where(drop[:, None, None], logits.detach(), logits)
-        return align_loss(
+        # What a clip does not hold is not decoded, and TMA reads the mean there, as in its own training.
+        motion, frames = soft_motion(
             self.net,
             logits,
             batch["tokens"],
             batch["kinds"],
-            latent,
-            similarity,
-            gumbel_temperature=config.gumbel_temperature,
+            tokenizer=tokenizer,
+            temperature=config.gumbel_temperature,
             sample=self.training,
-            **judge,
+            present=batch.get("present"),
+        )
+        made, _ = tma.encode_motion(motion, frames, batch.get("present"))
+        return info_nce(
+            latent, made, batch.get("similarity"), temperature=config.temperature, threshold=config.threshold
         )
 
-    def _align_samples(
-        self, batch: Batch, latent: Tensor, similarity: Tensor | None, judge: dict[str, Any]
-    ) -> Tensor:
-        known = batch.get("known")
-        count = self.loss_config.samples if self.training else 1
+    def _align_samples(self, batch: Batch, latent: Tensor, tokenizer: Tokenizer, tma: Tma) -> Tensor:
+        config, known = self.loss_config, batch.get("known")
+        count = config.samples if self.training else 1
         drawn = sample(self.net, batch["text"], count)
-        reward = rewards(drawn.codes, latent, similarity, **judge)
+        reward = rewards(
+            drawn.codes,
+            latent,
+            batch.get("similarity"),
+            tokenizer=tokenizer,
+            tma=tma,
+            temperature=config.temperature,
+            threshold=config.threshold,
+            present=batch.get("present"),
+        )
         if not self.training:
             return -reward.mean()
         lacking = None
