@@ -27,7 +27,6 @@ from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.actions import arms, floor, legs, locomotion
-from motionloom.datasets.synth.actions.chain import animate_in_turn
 from motionloom.datasets.synth.actions.maths import Array, rot_y
 from motionloom.datasets.synth.actions.pose import Track
 from motionloom.datasets.synth.actions.truth import (
@@ -41,6 +40,7 @@ from motionloom.datasets.synth.actions.truth import (
     require_known,
 )
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions
+from motionloom.datasets.synth.chain import animate_in_turn
 from motionloom.datasets.synth.dances import (
     Dance,
     DanceConfig,
