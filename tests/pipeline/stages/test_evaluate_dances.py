@@ -43,7 +43,6 @@ from motionloom.pipeline.evaluation.figures import (
 )
 from motionloom.pipeline.evaluation.movement import all_features, distances, movement_figures, multimodality
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.generators.timeline import TokenTimeline
 from motionloom.pipeline.inference.generators.ude import UdeGenerator
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe
 
@@ -288,16 +287,11 @@ def test_the_same_tokens_are_decoded_with_other_noise(
 ) -> None:
     """`decodings`: tokens are drawn once, the diffusion decoder's noise changes."""
     codes, decode = [], UdeGenerator.decode
-    draws, tokens = [], TokenTimeline.tokens
     monkeypatch.setattr(UdeGenerator, "decode", lambda *given: codes.append(given[1]) or decode(*given))
-    monkeypatch.setattr(TokenTimeline, "tokens", lambda *given: draws.append(1) or tokens(*given))
     bundle = Bundle.open(run[0])
     made = [bundle.generate(["a walk"], seconds=2.0, seed=3, noise_seed=noise) for noise in (1, 2, 1)]
     motions = [one[0].joints for one in made]
-    assert len({code.codes[name].numpy().tobytes() for code in codes for name in code.codes}) == 1
-    assert len(draws) == 1
-    bundle.generate(["a jump"], seconds=2.0, seed=3, noise_seed=1)
-    assert len(draws) == 2, "another caption has tokens of its own"
+    assert len({id(code) for code in codes}) == 1
     np.testing.assert_array_equal(motions[0], motions[2])
     assert np.abs(motions[0] - motions[1]).max() > 1e-3
 
