@@ -1,0 +1,267 @@
+"""`docs/results.md` from records: the figures are in `benchmarks/records`, the words in `results_page.md`.
+
+    python benchmarks/results.py                     # writes docs/results.md
+    python benchmarks/results.py --collect WORK/run  # first makes records of a run of ude_ingredients.py
+
+A record is a table: its title, day, commit, command, protocol, columns, and rows whose cells are values, one
+a seed, or text (`imported`: of the archived journal, which was not measured again). Several values are shown
+as their mean with 95 % by Student's t over seeds. In the words `{{name}}` is the table of a record and
+`{{name: row: column}}` one of its cells, so that no figure is typed by hand.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from motionloom.pipeline.evaluation.estimate import estimate
+from motionloom.pipeline.evaluation.figures import FILE_NAME, MODEL, NEAREST_WORDS, RECORDED, FigureFile
+
+HERE = Path(__file__).resolve().parent
+RECORDS, WORDS, PAGE = HERE / "records", HERE / "results_page.md", HERE.parent / "docs" / "results.md"
+Record = dict[str, Any]
+
+
+class Column(NamedTuple):
+    """A figure of `metrics.json`, scaled and with so many digits; `log:` names one of `metrics.jsonl`."""
+
+    title: str
+    figure: str
+    digits: int = 1
+    scale: float = 1.0
+
+
+class Table(NamedTuple):
+    """What becomes of some stages: row -> (stage without its seed, row of its figures)."""
+
+    title: str
+    rows: Mapping[str, tuple[str, str]]
+    columns: tuple[Column, ...]
+
+
+TEXT = (
+    Column("Top-1 among 61, %", "tma.top-1", 1, 100),
+    Column("FID_k", "movement.fid_k"),
+    Column("FID_m", "movement.fid_m"),
+    Column("Div_k", "movement.div_k", 2),
+    Column("Div_m", "movement.div_m", 2),
+    Column("MM_k", "movement.mm_k", 2),
+    Column("MM_m", "movement.mm_m", 2),
+)
+MUSIC = (Column("Beat Align", "beat_align.bailando", 3), *TEXT[1:])
+ANSWERS = {"recorded": RECORDED, "nearest training caption": NEAREST_WORDS}
+DECODERS = {
+    "tokenizer's decoder": "greedy",
+    "DMD, predicts the noise": "greedy_epsilon",
+    "DMD, predicts the motion": "greedy_sample",
+}
+ADVERSARIAL = {
+    "without L_adv": "adv0",
+    "weight 0.02, spectral norm": "adv002sn",
+    "weight 0.02": "adv002",
+    "weight 1, spectral norm": "adv1sn",
+    "weight 1 (the paper)": "adv1",
+}
+NETWORKS = {"GPT": "greedy", "GRU": "greedy_gru"}
+NOISE = {"without z": "greedy", "with z": "greedy_z"}
+
+
+def _of(prefix: str, stages: Mapping[str, str], answers: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    rows = {title: (prefix + stage, MODEL) for title, stage in stages.items()}
+    first = prefix + next(iter(stages.values()))
+    return rows | {title: (first, row) for title, row in answers.items()}
+
+
+TABLES = {
+    "ude_codebook": Table(
+        "Codebooks of 512 codes, 1,000 steps of 32 windows",
+        {
+            "moving averages [ours]": ("codes_ema", MODEL),
+            "gradient, from the first batch [ours]": ("codes_gradient_data", MODEL),
+            "gradient, from ± 1/K (the paper)": ("codes_gradient", MODEL),
+            "nearest training clip": ("codes_ema", "nearest training clip"),
+            "mean pose": ("codes_ema", "mean pose, still"),
+        },
+        (
+            Column("MPJPE, mm", "reconstruction.mpjpe"),
+            Column("pose, mm", "reconstruction.pose"),
+            Column("in the world, mm", "reconstruction.world", 0),
+            Column("codes in a batch, %", "log:train/usage_code", 0, 100),
+        ),
+    ),
+    "ude_decoders_text": Table("Table 5, captions", _of("text_", DECODERS, ANSWERS), TEXT),
+    "ude_decoders_music": Table("Table 5, music", _of("music_", DECODERS, {"recorded": RECORDED}), MUSIC),
+    "ude_noise_text": Table("Table 4, captions", _of("text_", NOISE, {}), TEXT),
+    "ude_noise_music": Table("Table 4, music", _of("music_", NOISE, {}), MUSIC),
+    "ude_networks_text": Table("Table 3, captions", _of("text_", NETWORKS, {}), TEXT),
+    "ude_networks_music": Table("Table 3, music", _of("music_", NETWORKS, {}), MUSIC),
+    "ude_adversarial": Table(
+        "L_adv from the first step on", _of("text_drawn_", ADVERSARIAL, {}), TEXT
+    ),
+}  # fmt: skip
+SEEDS = (7, 8, 9)
+
+
+def collect(run: Path) -> None:
+    """Write a record of every table of which a stage has finished."""
+    RECORDS.mkdir(exist_ok=True)
+    for name, table in TABLES.items():
+        rows = [row for row in (row_of(run, table, title) for title in table.rows) if row["cells"]]
+        if rows:
+            write(name, table.title, [column._asdict() for column in table.columns], rows)
+    path = run / "decoded.json"
+    if path.is_file():
+        write_decoded(json.loads(path.read_text()))
+
+
+def write(name: str, title: str, columns: list[dict[str, Any]], rows: list[Record]) -> None:
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=HERE)
+    record = {
+        "title": title, "measured": f"{datetime.now(UTC):%Y-%m-%d}", "commit": commit.stdout.strip(),
+        "command": "python benchmarks/ude_ingredients.py CLIPS WORK", "columns": columns, "rows": rows,
+    }  # fmt: skip
+    (RECORDS / f"{name}.json").write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+
+
+def row_of(run: Path, table: Table, title: str) -> Record:
+    """The cells of a row, one value for each seed that has finished, and how it was measured."""
+    stage, row = table.rows[title]
+    cells: dict[str, list[float]] = {}
+    seeds, protocol = [], {}
+    for seed in SEEDS if row == MODEL else SEEDS[:1]:
+        path = run / "stages" / f"{stage}_{seed}" / FILE_NAME
+        if not path.is_file():
+            continue
+        found = FigureFile.read(path)
+        seeds.append(seed)
+        for column in table.columns:
+            value = logged(run, stage, seed, column) if row == MODEL else None
+            figure = found.of(column.figure, row)
+            if figure is not None:
+                value, protocol = figure.value, {**protocol, **figure.protocol}
+            if value is not None:
+                cells.setdefault(column.figure, []).append(value)
+    shown = ("split", "clips", "songs", "repeats", "decodings")
+    drawn = {k: v for k, v in protocol.items() if k in shown or k.startswith("sampling")}
+    return {"title": title, "cells": cells, "seeds": seeds if row == MODEL else [], "protocol": drawn}
+
+
+def logged(run: Path, stage: str, seed: int, column: Column) -> float | None:
+    """The last value that the training which a stage of figures measures has logged."""
+    kind, _, name = column.figure.partition(":")
+    if kind != "log":
+        return None
+    path = run / "stages" / f"{stage.removeprefix('codes_')}_{seed}" / "metrics.jsonl"
+    values = [json.loads(line).get(name) for line in path.read_text().splitlines()]
+    return float([value for value in values if value is not None][-1])
+
+
+def write_decoded(found: Record) -> None:
+    """The decoders' record: true tokens of test clips, decoded twice."""
+    titles = dict(zip(("tokenizer", "epsilon", "sample"), DECODERS, strict=True))
+    columns = [
+        Column("pose error, mm", "pose error, mm"),
+        Column("two draws apart, mm", "variety, mm"),
+        Column("speed, % of the recorded", "speed", 0, 100),
+    ]
+    rows = []
+    for start, title in titles.items():
+        arms = {name: cells for name, cells in found["rows"].items() if name.split("_")[0] == start}
+        if arms:
+            cells = {column.figure: [arm[column.figure] for arm in arms.values()] for column in columns}
+            rows.append(
+                {
+                    "title": title,
+                    "cells": cells,
+                    "seeds": [],
+                    "protocol": {"split": "test", "clips": found["clips"]},
+                }
+            )
+    write("ude_true_tokens", "Decoders of true tokens", [c._asdict() for c in columns], rows)
+
+
+def shown(values: Any, column: Mapping[str, Any]) -> str:
+    """A cell: text as it is, a value, or the mean of several with its interval over seeds."""
+    if not isinstance(values, list):
+        return str(values)
+    digits, found = column["digits"], estimate([column["scale"] * value for value in values])
+    half = "" if found.interval is None else f" ± {found.interval:.{digits}f}"
+    return f"{found.value:.{digits}f}{half}"
+
+
+def table_of(record: Record) -> str:
+    """The table as Markdown, with its protocol below."""
+    columns = record["columns"]
+    head = [record.get("corner", ""), *(column["title"] for column in columns)]
+    lines = [head, ["---"] * len(head)]
+    for row in record["rows"]:
+        cells = [shown(row["cells"].get(column["figure"], ""), column) for column in columns]
+        count = len(row.get("seeds", []))
+        short = f" ({count} seed{'s' * (count > 1)})" if 0 < count < len(SEEDS) else ""
+        lines.append([row["title"] + short, *cells])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + protocol_of(record)
+
+
+def protocol_of(record: Record) -> str:
+    """How the rows were measured: what they share, then what each has of its own."""
+    each = {row["title"]: row.get("protocol", {}) for row in record["rows"] if row.get("protocol")}
+    if not each:
+        return ""
+    common = {k: v for k, v in next(iter(each.values())).items() if all(p.get(k) == v for p in each.values())}
+    parts = [said(common)]
+    for title, own in each.items():
+        rest = {k: v for k, v in own.items() if k not in common}
+        parts += [f"{title}: {said(rest)}"] if rest else []
+    return "\n\n" + "; ".join(part for part in parts if part) + f" ({record['measured']})."
+
+
+def said(facts: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{name.removeprefix('sampling.')} {value}" for name, value in facts.items() if value != {}
+    )
+
+
+def page(words: str, records: Mapping[str, Record]) -> str:
+    """The words with their figures."""
+
+    def filled(found: re.Match[str]) -> str:
+        name, *place = found[1].split(": ")
+        record = records[name]
+        if not place:
+            return table_of(record)
+        column = next(c for c in record["columns"] if c["title"] == place[1])
+        row = next(r for r in record["rows"] if r["title"] == place[0])
+        return shown(row["cells"][column["figure"]], column)
+
+    return re.sub(r"\{\{(.+?)\}\}", filled, words)
+
+
+def read_records() -> dict[str, Record]:
+    return {
+        path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(RECORDS.glob("*.json"))
+    }
+
+
+def rendered() -> str:
+    return page(WORDS.read_text(encoding="utf-8"), read_records())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--collect", type=Path, help="the folder of a run")
+    args = parser.parse_args()
+    if args.collect is not None:
+        collect(args.collect)
+    PAGE.write_text(rendered(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

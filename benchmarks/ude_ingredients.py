@@ -1,0 +1,249 @@
+"""UDE's own ingredients at a size where they can work, each beside what this program does instead.
+
+    python benchmarks/ude_ingredients.py CLIPS WORK
+
+CLIPS holds real captioned clips (BVH archives, `captions.jsonl`, `joint_map.json`); synthetic dances are
+made. One recipe is written into WORK and run there: data, judge, then an arm of every question for every seed.
+Killed and started again it goes on where it was; `--seeds` and `--until` take a part. Its figures are those of
+its stages' `metrics.json` (`benchmarks/results.py`) and, of decoders on true tokens, `decoded.json`.
+
+- codebook: learnt by gradient from the paper's start, from data, and by moving averages;
+- decoder: DMD (160 wide, 133 columns) that predicts the noise and the motion; the tokenizer's own;
+- L_adv from the first step on with weight 0, 0.02 and 1, with and without spectral norm;
+- GPT and GRU; z and none, with the likeliest tokens.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
+from motionloom.models.diffusion.dmd_sampling import decode_motions
+from motionloom.models.gpt.drawing import sample_seeds
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.truth import spread
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.plan import Selection
+
+Stages = dict[str, dict[str, Any]]
+
+CODEBOOKS: Stages = {
+    "ema": {"quantizer": "ema", "decay": 0.97, "reset_below": 0.1},
+    "gradient": {"quantizer": "gradient"},
+    "gradient_data": {"quantizer": "gradient", "start": "data"},
+}
+ADVERSARIAL = {
+    "adv0": (0.0, False),
+    "adv002sn": (0.02, True),
+    "adv002": (0.02, False),
+    "adv1sn": (1.0, True),
+    "adv1": (1.0, False),
+}
+EVERY = {"checkpoint_every": 200, "validate_every": 400}
+GREEDY, DRAWN = {"temperature": 0.0}, {"temperature": 1.0, "top_p": 0.95}
+
+
+def trained(steps: int, batch: int, lr: float, seed: int, warmup: int = 50) -> dict[str, Any]:
+    """Adam, as all of UDE is trained by (4.2)."""
+    return {
+        "optim": {"optimizer": "adam", "lr": lr, "warmup_steps": warmup, "schedule": "cosine"},
+        "train": {"steps": steps, "batch_size": batch, "seed": seed, **EVERY},
+    }
+
+
+def base(clips: Path) -> Stages:
+    """What all arms share: the data, the judge, and the tokenizer of the first seed."""
+    dances = {"songs": 150, "song_seconds": 12.0, "conditions": {"audio": 1.0, "both": 0.0}}
+    return {
+        "clips": {
+            "kind": "bvh", "source": str(clips), "joint_map": str(clips / "joint_map.json"), "fps": 20,
+            "captions": str(clips / "captions.jsonl"), "licence": "CC-BY-NC-4.0",
+        },
+        "dances": {
+            "kind": "synth", "layout": "body133", "clips": 600, "fps": 20, "min_seconds": 4.0,
+            "max_seconds": 6.0,
+            "test_fraction": 0.15, "val_fraction": 0.05, "actions": ["dance"], "dances": dances,
+        },
+        "data": {"kind": "mix", "inputs": {"data": ["clips", "dances"]}},
+        "stats": {"kind": "stats"},
+        "text": {"kind": "text"},
+        "audio": {"kind": "audio"},
+        "tma": {
+            "kind": "tma",
+            "net": {"latent": 128, "ff": 256, "layers": 2, "heads": 4, "attention_dropout": 0.0,
+                    "frame_stride": 4},
+            "optim": {"lr": 5.0e-4, "warmup_steps": 50, "schedule": "cosine"},
+            "train": {"steps": 400, "batch_size": 64, **EVERY},
+        },
+    }  # fmt: skip
+
+
+def codebook_arms(seed: int) -> Stages:
+    """Tokenizers, measured on what they reconstruct."""
+    out: Stages = {}
+    for name, how in CODEBOOKS.items():
+        net = {"part": "body", "width": 128, "depth": 1, "code_dim": 64, "num_codes": 512, **how}
+        out[f"{name}_{seed}"] = {"kind": "mq", "net": net, **trained(1000, 32, 1.0e-3, seed)}
+        out[f"codes_{name}_{seed}"] = evaluation([], f"{name}_{seed}", None)
+    return out
+
+
+def decoder_arms(seed: int) -> Stages:
+    """Diffusion decoders of one tokenizer."""
+    return {
+        f"{predicts}_{seed}": {
+            "kind": "dmd",
+            "inputs": {"tokenizer": "ema_7"},
+            "net": {"dim": 160, "ff": 320, "encoder_layers": 2, "decoder_layers": 3, "heads": 5,
+                    "dropout": 0.0, "attention_dropout": 0.0, "schedule": {"predicts": predicts}},
+            "window": 64,
+            **trained(800, 16, 1.0e-3, seed),
+        }
+        for predicts in ("epsilon", "sample")
+    }  # fmt: skip
+
+
+def token_model(seed: int, steps: int, net: dict[str, Any], loss: dict[str, Any]) -> dict[str, Any]:
+    """MATE and a small UTT, with the music of its frames beside each token [ours]."""
+    return {
+        "kind": "utt",
+        "inputs": {"tokenizer": "ema_7"},
+        "net": {"layers": 3, "dim": 128, "heads": 4, "ff": 512, "block_size": 48, "z_dim": 16,
+                "attention_dropout": 0.0, "frame_condition": True, **net},
+        "mate": {"dim": 128, "layers": 2, "heads": 4, "ff": 256, "attention_dropout": 0.0, "stride": 4},
+        "loss": loss,
+        **trained(steps, 16, 1.0e-3, seed),
+    }  # fmt: skip
+
+
+def engine(
+    name: str, utt: str, dmd: str | None, inject_z: bool, sampling: dict[str, Any], repeats: int
+) -> Stages:
+    """A generator and its figures for captions and for music."""
+    made = {"kind": "ude", "inputs": {"utt": utt, "dmd": dmd}, "inject_z": inject_z}
+    more = {"sampling": sampling, "repeats": repeats}
+    dances = {"kind": "evaluate_dances", "inputs": {"generators": [name]}, "clips": 60, "shuffles": 2, **more}
+    return {name: made, f"text_{name}": evaluation([name], None, "tma") | more, f"music_{name}": dances}
+
+
+def evaluation(generators: list[str], tokenizer: str | None, judge: str | None) -> dict[str, Any]:
+    inputs = {"generators": generators, "tokenizer": tokenizer, "tma": judge}
+    return {"kind": "evaluate", "inputs": inputs, "clips": 120, "repeats": 1}
+
+
+def loss_of(weight: float = 0.0, spectral: bool = False) -> dict[str, Any]:
+    """The loss of a token model."""
+    if not weight:
+        return {"adversarial": {"weight": 0.0}}
+    net = {"dim": 64, "ff": 128, "heads": 4, "spectral_norm": spectral}
+    adam = {"optimizer": "adam", "lr": 2.0e-4, "betas": [0.5, 0.99]}
+    return {"adversarial": {"weight": weight}, "discriminator": net, "discriminator_optim": adam}
+
+
+def token_arms(seed: int) -> Stages:
+    """GPT, decoded by each decoder without z, and with z."""
+    gpt = f"gpt_{seed}"
+    out: Stages = {gpt: token_model(seed, 1000, {}, loss_of())}
+    out |= engine(f"greedy_{seed}", gpt, None, False, GREEDY, 1)
+    for predicts in ("epsilon", "sample"):
+        out |= engine(f"greedy_{predicts}_{seed}", gpt, f"{predicts}_{seed}", False, GREEDY, 3)
+    return out | engine(f"greedy_z_{seed}", gpt, None, True, GREEDY, 3)
+
+
+def adversarial_arms(seed: int) -> Stages:
+    """Shorter trainings with L_adv from the first step on, as in the paper."""
+    out: Stages = {}
+    for name, (weight, spectral) in ADVERSARIAL.items():
+        arm = f"{name}_{seed}"
+        out[arm] = token_model(seed, 400, {}, loss_of(weight, spectral))
+        out |= engine(f"drawn_{arm}", arm, None, True, DRAWN, 2)
+    return out
+
+
+def gru_arms(seed: int) -> Stages:
+    gru = f"gru_{seed}"
+    out: Stages = {gru: token_model(seed, 1000, {"kind": "gru"}, loss_of())}
+    return out | engine(f"greedy_gru_{seed}", gru, None, False, GREEDY, 1)
+
+
+QUESTIONS = ((codebook_arms,), (decoder_arms,), (token_arms,), (adversarial_arms, gru_arms))
+"""In the order in which they are asked; of the last every seed answers all."""
+
+
+def decoded(run: Path, clips: int = 100) -> None:
+    """Write `decoded.json`: test clips' true tokens, decoded by each decoder twice."""
+    stages, cache = finished_stages(run), StageCache()
+    dataset = cache.get(stages["data"]).split("test")
+    tokenizer, layout = cache.get(stages["ema_7"]), dataset.layout
+    recorded = [np.asarray(dataset.motion(i))[:64] for i in spread(dataset, clips) if dataset.frames[i] >= 64]
+    codes, truth = tokenizer.encode(recorded), [joints_of(m, layout) for m in recorded]
+    out: dict[str, dict[str, float]] = {}
+    for name in ["tokenizer", *(s for s in stages if stages[s].kind.name == "dmd")]:
+        both = []
+        for seed in (0, 1):
+            if name == "tokenizer":
+                motions = tokenizer.decode(codes.codes, codes.groups.tolist())
+            else:
+                seeds = sample_seeds(seed, len(recorded))
+                made = decode_motions(
+                    cache.get(stages[name]).net, codes, seeds=seeds, sampler="dpm++", steps=20, window=64
+                )
+                motions = [tokenizer.of_coordinates(motion) for motion in made]
+            both.append([joints_of(m, layout) for m in motions])
+        out[name] = {
+            "pose error, mm": apart(both[0], truth, layout.fps),
+            "variety, mm": apart(both[0], both[1], layout.fps),
+            "speed": speed(both[0], layout.fps) / speed(truth, layout.fps),
+        }
+    (run / "decoded.json").write_text(
+        json.dumps({"clips": len(recorded), "frames": 64, "rows": out}, indent=1) + "\n"
+    )
+
+
+def apart(one: list[Any], other: list[Any], fps: float) -> float:
+    """Mean distance of joints, root and heading aligned, millimetres."""
+    pairs = zip(one, other, strict=True)
+    found = [
+        np.linalg.norm(local_joints_of(a, fps) - local_joints_of(b, fps), axis=-1).mean() for a, b in pairs
+    ]
+    return 1000 * float(np.mean(found))
+
+
+def speed(motions: list[Any], fps: float) -> float:
+    """Mean speed of all joints, metres a second: an average of several motions is too slow."""
+    return fps * float(np.mean([np.linalg.norm(np.diff(m, axis=0), axis=-1).mean() for m in motions]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("clips", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[7, 8, 9])
+    parser.add_argument("--until", help="stages, with commas between them")
+    args = parser.parse_args()
+    stages = base(args.clips.resolve())
+    for together in QUESTIONS:
+        for seed in args.seeds:
+            for question in together:
+                stages |= question(seed)
+    args.work.mkdir(parents=True, exist_ok=True)
+    recipe = args.work / "recipe.yaml"
+    recipe.write_text(
+        yaml.safe_dump({"name": "ude-ingredients", "seed": 7, "stages": stages}, sort_keys=False)
+    )
+    run = run_recipe(recipe, args.work / "run", select=Selection(until=args.until))
+    if not args.until:
+        decoded(run)
+
+
+if __name__ == "__main__":
+    main()

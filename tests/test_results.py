@@ -1,0 +1,32 @@
+"""`docs/results.md` is what its records say."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from tests.test_benchmarks import FOLDER, loaded
+
+
+def test_the_page_is_made_of_its_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = loaded(FOLDER / "results.py", monkeypatch)
+    assert results.PAGE.read_text() == results.rendered(), "run python benchmarks/results.py"
+
+
+def test_no_figure_is_typed_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = loaded(FOLDER / "results.py", monkeypatch).WORDS.read_text()
+    words = re.sub(r"```.*?```|`[^`]*`|\{\{.*?\}\}|\]\([^)]*\)|BY-NC\s4\.0", "", words, flags=re.DOTALL)
+    assert not re.findall(r"\d+\.\d+|\d ?%|±.?\d|\d ?mm\b", words)
+
+
+def test_several_seeds_are_a_mean_with_its_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = loaded(FOLDER / "results.py", monkeypatch)
+    column = {"title": "pose, mm", "figure": "pose", "digits": 1, "scale": 1.0}
+    one = {"title": "a", "cells": {"pose": [1.0, 2.0, 3.0]}, "seeds": [7, 8, 9], "protocol": {"clips": 4}}
+    two = {"title": "b", "cells": {"pose": [2.0]}, "seeds": [7], "protocol": {"clips": 5}}
+    record = {"measured": "today", "columns": [column], "rows": [one, two]}
+    page = results.page("{{t}}\n{{t: a: pose, mm}}", {"t": record})
+    # Student's t of three values: 4.303 deviations / sqrt(3).
+    assert "| a | 2.0 ± 2.5 |" in page and "| b (1 seed) | 2.0 |" in page and page.endswith("2.0 ± 2.5")
+    assert "a: clips 4; b: clips 5" in page, "rows that were measured otherwise say so"
