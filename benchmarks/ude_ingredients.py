@@ -3,9 +3,9 @@
     python benchmarks/ude_ingredients.py CLIPS WORK
 
 CLIPS holds real captioned clips (BVH archives, `captions.jsonl`, `joint_map.json`); synthetic dances are
-made. One recipe is written into WORK and run there: data, judge, then an arm of every question for every seed.
-Killed and started again it goes on where it was; `--seeds` and `--until` take a part. Its figures are those of
-its stages' `metrics.json` (`benchmarks/results.py`) and, of decoders on true tokens, `decoded.json`.
+made. One recipe is written into WORK and run there: data, judge, then an arm of every question for every
+seed. Killed and started again it goes on where it was; `--seeds` and `--until` take a part. Its figures are
+those of its stages' `metrics.json` (`benchmarks/results.py`) and, of decoders on true tokens, `decoded.json`.
 
 - codebook: learnt by gradient from the paper's start, from data, and by moving averages;
 - decoder: DMD (160 wide, 133 columns) that predicts the noise and the motion; the tokenizer's own;
