@@ -30,7 +30,14 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.plausibility import PlausibilityStats, measure
 from motionloom.datasets.schema import INDEX_FILE, SPLITS, ClipMeta, Manifest, ShardInfo, Split, UserError
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
-from motionloom.datasets.shards.index import ShardIndex, SplitIndex, clip_entries, index_path, load_index
+from motionloom.datasets.shards.index import (
+    ShardIndex,
+    SplitIndex,
+    Written,
+    clip_entries,
+    index_path,
+    load_index,
+)
 from motionloom.datasets.shards.reader import load_manifest, manifest_layout
 from motionloom.datasets.shards.tar import scan_tar
 
@@ -219,7 +226,8 @@ def _sound_indices(root: Path, shards: list[ShardInfo], findings: Findings) -> I
         path = root / shard.name
         try:
             stored = ShardIndex.load_json(index_path(path))
-            entries = clip_entries(path, [(clip.id, clip.present) for clip in stored.clips])
+            written = [Written(clip.id, clip.present, clip.source, clip.made_from) for clip in stored.clips]
+            entries = clip_entries(path, written)
         except (UserError, OSError, ValueError) as error:
             findings.error("index", index_path(path).name, f"does not fit its tar: {error}")
             continue

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,12 +57,25 @@ class ClipEntry(Config):
 
     key: str
     id: str
+    source: str
+    """The item it was made of, as reports name it."""
+    made_from: str
+    """Digest of all that its bytes depend on."""
     present: int = Field(alias="held")
     """Bits of `ClipMeta.present`."""
     frames: int
     motion_data: int
     motion_itemsize: int
     members: dict[str, tuple[int, int]]
+
+
+class Written(NamedTuple):
+    """What the writer knows of a clip and its tar does not."""
+
+    id: str
+    present: int
+    source: str
+    made_from: str
 
 
 class ShardIndex(Config):
@@ -85,21 +98,20 @@ def index_path(tar: Path) -> Path:
 
 
 def clip_entries(
-    path: Path, written: list[tuple[str, int]], *, clips: list[TarClip] | None = None
+    path: Path, written: list[Written], *, clips: list[TarClip] | None = None
 ) -> list[ClipEntry]:
-    """Index rows of a tar as it lies on the disk; `written` are the clips' (source id, present), in order."""
+    """Index rows of a tar as it lies on the disk; `written` says the rest of its clips, in order."""
     clips = scan_tar(path) if clips is None else clips
     entries = []
     with path.open("rb") as file:
-        for clip, (source, present) in zip(clips, written, strict=True):
+        for clip, about in zip(clips, written, strict=True):
             start, size = clip.members["motion.npy"]
             file.seek(start)
             header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'", size)
             entries.append(
                 ClipEntry(
                     key=clip.key,
-                    id=source,
-                    present=present,
+                    **about._asdict(),
                     frames=header.shape[0],
                     motion_data=start + header.start,
                     motion_itemsize=header.dtype.itemsize,

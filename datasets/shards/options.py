@@ -12,6 +12,9 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SCHEMA_VERSION, Config, Dropped, MotionType, UserError
 from motionloom.datasets.shards.cache import CacheConfig
 
+SOURCE_CHECKSUM = "source_sha256"
+"""The option that stands for the source's content: a finished data set follows its source, clip by clip."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -56,13 +59,14 @@ class DatasetFacts:
     notes: Sequence[str] = ()
 
     def made_from(self) -> dict[str, object]:
-        """What the bytes of every shard depend on, beside its items."""
+        """What the bytes of every clip depend on, beside its own source."""
         layout = self.layout
+        options = {key: value for key, value in self.options.items() if key != SOURCE_CHECKSUM}
         return {
             "schema_version": SCHEMA_VERSION,
             "layout": [layout.name, layout.family, layout.fps, layout.skeleton_name],
             "converter": [self.converter, self.converter_version],
-            "options": self.options,
+            "options": options,
             "motion_type": self.motion_type,
         }
 

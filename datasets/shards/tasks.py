@@ -7,17 +7,25 @@ finished.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of, sha256_of_json, write_json
 from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SPLITS, Dropped, MotionType, ShardInfo, Split, UserError
-from motionloom.datasets.shards.index import ShardIndex, clip_entries, index_path, shard_stem
+from motionloom.datasets.shards.index import (
+    ClipEntry,
+    ShardIndex,
+    Written,
+    clip_entries,
+    index_path,
+    shard_stem,
+)
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import DropClip, Sample, encode_sample
 
@@ -27,18 +35,30 @@ Result = tuple[ShardInfo | None, list[Dropped]]
 """A shard (None when every clip of it was dropped) and what was dropped."""
 
 
+class ShardItem(NamedTuple, Generic[T]):
+    """One item of a shard."""
+
+    name: str
+    """In reports."""
+    made_from: str
+    """Digest of all that its clips depend on."""
+    item: T
+
+
 @dataclass(frozen=True)
 class ShardTask(Generic[T]):
-    """Everything one shard depends on. `named_items` are (name for reports, item)."""
+    """Everything one shard depends on."""
 
     path: Path
     split: Split
     number: int
-    named_items: tuple[tuple[str, T], ...]
+    items: tuple[ShardItem[T], ...]
     layout: MotionLayout
     motion_type: MotionType
     strict: bool
     fingerprint: str
+    kept: Mapping[str, Path] = field(default_factory=dict)
+    """`made_from` of clips -> the tar of an earlier run that has them."""
 
 
 def plan_shards(
@@ -47,23 +67,34 @@ def plan_shards(
     facts: DatasetFacts,
     how: WriteOptions,
     describe: Callable[[T], str],
+    depends_on: Callable[[T], object] | None = None,
 ) -> list[ShardTask[T]]:
-    """Which items go to which shard, in which order: known before the first one is converted."""
+    """Which items go to which shard, in which order: known before the first one is converted.
+
+    With `depends_on`, what the content of an item is, they are ordered by a hash of their names: when others
+    come and go, those that stay keep their neighbours, so that a shard finds them in few old ones.
+    """
     tasks: list[ShardTask[T]] = []
-    made_from = facts.made_from()
+    made_from = sha256_of_json(facts.made_from())
     for position, split in enumerate(SPLITS):
         members = [item for item_split, item in items if item_split == split]
-        order = permutation(len(members), how.seed, position)
+        names = [describe(item) for item in members]
+        if depends_on is None:
+            order = permutation(len(members), how.seed, position).tolist()
+            content: list[object] = [None] * len(members)
+        else:
+            order = sorted(range(len(members)), key=lambda i: sha256_of_json([how.seed, names[i]]))
+            content = [depends_on(item) for item in members]
         for number, first in enumerate(range(0, len(members), how.clips_per_shard)):
-            chosen = [members[i] for i in order[first : first + how.clips_per_shard]]
-            named = tuple((describe(item), item) for item in chosen)
-            fingerprint = sha256_of_json(
-                [made_from, facts.name, split, number, [label for label, _ in named]]
+            chosen = tuple(
+                ShardItem(names[i], sha256_of_json([made_from, split, names[i], content[i]]), members[i])
+                for i in order[first : first + how.clips_per_shard]
             )
+            fingerprint = sha256_of_json([facts.name, split, number, [item.made_from for item in chosen]])
             path = out / f"{shard_stem(facts.name, split, number)}.tar"
             tasks.append(
                 ShardTask(
-                    path, split, number, named, facts.layout, facts.motion_type, how.strict, fingerprint
+                    path, split, number, chosen, facts.layout, facts.motion_type, how.strict, fingerprint
                 )
             )
     return tasks
@@ -73,19 +104,20 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
     """Write one shard and its index."""
     from webdataset.writer import TarWriter  # imports torch: two seconds that kept shards do not pay
 
-    written: list[tuple[str, int]] = []
+    written: list[Written] = []
     dropped: list[Dropped] = []
     with atomic_file(task.path) as file:
         hashing = HashingFile(file)
         with TarWriter(hashing, encoder=False, user="", group="", mtime=0) as tar:
-            for label, item in task.named_items:
-                samples = _convert_item(task, convert, label, item)
+            for item in task.items:
+                old = task.kept.get(item.made_from)
+                samples = _kept(old, item.made_from) if old else _convert_item(task, convert, item)
                 if isinstance(samples, Dropped):
                     dropped.append(samples)
                     continue
-                for source, present, members in samples:
+                for clip_id, present, members in samples:
                     tar.write({"__key__": f"{task.number:06d}-{len(written):06d}", **members})
-                    written.append((source, present))
+                    written.append(Written(clip_id, present, item.name, item.made_from))
     info = None
     entries = clip_entries(task.path, written)
     if entries:
@@ -104,12 +136,36 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
     return info, dropped
 
 
-def _convert_item(
-    task: ShardTask[T], convert: Convert[T], label: str, item: T
-) -> list[tuple[str, int, dict[str, bytes]]] | Dropped:
-    """(clip id, present, encoded members) of each sample of one item, or why there are none."""
+Encoded = list[tuple[str, int, dict[str, bytes]]]
+"""(clip id, present, encoded members) of each sample of one item."""
+
+
+def _kept(tar: Path, made_from: str) -> Encoded:
+    """The samples as an earlier run wrote them."""
+    out = []
+    with tar.open("rb") as file:
+        for clip in _clips_of(tar).get(made_from, []):
+            members = {}
+            for name, (start, size) in clip.members.items():
+                file.seek(start)
+                members[name] = file.read(size)
+            out.append((clip.id, clip.present, members))
+    return out
+
+
+@lru_cache(maxsize=8)
+def _clips_of(tar: Path) -> dict[str, list[ClipEntry]]:
+    found: dict[str, list[ClipEntry]] = {}
+    for clip in ShardIndex.load_json(index_path(tar)).clips:
+        found.setdefault(clip.made_from, []).append(clip)
+    return found
+
+
+def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -> Encoded | Dropped:
+    """The samples of one item, or why there are none."""
+    label = item.name
     try:
-        made = convert(item)
+        made = convert(item.item)
         samples = made if isinstance(made, list) else [made]
         return [
             (

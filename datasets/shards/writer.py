@@ -17,7 +17,8 @@ import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -28,9 +29,10 @@ from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import MANIFEST_FILE, SPLITS, Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
-from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
+from motionloom.datasets.shards.options import SOURCE_CHECKSUM, DatasetFacts, WriteOptions
 from motionloom.datasets.shards.tar import MOST_CLIPS
 from motionloom.datasets.shards.tasks import (
     Convert,
@@ -46,8 +48,8 @@ T = TypeVar("T")
 WORK_FOLDER = ".work"
 """Inside the folder of the shards: what a features step makes; removed when the manifest stands."""
 
-SOURCE_CHECKSUM = "source_sha256"
-"""The option that stands for the source's content: a finished dataset follows its source."""
+OLD_FOLDER = "old"
+"""Inside it: shards of an earlier run whose clips are taken over."""
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -79,19 +81,20 @@ def dataset_writer(
     how: WriteOptions | None = None,
     *,
     describe: Callable[[T], str] = str,
+    depends_on: Callable[[T], object] | None = None,
 ) -> Iterator[DatasetWriter[T]]:
     """Take hold of `out` and look at what is finished there, for work between that and the writing.
 
-    `describe` names an item in the manifest's drop list and in the fingerprint that decides whether a
-    finished shard is kept, so it must not change between runs; a change of the source files' *content* is not
-    noticed unless it shows in `describe` or in the facts' options.
+    `describe` names an item in reports and in the digest that decides whether what an earlier run made of it
+    is kept, so it must not change between runs. `depends_on` says what the item's content is, as plain JSON;
+    without it only names and the facts' options are compared.
     """
     how = how or WriteOptions()
     _check_arguments(facts, how)
     out.mkdir(parents=True, exist_ok=True)
     with folder_lock(out, shared=how.part is not None), Workers(how.workers) as pool:
         _check_same_dataset(out, facts.name, facts.layout, facts.options)
-        yield DatasetWriter(out, plan_shards(out, items, facts, how, describe), facts, how, pool)
+        yield DatasetWriter(out, plan_shards(out, items, facts, how, describe, depends_on), facts, how, pool)
 
 
 class DatasetWriter(Generic[T]):
@@ -102,20 +105,60 @@ class DatasetWriter(Generic[T]):
     ) -> None:
         self.out, self.pool = out, pool
         self._facts, self._how = facts, how
-        if how.part is None:
-            _remove_strays(out, facts.name, keep={task.path for task in tasks})
         # Every part of a features step looks at all shards: any of them may need its features.
         self._tasks = [task for at, task in enumerate(tasks) if how.features_only or how.has(at)]
         find = partial(finished_shard, verify=not how.features_only)
         with ThreadPoolExecutor(pool.count) as threads:  # hashing runs outside the interpreter's lock
             self._results = list(threads.map(find, self._tasks))
         self._todo = [at for at, result in enumerate(self._results) if result is None]
+        self._news = ""
         if self._todo:
             (out / MANIFEST_FILE).unlink(missing_ok=True)
+        if how.part is None:
+            if self._todo:
+                self._take_over(tasks)
+            _remove_strays(out, facts.name, keep={task.path for task in tasks})
+
+    def _take_over(self, tasks: list[ShardTask[T]]) -> None:
+        """Put the shards of an earlier run aside that are not as planned, and plan to keep their clips."""
+        folder = self.work_folder / OLD_FOLDER
+        finished = {task.path for task, result in zip(tasks, self._results, strict=True) if result}
+        for path in sorted(_shards_in(self.out, self._facts.name, ".tar")):
+            if path not in finished:
+                folder.mkdir(parents=True, exist_ok=True)
+                path.replace(folder / path.name)
+                if index_path(path).exists():
+                    index_path(path).replace(index_path(folder / path.name))
+        wanted = {item.made_from for at in self._todo for item in tasks[at].items}
+        kept: dict[str, Path] = {}
+        sources: set[str] = set()
+        for path in sorted(_shards_in(folder, self._facts.name, ".tar")):
+            with suppress(UserError):  # damaged, or without an index: made again
+                index = ShardIndex.load_json(index_path(path))
+                if index.shard is not None:
+                    require_intact(LocalShard(path, index.shard))
+                    sources.update(clip.source for clip in (*index.clips, *index.dropped))
+                    kept |= {clip.made_from: path for clip in index.clips if clip.made_from in wanted}
+        for at in self._todo:
+            own = {item.made_from: kept[item.made_from] for item in tasks[at].items if item.made_from in kept}
+            self._tasks[at] = replace(tasks[at], kept=own)
+        if sources:
+            self._news = self._changes(sources, {item.name for task in tasks for item in task.items})
+
+    def _changes(self, before: set[str], now: set[str]) -> str:
+        """What differs from the shards of an earlier run, in words."""
+        tasks = [self._tasks[at] for at in self._todo]
+        again = [item.name for task in tasks for item in task.items if item.made_from not in task.kept]
+        new = sum(name not in before for name in again)
+        counts = ((new, "new"), (len(again) - new, "changed"), (len(before - now), "gone"))
+        words = ", ".join(f"{count:,} {word}" for count, word in counts if count) or "none changed"
+        return f"{self.out}: of an earlier run's clips {len(now) - len(again):,} are kept; {words}"
 
     @property
     def progress_line(self) -> str:
         """What an earlier run has finished, in one line; empty when there is nothing yet."""
+        if self._news:
+            return self._news
         made = len(self._tasks) - len(self._todo)
         if not made:
             return ""
@@ -133,7 +176,9 @@ class DatasetWriter(Generic[T]):
         return self.out / WORK_FOLDER
 
     def pending(self) -> list[T]:
-        return [item for at in self._todo for _, item in self._tasks[at].named_items]
+        """Items that must be converted."""
+        tasks = [self._tasks[at] for at in self._todo]
+        return [item.item for task in tasks for item in task.items if item.made_from not in task.kept]
 
     def write(self, convert: Convert[T]) -> Manifest:
         """Write the shards that are not finished; then, unless this is a part, index and manifest.
@@ -210,7 +255,7 @@ def _check_same_dataset(out: Path, name: str, layout: MotionLayout, options: dic
     before |= {"layout": manifest.get("layout"), "fps": manifest.get("fps")}
     now = {**json.loads(json.dumps(options)), "layout": layout.name, "fps": layout.fps}
     changed = [
-        f"{key} {json.dumps(before.get(key))} -> {json.dumps(now.get(key))}"
+        _difference(key, before.get(key), now.get(key))
         for key in sorted({*before, *now})
         if key != SOURCE_CHECKSUM and before.get(key) != now.get(key)
     ]
@@ -222,16 +267,30 @@ def _check_same_dataset(out: Path, name: str, layout: MotionLayout, options: dic
         )
 
 
+def _difference(key: str, before: object, now: object) -> str:
+    """`fps 20.0 -> 10.0`; facts of files are not spelled out."""
+    if isinstance(before, dict) or isinstance(now, dict):
+        return f"{key} is another"
+    return f"{key} {json.dumps(before)} -> {json.dumps(now)}"
+
+
 def _remove_strays(out: Path, name: str, keep: set[Path]) -> None:
     """Delete temporary files of killed runs, and shards of this dataset that the plan does not have."""
     names = {path.name for path in keep} | {index_path(path).name for path in keep}
-    shard = re.compile(rf"{re.escape(name)}-({'|'.join(SPLITS)})-\d{{6,}}\.(tar|index\.json)")
     for folder in (out, *out.glob(".*/")):
         remove_temporaries(folder)
-    for path in out.iterdir():
-        if shard.fullmatch(path.name) and path.name not in names:
+    for path in _shards_in(out, name, ".tar", ".index.json"):
+        if path.name not in names:
             path.unlink()
     sync_folder(out)
+
+
+def _shards_in(folder: Path, name: str, *suffixes: str) -> list[Path]:
+    """Shards of the data set `name`, or their indices."""
+    shard = re.compile(
+        rf"{re.escape(name)}-({'|'.join(SPLITS)})-\d{{6,}}({'|'.join(map(re.escape, suffixes))})"
+    )
+    return [path for path in folder.iterdir() if shard.fullmatch(path.name)] if folder.is_dir() else []
 
 
 def _finish_index(out: Path, shards: list[ShardInfo]) -> None:

@@ -7,7 +7,7 @@ files) encodes its clips into a file of the work folder, and the shards are copi
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -51,11 +51,12 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         return plan
 
     def depends_on(self, clip: BvhClip) -> list[object]:
-        return [clip.id, clip.found.sha256, [caption.dump() for caption in clip.texts]]
+        return [clip.id, self._content(clip), [caption.dump() for caption in clip.texts]]
 
-    def options(self) -> dict[str, object]:
-        maps = {key: [one.sources, one.unit, one.up] for key, one in self.maps.by_skeleton.items()}
-        return super().options() | {"joint_maps": sha256_of_json(maps)}
+    def _content(self, clip: BvhClip) -> str:
+        """Digest of a clip's file and of how its joints are read."""
+        used = self.maps.by_skeleton.get(clip.found.skeleton)
+        return sha256_of_json([clip.found.sha256, [used.sources, used.unit, used.up] if used else None])
 
     def licence(self, plan: ConversionPlan[BvhClip]) -> str:
         return self.config.licence or ""
@@ -66,16 +67,16 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     def in_order(self, clip: BvhClip) -> bool:
         return clip.batch.archive is not None
 
-    def features(self, plan: ConversionPlan[BvhClip], made_from: str) -> FeatureStep[BvhClip]:
+    def features(self, clips: Sequence[BvhClip]) -> FeatureStep[BvhClip]:
+        made_from = sha256_of_json([self.version, self.options()])
         groups: dict[int, list[BvhClip]] = {}
-        for _, clip in plan.items:
+        for clip in clips:
             groups.setdefault(clip.number, []).append(clip)
         batches = []
         for number, group in sorted(groups.items()):
-            labels = tuple(clip.label() for clip in group)
-            digest = sha256_of_json([self.version, made_from, labels])
-            made = partial(self._batch, group[0].batch, labels)
-            batches.append(FeatureBatch(number, labels, self.layout.dim, digest, made))
+            labels = {clip.label(): self._content(clip) for clip in group}
+            made = partial(self._batch, group[0].batch, tuple(labels))
+            batches.append(FeatureBatch(number, labels, self.layout.dim, made_from, made))
         return FeatureStep(batches, operator.attrgetter("number"), self._sample)
 
     def convert(self, clip: BvhClip) -> Sample:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import operator
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -55,10 +55,9 @@ class Conversion(Generic[C]):
         content = [self.converter.depends_on(clip) for _, clip in self.plan.items]
         return self.converter.options() | {"source_sha256": sha256_of_json(content)}
 
-    @cached_property
-    def features(self) -> FeatureStep[C] | None:
-        """The step before the shards; None for sources whose clips are read one by one."""
-        return self.converter.features(self.plan, sha256_of_json(self.options))
+    def features(self, clips: Sequence[C]) -> FeatureStep[C] | None:
+        """The step before the shards of these clips; None for sources whose clips are read one by one."""
+        return self.converter.features(clips) if self.converter.features_first else None
 
     def facts(self) -> DatasetFacts:
         audio = self.converter.audio()
@@ -108,8 +107,8 @@ class Conversion(Generic[C]):
         return plan
 
     def _tasks(self) -> int:
-        if self.features is not None:
-            return len(self.features.batches)
+        if (features := self.features([clip for _, clip in self.plan.items])) is not None:
+            return len(features.batches)
         return sum(-(-count // _CLIPS_PER_SHARD) for count in self.plan.counts().values())
 
     def _trial(self) -> tuple[float, float] | None:
@@ -117,9 +116,9 @@ class Conversion(Generic[C]):
         if not self.plan.items:
             return None
         start = time.perf_counter()
-        if self.features is not None:
-            number = self.features.number_of(self.plan.items[0][1])
-            batch = next(batch for batch in self.features.batches if batch.number == number)
+        if (features := self.features([clip for _, clip in self.plan.items])) is not None:
+            number = features.number_of(self.plan.items[0][1])
+            batch = next(batch for batch in features.batches if batch.number == number)
             batch.trial(0.0)  # pays for imports
             first, start = time.perf_counter() - start, time.perf_counter()
             clips = batch.trial(_TRIAL_SECONDS)
@@ -159,18 +158,21 @@ def run_conversion(
     returned covers the part); the run without one then finds all parts and writes index and manifest.
     """
     how = WriteOptions(workers, clips_per_shard, seed, strict, progress, part)
-    plan, features = conversion.plan, conversion.features
+    plan = conversion.plan
     convert: Convert[C] = conversion.converter.convert
     plan.require_settled()
     if plan.items and not conversion.converter.licence(plan):
         raise UserError(f"{plan.name}: say under which licence the clips are: --licence CC-BY-4.0 (licence)")
     if strict:
         plan.require_whole()
-    if features is None and how.features_only:
+    if not conversion.converter.features_first and how.features_only:
         raise UserError(
             f"{conversion.converter.name}: this source has no features step; run the parts of 'shards'"
         )
-    with dataset_writer(out, plan.items, conversion.facts(), how, describe=_label) as writer:
+    depends_on = conversion.converter.depends_on
+    with dataset_writer(
+        out, plan.items, conversion.facts(), how, describe=_label, depends_on=depends_on
+    ) as writer:
         if writer.progress_line:
             say(writer.progress_line)
         if part is None and writer.pending():
@@ -179,7 +181,7 @@ def run_conversion(
                 seen.require_people(plan.name)
                 for warning in seen.warnings:
                     say(f"warning: {warning}")
-        if features is not None:
+        if (features := conversion.features(writer.pending())) is not None:
             convert = features.make(writer.pending(), writer.work_folder, writer.pool, how, say)
         manifest = writer.write(convert)
     if part is None:

@@ -7,6 +7,7 @@ there (`convert/registry.py`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -80,7 +81,7 @@ class Converter(ABC, Generic[Cfg, C]):
     @abstractmethod
     def depends_on(self, clip: C) -> list[object]:
         """What the sample of a clip is made from, as plain JSON: its id, sizes or checksums of its files,
-        captions. When it changes, the shards are made again.
+        captions. When it changes, the clip is made again.
         """
 
     def licence(self, plan: ConversionPlan[C]) -> str:
@@ -103,12 +104,12 @@ class Converter(ABC, Generic[Cfg, C]):
         """Whether the first clips of a clip's subset are the cheapest to read, as in an archive."""
         return False
 
-    def features(self, plan: ConversionPlan[C], made_from: str) -> FeatureStep[C] | None:
-        """For sources whose clips cannot be read one by one: how they are decoded together.
+    def features(self, clips: Sequence[C]) -> FeatureStep[C]:
+        """How clips are decoded together, where they cannot be read one by one (`features_first`).
 
-        `made_from` is the digest of what the samples depend on. The samples must be those of `convert`.
+        The samples must be those of `convert`.
         """
-        return None
+        raise NotImplementedError
 
     def meta(
         self,

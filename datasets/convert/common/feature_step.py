@@ -2,13 +2,14 @@
 
 An archive is read once, in its own order, while shards are shuffled: so features are made batch by batch (an
 archive is a batch) into a folder, one flat file and one index each, and the shard writer then picks clips
-from there in its own order. A batch is whole or absent; it is kept on a second run when its fingerprint fits.
+from there in its own order. A batch is whole or absent; it is kept on a second run when it holds what is
+wanted.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from operator import methodcaller
@@ -39,6 +40,8 @@ class BatchIndex(Config):
     dim: int
     clips: dict[str, tuple[int, int]]
     """Label -> first frame and number of frames."""
+    made_from: dict[str, str]
+    """Label -> digest of the clip's source, of the dropped ones too."""
     dropped: list[Dropped]
 
 
@@ -47,10 +50,11 @@ class FeatureBatch:
     """The clips that are read together. Picklable: it travels to a worker."""
 
     number: int
-    labels: tuple[str, ...]
+    labels: Mapping[str, str]
+    """The clips by their labels, with a digest of each one's source."""
     dim: int
     fingerprint: str
-    """Digest of what the features depend on, the content of the source included."""
+    """Digest of what the features of all depend on."""
     clips: Callable[[], Iterator[tuple[str, Features | Dropped]]]
     """(label, features [T, D] or the reason for none) of each clip, one in memory at a time."""
 
@@ -65,11 +69,14 @@ class FeatureBatch:
         except UserError:
             return False
         size = sum(count for _, count in found.clips.values()) * found.dim * _VALUES.itemsize
-        return found.fingerprint == self.fingerprint and path.is_file() and path.stat().st_size == size
+        same = found.fingerprint == self.fingerprint and self.labels.items() <= found.made_from.items()
+        return same and path.is_file() and path.stat().st_size == size
 
     def make(self, folder: Path) -> None:
         """Convert every clip into a file under `folder`. A clip that fails is recorded there, not raised."""
-        index = BatchIndex(fingerprint=self.fingerprint, dim=self.dim, clips={}, dropped=[])
+        index = BatchIndex(
+            fingerprint=self.fingerprint, dim=self.dim, clips={}, made_from=dict(self.labels), dropped=[]
+        )
         frames, path = 0, _path(folder, self.number)
         with atomic_file(path) as file:
             for label, made in self.clips():

@@ -23,6 +23,7 @@ from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, Split, UserError
+from motionloom.datasets.shards.index import ClipEntry, ShardIndex, index_path
 from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.writer import WORK_FOLDER
@@ -215,6 +216,39 @@ def run_part(given: BvhConfig, out: Path, part: Part) -> Manifest:
     return run_conversion(prepared, out, clips_per_shard=2, progress=False, part=part)
 
 
+def test_ten_files_later_only_what_changed_is_converted(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = config(copy, uncaptioned="keep")
+    convert(given, tmp_path / "out", clips_per_shard=3)
+    shutil.copy(clip_file(copy, "bow_angry"), copy / "new.bvh")
+    with (copy / "new.bvh").open("a") as file:
+        file.write("\n")
+    clip_file(copy, "bow_giant").unlink()
+    captions = copy / "captions.jsonl"
+    captions.write_text(captions.read_text().replace("a person", "somebody", 1))
+    real, encoded, said = Bvh.encode, list[str](), list[str]()
+
+    def counted(self: Bvh, label: str, data: bytes) -> Any:
+        encoded.append(label)
+        return real(self, label, data)
+
+    monkeypatch.setattr(Bvh, "encode", counted)
+    manifest = run_conversion(
+        prepare(given, out=tmp_path / "out"), tmp_path / "out", clips_per_shard=3, progress=False,
+        say=said.append,
+    )  # fmt: skip
+    assert "new.bvh" in encoded and len(encoded) == 2, "the new clip, and the one whose caption changed"
+    assert said[0].endswith("are kept; 1 new, 1 changed, 1 gone")
+    convert(given, tmp_path / "fresh", clips_per_shard=3)
+    assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "fresh")
+    assert "new" in {clip.id for shard in manifest.shards for clip in entries(tmp_path / "out", shard.name)}
+
+
+def entries(out: Path, shard: str) -> list[ClipEntry]:
+    return ShardIndex.load_json(index_path(out / shard)).clips
+
+
 def test_changed_file_and_changed_option_are_not_reused(copy: Path, tmp_path: Path) -> None:
     first = convert(config(copy), tmp_path / "out")
     path = clip_file(copy, "bow_childish")
@@ -234,7 +268,7 @@ def test_broken_files_are_reported_and_skipped(copy: Path, shared: Path, tmp_pat
         shutil.copy(path, copy)
     given = config(copy, uncaptioned="keep", min_seconds=0)
     plan = prepare(given).plan
-    assert len(plan.broken) == 2  # frame_time_zero, no_motion: the header alone shows it
+    assert len(plan.broken) == 4  # frame_time_zero, no_motion, missing_frames, extra_frames
     manifest = convert(given, tmp_path / "out")
     told = reasons(manifest)
     assert "10 frames, 6 found" in told["missing_frames.bvh"]
