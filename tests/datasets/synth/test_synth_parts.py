@@ -15,8 +15,8 @@ from motionloom.datasets.synth.actions.pose import OFFSETS, SKELETON, Track
 from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, FACES, HANDS, Span, Truth, draw
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions, words
 from motionloom.datasets.synth.dances import dance
-from motionloom.datasets.synth.hands import shape_hand
-from motionloom.datasets.synth.measure import hand_shape, measure_dance
+from motionloom.datasets.synth.hands import hand_shape, shape_hand
+from motionloom.datasets.synth.measure import measure_dance
 from motionloom.datasets.synth.signals import signals_of, tempo
 
 TIMES = {1: "once|one time", 2: "twice|two|2", 3: "three|3|thrice", 4: "four|4", 5: "five|5"}
