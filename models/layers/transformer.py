@@ -107,8 +107,6 @@ class SelfAttention(nn.Module):
 
     def __init__(self, dim: int, heads: int, attention_dropout: float) -> None:
         super().__init__()
-        if dim % heads:
-            raise ValueError(f"width {dim} is not a multiple of {heads} heads")
         self.heads = heads
         self.attention_dropout = attention_dropout
         self.qkv = nn.Linear(dim, 3 * dim)

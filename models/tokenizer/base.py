@@ -139,22 +139,19 @@ class Tokenizer(nn.Module, ABC):
     ) -> Latents:
         """Encode and quantize x [B, T, dim]; `valid` [B] counts frames in whole groups.
 
-        `missing`, bool [B] per stream, is true of clips that do not hold the stream's part (`_missing`).
+        `missing`, bool [B] per stream, is true of clips that do not hold the stream's part (`missing`).
         """
 
     @abstractmethod
     def _join(self, vectors: dict[str, Tensor]) -> Tensor:
         """Code vectors per stream [B, T / 4 * per_group, d] -> the decoder's input."""
 
-    def _missing(self, present: Tensor | None) -> dict[str, Tensor]:
-        """Bool [B] for each stream that belongs to a part which clips may lack: true where it is lacking."""
-        return {}
+    def missing(self, present: Tensor | None) -> dict[str, Tensor]:
+        """Bool [B] for each stream of a part that clips may lack: true where `present` [B, dim] lacks it.
 
-    def missing(self, present: Tensor) -> dict[str, Tensor]:
-        """Bool [B] for each stream of a part that clips may lack: true where `present` [B, dim] lacks it. The
-        stream's codes are then meaningless.
+        The stream's codes are then meaningless. None = all are present.
         """
-        return self._missing(present)
+        return {}
 
     def forward(
         self, x: Tensor, length: Tensor | None = None, present: Tensor | None = None
@@ -165,7 +162,7 @@ class Tokenizer(nn.Module, ABC):
         """
         valid = self._valid(x, length)
         coordinates = self.coordinates(x, present)
-        latents = self._quantize(coordinates, valid, self._missing(present), update=True)
+        latents = self._quantize(coordinates, valid, self.missing(present), update=True)
         reconstruction = self.decoder(latents.joined, valid)
         return TokenizerOutput(coordinates, reconstruction, latents.penalty, latents.codes, latents.metrics)
 
@@ -186,7 +183,7 @@ class Tokenizer(nn.Module, ABC):
         valid codes, also those of a part that the clip does not hold.
         """
         valid = self._valid(x, length)
-        return self._quantize(self.coordinates(x, present), valid, self._missing(present), update=False).codes
+        return self._quantize(self.coordinates(x, present), valid, self.missing(present), update=False).codes
 
     def decode(
         self, codes: dict[str, Tensor], length: Tensor | None = None, present: Tensor | None = None
@@ -198,9 +195,7 @@ class Tokenizer(nn.Module, ABC):
         """
         books = self.codebooks()
         vectors = {s.name: books[s.name].vectors(codes[s.name]) for s in self.streams}
-        for name, missing in self._missing(present).items():
-            vectors[name] = without(vectors[name], missing)
-        return self._decode(vectors, length)
+        return self._decode(vectors, length, present)
 
     def decode_soft(
         self, weights: dict[str, Tensor], length: Tensor | None = None, present: Tensor | None = None
@@ -208,9 +203,7 @@ class Tokenizer(nn.Module, ABC):
         """`decode` for weights over the codes [B, L, K], differentiable in them; one-hot gives `decode`."""
         books = self.codebooks()
         vectors = {s.name: weights[s.name] @ books[s.name].codebook.to(weights[s.name]) for s in self.streams}
-        for name, missing in self._missing(present).items():
-            vectors[name] = without(vectors[name], missing)
-        return self._decode(vectors, length)
+        return self._decode(vectors, length, present)
 
     def features(self, coordinates: Tensor, length: Tensor | None = None) -> Tensor:
         """Motion [B, T, dim] from the decoder's coordinates, exactly zero after the last valid group."""
@@ -230,7 +223,9 @@ class Tokenizer(nn.Module, ABC):
     def train(self, mode: bool = True) -> Self:
         return super().train(mode and not self.is_frozen)
 
-    def _decode(self, vectors: dict[str, Tensor], length: Tensor | None) -> Tensor:
+    def _decode(self, vectors: dict[str, Tensor], length: Tensor | None, present: Tensor | None) -> Tensor:
+        for name, missing in self.missing(present).items():
+            vectors[name] = without(vectors[name], missing)
         return self.features(self.decoder(self._join(vectors), _whole_groups(length)), length)
 
     def _valid(self, x: Tensor, length: Tensor | None) -> Tensor | None:

@@ -51,7 +51,7 @@ class BodyHandTokenizer(Tokenizer):
         self.register_buffer("body_columns", torch.from_numpy(body))
         self.register_buffer("hand_columns", torch.from_numpy(hand))
 
-    def _missing(self, present: Tensor | None) -> dict[str, Tensor]:
+    def missing(self, present: Tensor | None) -> dict[str, Tensor]:
         return {} if present is None else {"hand": ~present[:, self.hand_columns].all(1)}
 
     def _join(self, vectors: dict[str, Tensor]) -> Tensor:

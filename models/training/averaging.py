@@ -8,18 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TypedDict
 
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-
-
-class AverageState(TypedDict):
-    """What a checkpoint holds of an average."""
-
-    step: int
-    average: dict[str, Tensor]
 
 
 class AveragedWeights:
@@ -28,18 +20,16 @@ class AveragedWeights:
     def __init__(self, net: nn.Module, decay: float) -> None:
         average = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
         self.average = AveragedModel(net, multi_avg_fn=average)
-        self._step = 0
 
-    def state_dict(self) -> AverageState:
-        return {"step": self._step, "average": self.average.state_dict()}
+    def state_dict(self) -> dict[str, Tensor]:
+        state: dict[str, Tensor] = self.average.state_dict()
+        return state
 
-    def load_state_dict(self, state: AverageState) -> None:
-        self._step = state["step"]
-        self.average.load_state_dict(state["average"])
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.average.load_state_dict(state)
 
-    def update(self, net: nn.Module, step: int) -> None:
+    def update(self, net: nn.Module) -> None:
         self.average.update_parameters(net)
-        self._step = step
 
     @contextmanager
     def swapped(self, net: nn.Module) -> Iterator[None]:

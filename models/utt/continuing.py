@@ -50,13 +50,9 @@ def last_groups(codes: Codes, pattern: Sequence[str], count: int | None = None) 
     slots = []
     for slot, name in enumerate(pattern):
         per = list(pattern).count(name)
-        here = _slots(codes.codes[name], per)[:, :, list(pattern[:slot]).count(name)]
+        groups_of = codes.codes[name].unflatten(1, (-1, per))
+        here = groups_of[:, :, list(pattern[:slot]).count(name)]
         slots.append(here.gather(1, at.clamp(max=max(0, here.shape[1] - 1))))
     rows = torch.stack(slots, dim=2)
     valid = torch.arange(most, device=groups.device)[None] < kept[:, None]
     return torch.where(valid[..., None], rows, 0).flatten(1), kept
-
-
-def _slots(codes: Tensor, per: int) -> Tensor:
-    """[B, G * per] -> [B, G, per]."""
-    return codes.reshape(len(codes), codes.shape[1] // per, per)

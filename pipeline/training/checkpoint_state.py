@@ -22,7 +22,6 @@ from torch.distributed.checkpoint.state_dict import (
 from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
 
-from motionloom.models.training.averaging import AverageState
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Means, StageModule
 from motionloom.pipeline.training.progress import LogState
@@ -40,7 +39,7 @@ class Checkpoint(TypedDict):
     state_dict: dict[str, Tensor]
     optimizer_states: list[OptimizerState]
     scaler: dict[str, object]
-    average: AverageState | None
+    average: dict[str, Tensor] | None
     log: LogState
     row: list[list[Means]]
     """Means of the log's next row so far, of each rank."""

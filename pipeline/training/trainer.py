@@ -192,7 +192,7 @@ class Training:
         loss = self.module.take_step(self._parts(batches), self.optimizers, self.how)
         step = self.module.step
         if self.average is not None:
-            self.average.update(self.module.net, step)
+            self.average.update(self.module.net)
         self.telemetry.end_step()
         if self.profiler is not None:
             self.profiler.end_step(step)
