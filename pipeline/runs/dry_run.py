@@ -206,9 +206,8 @@ def explain_replacements(run: Path, recipe: str, stages: Sequence[Replaced]) -> 
         lines += [stage.say() for stage in stages]
     end = f"-o {_free(run)} keeps both, --replace goes on here: what fits is kept, the rest is made again"
     if other is None:
-        lines.append(
-            f"with the settings of the last run here (--set too): motionloom run {run}/recipe.yaml -o {run}"
-        )
+        again = f"motionloom run {run}/recipe.yaml -o {run}"
+        lines.append(f"with the settings of the last run here, --set too: {again}")
     return "\n".join([*lines, end]) if stages else f"{lines[0]}; {end}"
 
 
