@@ -275,6 +275,14 @@ class StageKind(ABC, Generic[C]):
         """Sizes of a kind that trains; None for the others."""
         return None
 
+    def step_seconds(self, config: C, given: Inputs, hardware: Hardware) -> float | None:
+        """How long a step of its training takes on this machine, tried out; None where that would be long."""
+        return None
+
+    def disk(self, config: C) -> int | None:
+        """Bytes of what it leaves on disk, where that is much and can be said."""
+        return None
+
     def show(self, stage: Finished, given: Inputs) -> list[Showing]:
         """Figures of the finished stage for the report, beside its curves."""
         return []

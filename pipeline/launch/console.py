@@ -33,6 +33,9 @@ def make_console(*, aside: bool = False) -> Console:
 def quiet_libraries() -> None:
     """Keep the libraries' chatter out of the way of our own lines."""
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+    # Threads that wait sleep: awake they take the cores of those they wait for, wherever a machine is shared.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("KMP_BLOCKTIME", "0")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     os.environ.setdefault("TRANSFORMERS_NO_ADVISORY_WARNINGS", "1")
     for name in (
