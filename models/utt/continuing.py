@@ -50,7 +50,7 @@ def last_groups(codes: Codes, pattern: Sequence[str], count: int | None = None) 
     slots = []
     for slot, name in enumerate(pattern):
         per = list(pattern).count(name)
-        groups_of = codes.codes[name].unflatten(1, (-1, per))
+        groups_of = codes.codes[name].reshape(len(groups), codes.codes[name].shape[1] // per, per)
         here = groups_of[:, :, list(pattern[:slot]).count(name)]
         slots.append(here.gather(1, at.clamp(max=max(0, here.shape[1] - 1))))
     rows = torch.stack(slots, dim=2)
