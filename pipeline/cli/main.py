@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.schema import UserError
@@ -34,7 +35,7 @@ from motionloom.pipeline.cli.options import (
     print_json,
     sampling_of,
 )
-from motionloom.pipeline.launch.console import SafeConsole, make_console, quiet_libraries
+from motionloom.pipeline.launch.console import make_console, quiet_libraries
 from motionloom.pipeline.launch.process import LOST, Interrupted, JointError, TeamError, leave, process_rank
 
 app = typer.Typer(
@@ -342,7 +343,7 @@ def main() -> None:
 
 def _exit_code() -> int:
     """Run the command; a user's mistake becomes one sentence on standard error."""
-    errors = SafeConsole(stderr=True, highlight=False, soft_wrap=True)
+    errors = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
         code = app(prog_name="motionloom", standalone_mode=False) or 0
         sys.stdout.flush()  # here a full disk can still be answered

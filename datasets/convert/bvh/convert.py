@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
-from motionloom.datasets.convert.bvh.plan import SUFFIX, BvhClip, BvhConfig, JointMaps, load_maps, plan_bvh
+from motionloom.datasets.convert.bvh.plan import (
+    SUFFIX,
+    BvhClip,
+    BvhConfig,
+    JointMaps,
+    load_maps,
+    plan_bvh,
+    read_motion,
+)
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.feature_step import FeatureBatch, FeatureStep
 from motionloom.datasets.convert.common.features import features_of
@@ -22,7 +30,6 @@ from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
-from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.sample import Sample
@@ -36,7 +43,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     name = "bvh"
     title = "BVH"
-    summary = "BVH files of any skeleton, loose or in tar archives, to shards."
+    summary = "BVH (and ASF/AMC) files of any skeleton, loose or in tar archives, to shards."
     example = "mocap shards --captions captions.jsonl --licence CC-BY-4.0"
     config_class = BvhConfig
     features_first = True
@@ -85,7 +92,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     def joints(self, clip: BvhClip) -> SourceJoints:
         """The joints as the map reads them, and the joints that no row of it names."""
-        motion = read_bvh(self._read(clip), name=clip.label())
+        motion = read_motion(self._read(clip), clip.label())
         joint_map = self.maps.of(motion)
         joints = joint_map.apply(motion, unit=self.config.unit, up=self.config.up)
         used = {name for names in joint_map.sources for name in names}
@@ -103,7 +110,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     def encode(self, label: str, data: bytes) -> NDArray[np.float32]:
         """Features [T', D] of one file; `label` names it in errors."""
         config = self.config
-        motion = read_bvh(data, name=label)
+        motion = read_motion(data, label)
         joint_map = self.maps.of(motion)
         joints = joint_map.apply(motion, unit=config.unit, up=config.up)
         try:

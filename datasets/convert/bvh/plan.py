@@ -23,6 +23,7 @@ from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.scan import Batch, BatchScan, FoundFile, list_batches, scan_batches
+from motionloom.datasets.motion.bvh.asf import FPS, JOINED, count_frames, read_amc, skeleton_of
 from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy, require_all_frames
@@ -35,7 +36,7 @@ MapChoice = Annotated[
 ]
 """A map file or a folder of them, or `auto` (from the command line also as a path) for guesses."""
 
-SUFFIX = ".bvh"
+SUFFIX = (".bvh", ".amc")
 MAPS_FOLDER = "joint_maps"
 """In the folder of the shards: the maps that were guessed, one for each skeleton."""
 
@@ -129,7 +130,7 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
             for file in batch.read(SUFFIX) if missing else ():
                 if labels.get(file.label) in missing:
                     with suppress(UserError):  # likewise; the next clip of this skeleton may be whole
-                        found[labels[file.label]] = read_bvh(file.data, name=file.label)
+                        found[labels[file.label]] = read_motion(file.data, file.label)
                         missing.remove(labels[file.label])
                 if not missing:
                     break
@@ -143,8 +144,8 @@ def guess_source(source: Path, target: Skeleton) -> JointGuess:
         for file in batch.read(SUFFIX):
             if file.error:
                 raise UserError(f"{file.label}: {file.error}")
-            return guess_joint_map(read_bvh(file.data, name=file.label), target)
-    raise UserError(f"{source}: no {SUFFIX} file in it")
+            return guess_joint_map(read_motion(file.data, file.label), target)
+    raise UserError(f"{source}: no {' or '.join(SUFFIX)} file in it")
 
 
 def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
@@ -245,7 +246,17 @@ def plan_bvh(
     return draft, maps
 
 
+def read_motion(data: bytes, label: str) -> BvhMotion:
+    """The motion of a BVH file, or of an AMC file behind its skeleton."""
+    asf, joined, amc = data.partition(JOINED)
+    return read_amc(asf, amc, name=label) if joined else read_bvh(data, name=label)
+
+
 def _header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
+    asf, joined, amc = data.partition(JOINED)
+    if joined:
+        found, parents = skeleton_of(asf, label)
+        return count_frames(amc, label), FPS, skeleton_key(found, parents), found
     text, where = load_text(data, label)
     section = find_motion(text, where)
     require_all_frames(text, section, where)

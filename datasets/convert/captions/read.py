@@ -36,7 +36,7 @@ TEXT_KEYS = ("caption", "text", "description")
 """What a caption's key may be called, in the order of preference; also with an `s` or a number at the end."""
 
 _TEXT = {word: re.compile(rf"{word}s?(?:_?\d+)?") for word in TEXT_KEYS}
-_SUFFIX = re.compile(r"\.(?:bvh|npz|npy|pkl|fbx|c3d|glb|txt|json|csv|mp4|wav)$", re.IGNORECASE)
+_SUFFIX = re.compile(r"\.(?:bvh|amc|npz|npy|pkl|fbx|c3d|glb|txt|json|csv|mp4|wav)$", re.IGNORECASE)
 _NUMBER = r"\s*(?:nan|[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|[-+]?\.\d+)\s*"
 _HUMANML = re.compile(rf"[^#].*#.*#{_NUMBER}#{_NUMBER}")
 _DELIMITERS = {",": "a ','", "\t": "a tab", ";": "a ';'"}

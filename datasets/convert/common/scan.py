@@ -13,21 +13,28 @@ import lzma
 import tarfile
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from motionloom.datasets.base.files import sha256_of_json, write_json
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.plan import drop
+from motionloom.datasets.motion.bvh.asf import JOINED
 from motionloom.datasets.schema import Config, Dropped, UserError
 
 ARCHIVES = (".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2")
 LOOSE_FILES_PER_BATCH = 64
 MAX_FILE_BYTES = 1 << 30
 """A motion file beyond this is refused unread: a few hours of text, or a bomb."""
+
+
+Suffix = str | tuple[str, ...]
+
+
+MAX_SKELETON_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -63,8 +70,11 @@ class Batch:
                 out.append((name, -1, 0))
         return out
 
-    def read(self, suffix: str) -> Iterator[SourceFile]:
-        """Every file with `suffix`, in archive order. `UserError` when the archive is damaged there."""
+    def read(self, suffix: Suffix) -> Iterator[SourceFile]:
+        """Every file with `suffix`, in archive order. `UserError` when the archive is damaged there.
+
+        The data of an .amc file come behind those of its .asf skeleton and `JOINED`.
+        """
         if self.archive is not None:
             yield from _read_archive(self.root / self.archive, self.archive, suffix)
             return
@@ -72,12 +82,17 @@ class Batch:
             path = self.root / name
             try:
                 problem = _too_large(path.stat().st_size)
-                yield SourceFile(name, name, b"" if problem else path.read_bytes(), problem)
+                data = b"" if problem else path.read_bytes()
+                if _needs_skeleton(name) and not problem:
+                    beside = [path.with_name(PurePosixPath(one).name) for one in _skeleton_names(name)]
+                    skeletons = {str(one): one.read_bytes() for one in beside if one.is_file()}
+                    data, problem = _with_skeleton(str(path), data, skeletons)
+                yield SourceFile(name, name, data, problem)
             except OSError as error:
                 yield SourceFile(name, name, b"", f"cannot read ({error.strerror})")
 
 
-def list_batches(source: Path, suffix: str) -> list[Batch]:
+def list_batches(source: Path, suffix: Suffix) -> list[Batch]:
     """Batches under `source` (a folder, a motion file or an archive), in name order."""
     if source.is_file():
         names, root = [source.name], source.parent
@@ -92,12 +107,14 @@ def list_batches(source: Path, suffix: str) -> list[Batch]:
     for first in range(0, len(loose), LOOSE_FILES_PER_BATCH):
         batches.append(Batch(root, None, tuple(loose[first : first + LOOSE_FILES_PER_BATCH])))
     if not batches:
-        raise UserError(f"{source}: no {suffix} file and no archive ({', '.join(ARCHIVES)}) in it")
+        wanted = suffix if isinstance(suffix, str) else " or ".join(suffix)
+        raise UserError(f"{source}: no {wanted} file and no archive ({', '.join(ARCHIVES)}) in it")
     return batches
 
 
-def _read_archive(path: Path, label: str, suffix: str) -> Iterator[SourceFile]:
+def _read_archive(path: Path, label: str, suffix: Suffix) -> Iterator[SourceFile]:
     last = "the start"
+    skeletons: dict[str, bytes] | None = None
     try:
         with tarfile.open(path, "r|*") as archive:
             for member in archive:
@@ -106,10 +123,47 @@ def _read_archive(path: Path, label: str, suffix: str) -> Iterator[SourceFile]:
                 where = f"{label}/{member.name}"
                 problem = _too_large(member.size)
                 file = None if problem else archive.extractfile(member)
-                yield SourceFile(where, member.name.removeprefix("./"), file.read() if file else b"", problem)
+                data = file.read() if file else b""
+                if _needs_skeleton(member.name) and not problem:
+                    skeletons = _skeletons(path) if skeletons is None else skeletons
+                    data, problem = _with_skeleton(member.name, data, skeletons)
+                yield SourceFile(where, member.name.removeprefix("./"), data, problem)
                 last = f"'{member.name}'"
     except (tarfile.TarError, EOFError, OSError, lzma.LZMAError, zlib.error) as error:
         raise UserError(f"{label}: damaged archive after {last} ({error or type(error).__name__})") from None
+
+
+def _needs_skeleton(name: str) -> bool:
+    return name.lower().endswith(".amc")
+
+
+def _skeleton_names(name: str) -> list[str]:
+    """Where the .asf of an .amc may be, best first: `01_02.asf`, then `01.asf` for `01_02.amc`."""
+    path = PurePosixPath(name)
+    words = path.stem.split("_")
+    return [str(path.with_name("_".join(words[:count]) + ".asf")) for count in range(len(words), 0, -1)]
+
+
+def _with_skeleton(name: str, data: bytes, skeletons: Mapping[str, bytes]) -> tuple[bytes, str]:
+    """An .amc's data behind its skeleton's, and what is wrong when there is none."""
+    wanted = _skeleton_names(name)
+    found = next((skeletons[one] for one in wanted if one in skeletons), None)
+    if found is None:
+        names = " or ".join(PurePosixPath(one).name for one in wanted[-2:])
+        return b"", f"no .asf skeleton beside it: an .amc needs its subject's, such as {names}"
+    return found + JOINED + data, ""
+
+
+def _skeletons(archive: Path) -> dict[str, bytes]:
+    """Every .asf of an archive."""
+    with tarfile.open(archive, "r|*") as members:
+        return {
+            one.name: file.read()
+            for one in members
+            if one.name.lower().endswith(".asf")
+            and one.size <= MAX_SKELETON_BYTES
+            and (file := members.extractfile(one)) is not None
+        }
 
 
 def _too_large(size: int) -> str:
@@ -158,7 +212,7 @@ class _Memory(Config):
 
 def scan_batches(
     batches: list[Batch],
-    suffix: str,
+    suffix: Suffix,
     header: Header,
     *,
     keep: Path | None = None,
@@ -201,7 +255,7 @@ def _save(path: Path | None, batches: dict[str, BatchScan]) -> None:
             write_json(path, _Memory(batches=batches).dump())
 
 
-def _scan(suffix: str, header: Header, batch: Batch) -> tuple[BatchScan, bool]:
+def _scan(suffix: Suffix, header: Header, batch: Batch) -> tuple[BatchScan, bool]:
     """What a batch holds, and whether that depends on the files alone (and not on a right to read them)."""
     files: list[FoundFile] = []
     joints: dict[str, tuple[str, ...]] = {}

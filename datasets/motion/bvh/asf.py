@@ -1,0 +1,212 @@
+"""Acclaim files (CMU, HDM05): an ASF skeleton and the AMC motions of its subject, read as `BvhMotion`.
+
+A bone starts where its parent ends and rotates by `C M C^-1`, where `C` is the bone's `axis` and `M` its
+degrees of freedom in the order of `dof` (angles about fixed axes: `rx ry rz` = Rz Ry Rx on column vectors).
+So a bone is a joint at its parent's end with three rotation channels, and its own end is the offset of its
+children. Lengths become centimetres: CMU's unit is `length 0.45`, inches divided by 0.45.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from motionloom.datasets.motion.bvh.motion import BvhMotion
+from motionloom.datasets.motion.bvh.text import Floats
+from motionloom.datasets.schema import UserError
+
+INCH = 2.54
+"""Centimetres."""
+
+FPS = 120.0
+"""An AMC file does not say its frame rate; the public collections have this one."""
+
+JOINED = b"\n\0\n"
+"""What stands between the two texts where both are read as one."""
+
+_CHANNELS = ("Zrotation", "Xrotation", "Yrotation")
+_ROOT = ("Xposition", "Yposition", "Zposition", *_CHANNELS)
+_FRAME = re.compile(rb"^[ \t]*\d+[ \t\r]*$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class _Bone:
+    """A bone of the ASF; the root has no length."""
+
+    end: Floats
+    """From its start to its end [3], in centimetres, in the rest pose."""
+    axis: tuple[str, tuple[float, ...]]
+    """Order of the local frame's angles, and the angles in degrees."""
+    dof: tuple[str, ...]
+    """`rx`, `ry`, `rz` (and `tx`, `ty`, `tz` of the root), in the order of the numbers of an AMC line."""
+
+
+@dataclass(frozen=True)
+class _Skeleton:
+    bones: dict[str, _Bone]
+    """Parents before children."""
+    parents: tuple[int, ...]
+    unit: float
+    """Centimetres in a length of the files."""
+    degree: float
+    """Degrees in an angle of the files: 1, or 180 / pi where they are radians."""
+
+
+def read_amc(asf: bytes, amc: bytes, *, name: str) -> BvhMotion:
+    """One motion of a subject, lengths in centimetres.
+
+    `UserError` names the file (`name`), the bone and what is wrong with it, for either text.
+    """
+    skeleton = _skeleton(asf, f"{name} (its .asf)")
+    numbers, frames = _frames(amc, skeleton.bones, name)
+    names, parents = tuple(skeleton.bones), skeleton.parents
+    ends = [skeleton.bones[bone].end for bone in names]
+    leaves = [joint for joint in range(len(names)) if joint not in parents]
+    turned = [
+        _turned(bone, numbers.get(key), frames, skeleton.degree) for key, bone in skeleton.bones.items()
+    ]
+    return BvhMotion(
+        name=name,
+        joints=names,
+        parents=parents,
+        offsets=np.array([ends[parent] if parent >= 0 else np.zeros(3) for parent in parents]),
+        channels=(_ROOT, *[_CHANNELS] * (len(names) - 1)),
+        values=np.concatenate([_moved(skeleton, numbers["root"]), *turned], axis=1),
+        frame_time=1 / FPS,
+        fps=FPS,
+        end_sites=tuple(
+            (leaf, (float(x), float(y), float(z))) for leaf in leaves for x, y, z in [ends[leaf]]
+        ),
+    )
+
+
+def count_frames(amc: bytes, name: str) -> int:
+    """Frames of an AMC text, without reading their numbers."""
+    return len(_marks(amc, name))
+
+
+def _marks(amc: bytes, where: str) -> list[tuple[int, int]]:
+    """Where the lines are that number the frames."""
+    marks = [mark.span() for mark in _FRAME.finditer(amc)]
+    if not marks:
+        raise UserError(f"{where}: no frames; an AMC file numbers each on a line of its own")
+    return marks
+
+
+def skeleton_of(asf: bytes, name: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Names of the joints of an ASF, and the parent of each (-1 = root)."""
+    skeleton = _skeleton(asf, name)
+    return tuple(skeleton.bones), skeleton.parents
+
+
+def _turned(bone: _Bone, numbers: Floats | None, frames: int, degree: float) -> Floats:
+    """Angles [T, 3] of `C M C^-1` for the three rotation channels."""
+    from scipy.spatial.transform import Rotation
+
+    columns = [column for column, dof in enumerate(bone.dof) if dof[0] == "r"]
+    if numbers is None or not columns:
+        return np.zeros((frames, 3))
+    order = "".join(bone.dof[column][1] for column in columns)
+    axis = Rotation.from_euler(*bone.axis, degrees=True)
+    turn = axis * Rotation.from_euler(order, numbers[:, columns] * degree, degrees=True) * axis.inv()
+    with warnings.catch_warnings():  # at a gimbal lock one of the many equal answers is as good as another
+        warnings.simplefilter("ignore", UserWarning)
+        return turn.as_euler("ZXY", degrees=True)
+
+
+def _moved(skeleton: _Skeleton, numbers: Floats) -> Floats:
+    """Position of the root [T, 3], in centimetres."""
+    dof = skeleton.bones["root"].dof
+    return np.stack([numbers[:, dof.index(axis)] * skeleton.unit for axis in ("tx", "ty", "tz")], axis=1)
+
+
+def _skeleton(text: bytes, where: str) -> _Skeleton:
+    sections = _sections(text)
+    missing = [key for key in ("root", "bonedata", "hierarchy") if key not in sections]
+    if missing:
+        raise UserError(f"{where}: no :{missing[0]} section; an ASF skeleton needs one")
+    units = {line[0]: line[1] for line in sections.get("units", []) if len(line) > 1}
+    degree = 1.0 if units.get("angle", "deg").startswith("deg") else 180 / np.pi
+    try:
+        unit = INCH / float(units.get("length", "1"))
+        bones = _bones(sections, unit, degree)
+    except (ValueError, IndexError, KeyError, ZeroDivisionError) as error:
+        raise UserError(f"{where}: a bone or unit cannot be read ({error})") from None
+    parents = {"root": -1}
+    for line in sections["hierarchy"]:
+        for child in line[1:]:
+            if line[0] not in parents or child in parents or child not in bones:
+                raise UserError(
+                    f"{where}: :hierarchy '{' '.join(line)[:60]}' names '{child[:40]}', which is no "
+                    "bone, has two parents, or comes before its parent"
+                )
+            parents[child] = list(parents).index(line[0])
+    if not all(np.isfinite(bones[bone].end).all() for bone in parents):
+        raise UserError(f"{where}: a direction or length is not finite")
+    return _Skeleton({bone: bones[bone] for bone in parents}, tuple(parents.values()), unit, degree)
+
+
+def _sections(text: bytes) -> dict[str, list[list[str]]]:
+    """Words of the lines of each `:section`, without comments and `begin`/`end`."""
+    sections: dict[str, list[list[str]]] = {}
+    lines: list[list[str]] = []
+    for raw in text.decode("utf-8", "replace").splitlines():
+        words = raw.split("#")[0].split()
+        if words and words[0].startswith(":"):
+            lines = sections.setdefault(words[0][1:].lower(), [])
+            words = words[1:]
+        if words and words[0] not in ("begin", "end"):
+            lines.append(words)
+    return sections
+
+
+def _bones(sections: dict[str, list[list[str]]], unit: float, degree: float) -> dict[str, _Bone]:
+    root = {line[0]: line[1:] for line in sections["root"]}
+    angles = tuple(degree * float(word) for word in root.get("orientation", ["0", "0", "0"]))
+    axis = (root.get("axis", ["XYZ"])[0].lower(), angles)
+    bones = {"root": _Bone(np.zeros(3), axis, tuple(word.lower() for word in root["order"]))}
+    fields: dict[str, list[str]] = {}
+    for line in [*sections["bonedata"], ["id"]]:
+        if line[0] == "id" and fields:
+            direction = np.array([float(word) for word in fields["direction"][:3]])
+            length = unit * float(fields["length"][0])
+            *turns, order = fields["axis"]
+            dof = tuple(word.lower() for word in fields.get("dof", ()) if word.lower() != "l")
+            axis = (order.lower(), tuple(degree * float(word) for word in turns))
+            bones[fields["name"][0]] = _Bone(length * direction / np.linalg.norm(direction), axis, dof)
+            fields = {}
+        fields[line[0]] = line[1:]
+    return bones
+
+
+def _frames(text: bytes, bones: dict[str, _Bone], where: str) -> tuple[dict[str, Floats], int]:
+    """Numbers of every bone that the file moves [T, degrees of freedom], and T."""
+    marks = _marks(text, where)
+    frames = [text[a:b].split() for (_, a), (b, _) in zip(marks, [*marks[1:], (len(text), 0)], strict=True)]
+    moved = [word.decode("utf-8", "replace") for word in frames[0] if word[:1].isalpha()]
+    stray = [bone for bone in moved if bone not in bones]
+    if stray or "root" not in moved or max(Counter(moved).values()) > 1:
+        wrong = f"bone '{stray[0][:40]}' is not in its .asf" if stray else "needs `root` and each bone once"
+        raise UserError(f"{where}: frame 1: {wrong}; is the .asf another subject's?")
+    widths = [len(bones[bone].dof) for bone in moved]
+    starts = np.cumsum([0, *(1 + width for width in widths)])
+    for number, words in enumerate(frames, 1):
+        if len(words) != starts[-1] or [words[at] for at in starts[:-1]] != [bone.encode() for bone in moved]:
+            raise UserError(
+                f"{where}: frame {number}: other bones or numbers than the first frame and the .asf say"
+            )
+    try:
+        table = {
+            bone: np.array([words[at + 1 : at + 1 + width] for words in frames], dtype=np.float64)
+            for bone, at, width in zip(moved, starts, widths, strict=False)
+        }
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from None
+    for bone, numbers in table.items():
+        if not np.isfinite(numbers).all():
+            raise UserError(f"{where}: bone '{bone}' has numbers that are not finite")
+    return table, len(frames)
