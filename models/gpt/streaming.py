@@ -2,11 +2,14 @@
 
 The network reads [text, token 0, token 1, ...], as many as its block has room for. When the block is full,
 or another text comes, a new block begins with the text and the last `context` groups [ours]: the network goes
-on from them as from the beginning of a clip. Its cache is one block, whatever the length of the motion. End
-tokens are never drawn.
+on from them as from the beginning of a clip. Its cache is one block, whatever the length of the motion.
 
-Draws are those of `drawing.py`, in the same order as `sampling.generate`: as long as the text stays and one
-block is not full, the tokens are those of a motion of a requested length.
+Where the network would draw End the clip is over, and a new block begins with the text alone [ours]: beyond
+the length of its training clips it knows nothing, and a walk would stand still after one of them. From what a
+clip ends with, which is often a figure that slows down, it would go on no better.
+
+Draws are those of `drawing.py`, in the same order as `sampling.generate`: as long as the text stays and no
+block is over, the tokens are those of a motion of a requested length.
 """
 
 from __future__ import annotations
@@ -48,6 +51,8 @@ class TokenStream:
         """What the network has not read yet, [1 or 2, L, D]."""
         self._block = torch.zeros(1, 0, dtype=torch.int64, device=gpt.null_text.device)
         """Tokens of this block, those that it goes on from included, [1, L]."""
+        self._drawn = 0
+        """Groups of this block that it does not go on from."""
 
     def condition(self, text: Tensor) -> None:
         """The text prior [1, E] of all that is drawn from now on."""
@@ -58,7 +63,7 @@ class TokenStream:
         """The tokens of one more group, int64 [1, P]."""
         gpt, size = self.gpt, len(self.gpt.pattern)
         if self._cache is None or self._block.shape[1] >= gpt.max_groups * size:
-            self._begin()
+            self._begin(self.context)
         device = self._block.device
         uniform = torch.from_numpy(self._numbers.random(size)).to(device)
         no = torch.zeros(1, dtype=torch.bool, device=device)
@@ -67,6 +72,9 @@ class TokenStream:
             hidden = gpt.hidden(self._inputs, self._cache)[:, -1:]
             scale = hidden.new_full((1,), self._scale) if len(hidden) == 2 else None
             draw = uniform[slot : slot + 1]
+            if slot == 0 and self._drawn and self._is_over(hidden, draw, scale):
+                self._begin(0)
+                hidden = gpt.hidden(self._inputs, self._cache)[:, -1:]
             token = next_token(gpt, hidden, slot, may_end=no, how=self.how, uniform=draw, scale=scale)[
                 :, None
             ]
@@ -74,18 +82,27 @@ class TokenStream:
             self._inputs = gpt.embed(token, gpt.slots[slot].expand(1, 1)).expand(len(hidden), -1, -1)
         group = torch.cat(drawn, dim=1)
         self._block = torch.cat([self._block, group], dim=1)
+        self._drawn += 1
         return group
 
-    def _begin(self) -> None:
-        """A new block: the text, and the last groups of the one before."""
+    def _is_over(self, hidden: Tensor, draw: Tensor, scale: Tensor | None) -> bool:
+        """Whether the network would end the clip here."""
+        slot = self.gpt.slots[0]
+        may_end = torch.ones(1, dtype=torch.bool, device=hidden.device)
+        token = next_token(self.gpt, hidden, 0, may_end=may_end, how=self.how, uniform=draw, scale=scale)
+        return bool(token == self.gpt.ends[slot])
+
+    def _begin(self, context: int) -> None:
+        """A new block: the text, and the last `context` groups of the one before."""
         if self._text is None:
             raise ValueError("nothing to draw from: give a text by `condition` first")
         gpt, size = self.gpt, len(self.gpt.pattern)
-        kept = min(self.context, self._block.shape[1] // size)
+        kept = min(context, self._block.shape[1] // size)
         self._block = self._block[:, self._block.shape[1] - kept * size :]
         first = gpt.embed_text(self._text)
         if self._scale != 1:
             first = torch.cat([first, gpt.embed_text(self._text, first.new_ones(1, dtype=torch.bool))])
         before = gpt.embed(self._block, gpt.slots.repeat(kept)[None])
         self._inputs = torch.cat([first, before.expand(len(first), -1, -1)], dim=1)
+        self._drawn = 0
         self._cache = gpt.stack.cache(gpt.max_groups * size)

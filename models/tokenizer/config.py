@@ -28,9 +28,9 @@ class BaseTokenizerConfig(Config):
 
     width: int = Field(default=512, ge=1)
     """Channels of the convolutions."""
-    depth: int = Field(default=3, ge=1)
+    depth: int = Field(default=3, ge=1, le=32)
     """Residual blocks per resolution."""
-    dilation_growth: int = Field(default=3, ge=1)
+    dilation_growth: int = Field(default=3, ge=1, le=16)
     code_dim: int = Field(default=512, ge=1)
     recon: Recon = "l2"
     velocity_weight: float = Field(default=0.0, ge=0)
@@ -118,9 +118,9 @@ class MqConfig(BaseTokenizerConfig):
     kind: Literal["mq"] = "mq"
     part: Part = "bodyhand"
     width: int = Field(default=1024, ge=1)
-    depth: int = Field(default=1, ge=0)
+    depth: int = Field(default=1, ge=0, le=32)
     """Residual blocks after each layer that changes the rate: 1 in public UDE code, 0 is the bare text."""
-    dilation_growth: int = Field(default=1, ge=1)
+    dilation_growth: int = Field(default=1, ge=1, le=16)
     code_dim: int = Field(default=1024, ge=1)
     num_codes: int = Field(default=2048, ge=2)
     quantizer: Literal["gradient", "ema"] = "gradient"

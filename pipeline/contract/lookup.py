@@ -188,7 +188,7 @@ class ExportedStage(Config):
     inputs: dict[str, str]
     """Role -> name of another stage of the export."""
     sha256: dict[str, str] = Field(default_factory=dict)
-    """File of weights -> its sha256; what stands here is compared when the stage is opened."""
+    """File of the stage's folder -> its sha256; what stands here is compared when the stage is opened."""
 
 
 class BundleFile(Config):
@@ -272,9 +272,9 @@ def _build(
 
 
 def _require_whole(stage: Path, digests: Mapping[str, str], path: Path) -> None:
-    """Refuse weights that are not those that were exported; files that are missing say so when they load."""
+    """Refuse files that are not those that were exported; files that are missing say so when they load."""
     for name, digest in digests.items():
-        if Path(name).name != name:
+        if Path(name).is_absolute() or ".." in Path(name).parts or not Path(name).name:
             raise UserError(
                 f"{path}: stages.{stage.name}.sha256 names {name!r}, which is no file of its folder"
             )

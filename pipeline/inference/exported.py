@@ -67,7 +67,11 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
             version=stage.kind.version,
             config=stage.kind.exported_config(stage.config).dump(),
             inputs={role: names[source.folder] for role, source in stage.inputs.items() if role in roles},
-            sha256={path.name: sha256_of(path) for path in sorted((out / name).glob("*.safetensors"))},
+            sha256={
+                path.relative_to(out / name).as_posix(): sha256_of(path)
+                for path in sorted((out / name).rglob("*"))
+                if path.is_file()
+            },
         )
     write_json(out / "skeleton.json", _plain(skeleton))
     facts = BundleFile(

@@ -26,11 +26,11 @@ from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.requests import caption_list
+from motionloom.pipeline.inference.requests import caption_list, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
 from motionloom.pipeline.inference.stream import MotionStream, stream_of
-from motionloom.pipeline.launch.hardware import choose_device
+from motionloom.pipeline.launch.hardware import choose_device, threads_for
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 
@@ -98,10 +98,11 @@ class MotionModel(
         """
         for unknown in self.unknown(caption_list(captions or ()), caption_list(face or ())):
             warnings.warn(str(unknown), stacklevel=2)
-        return self.bundle.generate(
-            captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
-            sampling=SamplingConfig.of(sampling), strict=True,
-        )  # fmt: skip
+        with threads_for(len(sounds or captions or ()), weight_bytes(self.bundle.stages)):
+            return self.bundle.generate(
+                captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
+                sampling=SamplingConfig.of(sampling), strict=True,
+            )  # fmt: skip
 
     def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
         """Captions that are far from all that it was trained on, and what it knows nearest to each."""

@@ -13,9 +13,10 @@ import torch
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
+from motionloom.pipeline.contract.generation import MotionGenerator, Prompt, StreamingGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.store.weights import MODEL_FILES
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -149,7 +150,9 @@ def frames_of(
         if units < 1 or (most is not None and units * unit > most):
             least = unit / fps
             span = f"any length from {least:.1f} s" if most is None else f"{least:.2g} to {most / fps:.1f} s"
-            raise UserError(f"{length:g} s is out of reach: this model makes {span}")
+            longer = most is not None and length * fps > most and isinstance(generator, StreamingGenerator)
+            more = "; a stream of it goes on as long as you like: --stream, or MotionModel.stream"
+            raise UserError(f"{length:g} s is out of reach: this model makes {span}{more if longer else ''}")
         out.append(units * unit)
     return out
 
@@ -198,3 +201,9 @@ def repeated_rows(conditions: Conditions, count: int) -> Conditions:
         )
         for name, (features, mask, pooled) in conditions.items()
     }
+
+
+def weight_bytes(stages: Iterable[Finished]) -> int:
+    """Size of the networks of some stages."""
+    files = (stage.folder / MODEL_FILES[0] for stage in stages)
+    return sum(path.stat().st_size for path in files if path.is_file())

@@ -8,7 +8,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Literal
 
 import torch
@@ -130,6 +131,24 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+FEW = 8
+"""Motions that are made at once by one thread: a step of a small batch is over before a second one is awake,
+and where other programs use the machine the threads wait for each other many times as long."""
+SMALL = 100 * 2**20
+"""Bytes of weights up to which that is so."""
+
+
+@contextmanager
+def threads_for(motions: int, weights: int = 0) -> Iterator[None]:
+    """As many threads as so many motions at once can use, by networks of so many bytes."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1 if motions < FEW and weights < SMALL else before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def choose_device(choice: str | torch.device) -> torch.device:

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -18,7 +18,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
 from motionloom.pipeline.inference.writers import WRITERS, default_formats
 from motionloom.pipeline.launch.console import make_console
-from motionloom.pipeline.launch.hardware import choose_device
+from motionloom.pipeline.launch.hardware import choose_device, threads_for
 from motionloom.pipeline.runs.resolve import nearest
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
@@ -28,23 +28,6 @@ if TYPE_CHECKING:
 
 STDIN = "-"
 """The caption that means the lines of standard input."""
-
-FEW = 8
-"""Motions that are made at once by one thread: a step of a small batch is over before a second one is awake,
-and where other programs use the machine the threads wait for each other many times as long."""
-
-
-@contextmanager
-def threads_for(motions: int) -> Iterator[None]:
-    """As many threads as so many motions at once can use."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1 if motions < FEW else before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @contextmanager
@@ -213,6 +196,7 @@ def stream_motion(
     if len(audio) > 1 or (face and len(face) > 1):
         raise UserError("a stream makes one motion: give one --audio and one --face")
     require_seed(seed)
+    out = None if out is not None and str(out) == STDIN else out
     if out is not None:
         require_file_place(out)
     sampling = sampling or SamplingConfig()
@@ -245,8 +229,7 @@ def stream_motion(
         if live:
             listener = threading.Thread(target=_listen, args=(stream, lines, console), daemon=True)
             listener.start()
-    with ExitStack() as stack:
-        file: TextIO = sys.stdout if out is None else stack.enter_context(out.open("w", encoding="utf-8"))
+    with _stream_file(out) as file:
         file.write(heading(bundle.layout, seed, folder.resolve().name))
         file.flush()
         started, first, frames = time.perf_counter(), math.nan, 0
@@ -269,6 +252,23 @@ def stream_motion(
         f"{frames} frames, {length:.1f} s of motion in {took:.1f} s; the first after {first:.2f} s",
         highlight=False,
     )
+
+
+@contextmanager
+def _stream_file(out: Path | None) -> Iterator[TextIO]:
+    """The file of a stream, or standard output; what cannot be written leaves no half of a file."""
+    try:
+        if out is None:
+            yield sys.stdout
+            sys.stdout.flush()
+            return
+        with out.open("w", encoding="utf-8") as file:
+            yield file
+    except OSError as error:
+        if out is not None and out.is_file():
+            out.unlink()
+        place = "standard output" if out is None else f"{out}"
+        raise UserError(f"{place}: the stream cannot be written ({error.strerror or error})") from None
 
 
 def _listen(stream: MotionStream, lines: Iterator[str], console: Console) -> None:

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable, Collection
 from concurrent.futures import Future
 from importlib import resources
 from typing import TypeVar
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
@@ -120,7 +120,7 @@ class Site:
         answer: Answer = await self._outcome(request, future, asked)
         headers = {"x-request": asked.request}
         if answer.file:
-            headers["content-disposition"] = f'attachment; filename="{answer.file}"'
+            headers["content-disposition"] = f"attachment; filename*=UTF-8''{quote(answer.file)}"
         return Response(answer.body, media_type=answer.kind, headers=headers)
 
     async def stream(self, request: Request) -> Response:
@@ -171,7 +171,7 @@ class Site:
         if "audio" not in self.model.modalities:
             raise HTTPException(400, "this model knows no music; give it captions")
         async with self._uploads:
-            data = await _body(request, _bytes(self.config), self.config.patience)
+            data = await _body(request, "the sound", _bytes(self.config), self.config.patience)
         try:
             name, sound = await asyncio.to_thread(self.sounds.add, data)
         except UserError as error:
@@ -182,9 +182,13 @@ class Site:
         kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
         if kind != "application/json":
             raise HTTPException(415, "send JSON with Content-Type: application/json")
-        data = await _body(request, round(self.config.max_request_kb * 1024), self.config.patience)
+        most = round(self.config.max_request_kb * 1024)
+        data = await _body(request, "the request", most, self.config.patience)
         try:
             given = json.loads(data)
+            json.dumps(given, ensure_ascii=False).encode()
+        except UnicodeEncodeError:
+            raise HTTPException(400, "the request holds half of a letter (a lone surrogate)") from None
         except (ValueError, RecursionError):
             raise HTTPException(400, "the request is not JSON") from None
         if not isinstance(given, dict):
@@ -230,14 +234,14 @@ def own(name: str) -> str:
 
 def _plain(name: object) -> str:
     """A request's name as a header can carry it."""
-    return "".join(letter for letter in str(name)[:64] if letter.isascii() and letter.isprintable())
+    return "".join(letter for letter in str(name)[:64] if letter.isascii() and letter.isprintable()).strip()
 
 
 def _bytes(config: ServeConfig) -> int:
     return round(config.max_sound_mb * 2**20)
 
 
-async def _body(request: Request, most: int, patience: float) -> bytes:
+async def _body(request: Request, what: str, most: int, patience: float) -> bytes:
     """The body, refused as soon as it is too large or too slow."""
     data = bytearray()
 
@@ -246,7 +250,9 @@ async def _body(request: Request, most: int, patience: float) -> bytes:
             data.extend(piece)
             if len(data) > most:
                 raise HTTPException(
-                    413, f"too large: this takes at most {most} bytes", {"connection": "close"}
+                    413,
+                    f"{what} is larger than this server takes: at most {most} bytes",
+                    {"connection": "close"},
                 )
 
     try:

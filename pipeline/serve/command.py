@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import socket
 from contextlib import closing
@@ -11,6 +12,7 @@ from types import FrameType
 import numpy as np
 import uvicorn
 from rich.console import Console
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
@@ -59,7 +61,7 @@ def listen(config: ServeConfig) -> socket.socket:
     where = f"{config.host} port {config.port}"
     try:
         kind = socket.getaddrinfo(config.host, config.port, type=socket.SOCK_STREAM)[0][0]
-        place = socket.create_server((config.host, config.port), family=kind, backlog=1024)
+        place = socket.create_server((config.host, config.port), family=kind, backlog=config.connections)
     except OSError as error:
         reason = (os.strerror(error.errno) if error.errno and error.errno > 0 else str(error)).lower()
         raise UserError(f"{where}: {reason}; choose another --port, or 0 for a free one") from None
@@ -85,7 +87,8 @@ def server_of(site: Site, worker: Worker) -> uvicorn.Server:
     """What speaks HTTP for a site."""
     config = uvicorn.Config(
         site.app,
-        http="h11",
+        http=connection_of(site.config),
+        backlog=site.config.connections,
         ws="none",
         lifespan="off",
         log_level="error",
@@ -97,6 +100,55 @@ def server_of(site: Site, worker: Worker) -> uvicorn.Server:
         proxy_headers=False,
     )
     return _Server(config, worker)
+
+
+def connection_of(config: ServeConfig) -> type[H11Protocol]:
+    """What reads a connection: so many at a time, and closed where headers do not come in time."""
+    most, patience = min(config.connections, _descriptors() // 4), config.patience
+
+    class Connection(H11Protocol):
+        _late: asyncio.TimerHandle | None = None
+
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            if len(self.connections) >= most:
+                transport.abort()
+                return
+            super().connection_made(transport)
+            self._late = self.loop.call_later(patience, self._drop)
+
+        def data_received(self, data: bytes) -> None:
+            if self._late is None and not self._asked():
+                self._late = self.loop.call_later(patience, self._drop)
+            super().data_received(data)
+            if self._late is not None and self._asked():
+                self._late.cancel()
+                self._late = None
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            if self._late is not None:
+                self._late.cancel()
+            if self in self.connections:
+                super().connection_lost(exc)
+
+        def _asked(self) -> bool:
+            """Whether a request's headers are here, and it is being answered."""
+            return self.cycle is not None and not self.cycle.response_complete
+
+        def _drop(self) -> None:
+            self._late = None
+            if not self._asked():
+                self.transport.close()
+
+    return Connection
+
+
+def _descriptors() -> int:
+    """Files and connections that this process may have open."""
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows
+        return 512
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
 
 
 class _Server(uvicorn.Server):

@@ -21,7 +21,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of, file_stem
-from motionloom.pipeline.inference.stream import MotionStream
+from motionloom.pipeline.inference.stream import MotionStream, stream_of
 from motionloom.pipeline.inference.stream_lines import frame_lines, heading, rounded
 from motionloom.pipeline.inference.writers import WRITERS, cell_of
 from motionloom.pipeline.render.viewer import viewer_data
@@ -51,7 +51,9 @@ class ServeConfig(Config):
     max_request_kb: float = Field(16.0, gt=0)
     """Largest request besides a sound."""
     patience: float = Field(20.0, gt=0)
-    """Seconds in which a request must have arrived."""
+    """Seconds in which a request must have arrived, its headers first."""
+    connections: int = Field(256, ge=1)
+    """Connections at a time; more are closed as they come."""
 
 
 def known_answer(name: str) -> str:
@@ -142,13 +144,14 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
         if seconds > sound.seconds + 0.5:
             raise UserError(f"{seconds:g} s were asked for and the sound lasts {sound.seconds:.1f} s")
         sound = sound.slice(0.0, min(seconds, sound.seconds))
-    motion = model.generate(
+    motion = model.bundle.generate(
         asked.captions or None,
         face=asked.faces or None,
         sounds=None if sound is None else [sound],
         seconds=seconds,
         seed=asked.seed,
         sampling=asked.sampling,
+        strict=True,
     )[0]
     if asked.format in WRITERS:
         return _file(motion, asked)
@@ -173,9 +176,10 @@ def stream(
         limits.max_seconds if sound is None else min(sound.seconds, limits.max_seconds)
     )
     caption = asked.caption if asked.caption.strip() else None
-    return model.stream(
-        caption, face=asked.face, sound=sound, seconds=seconds, seed=asked.seed, sampling=asked.sampling
-    )
+    return stream_of(
+        model.bundle, caption, face=asked.face, sound=sound, seconds=seconds, seed=asked.seed,
+        sampling=asked.sampling,
+    )  # fmt: skip
 
 
 def lines(stream: MotionStream, asked: MotionRequest, model: str, notes: Sequence[str] = ()) -> Iterator[str]:

@@ -82,11 +82,11 @@ function show(answer, body) {
 async function keep(format) {
   try {
     const answer = await post("/api/generate", { ...asked, format });
-    const name = /filename="([^"]+)"/.exec(answer.headers.get("content-disposition") || "");
+    const name = /filename\*=UTF-8''(.+)/.exec(answer.headers.get("content-disposition") || "");
     const address = URL.createObjectURL(await answer.blob());
     const link = document.createElement("a");
     link.href = address;
-    link.download = name ? name[1] : `motion.${format}`;
+    link.download = name ? decodeURIComponent(name[1]) : `motion.${format}`;
     link.click();
     setTimeout(() => URL.revokeObjectURL(address), 10000);
     say(`Saved ${link.download}`);
@@ -144,6 +144,10 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   one("sound-field").hidden = !info.modalities.includes("audio");
   const drivers = info.modalities.map((name) => (name === "audio" ? "music" : name)).join(" or ");
   say(`${info.model}: ${drivers} to motion, at most ${info.limits.seconds} s`);
+  if (info.modalities.includes("text")) {
+    one("caption").value = one("caption").placeholder; // something to see at once
+    generate();
+  }
   one("caption").focus();
 })();
 })();

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
 import torch
 from pydantic import Field, PrivateAttr
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
+from torch.nn.modules.module import (
+    register_module_buffer_registration_hook,
+    register_module_module_registration_hook,
+    register_module_parameter_registration_hook,
+)
 
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.motion.layout import MotionLayout
@@ -16,6 +23,7 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.store.files import write_json
 
 Fact = TypeVar("Fact")
+N = TypeVar("N", bound=torch.nn.Module)
 
 MODEL_FILES = ("model.safetensors", "model.json")
 """What a trained network leaves behind."""
@@ -85,6 +93,65 @@ def load_facts(folder: Path) -> ModelFacts:
     facts = ModelFacts.load_json(folder / "model.json")
     facts._where = str(folder / "model.json")
     return facts
+
+
+class _TooLargeError(Exception):
+    """A network outgrows the weights that it is to be filled with."""
+
+
+_TABLE = 2**24
+"""Numbers that a table may have which a network makes for itself, such as one of positions."""
+_PARTS = 64
+"""Modules that a network has for each of its tensors, at most."""
+
+
+def built(folder: Path, build: Callable[[], N]) -> N:
+    """The network that the facts in `folder` ask for; refused where the weights there are of a smaller one.
+
+    It is built without memory first, and given up as soon as it has more parts than the file.
+    """
+    path = folder / "model.safetensors"
+    try:
+        with safe_open(path, "pt") as file:
+            sizes = [torch.Size(file.get_slice(name).get_shape()).numel() for name in list(file.keys())]
+    except (OSError, SafetensorError) as error:
+        raise UserError(f"{path}: cannot be read as weights ({error}); copy the folder again") from None
+    largest, modules, parameters = max(sizes, default=0), 0, dict[int, torch.nn.Parameter]()
+
+    def weighed(_: torch.nn.Module, name: str, part: torch.nn.Parameter | None) -> None:
+        if part is not None:
+            parameters[id(part)] = part
+            if len(parameters) > len(sizes) or part.numel() > largest:
+                raise _TooLargeError
+
+    def kept(_: torch.nn.Module, name: str, part: torch.Tensor | None) -> None:
+        if part is not None and part.numel() > max(largest, _TABLE):
+            raise _TooLargeError
+
+    def counted(_: torch.nn.Module, name: str, part: torch.nn.Module | None) -> None:
+        nonlocal modules
+        modules += 1
+        if modules > _PARTS * (len(sizes) + 1):
+            raise _TooLargeError
+
+    hooks = (
+        register_module_parameter_registration_hook(weighed),
+        register_module_buffer_registration_hook(kept),
+        register_module_module_registration_hook(counted),
+    )
+    try:
+        with suppress(RuntimeError), torch.device("meta"):  # a constructor may mix devices
+            build()
+        modules, parameters = 0, {}
+        return build()
+    except (_TooLargeError, RuntimeError, OverflowError, MemoryError):
+        raise UserError(
+            f"{folder / 'model.json'}: asks for another network than {path.name} holds; copy the folder "
+            f"again, or run the stage that made it again"
+        ) from None
+    finally:
+        for hook in hooks:
+            hook.remove()
 
 
 def load_weights(folder: Path, net: torch.nn.Module) -> None:

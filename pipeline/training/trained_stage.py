@@ -21,7 +21,14 @@ from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.contract.stage import SHOWING, Every, Finished, Inputs, Role, StageContext, StageKind
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.files import copy_files
-from motionloom.pipeline.store.weights import MODEL_FILES, ModelFacts, load_facts, load_weights, save_model
+from motionloom.pipeline.store.weights import (
+    MODEL_FILES,
+    ModelFacts,
+    built,
+    load_facts,
+    load_weights,
+    save_model,
+)
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainedStageConfig
 
 if TYPE_CHECKING:
@@ -131,7 +138,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
 
     def load(self, stage: Finished, given: Inputs, device: torch.device) -> Any:
         facts, inputs = load_facts(stage.folder), self.inputs.of(given)
-        net = self.network(facts, inputs)
+        net = built(stage.folder, lambda: self.network(facts, inputs))
         load_weights(stage.folder, net)
         return self.loaded(_frozen(net.to(device)), facts, inputs)
 

@@ -38,6 +38,15 @@ def gpt() -> InterleavedGPT:
     return network()
 
 
+def ending(likely: float) -> InterleavedGPT:
+    """A network whose End has so much more, or less, in its favour."""
+    net = network()
+    bias = torch.zeros(net.heads[0].out_features).double()
+    bias[net.num_codes["body"]] = likely
+    net.heads[0].bias = torch.nn.Parameter(bias)
+    return net
+
+
 def text(seed: int) -> Tensor:
     return torch.randn(1, 4, generator=torch.Generator().manual_seed(seed)).double()
 
@@ -53,29 +62,37 @@ def slow(
     """A group for each of `texts`: the whole block is read again for every token."""
     numbers = np.random.Generator(np.random.Philox(key=seed)).random(len(texts) * len(PATTERN))
     out: list[list[int]] = []
-    begin, before = 0, None
+    begin, start, before = 0, 0, None
+
+    def token(group: list[int], now: Tensor, number: int, end: int) -> int:
+        """Of the codes and, where `end` is 1, of End."""
+        slot = len(group)
+        past = torch.tensor([t for g in out[begin:] for t in g] + group, dtype=torch.int64)
+        kinds = gpt.slots.repeat(number - begin + 1)[: len(past)]
+        logits = []
+        for null in (False, True):
+            first = gpt.embed_text(now, torch.tensor([null]))
+            hidden = gpt.hidden(torch.cat([first, gpt.embed(past[None], kinds[None])], dim=1))
+            head = gpt.heads[gpt.names.index(PATTERN[slot])]
+            logits.append(head(hidden[:, -1]).float()[:, : gpt.num_codes[PATTERN[slot]] + end])
+        mixed = logits[0] if scale == 1 else logits[1] + scale * (logits[0] - logits[1])
+        return int(HOW(mixed, torch.tensor(numbers[number * 3 + slot : number * 3 + slot + 1])))
+
     for number, now in enumerate(texts):
         if number - begin == gpt.max_groups or (before is not None and now is not before):
-            begin = max(begin, number - context)
-        before, group = now, []
-        for slot, name in enumerate(PATTERN):
-            past = torch.tensor([t for g in out[begin:] for t in g] + group, dtype=torch.int64)
-            kinds = gpt.slots.repeat(number - begin + 1)[: len(past)]
-            logits = []
-            for null in (False, True):
-                first = gpt.embed_text(now, torch.tensor([null]))
-                hidden = gpt.hidden(torch.cat([first, gpt.embed(past[None], kinds[None])], dim=1))
-                head = gpt.heads[gpt.names.index(name)]
-                logits.append(head(hidden[:, -1]).float()[:, : gpt.num_codes[name]])
-            mixed = logits[0] if scale == 1 else logits[1] + scale * (logits[0] - logits[1])
-            uniform = torch.tensor(numbers[number * 3 + slot : number * 3 + slot + 1])
-            group.append(int(HOW(mixed, uniform)))
+            begin, start = max(begin, number - context), number
+        if number > start and token([], now, number, 1) == gpt.num_codes["body"]:
+            begin = start = number  # the clip is over: the text alone
+        before, group = now, list[int]()
+        while len(group) < len(PATTERN):
+            group.append(token(group, now, number, 0))
         out.append(group)
     return out
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])
-def test_one_block_is_a_motion_of_that_length(gpt: InterleavedGPT, scale: float) -> None:
+def test_one_block_is_a_motion_of_that_length(scale: float) -> None:
+    gpt = ending(-1e3)
     stream = TokenStream(gpt, how=HOW, context=2, cfg_scale=scale, seed=11)
     stream.condition(text(0))
     made = drawn(stream, gpt.max_groups)
@@ -99,6 +116,15 @@ def test_it_goes_on_as_the_slow_version(gpt: InterleavedGPT, context: int, scale
         made += drawn(stream, 1)
     kept = min(context, gpt.max_groups - 1)
     assert made == slow(gpt, texts, context=kept, scale=scale, seed=5)
+
+
+def test_a_clip_that_is_over_begins_anew() -> None:
+    """Whatever the network has drawn: the next block has read the text alone."""
+    stream = TokenStream(ending(1e3), how=HOW, context=5, seed=5)
+    stream.condition(text(0))
+    for _ in range(5):
+        drawn(stream, 1)
+        assert stream._block.shape[1] == len(PATTERN)
 
 
 def test_memory_is_one_block(gpt: InterleavedGPT) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,15 @@ from typing import Any
 import huggingface_hub.hub_mixin
 import numpy as np
 import pytest
+from safetensors.torch import load_file, save_file
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.exported import write_bundle
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.shipped_models import model_folder
 
 STAGES = [
     "stats", "text", "tokenizer", "tma", "gpt", "face_tokenizer", "face_gpt", "face_vae", "face_diffusion",
@@ -39,10 +43,29 @@ def model(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "model"))
 
 
+@pytest.fixture
+def shipped(tmp_path: Path) -> Path:
+    """A copy of the model of the package, which needs no training."""
+    folder = model_folder("synthetic")
+    if not folder.is_dir():
+        pytest.skip("installed without its weights")
+    return Path(shutil.copytree(folder, tmp_path / "model"))
+
+
 def change(path: Path, edit: Callable[[Any], Any]) -> None:
+    """Edit a file; one of a stage gets its new sha256, as a stranger would give it."""
     data = json.loads(path.read_text())
     edit(data)
     path.write_text(json.dumps(data))
+    if path.name != "bundle.json":
+        seal(path)
+
+
+def seal(path: Path) -> None:
+    def digest(facts: Any) -> None:
+        facts["stages"][path.parent.name]["sha256"][path.name] = sha256_of(path)
+
+    change(path.parent.parent / "bundle.json", digest)
 
 
 def test_the_folder_lists_its_stages(whole: Path) -> None:
@@ -222,14 +245,44 @@ def test_seeds_go_by_the_place_in_the_list(whole: Path) -> None:
     assert not np.array_equal(alone.features, second.features)
 
 
-def test_weights_that_were_changed_are_refused(model: Path) -> None:
+@pytest.mark.parametrize("name", ["gpt/model.safetensors", "gpt/model.json", "text/text.json"])
+def test_files_that_were_changed_are_refused(name: str, shipped: Path) -> None:
     """One number of a network is another: it would load, and draw other motions."""
-    path = model / "gpt" / "model.safetensors"
-    data = bytearray(path.read_bytes())
-    data[-1] ^= 1
-    path.write_bytes(data)
-    with pytest.raises(UserError, match=r"gpt/model\.safetensors: is not the file that was exported"):
-        Bundle.open(model)
+    data = bytearray((shipped / name).read_bytes())
+    data[-2] ^= 1
+    (shipped / name).write_bytes(data)
+    with pytest.raises(UserError, match=f"{name}: is not the file that was exported"):
+        Bundle.open(shipped)
+
+
+@pytest.mark.parametrize(
+    ("stage", "key", "value"),
+    [
+        ("gpt", "layers", 10**9),
+        ("gpt", "dim", 6 * 10**9),
+        ("gpt", "block_size", 10**12),
+        ("tma", "layers", 10**9),
+        ("tokenizer", "depth", 10**9),
+        ("tokenizer", "num_codes", 10**10),
+        ("face_gpt", "layers", 10**9),
+    ],
+)
+def test_a_network_is_no_larger_than_its_weights(stage: str, key: str, value: int, shipped: Path) -> None:
+    change(shipped / stage / "model.json", lambda facts: facts["config"].update({key: value}))
+    started = time.process_time()
+    with pytest.raises(UserError, match=f"{stage}/model.json"):
+        Bundle.open(shipped)
+    assert time.process_time() - started < 10, "built until memory or patience ends, it would take hours"
+
+
+def test_weights_that_are_no_numbers_are_refused(shipped: Path) -> None:
+    path = shipped / "gpt/model.safetensors"
+    state = load_file(path)
+    next(iter(state.values())).view(-1)[0] = float("nan")
+    save_file(state, path)
+    seal(path)
+    with pytest.raises(UserError, match=r"gpt/model\.safetensors: '.*' holds numbers that are not finite"):
+        Bundle.open(shipped)
 
 
 def test_an_export_draws_as_it_recommends(small_run: Any, call: Any, tmp_path: Path) -> None:

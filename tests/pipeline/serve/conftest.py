@@ -47,6 +47,7 @@ class QuickModel:
             faces={"gpt": None},
             generator=generator,
             recommended=SamplingConfig(cfg_scale=1.5, top_p=0.9),
+            generate=self.generate,
         )
 
     def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
@@ -63,6 +64,7 @@ class QuickModel:
         seconds: float | None = None,
         seed: int = 0,
         sampling: Any = None,
+        strict: bool = False,
     ) -> list[GeneratedMotion]:
         caption = (captions or [""])[0]
         self.asked.append(caption)

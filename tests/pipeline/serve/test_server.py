@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import io
 import json
@@ -57,7 +58,7 @@ def test_the_viewers_data_and_files(served: Any, tmp_path: Path) -> None:
     assert data["motions"][0]["frames"] == 20 and data["motions"][0]["caption"] == "a person waves"
     bvh = served.post("/api/generate", {**WAVE, "format": "bvh"})
     assert bvh.body.startswith(b"HIERARCHY")
-    assert bvh.headers["content-disposition"] == 'attachment; filename="00-a-person-waves.bvh"'
+    assert bvh.headers["content-disposition"] == "attachment; filename*=UTF-8''00-a-person-waves.bvh"
     path = tmp_path / "made.npz"
     path.write_bytes(served.post("/api/generate", {**WAVE, "format": "npz", "seed": 3}).body)
     with np.load(path, allow_pickle=False) as file:
@@ -138,6 +139,38 @@ def test_a_slow_request_is_let_go(run_server: Callable[..., Any], quick: Any) ->
         raw.settimeout(20)
         raw.sendall(head + b"Content-Length: 100\r\n\r\n{")
         assert raw.recv(64).startswith(b"HTTP/1.1 408")
+
+
+def test_half_sent_headers_are_let_go(run_server: Callable[..., Any], quick: Any) -> None:
+    """At first, and behind a request that was answered."""
+    whole = b"GET /api/info HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with run_server(quick, patience=0.3) as served:
+        for sent in (b"", b"GET / HTTP/1.1\r\nHost: loc", whole + b"GET / HTTP/1.1\r\nHo"):
+            with socket.create_connection(("127.0.0.1", served.port)) as raw:
+                raw.settimeout(20)
+                raw.sendall(sent)
+                while raw.recv(4096):
+                    pass
+        assert served.post("/api/generate", WAVE).status == 200
+
+
+def test_more_connections_than_allowed_are_closed(run_server: Callable[..., Any], quick: Any) -> None:
+    with run_server(quick, connections=2) as served:
+        held = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(6)]
+        for raw in held[2:]:
+            raw.settimeout(20)
+            with contextlib.suppress(ConnectionResetError):
+                assert raw.recv(1) == b""
+        for raw in held:
+            raw.close()
+
+
+def test_names_that_no_header_can_carry(served: Any) -> None:
+    got = served.post("/api/generate", {**WAVE, "request": " mine "})
+    assert got.status == 200 and got.headers["x-request"] == "mine"
+    for body in ('{"caption": "\\ud800"}', '{"caption": "a", "request": "\\udfff"}'):
+        got = served.ask("POST", "/api/generate", body.encode(), {"Content-Type": "application/json"})
+        assert got.status == 400 and "lone surrogate" in got.json["error"]
 
 
 def test_a_bug_is_a_sentence_and_the_server_goes_on(served: Any, capsys: Any) -> None:
