@@ -69,7 +69,7 @@ def tell(what: str, seconds: tuple[float, float], motion: float) -> None:
 
 
 def unpack(source: Path) -> None:
-    for batch in list_batches(source, ".bvh")[0]:
+    for batch in list_batches(source, ".bvh"):
         for _ in batch.read(".bvh"):
             pass
 
@@ -77,7 +77,7 @@ def unpack(source: Path) -> None:
 def parse_seconds(source: Path) -> tuple[float, float, float]:
     """Wall and CPU seconds of parsing alone, without unpacking; and the length of the motion."""
     wall = cpu = motion = 0.0
-    for batch in list_batches(source, ".bvh")[0]:
+    for batch in list_batches(source, ".bvh"):
         for file in batch.read(".bvh"):
             start, start_cpu = time.perf_counter(), time.process_time()
             clip = read_bvh(file.data, name=file.label)
@@ -164,7 +164,7 @@ def main() -> None:
     tell("convert, 1 worker", seconds[1], motion)
     tell("convert, 2 workers", seconds[2], motion)
     tell("the same again, finished", again, motion)
-    total = len(list_batches(args.source, ".bvh")[0]) + finished(one)[1]
+    total = len(list_batches(args.source, ".bvh")) + finished(one)[1]
     kills = killed(args.source, broken, args.kills, args.seed, total)
     want = digests(one)
     verdicts = {"2 workers": digests(two) == want, f"killed {kills} times": digests(broken) == want}

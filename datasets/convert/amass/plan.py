@@ -63,7 +63,7 @@ class AmassConfig(CaptionConfig):
     """With `humanml_index`: also the mirrored clips (`M...`), which have texts of their own there."""
     up: Literal["z", "y"] = "z"
     """The axis that points up in the files; AMASS's is z."""
-    source_fps: float | None = Field(default=None, gt=0)
+    source_fps: float | None = Field(default=None, ge=1, le=10_000)
     """Overrides the files' frame rate, for collections that state a wrong one or none."""
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton (h3d features always do)."""

@@ -178,7 +178,7 @@ class BvhConfig(CaptionConfig):
     """Feature layout of the shards: body133, h3d263, or one with hands and a face."""
     fps: float = Field(default=20.0, gt=0, le=240)
     """Frame rate of the shards; clips are resampled by time."""
-    source_fps: float | None = Field(default=None, gt=0)
+    source_fps: float | None = Field(default=None, ge=1, le=10_000)
     """True frame rate of the files, for collections that state a wrong one."""
     unit: Unit = "cm"
     """Length unit of the files."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, read_plain
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -27,12 +27,9 @@ def read_text_file(path: Path, name: str | None = None) -> str:
     """
     name = str(path) if name is None else name
     try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_TEXT_BYTES + 1)
+        raw = read_plain(path, MAX_TEXT_BYTES)
     except OSError as error:
         raise UserError(f"{name}: cannot read ({error.strerror})") from None
-    if len(raw) > MAX_TEXT_BYTES:
-        raise UserError(f"{name}: more than {MAX_TEXT_BYTES} bytes; is it a text file?")
     if b"\0" in raw or raw.startswith(b"PK\x03\x04"):
         raise UserError(f"{name}: not a text file in UTF-8; save it as text, CSV or JSON in UTF-8")
     body = raw.removeprefix(_BOM)

@@ -25,7 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import Config, UserError, read_plain
 
 Unit = Literal["m", "cm", "mm", "inch"]
 Up = Literal["y", "z"]
@@ -40,6 +40,7 @@ class UnfinishedMapError(UserError):
 
 
 class _About(Config):
+    unmapped: tuple[str, ...] = ()
     skeleton: str = ""
     unit: Unit | None = None
     up: Up | None = None
@@ -69,10 +70,10 @@ class JointMap:
     def load(path: Path, *, target: str = "smpl22") -> JointMap:
         """Read the rows of skeleton `target` from a map file; every target joint must have one row."""
         try:
-            data = json.loads(path.read_text(encoding="utf-8-sig"))
+            data = json.loads(read_plain(path, 2**22).decode("utf-8-sig"))
         except OSError as error:
             raise UserError(f"{path}: cannot read the joint map ({error.strerror})") from None
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise UserError(f"{path}: not valid JSON ({error})") from None
         if not isinstance(data, dict) or target not in data:
             keys = ", ".join(data) if isinstance(data, dict) else "no keys"
@@ -107,10 +108,11 @@ class JointMap:
         missing = [name for i, name in enumerate(skeleton.joints) if i not in sources]
         if missing:
             raise UserError(f"{path}: {target} has no row for {', '.join(missing)}")
-        unmapped = tuple(str(name) for name in data.get("unmapped", []))
         about = _About.parse({key: data[key] for key in _About.model_fields if key in data}, str(path))
         rows_in_order = tuple(sources[i] for i in range(len(skeleton)))
-        return JointMap(str(path), skeleton, rows_in_order, unmapped, about.skeleton, about.unit, about.up)
+        return JointMap(
+            str(path), skeleton, rows_in_order, about.unmapped, about.skeleton, about.unit, about.up
+        )
 
     def require_fit(self, joints: Sequence[str], clip: str) -> None:
         """`UserError` naming `clip` and the first joint of the map that is not among `joints`, or twice."""
