@@ -37,8 +37,11 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.synth.actions.truth import FACES, HANDS, takes_part
-from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
+from motionloom.datasets.synth.captions import body_captions
+from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of, truth_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.evaluation.figures import NEAREST_LABELS, NEAREST_WORDS
+from motionloom.pipeline.evaluation.lookup import most_alike, nearest_texts
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
@@ -136,6 +139,23 @@ def truth_from(sample: Sample, config: SynthConfig) -> Truth:
     )
 
 
+def lookups(truths: Sequence[Truth], config: SynthConfig) -> dict[str, list[Truth]]:
+    """The training clips that know the labels best, and those whose first caption is nearest: no model."""
+    train = [index for index in range(config.clips) if split_of(index, config) == "train"]
+    plans = {index: truth_of(index, config) for index in train}
+    # As make_clip draws them.
+    words = {index: np.random.default_rng([config.seed, index, 3]) for index in train}
+    texts = [body_captions(plans[k], words[k], config.captions, True, config.wordings)[0] for k in train]
+    found = {
+        NEAREST_LABELS: most_alike(
+            [plans[k].record(hands=True, face=True) for k in train], [t.truth or {} for t in truths]
+        ),
+        NEAREST_WORDS: nearest_texts(texts, [t.caption for t in truths]),
+    }
+    clips = {k: truth_from(make_sample(train[k], config), config) for row in found.values() for k in {*row}}
+    return {title: [clips[k] for k in row] for title, row in found.items()}
+
+
 def noted(model: Path) -> dict[str, Any]:
     """What the card beside a model holds; empty where there is none."""
     path = model / CARD_FIGURES
@@ -192,6 +212,8 @@ def main() -> None:
         return out
 
     shares = {GUESS: judge(truths, ((truths[k].joints, truths[k].face) for k in order), fps, hold_out)}
+    for title, clips in lookups(truths, data).items():
+        shares[title] = judge(truths, ((clip.joints, clip.face) for clip in clips), fps, hold_out)
     shares |= measured(sampling)
     single = measured(sampling.model_copy(update={"candidates": 1})) if sampling.candidates > 1 else {}
     table = Table("right, %", *(f"{title}: {kind}" for title in shares for kind in KINDS))
@@ -235,6 +257,7 @@ def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     gaps = {
         f"{name}, {title}, {kind}": 100 * abs(value - before["right"][title][kind][name])
         for title, kinds in now["right"].items()
+        if title in before["right"]
         for kind, row in kinds.items()
         for name, value in row.items()
     }

@@ -16,6 +16,8 @@ import pytest
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import synthesize
+from motionloom.pipeline.evaluation.figures import NEAREST_LABELS, NEAREST_WORDS
+from motionloom.pipeline.evaluation.lookup import by_labels
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.recipe import load_recipe
 
@@ -83,6 +85,14 @@ stages:
     for truth in made:
         for name, value in vars(wanted[truth.id]).items():
             np.testing.assert_array_equal(getattr(truth, name), value, err_msg=name)
+    train = ShardDataset.open(tmp_path / "shards", "train")
+    found = card.lookups(made, config)
+    for own, theirs, wanted_of in zip(found[NEAREST_LABELS], by_labels(train, made), made, strict=True):
+        said = {k: v for k, v in wanted_of.truth.items() if v is not None}
+        alike = [sum(one.truth.get(k) == v for k, v in said.items()) for one in (own, theirs)]
+        assert alike[0] == alike[1]
+    captions = {clip.caption for clip in (truth_of(train, row) for row in range(len(train)))}
+    assert {clip.caption for clip in found[NEAREST_WORDS]} <= captions
     few, _ = card.test_clips(recipe, 3)
     assert [truth.id for truth in few] == [truth.id for truth in made[:3]]
 

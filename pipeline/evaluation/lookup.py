@@ -5,7 +5,7 @@ A text-to-motion model has learnt more than its training clips only where it doe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -30,16 +30,21 @@ def by_words(train: ClipDataset, truths: Sequence[Truth]) -> list[Truth]:
         for span in caption_spans(train.texts(index), train.layout.fps, int(train.frames[index]), _MIN_FRAMES)
     ]
     first = {span.text: number for number, (_, span) in reversed(list(enumerate(spans)))}
-    words = sorted({*first, *(t.caption for t in truths)})
+    if not first:
+        return []
+    numbers = list(first.values())
+    nearest = nearest_texts(list(first), [t.caption for t in truths])
+    return [truth_in(train, *spans[numbers[index]]) for index in nearest]
+
+
+def nearest_texts(known: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """For each wanted text the number of the known one with the nearest sentence embedding, by cosine."""
+    words = sorted({*known, *wanted})
     encoder = load_text_encoder(_ENCODER)
     parts = [encoder.encode(words[at : at + _AT_ONCE]).sentence for at in range(0, len(words), _AT_ONCE)]
     sentence = dict(zip(words, np.concatenate(parts), strict=True))
-    if not first:
-        return []
-    known = np.stack([sentence[text] for text in first])
-    numbers = list(first.values())
-    nearest = [numbers[int((known @ sentence[t.caption]).argmax())] for t in truths]
-    return [truth_in(train, *spans[number]) for number in nearest]
+    rows = np.stack([sentence[text] for text in known])
+    return [int((rows @ sentence[text]).argmax()) for text in wanted]
 
 
 def by_labels(train: ClipDataset, truths: Sequence[Truth]) -> list[Truth]:
@@ -50,13 +55,18 @@ def by_labels(train: ClipDataset, truths: Sequence[Truth]) -> list[Truth]:
     records = [train.meta(index).truth for index in usable]
     if not usable or not all(records) or not all(t.truth for t in truths):
         return []
-    names = sorted({name for t in truths for name in t.truth or {}})
-    known = {name: np.array([str((record or {}).get(name)) for record in records]) for name in names}
+    nearest = most_alike([record or {} for record in records], [t.truth or {} for t in truths])
+    return [truth_of(train, usable[index]) for index in nearest]
+
+
+def most_alike(known: Sequence[Mapping[str, object]], wanted: Sequence[Mapping[str, object]]) -> list[int]:
+    """For each wanted truth the number of the first known one that agrees in most of its attributes."""
+    names = sorted({name for one in wanted for name in one})
+    columns = {name: np.array([str(record.get(name)) for record in known]) for name in names}
     out = []
-    for t in truths:
-        given = [(name, str(value)) for name, value in (t.truth or {}).items() if value is not None]
-        agree = np.sum([known[name] == value for name, value in given], axis=0)
-        out.append(truth_of(train, usable[int(agree.argmax())]))
+    for one in wanted:
+        given = [(name, str(value)) for name, value in one.items() if value is not None]
+        out.append(int(np.sum([columns[name] == value for name, value in given], axis=0).argmax()))
     return out
 
 
