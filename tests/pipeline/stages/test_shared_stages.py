@@ -22,7 +22,8 @@ DANCES = """
 extends: ude-small
 name: ude-small
 stages:
-  evaluate_dances: {kind: evaluate_dances, clips: 3, repeats: 3, shuffles: 1, pool: 4}
+  evaluate: {kind: evaluate, clips: 5, repeats: 2, size: 4}
+  evaluate_dances: {kind: evaluate_dances, clips: 3, repeats: 2, decodings: 2, shuffles: 1, pool: 4}
 """
 
 
@@ -37,7 +38,7 @@ def run(start: Callable[..., Any], *arguments: object) -> str:
     ("given", "recipe", "stages"),
     [
         ("small_run", CAPTIONS, {"tokens": "tokens-train.safetensors", "evaluate": "metrics.json"}),
-        ("ude_run", DANCES, {"evaluate_dances": "metrics.json"}),
+        ("ude_run", DANCES, {"evaluate": "metrics.json", "evaluate_dances": "metrics.json"}),
     ],
 )
 def test_two_processes_make_what_one_makes(
@@ -63,9 +64,15 @@ def test_two_processes_make_what_one_makes(
         assert not list(folder.glob("stages/*/work"))
         made.append({name: (folder / "stages" / name / file).read_bytes() for name, file in stages.items()})
     assert made[0] == made[1]
-    if "evaluate" in stages:
-        again = run(start, "evaluate", tmp_path / "run2", "--clips", 7, "--repeats", 3)
-        assert (tmp_path / "run2/evaluate/metrics.json").read_bytes() == made[0]["evaluate"]
-        assert "R@1" in again
-        figures = json.loads(made[0]["evaluate"])["figures"]
-        assert {"tma.t2m_r1", "tma.matching_score"} <= {one["name"] for one in figures}
+    for folder in (tmp_path / "run1", tmp_path / "run2"):
+        # Again, by one process and by two, and after an export: figures of the run's own recipe.
+        run(start, "export", folder, "-o", folder.with_suffix(".model"))
+        again = run(start, "evaluate", folder)
+        assert (folder / "evaluate/metrics.json").read_bytes() == made[0]["evaluate"]
+        if "evaluate_dances" in stages:
+            dances = folder / "evaluate/evaluate_dances/metrics.json"
+            assert dances.read_bytes() == made[0]["evaluate_dances"]
+        else:
+            assert "R@1" in again
+            figures = json.loads(made[0]["evaluate"])["figures"]
+            assert {"tma.t2m_r1", "tma.matching_score"} <= {one["name"] for one in figures}
