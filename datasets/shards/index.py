@@ -212,7 +212,8 @@ def read_index(file: BinaryIO, where: str, split: Split, shards: list[ShardInfo]
                 for name in _ARRAYS
             }
     except UserError as error:
-        raise UserError(f"{error}; not a readable index: convert the dataset again") from None
+        reason = str(error).removeprefix(f"{where}: ")
+        raise UserError(f"{where}: not a readable index ({reason}); convert the dataset again") from None
     for name in ("offsets", "sizes"):  # a data set may be older than a modality that was added
         missing = len(MEMBERS) - arrays[name].shape[-1]
         if arrays[name].ndim == 2 and 0 < missing < len(MEMBERS):

@@ -45,7 +45,7 @@ def scan_tar(path: Path, *, foreign: bool = False, most: int = MOST_CLIPS) -> li
     try:
         with tarfile.open(path, mode="r:") as archive:
             for info in archive:
-                archive.members = []  # tarfile keeps every entry
+                archive.members = []  # type: ignore[attr-defined]  # tarfile keeps every entry
                 end = info.offset_data + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
                 key, member = _checked_name(path, info, foreign)
                 if not key or not member:

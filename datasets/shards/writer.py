@@ -137,7 +137,8 @@ class DatasetWriter(Generic[T]):
                 index = ShardIndex.load_json(index_path(path))
                 if index.shard is not None:
                     require_intact(LocalShard(path, index.shard))
-                    sources.update(clip.source for clip in (*index.clips, *index.dropped))
+                    sources.update(clip.source for clip in index.clips)
+                    sources.update(drop.source for drop in index.dropped)
                     kept |= {clip.made_from: path for clip in index.clips if clip.made_from in wanted}
         for at in self._todo:
             own = {item.made_from: kept[item.made_from] for item in tasks[at].items if item.made_from in kept}

@@ -112,7 +112,9 @@ def _row(where: str, values: dict[str, object], splits: SplitNames) -> tuple[Cap
         clip_id = clip_id.rsplit("/", 1)[-1]
     check_id(clip_id, where)
     is_list = any(isinstance(values.get(key), list) for key in keys)
-    given = {"source": SOURCE} if is_list else {"source": SOURCE, "start": about.start, "end": about.end}
+    given: dict[str, object] = {"source": SOURCE}
+    if not is_list:
+        given |= {"start": about.start, "end": about.end}
     texts = [text for key in keys for text in _captions(f"{where}: '{key}'", values.get(key), given)]
     choice = splits.of(about.split, lambda: where) if about.split else None
     stated = None if choice == "drop" else choice

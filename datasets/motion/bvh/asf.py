@@ -115,7 +115,7 @@ def _turned(bone: _Bone, numbers: Floats | None, frames: int, degree: float) -> 
     turn = axis * Rotation.from_euler(order, numbers[:, columns] * degree, degrees=True) * axis.inv()
     with warnings.catch_warnings():  # at a gimbal lock one of the many equal answers is as good as another
         warnings.simplefilter("ignore", UserWarning)
-        return turn.as_euler("ZXY", degrees=True)
+        return np.asarray(turn.as_euler("ZXY", degrees=True), dtype=np.float64)
 
 
 def _moved(skeleton: _Skeleton, numbers: Floats) -> Floats:

@@ -369,7 +369,7 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(shin, np.linalg.norm(layout.skeleton.offsets[7]), atol=1e-3)
     assert total == 2
     (tmp_path / "nothing").mkdir()
-    with pytest.raises(UserError, match=r"no \.bvh file"):
+    with pytest.raises(UserError, match=r"no \.bvh .*file"):
         prepare(config(copy, source=tmp_path / "nothing"))
     with pytest.raises(UserError, match="no such file or folder"):
         prepare(config(copy, source=tmp_path / "none"))
