@@ -23,10 +23,10 @@ from torch import Tensor
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES
-from motionloom.models.training.stage_module import evaluating
 
 
 @torch.no_grad()

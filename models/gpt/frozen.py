@@ -1,7 +1,9 @@
-"""`Frozen`: a trained network that a later stage uses and must not change."""
+"""Trained networks that are used and must not change: `Frozen` for good, `evaluating` for a while."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Generic, TypeVar
 
 from torch import nn
@@ -17,3 +19,14 @@ class Frozen(Generic[M]):
 
     def __init__(self, module: M) -> None:
         self.module = module.eval().requires_grad_(False)
+
+
+@contextmanager
+def evaluating(net: nn.Module) -> Iterator[None]:
+    """Inside, `net` is in evaluation mode; afterwards it is as it was."""
+    before = net.training
+    net.eval()
+    try:
+        yield
+    finally:
+        net.train(before)

@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.losses import predicted
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate
@@ -26,7 +27,6 @@ from motionloom.models.tma.losses import false_negatives
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.training.distributed import gather_rows, masked_mean, rank
-from motionloom.models.training.stage_module import evaluating
 
 
 class Samples(NamedTuple):

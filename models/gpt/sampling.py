@@ -18,9 +18,9 @@ from torch import Tensor
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import Drawing, decode, requested_groups, seeds_of, uniform_numbers
+from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes, as_codes
-from motionloom.models.training.stage_module import evaluating
 
 
 @torch.no_grad()

@@ -9,8 +9,8 @@ Codebooks draw by themselves, the same on every rank (`quantize/base.py`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypedDict
 
@@ -85,17 +85,6 @@ class Execution:
             optimizer.step()
         else:
             self.scaler.step(optimizer)
-
-
-@contextmanager
-def evaluating(net: nn.Module) -> Iterator[None]:
-    """Inside, `net` is in evaluation mode; afterwards it is as it was."""
-    before = net.training
-    net.eval()
-    try:
-        yield
-    finally:
-        net.train(before)
 
 
 class StageModule(L.LightningModule, ABC):
