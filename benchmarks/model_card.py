@@ -53,6 +53,9 @@ KINDS = ("held out", "other")
 WORDS = Path(__file__).with_name("synthetic_wordings.json")
 FAMILIAR, OTHER, GUESS = "as in training", "other words", "another clip's motion"
 
+ASKED = 60
+"""Clips whose captions are asked about: each is read beside dozens of known ones."""
+
 CARD = Path(__file__).with_suffix(".md")
 
 
@@ -231,7 +234,13 @@ def main() -> None:
         "seed": seed,
         "right": shares,
         "single draws": single,
-        "unknown": {title: len(unknown_captions(bundle, captions)) for title, (captions, _) in said.items()},
+        "unknown": {
+            **{
+                title: len(unknown_captions(bundle, captions[:ASKED]))
+                for title, (captions, _) in said.items()
+            },
+            "captions": min(ASKED, len(truths)),
+        },
     }
     if args.write:
         (model / CARD_FIGURES).write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
@@ -319,7 +328,8 @@ def card_of(
         examples="; ".join(f'"{body}"' for body, _ in other[:3]),
         chosen=choice(sampling),
         single=single_draws(figures["single draws"]),
-        unknown=f"{strange[OTHER]} of these captions and {strange[FAMILIAR]} of the usual it calls unknown.",
+        unknown=f"Of the first {strange['captions']} clips it calls {strange[OTHER]} of these captions and "
+        f"{strange[FAMILIAR]} of the usual unknown.",
         commands=f"motionloom run {recipe_file}{settings}\n"
         f"motionloom export runs/{recipe.name} -o {figures['name']} --half{options}\n"
         f"python benchmarks/model_card.py {figures['name']} --recipe {recipe_file}{settings} --write",

@@ -393,7 +393,8 @@ def unknown_captions(
     """
     out: list[Unknown] = []
     for stage, given in ((bundle.main, captions), (bundle.choose_face(face_model), face)):
-        text = None if stage is None else bundle.of(stage).text
-        if isinstance(text, TextSource):
-            out += text.unknown([caption for caption in given if caption.strip()], face=given is face)
+        part = None if stage is None else bundle.of(stage)
+        if part is not None and isinstance(part.text, TextSource):
+            said, read = [caption for caption in given if caption.strip()], getattr(part, "read", None)
+            out += part.text.unknown(said, face=given is face, read=read)
     return out

@@ -4,6 +4,9 @@ A generator makes a motion of any caption. One that is far from all it was train
 happens to find near, and nothing in the motion says so. A few hundred training captions that stand for all of
 them lie beside the encoder, with their sentence embeddings: no caption of the training set is far from one of
 these. Embeddings are MiniLM's, which comes with the installation, whatever encoder the networks read.
+
+A caption is known if it has no word that training had nothing like, and if a caption of the training is near
+it, both as a sentence and as the model itself reads the two.
 """
 
 from __future__ import annotations
@@ -21,18 +24,21 @@ from safetensors.numpy import load_file, save_file
 from motionloom.datasets.base.files import atomic_path, write_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.text.words import Encode, HeardWords, words_of
 
 KNOWN_FILES = ("known.json", "known.safetensors")
 
 COUNT = 384
 """Number of representative captions of each kind, of bodies and of faces."""
 
-FAR = 0.45
-"""Cosine below which a caption is far from another.
+FAR = 0.5
+"""Cosine of sentence embeddings below which a caption is far from another; like `ALIKE` chosen on the
+development half of `benchmarks/known_words.yaml`."""
 
-On synthetic captions 17 of 17 other wordings of what training says lie above it ("a guy greets you with his
-right arm": 0.64) and 13 of 18 that are about something else below ("a person plays the violin": 0.35; but "a
-person does a backflip": 0.48)."""
+ALIKE = 0.6
+"""Cosine of the model's own readings from which it takes two captions for the same."""
+NEAREST = 32
+"""Known captions that the model reads beside a new one."""
 
 
 class _Texts(Config):
@@ -40,6 +46,7 @@ class _Texts(Config):
 
     body: tuple[str, ...]
     face: tuple[str, ...]
+    words: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,17 +72,36 @@ class KnownCaptions:
 
     captions: tuple[str, ...]
     embeddings: NDArray[np.float32]
+    words: frozenset[str] = frozenset()
+    """All words of the training's captions; empty where they were not kept."""
 
     def unknown(
-        self, captions: Sequence[str], embeddings: NDArray[np.float32], count: int = 3
+        self, captions: Sequence[str], encode: Encode, read: Encode | None = None, count: int = 3
     ) -> list[Unknown]:
-        """Those of `captions`, embeddings [m, E], that are far from all of these, in order, each once."""
-        cosines = np.asarray(embeddings, dtype=np.float32) @ self.embeddings.T
-        found: dict[str, Unknown] = {}
+        """Those of `captions` that are not known, in order, each once.
+
+        Args:
+            captions: What was said.
+            encode: Sentence embeddings, those of these captions.
+            read: The model's own unit-length readings of captions; without, sentences alone decide.
+            count: How many of the nearest to name.
+        """
+        if not self.captions:
+            return []
+        heard, found = HeardWords(self.words, encode), dict[str, Unknown]()
+        cosines = np.asarray(encode(captions), dtype=np.float32) @ self.embeddings.T
         for caption, row in zip(captions, cosines, strict=True):
-            if len(row) and row.max() < FAR:
-                nearest = np.argsort(-row, kind="stable")[:count]
-                found.setdefault(caption, Unknown(caption, tuple(self.captions[k] for k in nearest)))
+            nearest = [self.captions[k] for k in np.argsort(-row, kind="stable")]
+            near = nearest[: min(NEAREST, int((row >= FAR).sum()))]
+            if near and read is not None:
+                readings = read([caption, *near])
+                near = [
+                    text
+                    for text, vector in zip(near, readings[1:], strict=True)
+                    if vector @ readings[0] >= ALIKE
+                ]
+            if not near or heard.unheard(caption):
+                found.setdefault(caption, Unknown(caption, tuple(nearest[:count])))
         return list(found.values())
 
 
@@ -98,7 +124,7 @@ def representatives(
         chosen.append(int(nearest.argmin()))
         nearest = np.maximum(nearest, vectors @ vectors[chosen[-1]])
         nearest[chosen[-1]] = np.inf
-    return KnownCaptions(tuple(texts[k] for k in chosen), vectors[chosen])
+    return KnownCaptions(tuple(texts[k] for k in chosen), vectors[chosen], words_of(texts))
 
 
 def save_known(folder: Path, body: KnownCaptions, face: KnownCaptions) -> None:
@@ -106,7 +132,7 @@ def save_known(folder: Path, body: KnownCaptions, face: KnownCaptions) -> None:
     kinds = {"body": body, "face": face}
     with atomic_path(folder / KNOWN_FILES[1]) as path:
         save_file({name: known.embeddings.astype(np.float16) for name, known in kinds.items()}, path)
-    texts = _Texts(body=body.captions, face=face.captions)
+    texts = _Texts(body=body.captions, face=face.captions, words=tuple(sorted(body.words)))
     write_json(folder / KNOWN_FILES[0], texts.dump())
 
 
@@ -130,5 +156,6 @@ def load_known(folder: Path) -> dict[str, KnownCaptions]:
             raise UserError(
                 f"{embeddings}: '{name}' does not go with {texts.name}; delete both, or copy them again"
             )
-        out[name] = KnownCaptions(captions, vectors.astype(np.float32))
+        words = frozenset(said.words if name == "body" else ())
+        out[name] = KnownCaptions(captions, vectors.astype(np.float32), words)
     return out

@@ -19,6 +19,7 @@ from motionloom.datasets.base.places import hub_is_away
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
+from motionloom.datasets.text.words import Encode
 from motionloom.pipeline.store.files import copy_files, remove_tree, write_json
 from motionloom.pipeline.store.known_captions import KNOWN_FILES, KnownCaptions, Unknown, load_known
 
@@ -111,12 +112,14 @@ class TextSource:
         """Captions that represent those of the training, "body" and "face"; none where they were not kept."""
         return load_known(self.folder)
 
-    def unknown(self, captions: Sequence[str], *, face: bool = False) -> list[Unknown]:
-        """Those of `captions` that are far from all that were trained on."""
+    def unknown(
+        self, captions: Sequence[str], *, face: bool = False, read: Encode | None = None
+    ) -> list[Unknown]:
+        """Those of `captions` that are unlike all that were trained on; `read` is how the model reads."""
         known = self.known.get("face" if face else "body")
         if known is None or not captions:
             return []
-        return known.unknown(captions, self._sentences.encode(captions).sentence)
+        return known.unknown(captions, lambda texts: self._sentences.encode(texts).sentence, read)
 
     @cached_property
     def _sentences(self) -> TextEncoder:

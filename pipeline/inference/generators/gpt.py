@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.text.words import Encode
 from motionloom.models.gpt.drawing import Drawing, sample_seeds
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.streaming import TokenStream
@@ -81,6 +82,21 @@ class GptGenerator:
         """TMA used to rank candidates: the one behind the text prior, if it models the same body part."""
         tma: LoadedTma | None = self.given.get("tma") if self.gpt.prior == "tma" else None
         return tma if tma is not None and tma.part == self.part else None
+
+    @property
+    def read(self) -> Encode | None:
+        """How it reads captions, where they reach it by way of TMA: unit-length latents [n, Z]."""
+        tma, text = self.reranker, self.text
+        if tma is None or text is None:
+            return None
+
+        def read(captions: Sequence[str]) -> NDArray[np.float32]:
+            latents: NDArray[np.float32] = F.normalize(
+                tma.embed_captions(list(captions), text), dim=-1
+            ).numpy()
+            return latents
+
+        return read
 
     @property
     def unit_frames(self) -> int:

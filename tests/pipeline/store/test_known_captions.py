@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,19 +68,37 @@ def test_fewer_captions_than_are_wanted_all_stand_for_themselves() -> None:
 def test_other_words_are_known_and_other_things_are_not() -> None:
     encoder = load_text_encoder("minilm")
     known = KnownCaptions(TRAINED, encoder.encode(TRAINED).sentence)
-    assert known.unknown(OTHER_WORDS, encoder.encode(OTHER_WORDS).sentence) == []
-    found = known.unknown(ELSEWHERE, encoder.encode(ELSEWHERE).sentence)
+    assert known.unknown(OTHER_WORDS, lambda texts: encoder.encode(texts).sentence) == []
+    found = known.unknown(ELSEWHERE, lambda texts: encoder.encode(texts).sentence)
     assert [one.caption for one in found] == list(ELSEWHERE)
     assert "a man rides a bicycle" in str(found[1]) and found[1].nearest[0] in str(found[1])
 
 
+def test_a_caption_that_the_model_reads_as_something_else_is_unknown() -> None:
+    encoder = load_text_encoder("minilm")
+    known = KnownCaptions(TRAINED, encoder.encode(TRAINED).sentence)
+    punch, walk = np.eye(2, dtype=np.float32)
+
+    def read(texts: Sequence[str]) -> np.ndarray:
+        return np.stack([walk if text == said else punch for text in texts])
+
+    said = "a person waves with the left hand"
+    assert not known.unknown([said], lambda texts: encoder.encode(texts).sentence)
+    assert known.unknown([said], lambda texts: encoder.encode(texts).sentence, read)
+
+
 def test_files_come_back(tmp_path: Path) -> None:
-    body, face = KnownCaptions(("a", "b"), unit(2, 8, 4)), KnownCaptions((), np.zeros((0, 8), np.float32))
+    heard = frozenset({"b", "a"})
+    body = KnownCaptions(("a", "b"), unit(2, 8, 4), heard)
+    face = KnownCaptions((), np.zeros((0, 8), np.float32))
     save_known(tmp_path, body, face)
     found = load_known(tmp_path)
     assert found["body"].captions == ("a", "b") and found["face"].captions == ()
+    assert found["body"].words == heard
     np.testing.assert_allclose(found["body"].embeddings, body.embeddings, atol=2**-11)
-    assert found["face"].unknown(["x"], unit(1, 8, 5)) == [], "a model without faces calls no face unknown"
+    assert found["face"].unknown(["x"], lambda _: unit(1, 8, 5)) == [], (
+        "a model without faces calls no face unknown"
+    )
     assert load_known(tmp_path / "none") == {}
 
 

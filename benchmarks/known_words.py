@@ -1,0 +1,61 @@
+"""Does a model know what it does not know? 200 everyday sentences, what it makes of them, and what it says.
+
+    python benchmarks/known_words.py synthetic
+    python benchmarks/known_words.py synthetic --held-out
+
+One motion is made for every sentence of `known_words.yaml` and measured on its joints: does it do what is
+said? Beside it whether the model noted that it does not know the caption. The sentences that are held out
+were looked at when everything was decided, and nothing was changed after that.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from motionloom.datasets.synth.measure import agrees, measure
+from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
+from motionloom.pipeline.inference.shipped_models import model_folder
+
+SENTENCES = Path(__file__).with_suffix(".yaml")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "model", type=Path, help="a run, an exported folder, or the name of a model of the package"
+    )
+    parser.add_argument("--held-out", action="store_true", help="the other half of the sentences")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    half = slice(int(args.held_out), None, 2)
+    kinds = yaml.safe_load(SENTENCES.read_text(encoding="utf-8"))
+    rows = [(kind, *row) for kind, sentences in kinds.items() for row in sentences[half]]
+    bundle, console = Bundle.open(model_folder(args.model)), Console(soft_wrap=True)
+    captions = [caption for _, caption, _ in rows]
+    made = bundle.generate(captions, seed=args.seed)
+    noted = {one.caption for one in unknown_captions(bundle, captions)}
+    counts: dict[str, list[int]] = {}
+    for (kind, caption, truth), motion in zip(rows, made, strict=True):
+        right = truth is not None and all(agrees(truth, motion.joints, None, motion.fps).values())
+        for name in (kind, "all"):
+            count = counts.setdefault(name, [0, 0, 0, 0])
+            count[2 * right] += caption in noted
+            count[2 * right + 1] += 1
+        if right == (caption in noted):
+            did = measure(motion.joints, motion.fps).action
+            console.print(f"{'noted, and right' if right else 'not noted, and wrong'}: '{caption}' ({did})")
+    table = Table("sentences", "wrong: noted", "of", "right: noted", "of")
+    for kind, count in counts.items():
+        table.add_row(kind, *map(str, count))
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()
