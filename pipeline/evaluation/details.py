@@ -182,10 +182,10 @@ def _matrix(found: dict[str, Any]) -> Matrix:
         corner = "asked for ↓ shown →"
     else:
         title += f": the nearest of {found['captions']} captions to each {motion}"
-    names = [
+    rows, columns = (
         [name if about == "caption" else label(name) for name in found[side]] for side in ("rows", "columns")
-    ]
-    return Matrix(title, corner, *names, found["counts"])
+    )
+    return Matrix(title, corner, rows, columns, found["counts"])
 
 
 def _pair(case: Case, made: str, figures: Mapping[str, Any]) -> list[ViewerMotion]:

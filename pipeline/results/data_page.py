@@ -133,7 +133,7 @@ def write_data_report(
     manifest = load_manifest(root)
     layout = manifest_layout(manifest)
     there = {shard.split for shard in manifest.shards}
-    opened = {split: ShardDataset.open(root, split) for split in SPLITS if split in there}
+    opened: dict[str, ShardDataset] = {s: ShardDataset.open(root, s) for s in SPLITS if s in there}
     records = Records()
     with Progress(disable=not progress) as bar:
         for split, dataset in opened.items():
