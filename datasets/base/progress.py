@@ -15,13 +15,15 @@ LINE_EVERY_SECONDS = 15.0
 
 
 def duration(seconds: float) -> str:
-    """ "12 s", "3 min 20 s", "2 h 05 min"."""
+    """ "12 s", "3 min 20 s", "2 h 05 min", "10 d 9 h"."""
     whole = round(seconds)
     if whole < 60:
         return f"{seconds:.1f} s" if seconds < 9.95 else f"{whole} s"
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    if whole < 2 * 86400:
+        return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    return f"{whole // 86400} d {whole % 86400 // 3600} h"
 
 
 class Pace:

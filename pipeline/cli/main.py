@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.schema import UserError
@@ -35,7 +34,7 @@ from motionloom.pipeline.cli.options import (
     print_json,
     sampling_of,
 )
-from motionloom.pipeline.launch.console import make_console, quiet_libraries
+from motionloom.pipeline.launch.console import SafeConsole, make_console, quiet_libraries
 from motionloom.pipeline.launch.process import LOST, Interrupted, JointError, TeamError, leave, process_rank
 
 app = typer.Typer(
@@ -343,7 +342,7 @@ def main() -> None:
 
 def _exit_code() -> int:
     """Run the command; a user's mistake becomes one sentence on standard error."""
-    errors = Console(stderr=True, highlight=False, soft_wrap=True)
+    errors = SafeConsole(stderr=True, highlight=False, soft_wrap=True)
     try:
         code = app(prog_name="motionloom", standalone_mode=False) or 0
         sys.stdout.flush()  # here a full disk can still be answered

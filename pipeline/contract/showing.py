@@ -82,3 +82,6 @@ class ModelCard:
     memory_bytes: int
     note: str
     """What its tokens are."""
+    steps: int
+    checkpoint_bytes: int
+    """Of all that are kept at a time."""

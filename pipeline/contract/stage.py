@@ -6,7 +6,7 @@ report ask these questions of the stages of a run; a new stage answers them in i
 by one line.
 
 A package adds kinds by an entry point of the group `motionloom.stages` that names a module; a lone file by
-the environment variable `MOTIONLOOM_STAGES`, a comma-separated list of importable modules. The module calls
+the environment variable `MOTIONLOOM_STAGES`, a comma-separated list of modules or files. The module calls
 `register(MyStage())`; ours come in the same way. A recipe never names code: it is data, and reading one runs
 nothing.
 """
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -274,6 +275,14 @@ class StageKind(ABC, Generic[C]):
         """Sizes of a kind that trains; None for the others."""
         return None
 
+    def step_seconds(self, config: C, given: Inputs, hardware: Hardware) -> float | None:
+        """How long a step of its training takes on this machine, tried out; None where that would be long."""
+        return None
+
+    def disk(self, config: C) -> int | None:
+        """Bytes of what it leaves on disk, where that is much and can be said."""
+        return None
+
     def show(self, stage: Finished, given: Inputs) -> list[Showing]:
         """Figures of the finished stage for the report, beside its curves."""
         return []
@@ -336,11 +345,14 @@ def stage_kinds() -> Mapping[str, StageKind]:
         for point in entry_points(group=_GROUP):
             point.load()
         for module in filter(None, map(str.strip, os.environ.get(VARIABLE, "").split(","))):
+            if module.endswith(".py"):
+                # Loader workers get the path and import the file by its name, too.
+                sys.path.append(str(Path(module).absolute().parent))
             try:
-                importlib.import_module(module)
+                importlib.import_module(Path(module).stem if module.endswith(".py") else module)
             except ImportError as error:
                 raise UserError(
-                    f"{VARIABLE}={module}: cannot be imported ({error}); name a module on Python's path"
+                    f"{VARIABLE}={module}: cannot be imported ({error}); name a file, or a module on the path"
                 ) from None
     return _KINDS
 

@@ -52,6 +52,11 @@ class MotionModel(
         # The mixin would write our argument, a local path, into the config.json that the hub wants.
         self._hub_mixin_config = dict(HUB_CONFIG)
 
+    def __repr__(self) -> str:
+        makers = ", ".join(f"{stage.name} ({stage.kind.name})" for stage in self.bundle.stages)
+        layout = self.bundle.layout
+        return f"MotionModel({str(self.folder)!r}: {makers}; {layout.name}, {layout.fps:g} frames/s)"
+
     @classmethod
     def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> MotionModel:
         """A folder, a model that comes with the package, or a name on the hub (`owner/name`).

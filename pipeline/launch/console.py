@@ -5,10 +5,20 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+from typing import Any
 
 from rich.console import Console
+from rich.text import Text
 
+from motionloom.datasets.base.printable import printable
 from motionloom.pipeline.launch.process import process_rank
+
+
+class SafeConsole(Console):
+    """Writes out characters of strangers' text (captions, names) that a terminal or a log would obey."""
+
+    def render_str(self, text: str, **how: Any) -> Text:  # type: ignore[override]
+        return super().render_str("\n".join(map(printable, text.split("\n"))), **how)
 
 
 def make_console(*, aside: bool = False) -> Console:
@@ -17,12 +27,15 @@ def make_console(*, aside: bool = False) -> Console:
     `aside` takes standard error, where standard output is for a program.
     """
     width = None if os.environ.get("COLUMNS") or os.isatty(2 if aside else 1) else 120
-    return Console(stderr=aside, quiet=process_rank() > 0, width=width, highlight=False)
+    return SafeConsole(stderr=aside, quiet=process_rank() > 0, width=width, highlight=False)
 
 
 def quiet_libraries() -> None:
     """Keep the libraries' chatter out of the way of our own lines."""
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+    # Threads that wait sleep: awake they take the cores of those they wait for, wherever a machine is shared.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("KMP_BLOCKTIME", "0")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     os.environ.setdefault("TRANSFORMERS_NO_ADVISORY_WARNINGS", "1")
     for name in (

@@ -37,7 +37,7 @@ class Hardware(Config):
     convert_workers: int = Field(2, ge=1)
     """Processes that convert or synthesise shards."""
     threads: int = Field(0, ge=0)
-    """CPU threads per process; 0 leaves torch's choice."""
+    """CPU threads per process; 0 takes one for networks below ten million parameters, else torch's choice."""
     stall_seconds: int = Field(600, ge=0)
     """Seconds without a step, a validation batch or a checkpoint after which a training ends itself and
     leaves the stacks of its threads; 0 = never. Compiling counts, so it must be longer than that takes."""
@@ -109,11 +109,8 @@ class Hardware(Config):
             where = f"{count} x {torch.cuda.get_device_name(0) if here else 'GPU (none is here)'}"
         else:
             why = "" if self.accelerator == "cpu" else " (no GPU found)"
-            threads = self.threads or torch.get_num_threads()
-            where = (
-                f"CPU{why}, {count} process{'es' if count > 1 else ''}"
-                f" x {threads} thread{'s' if threads > 1 else ''}"
-            )
+            threads = f" x {self.threads} thread{'s' if self.threads > 1 else ''}" if self.threads else ""
+            where = f"CPU{why}, {count} process{'es' if count > 1 else ''}{threads}"
         return where + (f", {nodes} nodes" if nodes > 1 else "")
 
 

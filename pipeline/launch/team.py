@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import cache
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import torch.distributed as dist
@@ -62,8 +63,7 @@ class Team:
             plugins=[launcher] if launcher else None,
         )
         fabric.launch()
-        waiting = dist.new_group(backend="gloo", timeout=_PATIENCE)
-        return Team(fabric.global_rank, fabric.world_size, waiting)
+        return Team(fabric.global_rank, fabric.world_size, _patient_group())
 
     @property
     def leads(self) -> bool:
@@ -98,14 +98,19 @@ def lead_finds(find: Callable[[], Found]) -> Found:
     if not dist.is_initialized() or dist.get_world_size() == 1:
         return find()
     try:
-        group = dist.new_group(backend="gloo", timeout=_PATIENCE)
         found = [find() if dist.get_rank() == 0 else None]
-        dist.broadcast_object_list(found, src=0, group=group)
+        dist.broadcast_object_list(found, src=0, group=_patient_group())
     except RuntimeError as error:
         if "by peer" in str(error):
             raise TeamError(str(error)) from None
         raise
     return cast(Found, found[0])
+
+
+@cache
+def _patient_group() -> dist.ProcessGroup:
+    """Made once: every group is a connection of all with all, which may fail where a machine is busy."""
+    return cast(dist.ProcessGroup, dist.new_group(backend="gloo", timeout=_PATIENCE))
 
 
 def environment() -> ClusterEnvironment | None:

@@ -74,7 +74,7 @@ def run_recipe(
         raise
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if dry_run:
-        say_estimate(loaded, console, [row.stage for row in todo])
+        say_estimate(loaded, console, run, todo)
         console.print(plan_table(loaded, plan))
         require_fit(todo, loaded.hardware)
     replaced = replaced_stages(run, plan)

@@ -9,10 +9,11 @@ they run again; `--replace` asks for all.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from statistics import median
 
 from rich.console import Console
 from rich.markup import escape
@@ -28,6 +29,7 @@ from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.files import read_record
 from motionloom.pipeline.store.run_folder import stage_folder
+from motionloom.pipeline.store.training_log import read_flight
 from motionloom.pipeline.store.yaml import read_yaml
 
 
@@ -63,16 +65,61 @@ def estimate(recipe: Recipe, names: Collection[str] | None = None) -> dict[str, 
     return cards
 
 
-def estimate_table(cards: dict[str, ModelCard]) -> Table:
+@dataclass(frozen=True)
+class TrainingTime:
+    """How long a training will take."""
+
+    seconds: float
+    """Of the steps that are left."""
+    own: bool
+    """Whether the run itself has taken such steps; else they were tried out here."""
+
+
+_TRIED_BYTES, _TRIED_PARAMETERS = 2 * 2**30, 10_000_000
+"""A training that needs more is not tried out: its steps take long on a CPU."""
+
+
+def training_times(
+    recipe: Recipe, run: Path, rows: Sequence[PlannedStage], cards: Mapping[str, ModelCard]
+) -> dict[str, TrainingTime]:
+    """Of the trainings in `rows`, by the run's own telemetry; else those of `cards` are tried out."""
+    stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
+    out = {}
+    for stage in (row.stage for row in rows if row.stage.kind.trains):
+        folder, resumed = stage_folder(run, stage.name), row_of(rows, stage).action == "resume"
+        flights = read_flight(folder).get(0, ())
+        found = [row["step_seconds"] for row in flights if "step_seconds" in row]
+        done = max((int(row["step"]) for row in flights), default=0) if resumed else 0
+        seconds = median(found) if found else None
+        card = cards.get(stage.name)
+        small = card and card.memory_bytes < _TRIED_BYTES and card.parameters < _TRIED_PARAMETERS
+        if seconds is None and small:
+            given = previews(stage, stages)
+            seconds = stage.kind.step_seconds(stage.config, given, recipe.hardware)
+        if seconds is not None:
+            left = max(0, stage.config.train.steps - done)
+            out[stage.name] = TrainingTime(seconds * left, bool(found))
+    return out
+
+
+def row_of(rows: Sequence[PlannedStage], stage: Stage) -> PlannedStage:
+    """The row of a plan that is about a stage."""
+    return next(row for row in rows if row.stage.name == stage.name)
+
+
+def estimate_table(cards: Mapping[str, ModelCard], times: Mapping[str, TrainingTime]) -> Table:
     """For a terminal."""
     table = Table(title="what the trainings take (one process)", title_justify="left")
-    for column in ("stage", "parameters", "batch", "memory", "tokens"):
+    for column in ("stage", "parameters", "batch", "steps", "time", "memory", "checkpoints", "tokens"):
         table.add_column(column, overflow="fold")
     for name, card in cards.items():
         parameters = _count(card.parameters)
         if card.codebook:
             parameters += f" + {_count(card.codebook)} codebook"
-        table.add_row(name, parameters, str(card.local_batch), _size(card.memory_bytes), card.note)
+        took = f"about {duration(times[name].seconds)}" if name in times else "not known here"
+        memory, disk = _size(card.memory_bytes), _size(card.checkpoint_bytes)
+        cells = str(card.local_batch), f"{card.steps:,}", took, memory, disk, card.note
+        table.add_row(name, parameters, *cells)
     return table
 
 
@@ -84,10 +131,12 @@ def _size(count: int) -> str:
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 / 10 else f"{count / 2**20:.1f} MiB"
 
 
-def say_estimate(recipe: Recipe, console: Console, todo: Sequence[Stage] | None = None) -> None:
-    """Print what the trainings of the stages `todo` (None = all) take, where the recipe says enough."""
-    todo = recipe.stages if todo is None else todo
-    if not any(stage.kind.trains for stage in todo):
+def say_estimate(
+    recipe: Recipe, console: Console, run: Path | None = None, todo: Sequence[PlannedStage] | None = None
+) -> None:
+    """Print what the trainings among `todo` (None = all) take, where the recipe says enough."""
+    named = [row.stage for row in todo] if todo is not None else list(recipe.stages)
+    if not any(stage.kind.trains for stage in named):
         return
     stages = {stage.name: stage for stage in recipe.stages}
     for stage in recipe.stages:
@@ -98,7 +147,15 @@ def say_estimate(recipe: Recipe, console: Console, todo: Sequence[Stage] | None 
         except UserError as error:
             console.print(str(error), markup=False)
             return
-    console.print(estimate_table(estimate(recipe, {stage.name for stage in todo})))
+    cards = estimate(recipe, {stage.name for stage in named})
+    times = {} if run is None or todo is None else training_times(recipe, run, todo, cards)
+    console.print(estimate_table(cards, times))
+    total = sum(one.seconds for one in times.values())
+    known = [size for stage in named if (size := stage.kind.disk(stage.config)) is not None]
+    lines = [f"disk: {_size(sum(card.checkpoint_bytes for card in cards.values()))} for checkpoints"]
+    lines += [f"about {_size(sum(known))} for data"] if known else []
+    lines += [f"trainings: about {duration(total)} on {recipe.hardware.describe()}"] if times else []
+    console.print("; ".join(lines), markup=False)
 
 
 def plan_record(
@@ -119,11 +176,12 @@ def plan_record(
     todo = [row for row in plan if row.action in {"run", "resume"}]
     require_fit(todo, loaded.hardware)
     cards = estimate(loaded, {row.stage.name for row in todo})
+    times = training_times(loaded, run, todo, cards)
     return {
         "recipe": loaded.name,
         "folder": run,
         "hardware": loaded.hardware,
-        "stages": [_row(row, cards) for row in plan],
+        "stages": [_row(row, cards, times) for row in plan],
         "replaces": {
             "finished": [one.stage for one in replaced_stages(run, plan)],
             "started": started_trainings(run, plan),
@@ -131,7 +189,9 @@ def plan_record(
     }
 
 
-def _row(row: PlannedStage, cards: dict[str, ModelCard]) -> dict[str, object]:
+def _row(
+    row: PlannedStage, cards: Mapping[str, ModelCard], times: Mapping[str, TrainingTime]
+) -> dict[str, object]:
     stage = row.stage
     return {
         "stage": stage.name,
@@ -141,6 +201,7 @@ def _row(row: PlannedStage, cards: dict[str, ModelCard]) -> dict[str, object]:
         "inputs": stage.inputs,
         "fingerprint": row.fingerprint,
         "training": cards.get(stage.name),
+        "time": times.get(stage.name),
     }
 
 
@@ -205,6 +266,9 @@ def explain_replacements(run: Path, recipe: str, stages: Sequence[Replaced]) -> 
         lines[0] += f"{joint} replace {len(stages)} finished stage{'s' * (len(stages) > 1)}{total}:"
         lines += [stage.say() for stage in stages]
     end = f"-o {_free(run)} keeps both, --replace goes on here: what fits is kept, the rest is made again"
+    if other is None:
+        again = f"motionloom run {run}/recipe.yaml -o {run}"
+        lines.append(f"with the settings of the last run here, --set too: {again}")
     return "\n".join([*lines, end]) if stages else f"{lines[0]}; {end}"
 
 

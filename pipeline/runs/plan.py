@@ -259,7 +259,11 @@ def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[
         old = artifact.inputs.get(role)
         if old is None or old.fingerprint != _fingerprint(recipe, name, rows):
             return f"input {name} changed"
-    return "seed, source files or the order of inputs changed"
+    if artifact.seed != recipe.seed_of(stage):
+        own = recipe.data_seed is None and not stage.kind.trains
+        keep = f"; data_seed: {artifact.seed} keeps what comes before the trainings" if own else ""
+        return f"seed {artifact.seed} -> {recipe.seed_of(stage)}{keep}"
+    return "source files or the order of inputs changed"
 
 
 def _changed_fields(old: object, new: object, prefix: str = "") -> Iterator[str]:

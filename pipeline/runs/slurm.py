@@ -17,16 +17,23 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
 from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.progress import duration
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.process import SAVED
-from motionloom.pipeline.runs.dry_run import explain_replacements, replaced_stages
+from motionloom.pipeline.runs.dry_run import (
+    TrainingTime,
+    explain_replacements,
+    replaced_stages,
+    say_estimate,
+    training_times,
+)
 from motionloom.pipeline.runs.launch_plan import Group, LaunchPlan, SlurmOptions, make_launch_plan
 from motionloom.pipeline.runs.plan import make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
@@ -141,11 +148,25 @@ def launch_recipe(
         gpus_per_node=gpus_per_node,
     )
     console.print(plan.table())
+    planned = [row for row in make_plan(loaded, run) if row.action in {"run", "resume"}]
+    _require_time(plan, asked, training_times(loaded, run, planned, {}))
     if dry_run:
+        say_estimate(loaded, console, run, planned)
         _show_scripts(plan, asked, console)
     else:
         submit_run(plan, asked, console)
     return plan
+
+
+def _require_time(plan: LaunchPlan, options: SlurmOptions, times: Mapping[str, TrainingTime]) -> None:
+    """Refuse a time limit within which, with all its tries, a group's trainings cannot end."""
+    for group in plan.groups:
+        needed = sum(times[name].seconds for name in group.stages if name in times)
+        if needed > 60 * group.machines.minutes * (options.requeues + 1):
+            raise UserError(
+                f"group {group.name} takes about {duration(needed)} and has {group.machines.minutes} minutes "
+                f"{options.requeues + 1} times; raise --cluster time_minutes or requeues"
+            )
 
 
 def _show_scripts(plan: LaunchPlan, options: SlurmOptions, console: Console) -> None:

@@ -38,6 +38,19 @@ def prepare_module(module: StageModule, config: TrainConfig) -> None:
             part.checkpointed = config.checkpoint_activations
 
 
+SMALL = 10_000_000
+"""Parameters below which a second thread gains nothing, and loses much where others use the machine."""
+
+
+def set_threads(module: nn.Module, hardware: Hardware) -> None:
+    """CPU threads of this process, as the recipe says or the network needs."""
+    threads = hardware.threads
+    if not threads and hardware.resolved_accelerator() == "cpu":
+        threads = int(sum(param.numel() for param in module.parameters()) < SMALL)
+    if threads:
+        torch.set_num_threads(threads)
+
+
 def launch(hardware: Hardware, config: TrainConfig) -> Fabric:
     """Devices, processes and precision."""
     launcher = environment()

@@ -42,7 +42,13 @@ from motionloom.pipeline.training.checkpoint_state import (
 )
 from motionloom.pipeline.training.checkpointing import BackgroundWriter, name_of, read_checkpoint, readable
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.training.execution import TrainingData, execution, launch, prepare_module
+from motionloom.pipeline.training.execution import (
+    TrainingData,
+    execution,
+    launch,
+    prepare_module,
+    set_threads,
+)
 from motionloom.pipeline.training.failures import FailureGuard, StallTimer
 from motionloom.pipeline.training.loggers import Loggers
 from motionloom.pipeline.training.preemption import Agreement, Signals
@@ -60,8 +66,7 @@ def fit(
 ) -> None:
     """Train `module` for `config.steps`, resuming from the newest good checkpoint in the stage's folder."""
     hardware = context.hardware
-    if hardware.threads:
-        torch.set_num_threads(hardware.threads)
+    set_threads(module, hardware)
     if hardware.resolved_accelerator() == "gpu":
         hardware.device()  # refuses in one sentence where there is no GPU
     fabric = launch(hardware, config)

@@ -63,6 +63,16 @@ class ShardsStage(DataStage):
         settle_shards(config, folder)
 
 
+class SynthStage(DataStage):
+    """Synthetic shards."""
+
+    def disk(self, config: SynthConfig) -> int:
+        """Motion in float32, of clips of the mean length."""
+        layout = config.motion_layout
+        seconds = (config.min_seconds + config.max_seconds) / 2
+        return round(4 * layout.dim * config.clips * seconds * layout.fps)
+
+
 class SynthStageConfig(SynthConfig, StageConfig):
     """Synthetic whole-body shards."""
 
@@ -162,5 +172,5 @@ def say_shards(context: StageContext, manifest: Manifest) -> None:
     )
 
 
-register(DataStage("synth", "synthetic shards", SynthStageConfig, run_synth))
+register(SynthStage("synth", "synthetic shards", SynthStageConfig, run_synth))
 register(ShardsStage("shards", "existing shards", ShardsStageConfig, run_shards))

@@ -6,6 +6,7 @@ from typing import Any
 
 from pydantic import Field
 
+from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import (
@@ -77,7 +78,7 @@ class GenerateStage(StageKind):
         )
         titles = [motion.caption for motion in said] + [f"dance to {clip.title}" for _, clip in danced]
         for motion, title in zip(motions, titles, strict=True):
-            line = f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {title}"
+            line = f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {printable(title)}"
             context.console.print(line, markup=False)
 
 

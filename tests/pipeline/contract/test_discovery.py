@@ -8,8 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from motionloom.pipeline.contract import stage
+from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.stages import networks
 
 PACER = Path(__file__).resolve().parents[2] / "helpers/pacer_stage.py"
@@ -22,3 +24,21 @@ def test_a_file_beside_the_others_is_a_kind(tmp_path: Path, monkeypatch: pytest.
     runpy.run_module("motionloom.pipeline.stages.table")
     made = sys.modules.pop("motionloom.pipeline.stages.networks.pacer")
     assert type(stage.stage_kind("pacer", "here")).__module__ == made.__name__
+
+
+def test_the_example_of_the_documents_runs_from_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (PACER.parents[2] / "docs/architecture.md").read_text()
+    (tmp_path / "count_clips.py").write_text(text.split("```python\n")[1].split("```")[0])
+    monkeypatch.setattr(stage, "_KINDS", dict(stage.stage_kinds()))
+    monkeypatch.setattr(stage, "_loaded", False)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(stage, "entry_points", lambda group: ())
+    monkeypatch.setenv("MOTIONLOOM_STAGES", str(tmp_path / "count_clips.py"))
+    (tmp_path / "mine.yaml").write_text(
+        "name: mine\nstages: {data: {kind: synth, clips: 4, layout: body133, val_fraction: 0, "
+        "test_fraction: 0}, clips: {kind: count}}"
+    )
+    run = run_recipe(tmp_path / "mine.yaml", tmp_path / "run", console=Console(quiet=True))
+    assert (run / "stages/clips/clips.txt").read_text() == "4 training clips"

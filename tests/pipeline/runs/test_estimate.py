@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import torch
 from rich.console import Console
 
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.tokenizer.build import build_tokenizer
@@ -16,8 +19,9 @@ from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.dry_run import estimate
+from motionloom.pipeline.runs.dry_run import TrainingTime, estimate, plan_record
 from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.slurm import launch_recipe
 from motionloom.pipeline.training.memory import _saved_bytes
 
 PAPER = """
@@ -54,10 +58,10 @@ def test_paper_counts(paper: Path, tmp_path: Path) -> None:
     assert rows["tokenizer"].note == "2 body + 1 hand per 4 frames, 202 bit/s"
     assert rows["vanilla"].note == "1 code per 4 frames, 75 bit/s"
     assert {row.local_batch for row in rows.values()} == {64}
-    console = Console(record=True, width=160)
+    console = Console(record=True, width=200)
     run_recipe(paper, tmp_path / "run", dry_run=True, console=console)
     said = console.export_text()
-    assert rows["gpt"].note in said and "GiB" in said and not (tmp_path / "run").exists()
+    assert "GiB" in said and "300,000" in said and not (tmp_path / "run").exists()
 
 
 def test_memory_follows_batch_and_checkpointing(paper: Path) -> None:
@@ -70,6 +74,37 @@ def test_memory_follows_batch_and_checkpointing(paper: Path) -> None:
     assert whole - weights == pytest.approx(2 * (half - weights), rel=0.02)
     assert memory("gpt.train.checkpoint_activations=true") - weights < 0.2 * (whole - weights)
     assert memory("gpt.train.accumulate=2") == half
+
+
+SMALL = """
+name: small
+hardware: {accelerator: cpu, devices: 1}
+stages:
+  data: {kind: synth, layout: body133, clips: 10}
+  stats: {kind: stats}
+  tokenizer:
+    {kind: vq, net: {width: 16, depth: 1, code_dim: 8, num_codes: 16}, train: {steps: 7, batch_size: 8}}
+"""
+
+
+def test_time_is_tried_out_or_known_from_the_run_itself(tmp_path: Path) -> None:
+    """And a time limit that cannot be enough is refused."""
+    path, flight = tmp_path / "small.yaml", tmp_path / "run/stages/tokenizer/flight/rank_0.jsonl"
+    path.write_text(SMALL)
+    (row,) = [row for row in plan_record(path, tmp_path / "run")["stages"] if row["training"]]  # type: ignore[attr-defined]
+    assert row["time"].seconds > 0 and not row["time"].own and row["training"].steps == 7
+    # Weights and two moments in float32, of the two checkpoints that are kept.
+    assert row["training"].checkpoint_bytes >= 2 * 3 * 4 * row["training"].parameters
+    write_text(flight, "".join(json.dumps({"step": k, "step_seconds": 3600.0}) + "\n" for k in range(3)))
+    (row,) = [row for row in plan_record(path, tmp_path / "run")["stages"] if row["training"]]  # type: ignore[attr-defined]
+    assert row["time"] == TrainingTime(7 * 3600.0, own=True)
+    quiet = Console(quiet=True)
+    for minutes, requeues in ((300, 1), (300, 0)):
+        words = [f"time_minutes={minutes}", f"requeues={requeues}"]
+        with pytest.raises(UserError, match="takes about 7 h") if not requeues else nullcontext():
+            launch_recipe(
+                path, out=tmp_path / "run", gpus_per_node=0, options=words, dry_run=True, console=quiet
+            )
 
 
 def test_saved_bytes_of_a_known_network() -> None:

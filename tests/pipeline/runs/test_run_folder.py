@@ -146,6 +146,7 @@ def test_finished_trainings_are_not_replaced_unasked(go: Go, tmp_path: Path) -> 
         f"{run}: this would replace 2 finished stages, 10 h 25 min of work:",
         "  tokenizer: changed: add 1 -> 2 (2 h 05 min of training)",
         "  gpt: input tokens changed (8 h 20 min of training)",
+        f"with the settings of the last run here, --set too: motionloom run {run}/recipe.yaml -o {run}",
         f"-o {run}-2 keeps both, --replace goes on here: what fits is kept, the rest is made again",
     ]
     said = go("tokenizer.add=2", "evaluate.add=3", dry_run=True)
