@@ -19,7 +19,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
@@ -224,16 +223,11 @@ def _tensors(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Ten
         found = load_file(path)
     except (OSError, SafetensorError) as error:
         raise UserError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]}); {_MAKE}") from None
-    for name in sorted(shapes.keys() - found.keys()):
-        raise UserError(f"{path}: tensor '{name}' is missing; {_MAKE}")
-    for name in sorted(found.keys() - shapes.keys()):
-        raise UserError(f"{path}: tensor '{name}' is not of this evaluator; {_MAKE}")
-    for name, shape in shapes.items():
-        if tuple(found[name].shape) != shape:
-            raise UserError(
-                f"{path}: tensor '{name}' is {list(found[name].shape)}, and the published one is "
-                f"{list(shape)}; {_MAKE}"
-            )
-        if not bool(np.isfinite(found[name].float().numpy()).all()):
+    for name in sorted(shapes.keys() | found.keys()):
+        shape = list(found[name].shape) if name in found else None
+        if shape is None or shape != list(shapes.get(name, ())):
+            wanted = list(shapes[name]) if name in shapes else "no tensor"
+            raise UserError(f"{path}: tensor '{name}' is {shape}, and the published one {wanted}; {_MAKE}")
+        if not bool(found[name].isfinite().all()):
             raise UserError(f"{path}: tensor '{name}' holds numbers that are not finite; {_MAKE}")
     return {name: value.float() for name, value in found.items()}

@@ -151,15 +151,6 @@ def test_torchrun_equals_one_process(
     assert_same_training(single, run, "gpt")
 
 
-def test_a_launcher_that_does_not_match_is_refused(
-    recipe: Path, call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, value in (("RANK", "0"), ("LOCAL_RANK", "0"), ("WORLD_SIZE", "2"), ("LOCAL_WORLD_SIZE", "2")):
-        monkeypatch.setenv(name, value)
-    done = call("run", recipe, "--out", tmp_path / "run", "--set", "hardware.devices=1")
-    assert done.code == 2 and "the launcher started 2 processes and the recipe asks for 1" in done.err
-
-
 def test_a_batch_that_does_not_divide_is_refused_before_anything_runs(
     recipe: Path, call: Callable[..., Any], tmp_path: Path
 ) -> None:

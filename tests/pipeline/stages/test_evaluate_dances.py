@@ -330,17 +330,6 @@ def test_generated_files_have_their_music(run: tuple[Path, str]) -> None:
     assert [len(np.load(path)["joints"]) for path in sorted(folder.glob("*.npz"))][1:] == [40, 40]
 
 
-@pytest.mark.slow
-def test_evaluated_again_the_figures_are_the_same(run: tuple[Path, str]) -> None:
-    """By the run, and by `motionloom evaluate` twice after it, protocols included."""
-    stages = run[0] / "stages"
-    first = [FigureFile.read(stages / name / "metrics.json") for name in ("evaluate", "evaluate_dances")]
-    for _ in range(2):
-        out = evaluate_run(run[0], console=Console(quiet=True))
-        again = FigureFile.read(out / "metrics.json"), FigureFile.read(out / "evaluate_dances/metrics.json")
-        assert [one.figures for one in again] == [one.figures for one in first]
-
-
 def test_evaluate_runs_every_stage_of_figures(run: tuple[Path, str]) -> None:
     out = evaluate_run(run[0], clips=2, repeats=1, console=Console(quiet=True))
     for path in (out / "metrics.json", out / "evaluate_dances/metrics.json"):

@@ -204,15 +204,15 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "missing": (
         lambda f: spoil(f, "model.safetensors", lambda t: t.pop(BIAS)),  # type: ignore[arg-type, return-value]
-        f"tensor '{BIAS}' is missing",
+        f"tensor '{BIAS}' is None",
     ),
     "unknown": (
         lambda f: spoil(f, "model.safetensors", lambda t: t.update(more=torch.ones(1))),
-        "tensor 'more' is not of this evaluator",
+        r"tensor 'more' is \[1\]",
     ),
     "shape": (
         lambda f: spoil(f, "model.safetensors", lambda t: t.update({BIAS: torch.ones(511)})),
-        rf"tensor '{BIAS}' is \[511\], and the published one is \[512\]",
+        rf"tensor '{BIAS}' is \[511\]",
     ),
     "not finite": (
         lambda f: spoil(f, "stats.safetensors", lambda t: t["mean"].fill_(torch.nan)),  # type: ignore[arg-type, return-value]
