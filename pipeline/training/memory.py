@@ -79,7 +79,8 @@ def seconds_a_step(
         set_threads(module, hardware)
         fabric = Fabric(accelerator=hardware.lightning_accelerator(), devices=1, precision=train.precision)
         how, batch = execution(fabric, module, train), fabric.to_device(_random(example))
-        optimizers, times, begin = module.configure_optimizers(), [], time.perf_counter()
+        optimizers, begin = module.configure_optimizers(), time.perf_counter()
+        times: list[float] = []
         while len(times) < 4 and time.perf_counter() - begin < _TRIED_SECONDS:
             before = time.perf_counter()
             float(module.take_step([batch] * train.accumulate, optimizers, how))

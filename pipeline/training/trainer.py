@@ -40,7 +40,13 @@ from motionloom.pipeline.training.checkpoint_state import (
     rows_of_ranks,
     weights_of,
 )
-from motionloom.pipeline.training.checkpointing import BackgroundWriter, name_of, read_checkpoint, readable
+from motionloom.pipeline.training.checkpointing import (
+    BackgroundWriter,
+    name_of,
+    read_checkpoint,
+    readable,
+    step_of,
+)
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
 from motionloom.pipeline.training.execution import (
     TrainingData,
@@ -338,8 +344,9 @@ def _find_resume_point(context: StageContext, config: TrainConfig) -> ResumePoin
     found = resume_point(
         folder, config, partial(context.console.print, style="yellow", markup=False, soft_wrap=True)
     )
-    for path in folder.glob("*.ckpt") if found.checkpoint is not None else ():
-        if path.name > found.checkpoint.name:
+    newest = found.checkpoint
+    for path in folder.glob("*.ckpt"):
+        if newest is not None and (step_of(path) or 0) > (step_of(newest) or 0):
             path.unlink()  # passed over
     return found
 

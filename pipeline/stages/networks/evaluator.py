@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.evaluator.losses import MATCHING, MOVEMENT, EvaluatorLossConfig
-from motionloom.models.evaluator.network import PART, UNIT, Evaluator, EvaluatorConfig
+from motionloom.models.evaluator.network import UNIT, Evaluator, EvaluatorConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import register
@@ -30,7 +30,7 @@ class EvaluatorStageConfig(CaptionStageConfig):
     the number of its steps is ours, as the published code counts epochs over windows.
     """
 
-    part: Literal["bodyhand"] = PART
+    part: Literal["bodyhand"] = "bodyhand"
 
     net: EvaluatorConfig = EvaluatorConfig()
     loss: EvaluatorLossConfig = EvaluatorLossConfig()
