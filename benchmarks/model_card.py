@@ -225,7 +225,7 @@ def main() -> None:
     console.print(table)
     figures = {
         "name": args.name or before.get("name", args.model.resolve().name),
-        "description": recipe.description,
+        "description": f"{recipe.description}; it knows {', '.join(data.action_names)}",
         "recipe": args.recipe or before.get("recipe", RECIPE),
         "settings": settings,
         "clips": len(truths),

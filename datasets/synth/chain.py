@@ -76,7 +76,7 @@ def joined(first: Track, second: Track) -> Track:
         for name in ("foot_pitch", "knee_out"):
             getattr(out, name)[side] = mixed(getattr(first, name)[side], getattr(second, name)[side], weight)
         for name in ("direction", "reach", "bend", "roll", "flex"):
-            arms = (getattr(track.arms[side], name) for track in (first, second))
-            setattr(out.arms[side], name, mixed(*arms, weight))
+            before, after = (getattr(track.arms[side], name) for track in (first, second))
+            setattr(out.arms[side], name, mixed(before, after, weight))
     out.lower_to_reach()
     return out
