@@ -102,7 +102,13 @@ TABLES = {
     "ude_networks_text": Table("Table 3, captions", _of("text_", NETWORKS, {}), TEXT),
     "ude_networks_music": Table("Table 3, music", _of("music_", NETWORKS, {}), MUSIC),
     "ude_adversarial": Table(
-        "L_adv from the first step on", _of("text_drawn_", ADVERSARIAL, {}), TEXT
+        "L_adv from the first step on, 200 steps",
+        {title: (stage, MODEL) for title, stage in ADVERSARIAL.items()},
+        (
+            Column("cross-entropy", "log:train/tokens_ce", 2),
+            Column("right tokens, %", "log:train/tokens_accuracy_code", 0, 100),
+            Column("critic is right, %", "log:train/critic_accuracy", 0, 100),
+        ),
     ),
 }  # fmt: skip
 SEEDS = (7, 8, 9)
@@ -135,14 +141,14 @@ def row_of(run: Path, table: Table, title: str) -> Record:
     cells: dict[str, list[float]] = {}
     seeds, protocol = [], {}
     for seed in SEEDS if row == MODEL else SEEDS[:1]:
-        path = run / "stages" / f"{stage}_{seed}" / FILE_NAME
-        if not path.is_file():
+        folder = run / "stages" / f"{stage}_{seed}"
+        if not (folder / "artifact.json").is_file():
             continue
-        found = FigureFile.read(path)
+        found = FigureFile.read(folder / FILE_NAME) if (folder / FILE_NAME).is_file() else None
         seeds.append(seed)
         for column in table.columns:
             value = logged(run, stage, seed, column) if row == MODEL else None
-            figure = found.of(column.figure, row)
+            figure = found.of(column.figure, row) if found else None
             if figure is not None:
                 value, protocol = figure.value, {**protocol, **figure.protocol}
             if value is not None:
@@ -153,13 +159,14 @@ def row_of(run: Path, table: Table, title: str) -> Record:
 
 
 def logged(run: Path, stage: str, seed: int, column: Column) -> float | None:
-    """The last value that the training which a stage of figures measures has logged."""
+    """What the training that a stage of figures measures has logged in the end: a mean of five values."""
     kind, _, name = column.figure.partition(":")
     if kind != "log":
         return None
     path = run / "stages" / f"{stage.removeprefix('codes_')}_{seed}" / "metrics.jsonl"
     values = [json.loads(line).get(name) for line in path.read_text().splitlines()]
-    return float([value for value in values if value is not None][-1])
+    last = [value for value in values if value is not None][-5:]
+    return sum(last) / len(last) if last else None
 
 
 def write_decoded(found: Record) -> None:
