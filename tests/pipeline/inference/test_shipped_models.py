@@ -89,9 +89,9 @@ def synthetic() -> Path:
 def test_the_model_that_ships_is_small_and_whole(synthetic: Path) -> None:
     assert shipped_models()["synthetic"].bytes <= 20e6
     stages = json.loads((synthetic / "bundle.json").read_text())["stages"]
-    weights = {p.relative_to(synthetic).as_posix(): sha256_of(p) for p in synthetic.glob("*/*.safetensors")}
+    weights = {p.relative_to(synthetic).as_posix() for p in synthetic.glob("*/*.safetensors")}
     noted = {f"{name}/{file}": value for name, one in stages.items() for file, value in one["sha256"].items()}
-    assert noted == weights
+    assert weights <= set(noted) and noted == {name: sha256_of(synthetic / name) for name in noted}
     model = MotionModel.from_pretrained("synthetic", device="cpu")
     assert model.modalities == {"text"} and model.bundle.faces and model.bundle.layout.has("face")
 
