@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -108,7 +107,8 @@ _PARTS = 64
 def built(folder: Path, build: Callable[[], N]) -> N:
     """The network that the facts in `folder` ask for; refused where the weights there are of a smaller one.
 
-    It is built without memory first, and given up as soon as it has more parts than the file.
+    Construction is given up as soon as there are more parts than in the file, or one larger than any there.
+    Most parts are filled after they are registered, so that until then their memory is only reserved.
     """
     path = folder / "model.safetensors"
     try:
@@ -140,9 +140,6 @@ def built(folder: Path, build: Callable[[], N]) -> N:
         register_module_module_registration_hook(counted),
     )
     try:
-        with suppress(RuntimeError), torch.device("meta"):  # a constructor may mix devices
-            build()
-        modules, parameters = 0, {}
         return build()
     except (_TooLargeError, RuntimeError, OverflowError, MemoryError):
         raise UserError(
