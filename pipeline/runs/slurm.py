@@ -148,7 +148,13 @@ def launch_recipe(
         gpus_per_node=gpus_per_node,
     )
     console.print(plan.table())
-    planned = [row for row in make_plan(loaded, run) if row.action in {"run", "resume"}]
+    try:
+        planned = [row for row in make_plan(loaded, run) if row.action in {"run", "resume"}]
+    except UserError as error:
+        if not dry_run or (run / "recipe.yaml").is_file():
+            raise
+        planned = []  # the data may be on another machine
+        console.print(f"time and disk not estimated: {error}", soft_wrap=True, markup=False)
     _require_time(plan, asked, training_times(loaded, run, planned, {}))
     if dry_run:
         say_estimate(loaded, console, run, planned)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
 
@@ -102,6 +103,8 @@ _TABLE = 2**24
 """Numbers that a table may have which a network makes for itself, such as one of positions."""
 _PARTS = 64
 """Modules that a network has for each of its tensors, at most."""
+_BUILDING: ContextVar[Path | None] = ContextVar("building", default=None)
+"""The weights whose network is built, which may load the network of another stage meanwhile."""
 
 
 def built(folder: Path, build: Callable[[], N]) -> N:
@@ -119,18 +122,18 @@ def built(folder: Path, build: Callable[[], N]) -> N:
     largest, modules, parameters = max(sizes, default=0), 0, dict[int, torch.nn.Parameter]()
 
     def weighed(_: torch.nn.Module, name: str, part: torch.nn.Parameter | None) -> None:
-        if part is not None:
+        if part is not None and _BUILDING.get() == path:
             parameters[id(part)] = part
             if len(parameters) > len(sizes) or part.numel() > largest:
                 raise _TooLargeError
 
     def kept(_: torch.nn.Module, name: str, part: torch.Tensor | None) -> None:
-        if part is not None and part.numel() > max(largest, _TABLE):
+        if part is not None and _BUILDING.get() == path and part.numel() > max(largest, _TABLE):
             raise _TooLargeError
 
     def counted(_: torch.nn.Module, name: str, part: torch.nn.Module | None) -> None:
         nonlocal modules
-        modules += 1
+        modules += _BUILDING.get() == path
         if modules > _PARTS * (len(sizes) + 1):
             raise _TooLargeError
 
@@ -139,6 +142,7 @@ def built(folder: Path, build: Callable[[], N]) -> N:
         register_module_buffer_registration_hook(kept),
         register_module_module_registration_hook(counted),
     )
+    building = _BUILDING.set(path)
     try:
         return build()
     except (_TooLargeError, RuntimeError, OverflowError, MemoryError):
@@ -147,6 +151,7 @@ def built(folder: Path, build: Callable[[], N]) -> N:
             f"again, or run the stage that made it again"
         ) from None
     finally:
+        _BUILDING.reset(building)
         for hook in hooks:
             hook.remove()
 

@@ -202,7 +202,7 @@ def test_generated_motions_pass_their_scores_to_film_and_page(
 ) -> None:
     layout = MotionLayout.named("tomato623")
     motions = [
-        GeneratedMotion(Prompt(name), np.zeros((8, 1), np.float32), walk(8), None, layout) for name in "ab"
+        GeneratedMotion(Prompt(name), np.zeros((8, 623), np.float32), walk(8), None, layout) for name in "ab"
     ]
     scores = [Score(song(1.0), [0.1], [(0, 0.2, "walks")]), Score()]
     write_motions(tmp_path / "out", motions, ["mp4", "html"], title="t", seed=0, scores=scores)
