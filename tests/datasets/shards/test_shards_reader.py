@@ -272,6 +272,8 @@ def test_a_million_clips_in_ten_thousand_shards_open_in_a_second(made: ModuleTyp
     clips = [
         ClipEntry(
             key=f"000000-{j:06d}",
+            source="one",
+            made_from="it",
             id=f"source-{j:019d}",
             present=j % 4,
             frames=frames,

@@ -117,7 +117,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_dry_run_counts_it_without_data(recipe: Path) -> None:
     output = program("run", recipe, "--out", recipe.parent / "nothing", "--dry-run")
-    row = re.search(r"│ pacer +│ ([\d.]+) k +│ 8 +│ ([\d.]+) MiB +│ 32 frames +│", output)
+    row = re.search(r"│ pacer +│ ([\d.]+) k +│ 8 +│ 120 +│[^│]+│ ([\d.]+) MiB +│[^│]+│ 32 frames +│", output)
     assert row, output
     # Two convolutions over 9 frames and one over 1, with biases: 438 features and 4 of noise to 133 columns.
     assert float(row[1]) == pytest.approx(
