@@ -144,10 +144,6 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   one("sound-field").hidden = !info.modalities.includes("audio");
   const drivers = info.modalities.map((name) => (name === "audio" ? "music" : name)).join(" or ");
   say(`${info.model}: ${drivers} to motion, at most ${info.limits.seconds} s`);
-  if (info.modalities.includes("text")) {
-    one("caption").value = one("caption").placeholder; // something to see at once
-    generate();
-  }
   one("caption").focus();
 })();
 })();

@@ -134,12 +134,12 @@ class Launched:
             time.sleep(0.1)
 
 
-def launch(cluster: Cluster, recipe: Path, run: Path, *, parts: int = 2, pause: float = 0.0) -> Launched:
+def launch(cluster: Cluster, recipe: Path, run: Path, *, pause: float = 0.0) -> Launched:
     """`motionloom launch` on both nodes; every step leaves a line beside the run folder."""
     records = run.with_name(f"{run.name}-records")
     records.mkdir(parents=True)
     words = ["motionloom", "launch", str(recipe), "--nodes", "2", "--gpus-per-node", "0", "--out", str(run)]
-    words += [word for asked in (*ASKED, f"parts={parts}") for word in ("--cluster", asked)]
+    words += [word for asked in ASKED for word in ("--cluster", asked)]
     path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(Path(__file__).parent)]))
     watched = {"MOTIONLOOM_STAGES": "watched_steps", RECORDS: str(records), PAUSE: str(pause)}
     before = _jobs(cluster)
@@ -193,7 +193,7 @@ def preempt(
     shutil.copytree(calm.run, run, ignore=shutil.ignore_patterns(".slurm"))
     for name in TRAINED:
         shutil.rmtree(run / "stages" / name)
-    launched = launch(calm.cluster, recipe, run, parts=1, pause=0.1)
+    launched = launch(calm.cluster, recipe, run, pause=0.1)
     starts = []
     for number, step in enumerate(after):
         launched.wait_for_step(step, number)
