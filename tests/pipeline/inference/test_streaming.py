@@ -67,7 +67,7 @@ def test_one_caption_is_what_generate_makes(model: MotionModel, chunk_frames: in
         streaming={"chunk_frames": chunk_frames},
     )  # fmt: skip
     chunks = list(stream)
-    assert len(chunks) > 2 and all(len(chunk.joints) >= chunk_frames for chunk in chunks[:-1])
+    assert len(chunks) > 1 and all(len(chunk.joints) >= chunk_frames for chunk in chunks[:-1])
     wanted = model.generate(
         ["a person waves"], face=["a person looks sad"], seconds=1.8, seed=5, sampling=sampling
     )
