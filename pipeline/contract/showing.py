@@ -48,30 +48,6 @@ class FigureTable:
 
 
 @dataclass(frozen=True)
-class JointErrors:
-    """Errors of each joint."""
-
-    title: str
-    skeleton: str
-    errors: Sequence[float | None]
-    """mm of each joint; None of joints that no clip has."""
-    hands: Sequence[float] = ()
-    """mm of the finger joints from their wrists, left hand first."""
-
-
-@dataclass(frozen=True)
-class Matrix:
-    """Counts [R, C] of what was taken for what."""
-
-    title: str
-    corner: str
-    """What rows and columns are."""
-    rows: Sequence[str]
-    columns: Sequence[str]
-    counts: Sequence[Sequence[int]]
-
-
-@dataclass(frozen=True)
 class ModelCard:
     """What a dry run says of a stage that trains, computed without any data."""
 

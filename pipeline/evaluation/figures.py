@@ -174,7 +174,7 @@ class FigureFile:
     about: Mapping[str, Any] = field(default_factory=dict)
     """What was evaluated and what judged: stages by role, their checksums, the seed."""
     details: Mapping[str, Any] = field(default_factory=dict)
-    """What is drawn beside the figures (`details.py`)."""
+    """Of the worst and the best, which are kept beside the figures (`cases.py`)."""
 
     def of(self, name: str, row: str = MODEL) -> Figure | None:
         """One figure; None where it was not measured."""

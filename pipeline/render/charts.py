@@ -15,8 +15,6 @@ from html import escape
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from motionloom.datasets.schema import UserError
-
 WIDTH, HEIGHT = 640, 320
 LEFT, RIGHT, TOP, BOTTOM = 62, 24, 14, 46
 STRETCHES = 200
@@ -126,59 +124,6 @@ def histogram(
             )
         below += values
     return _svg(title, parts, None) + _legend([Line(name, (), ()) for name in stacks])
-
-
-def ranking(items: Sequence[tuple[str, float]]) -> str:
-    """An ordered list of names with bars and values, as HTML: names stay text that can be read and found."""
-    most = max((value for _, value in items), default=0) or 1
-    rows = "".join(
-        f'<li><span class="name">{escape(name)}</span>'
-        f'<span class="track"><i style="width:{100 * value / most:.1f}%"></i></span>'
-        f'<span class="value">{value:,g}</span></li>'
-        for name, value in items
-    )
-    return f'<ol class="ranking">{rows}</ol>'
-
-
-def matrix_table(
-    rows: Sequence[str],
-    columns: Sequence[str],
-    counts: Sequence[Sequence[int]],
-    *,
-    title: str = "",
-    corner: str = "",
-) -> str:
-    """An HTML table of `counts` [R, C]; a cell whose row and column have one name is a right answer.
-
-    Rows are what it is, columns what it was taken for. Cells are shaded by their share of the row; the
-    numbers stay text, so that nothing depends on colour.
-    """
-    if len(counts) != len(rows) or any(len(row) != len(columns) for row in counts):
-        raise UserError(
-            f"matrix '{title}': {len(rows)} rows and {len(columns)} columns do not fit its counts"
-        )
-    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in columns)
-    body = []
-    for name, values in zip(rows, counts, strict=True):
-        total = sum(values)
-        cells = "".join(
-            _matrix_cell(value, total, name == column) for column, value in zip(columns, values, strict=True)
-        )
-        body.append(f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>')
-    caption = f"<caption><span>{escape(title)}</span></caption>" if title else ""
-    return (
-        f'<div class="scroll"><table class="matrix">{caption}<thead><tr>'
-        f'<th class="corner">{escape(corner)}</th>{head}</tr></thead>'
-        f"<tbody>{''.join(body)}</tbody></table></div>"
-    )
-
-
-def _matrix_cell(value: int, total: int, right: bool) -> str:
-    if not value:
-        return '<td class="none">·</td>'
-    share = 100 * value / total
-    kind = "right" if right else "wrong"
-    return f'<td class="{kind}" style="--share:{share:.0f}%" title="{share:.0f} % of the row">{value:,}</td>'
 
 
 class _Axis:

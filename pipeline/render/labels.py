@@ -39,31 +39,3 @@ def curve_label(key: str) -> str:
         return words
     level = _LEVEL.fullmatch(stream)
     return f"{words}: {f'level {level[1]}' if level else label(stream)}"
-
-
-_JOINTS = {
-    "collar": "collarbone",
-    "foot": "ball of the foot",
-    "spine1": "lower spine",
-    "spine2": "middle spine",
-    "spine3": "upper spine",
-    "pinky": "little finger",
-    "index": "index finger",
-    "middle": "middle finger",
-    "ring": "ring finger",
-}
-_ALONG_FINGER = {"1": "knuckle", "2": "middle joint", "3": "last joint"}
-_ALONG_THUMB = {"1": "base", "2": "middle joint", "3": "last joint"}
-
-
-def joint_label(joint: str) -> str:
-    """A joint of `smpl22` or `smplx52` in words; other names without their underscores."""
-    side, _, rest = joint.partition("_")
-    if side not in ("left", "right"):
-        return _JOINTS.get(joint, label(joint))
-    finger, place = rest[:-1], rest[-1:]
-    if finger == "thumb" and place in _ALONG_THUMB:
-        return f"{side} thumb, {_ALONG_THUMB[place]}"
-    if finger in _JOINTS and place in _ALONG_FINGER:
-        return f"{side} {_JOINTS[finger]}, {_ALONG_FINGER[place]}"
-    return f"{side} {_JOINTS.get(rest, label(rest))}"

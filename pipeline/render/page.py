@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.charts import COLOURS, Line, histogram, line_chart, matrix_table, ranking
+from motionloom.pipeline.render.charts import COLOURS, Line, histogram, line_chart
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
     fill,
@@ -101,17 +101,6 @@ class Page:
         self._blocks.append(_table(columns, rows, caption, digits, pinned))
         return self
 
-    def add_matrix(
-        self,
-        rows: Sequence[str],
-        columns: Sequence[str],
-        counts: Sequence[Sequence[int]],
-        title: str,
-        corner: str = "",
-    ) -> Page:
-        """Counts [R, C] of what was taken for what; neighbours stand side by side where there is room."""
-        return self._add_beside("matrices", matrix_table(rows, columns, counts, title=title, corner=corner))
-
     @contextmanager
     def folded(self, summary: str) -> Iterator[Page]:
         """Blocks that are closed until the reader opens them."""
@@ -152,10 +141,6 @@ class Page:
         chart = histogram(counts, edges, x_label=x_label, y_label=y_label, title=title)
         return self._add_chart(chart, title)
 
-    def add_ranking(self, items: Sequence[tuple[str, float]], title: str) -> Page:
-        """Names with bars, in the order given."""
-        return self._add_chart(ranking(items), title)
-
     def add_viewer(self, motions: Sequence[ViewerMotion], note: str = "") -> Page:
         """Motions that play in the page, with their own controls below."""
         self._viewers += 1
@@ -194,14 +179,10 @@ class Page:
 
     def _add_chart(self, chart: str, title: str) -> Page:
         block = f'<figure class="plot"><figcaption>{escape(title)}</figcaption>{chart}</figure>'
-        return self._add_beside("plots", block)
-
-    def _add_beside(self, kind: str, block: str) -> Page:
-        """Beside the block before, if that is of the same kind."""
-        if self._blocks and self._blocks[-1].startswith(f'<div class="{kind}">'):
+        if self._blocks and self._blocks[-1].startswith('<div class="plots">'):  # beside its neighbour
             self._blocks[-1] = self._blocks[-1].removesuffix("</div>") + block + "</div>"
         else:
-            self._blocks.append(f'<div class="{kind}">{block}</div>')
+            self._blocks.append(f'<div class="plots">{block}</div>')
         return self
 
 

@@ -1,15 +1,13 @@
 """The page about a data set: one HTML file with what one wants to know before training on it.
 
-Counts, lengths, captions, features with outliers, rejected clips with reasons, licences, the source's
+Counts, lengths, captions, features, rejected clips with reasons, licences, the source's
 options, and some clips to watch. Made for strangers' data: every text is escaped, and nothing is loaded from
-outside. Counts, lengths, captions and licences are of every clip; feature statistics and the search for
-outliers look at no more than `MEASURED` clips of a split, spread evenly over it.
+outside. Counts, lengths, captions and licences are of every clip; feature statistics look at no more than
+`MEASURED` clips of a split, spread evenly over it.
 """
 
 from __future__ import annotations
 
-import heapq
-import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,20 +23,17 @@ from motionloom.datasets.loading.statistics import STD_FLOOR, Moments
 from motionloom.datasets.motion.canonical import canonicalize, resample
 from motionloom.datasets.motion.features.codec import face_of
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SPLITS, Caption, Manifest, UserError
 from motionloom.datasets.shards.left_out import grouped
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest, manifest_layout
 from motionloom.pipeline.render.body.face import synthetic_face_controls
-from motionloom.pipeline.render.labels import joint_label, label
+from motionloom.pipeline.render.labels import label
 from motionloom.pipeline.render.page import Page, Value
 from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.store.yaml import flatten, setting_text
 
 MEASURED = 20_000
-OUTLIERS = 12
 BINS = 24
-TOP_WORDS = 14
 EXAMPLES = 8
 """Captions of each split that are shown."""
 REASONS = 40
@@ -47,37 +42,6 @@ WATCH_FPS, WATCH_SECONDS = 20.0, 10.0
 """Clips are thinned and cut to this for the page."""
 
 Rows = list[list[Value]]
-
-_WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?")
-_FILLERS = frozenset(
-    _WORD.findall(
-        "a an and are as at back be being both by for from has have he her his i in into is it its of off on "
-        "one or other out over she so some someone somebody something that the their them then there they "
-        "this to up was were what while who with person man woman figure human"
-    )
-)
-_FIRST_JOINT = {
-    "positions": 1,
-    "rotations_6d": 1,
-    "velocities": 0,
-    "pose": 0,
-    "root_orient": 0,
-    "pose_body": 1,
-    "pose_hand": 22,
-}
-"""Fields with a few values for each joint, and the joint they begin with."""
-_AXES = {"rotations_6d": ("a1", "a2", "a3", "b1", "b2", "b3")}
-
-
-@dataclass(frozen=True)
-class Outlier:
-    """The value of a training clip that is furthest from its column's mean, in deviations."""
-
-    deviations: float
-    clip: int
-    frame: int
-    column: int
-    value: float
 
 
 @dataclass
@@ -89,7 +53,6 @@ class Records:
     """Hashes of the captions' texts."""
     captioned: Counter[str] = field(default_factory=Counter)
     """Clips with a caption, by split."""
-    words: Counter[str] = field(default_factory=Counter)
     examples: Rows = field(default_factory=list)
     licences: Counter[str] = field(default_factory=Counter)
     remarks: Counter[str] = field(default_factory=Counter)
@@ -101,7 +64,6 @@ class Records:
         self.captioned[dataset.split] += bool(captions)
         for caption in captions:
             self.different.add(hash(caption.text))
-            self.words.update(word.lower() for word in _WORD.findall(caption.text))
         if example and captions:
             self.examples.append([dataset.split, meta.id, captions[0].text])
         self.licences[meta.licence] += 1
@@ -112,13 +74,12 @@ class Records:
 
 @dataclass(frozen=True)
 class Measures:
-    """Statistics of the features of one split's clips, and the most unusual values."""
+    """Statistics of the features of one split's clips."""
 
     clips: int
     moments: Moments
     low: NDArray[np.float64]
     high: NDArray[np.float64]
-    outliers: list[Outlier]
 
 
 def write_data_report(
@@ -165,9 +126,7 @@ def write_data_report(
 
 
 def measure(dataset: ShardDataset, bar: Progress) -> Measures:
-    """Two passes over the features: their moments, then the clips with the most unusual values, one value a
-    clip; columns that never move are left out there.
-    """
+    """Moments and ends of every column."""
     layout, chosen = dataset.layout, _spread(len(dataset), MEASURED)
     moments, low, high = Moments.none(layout.dim), np.full(layout.dim, np.inf), np.full(layout.dim, -np.inf)
     for clip in bar.track(chosen, description="measuring"):
@@ -175,21 +134,8 @@ def measure(dataset: ShardDataset, bar: Progress) -> Measures:
         moments = moments.merge(Moments.of(motion, present))
         low[present] = np.minimum(low, motion.min(axis=0))[present]
         high[present] = np.maximum(high, motion.max(axis=0))[present]
-    std = np.where(moments.std < STD_FLOOR, np.inf, moments.std)
-    best: list[tuple[float, int, Outlier]] = []
-    for clip in bar.track(chosen, description="outliers"):
-        motion = dataset.motion(clip)
-        away = np.abs(motion - moments.mean) / std
-        away[:, ~layout.present_columns[dataset.present[clip]]] = 0.0
-        frame, column = np.unravel_index(int(away.argmax()), away.shape)
-        most = float(away[frame, column])
-        found = Outlier(most, clip, int(frame), int(column), float(motion[frame, column]))
-        heapq.heappush(best, (most, -clip, found))
-        if len(best) > OUTLIERS:
-            heapq.heappop(best)
     seen = moments.count > 0
-    outliers = [found for _, _, found in sorted(best, reverse=True)]
-    return Measures(len(chosen), moments, np.where(seen, low, 0.0), np.where(seen, high, 0.0), outliers)
+    return Measures(len(chosen), moments, np.where(seen, low, 0.0), np.where(seen, high, 0.0))
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -294,12 +240,8 @@ def _captions(page: Page, records: Records, clips: int) -> None:
             "a clip": records.captions / clips,
             "clips without": clips - sum(records.captioned.values()),
             "different texts": len(records.different),
-            "different words": len(records.words),
-            "words a caption": sum(records.words.values()) / records.captions,
         }
     )
-    common = [(word, count) for word, count in records.words.most_common() if word not in _FILLERS]
-    page.add_ranking(common[:TOP_WORDS], "Most common words (without fillers)")
     page.add_table(["split", "clip", "caption"], records.examples, "Examples")
 
 
@@ -319,13 +261,6 @@ def _features(page: Page, dataset: ShardDataset, found: Measures) -> None:
         rows.append([label(name), size, *means, *ends, still])
     columns = ["feature", "columns", "mean of |mean|", "mean deviation", "largest", "lowest value"]
     page.add_table([*columns, "highest value", "still columns"], rows, digits=4)
-    unusual: Rows = []
-    for one in found.outliers:
-        caption = _main_caption(dataset.texts(one.clip)) or None
-        place = dataset.ids[one.clip], value_name(one.column, layout), one.frame
-        unusual.append([*place, one.value, one.deviations, caption])
-    columns = ["clip", "value", "frame", "is", "deviations", "caption"]
-    page.add_table(columns, unusual, "Most unusual values, one a clip", digits=3)
 
 
 def _rejected(page: Page, manifest: Manifest, clips: int) -> None:
@@ -384,17 +319,3 @@ def _checked(page: Page, found: CheckReport) -> None:
 def _verdict(found: CheckReport) -> str:
     errors, warnings = sum(found.error_kinds.values()), sum(found.warning_kinds.values())
     return f"{errors or 'no'} errors, {warnings or 'no'} warnings"
-
-
-def value_name(column: int, layout: MotionLayout) -> str:
-    """A column in words: the field, and the joint and axis where it has them."""
-    field = next(name for name, _ in layout.fields if column < layout.slice(name).stop)
-    part = layout.slice(field)
-    at, name = column - part.start, label(field)
-    if field not in _FIRST_JOINT:
-        return f"{name} {at}" if part.stop - part.start > 1 else name
-    axes = _AXES.get(field, ("x", "y", "z"))
-    number = at // len(axes) + _FIRST_JOINT[field]
-    known = number < layout.num_joints
-    joint = joint_label(layout.skeleton.joints[number]) if known else f"joint {number}"
-    return f"{name}: {joint}, {axes[at % len(axes)]}"

@@ -11,24 +11,30 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import FACE_ALIGNMENT, GENERATOR, Every, StageContext, register
 from motionloom.pipeline.contract.units import Arrays, Row, as_rows
 from motionloom.pipeline.evaluation.answers import mean_poses
+from motionloom.pipeline.evaluation.cases import Case, extreme_cases, write_cases
 from motionloom.pipeline.evaluation.clip_metrics import (
     CAPTION_METRICS,
     Performance,
     clip_figures,
     measure_clip,
 )
-from motionloom.pipeline.evaluation.details import write_cases
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, STILL, TRAINING, Fact, Figure, FigureFile
 from motionloom.pipeline.evaluation.judges import Judge
-from motionloom.pipeline.evaluation.latent_metrics import GUO_BATCH, judged_figures, reconstructed_figures
+from motionloom.pipeline.evaluation.latent_metrics import (
+    GUO_BATCH,
+    caption_distances,
+    judged_figures,
+    reconstructed_figures,
+)
 from motionloom.pipeline.evaluation.lookup import LOOKUPS
 from motionloom.pipeline.evaluation.movement import Features, all_features, movement_figures
 from motionloom.pipeline.evaluation.reconstruction import clip_error_figures, face_figures
-from motionloom.pipeline.evaluation.truth import Truth, digest_of, spread_any, truth_of
+from motionloom.pipeline.evaluation.truth import Truth, digest_of, reconstruct_truth, spread_any, truth_of
 from motionloom.pipeline.stages.results.evaluate_units import (
     CAPTIONS,
     CLIP,
@@ -73,6 +79,10 @@ class EvaluateStage(EvaluationStage):
 class _Evaluation(EvaluationUnits):
     """What is read from what all processes have made."""
 
+    def __init__(self, context: StageContext) -> None:
+        super().__init__(context)
+        self.cases: list[Case] = []
+
     def measured(self) -> FigureFile:
         """All figures, each beside its trivial answers; `cases.safetensors` is written beside them."""
         context, split = self.context, self.dataset.split
@@ -88,11 +98,9 @@ class _Evaluation(EvaluationUnits):
         if self.performs:
             made = list(context.units.read("generated", len(self.performances)))
             figures += self.by_judges(made) + self.clip_by_clip(made) + self.movement(made)
-            if any(t.truth for t in self.truths):
-                self.details.performed(self.truths, self._first(made))
-        write_cases(context.folder, self.details.cases)
         about = self.about(self.bundle) | {"judges": self._judged_by()}
-        return FigureFile("evaluate", tuple(figures), about, self.details.record())
+        details = write_cases(context.folder, self.cases, self.dataset.layout)
+        return FigureFile("evaluate", tuple(figures), about, details)
 
     def _judged_by(self) -> dict[str, dict[str, Any]]:
         """Stage, kind and checksum of each judge."""
@@ -148,8 +156,15 @@ class _Evaluation(EvaluationUnits):
                     repeats=self.config.repeats,
                     seed=self.context.seed,
                 )
-        self.details.reconstructed(self.tokenizer, self.shown)
+        self.cases += extreme_cases(
+            "reconstruction", self.shown, [row["mpjpe"] for row in rows], self._reconstructed
+        )
         return out
+
+    def _reconstructed(self, number: int) -> NDArray[np.float64]:
+        """Joints [T, N, 3] of a clip through the tokenizer."""
+        assert self.tokenizer is not None
+        return joints_of(reconstruct_truth(self.tokenizer, self.shown[number]), self.tokenizer.layout)
 
     def by_judges(self, made: Sequence[Arrays]) -> list[Figure]:
         """Figures by the latents of each judge."""
@@ -160,7 +175,8 @@ class _Evaluation(EvaluationUnits):
             nearest = {} if judge.motions.part == "face" else self._nearest_captions
             latents = judge.latents(truths, self._latents(made, role), others, nearest)
             if role == "tma":
-                self.details.judged(latents, truths, self._first(made))
+                far = caption_distances(latents.text, latents.made[0]).tolist()
+                self.cases += extreme_cases("generated", truths, far, self._first(made).__getitem__)
             out += judged_figures(
                 role,
                 _NAMES[role],

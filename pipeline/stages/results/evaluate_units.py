@@ -17,7 +17,6 @@ from motionloom.pipeline.contract.stage import StageConfig, StageContext
 from motionloom.pipeline.contract.units import Arrays, as_table, even_slices
 from motionloom.pipeline.evaluation.answers import NearestClip
 from motionloom.pipeline.evaluation.clip_metrics import CAPTION_METRICS, Performance, measure_clip
-from motionloom.pipeline.evaluation.details import Details
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.movement import features_of
 from motionloom.pipeline.evaluation.reconstruction import clip_errors, face_errors, read_basis
@@ -90,7 +89,6 @@ class EvaluationUnits(Evaluation):
             self.bundle = bundle_driven_by("text", makers, context.stage_cache) or Bundle(
                 makers, context.stage_cache
             )
-        self.details = Details(self.dataset.layout, self.dataset.split)
         self.judges = self._judges()
         if self.tokenizer is not None:
             unit = self.tokenizer.net.group_frames

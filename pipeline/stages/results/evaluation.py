@@ -15,7 +15,7 @@ from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.showing import FigureTable, Showing
 from motionloom.pipeline.contract.stage import SHOWING, Finished, Inputs, StageContext, StageKind
 from motionloom.pipeline.contract.units import Arrays, even_slices
-from motionloom.pipeline.evaluation.details import detail_showings
+from motionloom.pipeline.evaluation.cases import shown_cases
 from motionloom.pipeline.evaluation.figures import (
     FILE_NAME,
     Fact,
@@ -55,10 +55,10 @@ class EvaluationStage(StageKind):
         context.units.clear()
 
     def show(self, stage: Finished, given: Inputs) -> list[Showing]:
-        """The tables, and what is drawn beside them."""
+        """The tables, and the worst and the best to watch."""
         found = FigureFile.read(stage.folder / FILE_NAME)
         tables = [FigureTable(*table) for table in figure_tables(found.figures)]
-        return [*tables, *detail_showings(stage.folder, found.details)]
+        return [*tables, *shown_cases(stage.folder, found.details)]
 
 
 class Evaluation:

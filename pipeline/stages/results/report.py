@@ -1,4 +1,4 @@
-"""Report stage: one self-contained page with motions to watch, figures, where they err, curves and codebooks.
+"""Report stage: one self-contained page with motions to watch, figures, curves and codebooks.
 
 Of an unfinished run it shows what there is, and says what is missing (`StageContext.again`).
 """
@@ -18,6 +18,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.showing import Bars, FigureTable
 from motionloom.pipeline.contract.stage import (
     GENERATOR,
     SHOWING,
@@ -29,6 +30,7 @@ from motionloom.pipeline.contract.stage import (
     register,
     stage_kind,
 )
+from motionloom.pipeline.evaluation.cases import Clips
 from motionloom.pipeline.evaluation.dances import dances_of, with_music
 from motionloom.pipeline.evaluation.truth import (
     Truth,
@@ -45,12 +47,7 @@ from motionloom.pipeline.render.body.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.viewer import ViewerMotion
-from motionloom.pipeline.stages.results.report_drawings import (
-    draw_bars,
-    draw_curves,
-    draw_flights,
-    draw_showings,
-)
+from motionloom.pipeline.stages.results.report_drawings import draw_curves, draw_flights, draw_showings
 from motionloom.pipeline.stages.results.report_facts import add_run_facts, say_missing
 from motionloom.pipeline.store.run_state import RunState, run_state
 
@@ -108,9 +105,10 @@ class ReportStage(StageKind):
         shown = [
             thing for stage in stages for thing in stage.kind.show(stage, context.stage_cache.given_to(stage))
         ]
-        draw_showings(page, shown)
+        draw_showings(page, "Figures on held-out clips", FigureTable, shown)
+        draw_showings(page, "Worst and best", Clips, shown)
         draw_curves(page, stages if state is None else _logged(stages, state))
-        draw_bars(page, shown)
+        draw_showings(page, "Codebooks", Bars, shown)
         if state is not None:
             draw_flights(page, state)
         add_run_facts(page, context, state)

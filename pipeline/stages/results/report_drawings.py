@@ -1,78 +1,33 @@
-"""How the report draws what stages have to show: tables, curves, bodies, matrices, motions."""
+"""How the report draws what stages have to show: tables, curves, codebooks, motions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.pipeline.contract.showing import Bars, FigureTable, JointErrors, Matrix, Showing
+from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
 from motionloom.pipeline.contract.stage import Finished
-from motionloom.pipeline.evaluation.details import Clips
+from motionloom.pipeline.evaluation.cases import Clips
 from motionloom.pipeline.render.charts import Line, log_lines
-from motionloom.pipeline.render.labels import curve_label, joint_label
+from motionloom.pipeline.render.labels import curve_label
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.store.run_state import RunState
 from motionloom.pipeline.store.training_log import CRASHES, read_flight, read_training_log
 
-_WORST = 12
-"""Joints that are shown before all of them are unfolded."""
-_ORDER: tuple[tuple[str, type[Showing]], ...] = (
-    ("Figures on held-out clips", FigureTable),
-    ("Where on the body", JointErrors),
-    ("What is taken for what", Matrix),
-    ("Worst and best", Clips),
-)
 
-
-def draw_showings(page: Page, shown: Sequence[Showing]) -> None:
-    """Each kind of thing under a heading of its own."""
-    for heading, kind in _ORDER:
-        draw_kind(page, heading, [thing for thing in shown if isinstance(thing, kind)])
-
-
-def draw_bars(page: Page, shown: Sequence[Showing]) -> None:
-    """Codebooks."""
-    draw_kind(page, "Codebooks", [thing for thing in shown if isinstance(thing, Bars)])
-
-
-def draw_kind(page: Page, heading: str, things: Sequence[Showing]) -> None:
-    """What stages show of one kind; nothing where there is none."""
+def draw_showings(page: Page, heading: str, kind: type[Showing], shown: Sequence[Showing]) -> None:
+    """What stages show of one kind, under a heading; nothing where there is none."""
+    things = [thing for thing in shown if isinstance(thing, kind)]
     if things:
         page.add_heading(heading)
     for thing in things:
-        _draw(page, thing)
-
-
-def _draw(page: Page, thing: Showing) -> None:
-    if isinstance(thing, FigureTable):
-        page.add_table(list(thing.columns), [list(row) for row in thing.rows], thing.title, pinned=True)
-    elif isinstance(thing, Bars):
-        page.add_histogram(
-            {thing.y_label: thing.values}, (0, len(thing.values)), thing.title, thing.x_label, thing.y_label
-        )
-    elif isinstance(thing, JointErrors):
-        _joints(page, thing)
-    elif isinstance(thing, Matrix):
-        page.add_matrix(thing.rows, thing.columns, thing.counts, thing.title, thing.corner)
-    elif isinstance(thing, Clips):
-        page.add_subheading(thing.title)
-        page.add_viewer(thing.motions, thing.note)
-
-
-def _joints(page: Page, thing: JointErrors) -> None:
-    names = Skeleton.named(thing.skeleton).joints
-    wrists: list[float | None] = [None] * len(names)
-    if thing.hands:
-        wrists[BODY_JOINTS:] = thing.hands
-    rows = [
-        (joint_label(joint), error, wrist)
-        for joint, error, wrist in zip(names, thing.errors, wrists, strict=True)
-        if error is not None
-    ]
-    rows.sort(key=lambda row: -row[1])
-    page.add_ranking([(joint, error) for joint, error, _ in rows[:_WORST]], thing.title)
-    page.add_folded("The error of every joint", ["joint", "mm, from the root", "mm, from the wrist"], rows)
+        if isinstance(thing, FigureTable):
+            page.add_table(list(thing.columns), [list(row) for row in thing.rows], thing.title, pinned=True)
+        elif isinstance(thing, Clips):
+            page.add_subheading(thing.title)
+            page.add_viewer(thing.motions, thing.note)
+        elif isinstance(thing, Bars):
+            uses, ends = {thing.y_label: thing.values}, (0, len(thing.values))
+            page.add_histogram(uses, ends, thing.title, thing.x_label, thing.y_label)
 
 
 def draw_curves(page: Page, stages: Sequence[Finished]) -> None:

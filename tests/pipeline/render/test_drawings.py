@@ -1,4 +1,4 @@
-"""Charts, matrices and marked cells as HTML: right numbers, readable names, nothing unescaped."""
+"""Charts and marked cells as HTML: right numbers, readable names, nothing unescaped."""
 
 from __future__ import annotations
 
@@ -12,14 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.charts import Line, histogram, line_chart, matrix_table
-from motionloom.pipeline.render.labels import curve_label, joint_label
+from motionloom.pipeline.render.charts import Line, histogram, line_chart
+from motionloom.pipeline.render.labels import curve_label
 from motionloom.pipeline.render.page import Cell, Page
 
 NASTY = '<b onclick="x">&'
-WHOLE = Skeleton.named("smplx52")
 
 
 class Balanced(HTMLParser):
@@ -41,18 +38,7 @@ class Balanced(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_joints_and_figures_of_a_log_have_names_for_people() -> None:
-    for joint, words in {
-        "left_index2": "left index finger, middle joint",
-        "right_pinky1": "right little finger, knuckle",
-        "left_thumb3": "left thumb, last joint",
-        "right_foot": "right ball of the foot",
-        "left_collar": "left collarbone",
-        "tail_base": "tail base",
-    }.items():
-        assert joint_label(joint) == words
-    labels = [joint_label(joint) for joint in WHOLE.joints]
-    assert len(set(labels)) == 52 and not any("_" in label for label in labels)
+def test_figures_of_a_log_have_names_for_people() -> None:
     for key, words in {
         "tokens_ce": "tokens cross-entropy",
         "tokens_accuracy_left_hand": "tokens accuracy: left hand",
@@ -64,32 +50,16 @@ def test_joints_and_figures_of_a_log_have_names_for_people() -> None:
         assert curve_label(key) == words
 
 
-def test_a_matrix_says_counts_and_shares() -> None:
-    html = matrix_table(["walk", NASTY], ["walk", NASTY, "else"], [[3, 1, 0], [0, 0, 2]], title=NASTY)
-    Balanced(html)
-    assert "<b" not in html.replace("<body", "").replace("<tbody", "") and "&lt;b" in html
-    assert re.findall(r'<td class="(\w+)"(?: style="--share:(\d+)%")?[^>]*>([^<]+)', html) == [
-        ("right", "75", "3"),
-        ("wrong", "25", "1"),
-        ("none", "", "·"),
-        ("none", "", "·"),
-        ("none", "", "·"),
-        ("wrong", "100", "2"),
-    ]
-    with pytest.raises(UserError, match="1 rows and 2 columns do not fit its counts"):
-        matrix_table(["a"], ["a", "b"], [[1]], title="t")
-
-
 def test_cells_and_folds_of_a_page() -> None:
     page = Page("t").add_table(
         ["", Cell(NASTY, colour=3)], [["a", Cell(NASTY, best=True)], ["b", Cell("2", soft=True)]], pinned=True
     )
     with page.folded(NASTY):
-        page.add_matrix(["a"], ["a"], [[1]], "one").add_matrix(["a"], ["a"], [[1]], "two")
-        page.add_plot([Line("x", [1, 2], [1, 2])], "three")
+        for title in ("two", "three"):
+            page.add_plot([Line("x", [1, 2], [1, 2])], title)
     body = page.html().split("<main>")[1].split("</main>")[0]
     assert NASTY not in body and body.count("★") == 1 and '<i class="key s3">' in body
-    assert body.count('<div class="matrices">') == 1 and body.count('<div class="plots">') == 1
+    assert body.count('<div class="plots">') == 1
     assert body.index("<details") < body.index("three") < body.index("</details>")
 
 

@@ -99,7 +99,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory, walk: Any) -> Path:
         [LONG, "z" * 200]
     )
     page.add_folded("listed", ["where", "what"], [[f"clip {k}", LONG] for k in range(60)])
-    page.add_matrix([LONG] * 8, [f"word {k}" for k in range(16)], [[3] * 16] * 8, title=LONG)
     page.add_facts({"a fact": "w" * 60, "clips": 12}).write(root / "report.html")
     return root
 

@@ -104,7 +104,6 @@ def test_it_says_what_is_in_the_set(page: Path, nasty: Path) -> None:
         "No errors",
         "40 warnings",
         "root yaw velocity",
-        "Most unusual values",
     ):
         assert word in whole, word
     assert whole.count("<h1>") == 1 and whole.count("<h2") == 7
@@ -118,12 +117,6 @@ def test_statistics_are_of_the_training_split(nasty: Path) -> None:
     np.testing.assert_allclose(found.moments.mean, motion.mean(axis=0), atol=1e-6)
     np.testing.assert_allclose(found.moments.std, motion.std(axis=0), atol=1e-6)
     np.testing.assert_array_equal(found.low, motion.min(axis=0))
-    away = np.abs(motion - motion.mean(axis=0)) / motion.std(axis=0)
-    best = found.outliers[0]
-    assert best.deviations == pytest.approx(away.max(), rel=1e-4)
-    assert train.motion(best.clip)[best.frame, best.column] == np.float32(best.value)
-    deviations = [one.deviations for one in found.outliers]
-    assert deviations == sorted(deviations, reverse=True)
 
 
 def test_the_same_data_give_the_same_page(page: Path, nasty: Path, tmp_path: Path) -> None:

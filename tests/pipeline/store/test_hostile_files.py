@@ -35,7 +35,7 @@ from motionloom.datasets.shards.sample import captions_from_json
 from motionloom.datasets.text.cache import CacheInfo, TextCache
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.contract.lookup import open_exported
-from motionloom.pipeline.evaluation.details import read_cases
+from motionloom.pipeline.evaluation.cases import read_cases
 from motionloom.pipeline.evaluation.reconstruction import read_basis
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.tokens import TokenStore

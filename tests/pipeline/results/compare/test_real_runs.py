@@ -39,43 +39,21 @@ def text_of(page: Path) -> str:
     return unescape(re.sub(r"<[^>]+>", " ", re.sub(r"<(script|style).*?</\1>", "", html, flags=re.S)))
 
 
-def test_an_evaluation_keeps_joints_confusions_and_cases(small_run: Any) -> None:
+def test_a_finished_run_keeps_its_worst_and_best_to_watch(small_run: Any) -> None:
     folder = small_run.folder / "stages/evaluate"
-    file = FigureFile.read(folder / "metrics.json")
-    figures, mpjpe = file.details, file.of("reconstruction.mpjpe")
-    assert (
-        mpjpe is not None
-        and len(figures["joint_errors_mm"]) == 52
-        and len(figures["hand_joint_errors_mm"]) == 30
-    )
-    mean = sum(figures["joint_errors_mm"]) / 52
-    assert mean == pytest.approx(mpjpe.value, abs=0.02)
-    assert {(c["of"], c["by"]) for c in figures["confusions"]} >= {
-        ("generated", "retrieval"),
-        ("real", "retrieval"),
-        ("generated", "joints"),
-    }
-    for matrix in figures["confusions"]:
-        assert sum(map(sum, matrix["counts"])) <= mpjpe.protocol["clips"]
-    assert {case["of"] for case in figures["cases"]} == {"reconstruction", "generated"}
-    worst = [c["error"] for c in figures["cases"] if c["of"] == "generated" and c["place"] == "worst 1"]
-    best = [c["error"] for c in figures["cases"] if c["of"] == "generated" and c["place"] == "best 1"]
-    assert worst >= best and (folder / "cases.safetensors").is_file()
-
-
-def test_the_page_of_a_run_says_where_it_errs_and_what_was_run(small_run: Any) -> None:
+    cases = FigureFile.read(folder / "metrics.json").details["cases"]
+    assert (folder / "cases.safetensors").is_file()
+    for of in ("reconstruction", "generated"):
+        error = {one["place"]: one["error"] for one in cases if one["of"] == of}
+        assert error["worst 1"] >= error["best 1"] > 0
     text = text_of(small_run.folder / "stages/report/report.html")
     for words in (
-        "Where reconstructions err: mean error of each joint over",
-        "left index finger",
-        "Taken for which action",
         "Worst and best reconstructions",
         "Worst and best generated motions",
         "Settings of every stage",
         "The data: 52 joints at 20 frames a second",
     ):
         assert words in text, words
-    assert "left_hand" not in text.split("What was run")[0]
     assert "in training" not in text and "Still missing" not in text
 
 
