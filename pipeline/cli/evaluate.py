@@ -28,8 +28,7 @@ def evaluate(
         typer.Option(help="Measure nothing; show a table of a paper with the finished runs' rows: ude/2."),
     ] = None,
     tables: Annotated[bool, typer.Option("--tables", help="List the tables of the papers.")] = False,
-    format_: Annotated[str | None, typer.Option("--format", help="Of a table: markdown or latex.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="File for a table.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Markdown file for a table.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Figures on the test split, each beside its trivial answer; with --table, beside a paper's.
@@ -42,10 +41,10 @@ def evaluate(
     if tables or table is not None:
         if as_json:
             raise UserError("--json is of figures measured anew; leave it out")
-        _show_table(table, tables, runs, format_, out, measuring=clips or repeats or device != "auto")
+        _show_table(table, tables, runs, out, measuring=clips or repeats or device != "auto")
         return
-    if format_ is not None or out is not None:
-        raise UserError("--format and --out are of a table; name one, like --table humantomato/7")
+    if out is not None:
+        raise UserError("--out is of a table; name one, like --table humantomato/7")
     if len(runs) != 1:
         raise UserError(
             f"{len(runs)} run folders to evaluate; name one, like: motionloom evaluate runs/NAME "
@@ -61,13 +60,7 @@ def evaluate(
 
 
 def _show_table(
-    table: str | None,
-    tables: bool,
-    runs: list[Path],
-    form: str | None,
-    out: Path | None,
-    *,
-    measuring: object,
+    table: str | None, tables: bool, runs: list[Path], out: Path | None, *, measuring: object
 ) -> None:
     """A table of a paper, or the list of all; what is not of tables is refused."""
     from motionloom.pipeline.results.paper.compare import compare_with_paper, list_tables
@@ -78,8 +71,8 @@ def _show_table(
             "leave them out"
         )
     if table is not None:
-        compare_with_paper(table, runs, format=form, out=out, console=make_console())
-    elif runs or form is not None or out is not None:
+        compare_with_paper(table, runs, out=out, console=make_console())
+    elif runs or out is not None:
         raise UserError("--tables lists the tables alone; to see one, give --table NAME RUN...")
     else:
         list_tables(make_console())

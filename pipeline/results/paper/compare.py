@@ -16,41 +16,33 @@ from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.results.paper.fill import fill
 from motionloom.pipeline.results.paper.filled import FilledTable
 from motionloom.pipeline.results.paper.schema import PaperTable
-from motionloom.pipeline.results.paper.writers import SUFFIXES, WRITERS, print_text
 from motionloom.pipeline.store.files import require_file_place
 from motionloom.pipeline.store.yaml import read_yaml
 
 
 def compare_with_paper(
-    table: str,
-    runs: Sequence[Path] = (),
-    *,
-    format: str | None = None,
-    out: Path | None = None,
-    console: Console | None = None,
+    table: str, runs: Sequence[Path] = (), *, out: Path | None = None, console: Console | None = None
 ) -> FilledTable:
-    """Print a table of a paper with the rows of finished runs, or write it to the file `out`.
+    """Print a table of a paper with the rows of finished runs, or write it to the file `out` as Markdown.
 
     Nothing is measured and no model is loaded: the figures are those of the runs' finished evaluations.
 
     Args:
         table: Its name, such as `humantomato/7`, or a YAML file of the same form.
         runs: Run folders; without any, the paper's numbers stand alone.
-        format: markdown or latex; by default what the suffix of `out` says, or a table for the terminal.
-        out: File to write in place of printing.
+        out: File (.md) to write in place of printing.
         console: Where to print; standard output by default.
     """
     console = console or make_console()
-    form = _format(format, out)
     if out is not None:
+        if out.suffix.lower() != ".md":
+            raise UserError(f"{out}: a table is written as Markdown; name a file that ends in .md")
         require_file_place(out)
     filled = fill(table, paper_table(table), runs)
-    if form is None:
-        print_text(filled, console)
-    elif out is None:
-        console.print(WRITERS[form](filled), soft_wrap=True, markup=False, emoji=False, end="")
+    if out is None:
+        filled.print(console)
     else:
-        write_text(out, WRITERS[form](filled))
+        write_text(out, filled.markdown())
         console.print(str(out), soft_wrap=True)
     return filled
 
@@ -64,16 +56,6 @@ def list_tables(console: Console | None = None) -> None:
         ours = sum(row.ours is not None or row.recorded for row in table.rows)
         grid.add_row(name, table.title, table.section, str(len(table.rows)), str(ours))
     (console or make_console()).print(grid)
-
-
-def _format(given: str | None, out: Path | None) -> str | None:
-    if given is None and out is not None:
-        if out.suffix.lower() not in SUFFIXES:
-            raise UserError(f"{out}: a table is written as {' or '.join(SUFFIXES)}; name such a file")
-        return SUFFIXES[out.suffix.lower()]
-    if given is not None and given not in WRITERS:
-        raise UserError(f"--format {given}: no such format; choose {' or '.join(WRITERS)}")
-    return given
 
 
 def shipped_tables() -> dict[str, Path]:

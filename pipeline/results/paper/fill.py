@@ -10,7 +10,7 @@ from pathlib import Path
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, ROWS, Figure, Protocol, say_difference
 from motionloom.pipeline.results.paper.conditions import config_fits, may_fill, value_at
 from motionloom.pipeline.results.paper.evaluations import Evaluation, evaluations_of
-from motionloom.pipeline.results.paper.filled import Cell, FilledRow, FilledTable, Head
+from motionloom.pipeline.results.paper.filled import Cell, FilledRow, FilledTable
 from motionloom.pipeline.results.paper.notes import data_set_of, differences, notes_of
 from motionloom.pipeline.results.paper.schema import Column, PaperTable, Row
 from motionloom.pipeline.store.run_state import StageRecord
@@ -18,7 +18,6 @@ from motionloom.pipeline.store.run_state import StageRecord
 _MISSING, _NO_MODEL = "missing in these runs", "missing: no model of ours"
 
 _ANSWERS = tuple(row for row in ROWS if row != MODEL)
-_PAPERS = {"humantomato": "HumanTOMATO", "ude": "UDE"}
 
 
 def fill(name: str, table: PaperTable, runs: Sequence[Path] = ()) -> FilledTable:
@@ -47,7 +46,6 @@ class _Filling:
 
     def filled(self) -> FilledTable:
         """The paper's rows, ours below each, and the answers that need no model."""
-        heads = tuple(Head(c.group, c.name, c.unit, c.better, c.printed) for c in self.table.columns)
         models = [self._models(row) for row in self.table.rows]
         rows: list[FilledRow] = []
         for row, ours in zip(self.table.rows, models, strict=True):
@@ -65,15 +63,10 @@ class _Filling:
                 evaluation, self.labels[run], self.table, self.shown.get((run, name), [])
             )
         ]
-        paper, _, number = self.name.partition("/")
-        title = f"{_PAPERS.get(paper, paper)} Table {number}" if number else self.name
-        said = {key: str(value) for key, value in self.table.measured.dump().items() if value}
-        marked = mark_best(rows, heads)
+        marked = mark_best(rows, self.table.columns)
         doubts = [*self._unlike(), *self.doubts]
         notes = notes_of(self.table, marked, list(self.settings), doubts, with_runs=bool(self.evaluations))
-        return FilledTable(
-            self.name, title, self.table.title, self.table.section, said, heads, marked, tuple(found), notes
-        )
+        return FilledTable(self.name, self.table, marked, tuple(found), notes)
 
     def _unlike(self) -> list[str]:
         """How our figures of a column were measured differently from each other."""
@@ -160,31 +153,21 @@ class _Filling:
     ) -> FilledRow:
         assert row.ours is not None
         cells: list[Cell | None] = []
-        alike: list[str | None] = []
         models, evaluations = dict.fromkeys([name] if name else []), dict[str, None]()
         for at, found in enumerate(chosen):
             column = self.table.columns[at]
             if found is None or column.figure is None:
                 cells.append(None)
-                alike.append(None)
                 continue
             evaluation, model = found
             models[model.name] = None
             evaluations[evaluation.name] = None
             figure = evaluation.figure(column.figure.format(**row.values))
             cells.append(None if figure is None else self._cell(evaluation, figure, at))
-            alike.append(None if figure is None else figure.protocol_key)
             self._settings(run, model, {**row.ours.setting, **column.setting})
         label = " ".join([self.labels[run], ", ".join(models)])
         return FilledRow(
-            "ours",
-            row.method,
-            label,
-            tuple(cells),
-            self.labels[run],
-            tuple(models),
-            tuple(evaluations),
-            tuple(alike),
+            "ours", row.method, label, tuple(cells), self.labels[run], tuple(models), tuple(evaluations)
         )
 
     def _settings(self, run: Path, model: StageRecord, paper: Mapping[str, object]) -> None:
@@ -205,7 +188,7 @@ class _Filling:
         mean = figure.value * column.scale
         spread = None if figure.interval is None else figure.interval * column.scale
         text = f"{mean:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
-        return Cell(text, mean, spread)
+        return Cell(text, mean, spread, figure.protocol_key)
 
     def _references(self, values: Mapping[str, str], titles: Iterable[str]) -> list[FilledRow]:
         """Answers that need no model, of the evaluations that the table uses; equal ones of a run once."""
@@ -238,37 +221,25 @@ class _Filling:
 # Which rows are shown, and which figures are the best of those measured alike.
 
 
-def mark_best(rows: Sequence[FilledRow], heads: Sequence[Head]) -> tuple[FilledRow, ...]:
+def mark_best(rows: Sequence[FilledRow], columns: Sequence[Column]) -> tuple[FilledRow, ...]:
     """The rows with the best figures marked: of models of ours, two or more of them measured alike.
 
     The paper's rows, recorded motion and other answers that need no model are never ranked. Equal figures
     are marked together; the figure as it is printed decides.
     """
     best: dict[int, set[int]] = defaultdict(set)
-    for at, head in enumerate(heads):
-        if head.better is None:
-            continue
-        for group in _measured_alike(rows, at).values():
-            if len(group) < 2:
-                continue
-            values = {number: float(cell.text.split(" ")[0]) for number, cell in group}
-            wanted = min(values.values()) if head.better == "lower" else max(values.values())
+    for at, column in enumerate(columns):
+        alike: dict[str, dict[int, float]] = defaultdict(dict)
+        for number, row in enumerate(rows):
+            cell = row.cells[at]
+            if cell is not None and row.source == "ours":
+                alike[cell.alike][number] = float(cell.text.split(" ")[0])
+        for values in alike.values() if column.better else ():
+            wanted = min(values.values()) if column.better == "lower" else max(values.values())
             for number, value in values.items():
                 if value == wanted and len(set(values.values())) > 1:
                     best[number].add(at)
     return tuple(row.marked(best[number]) for number, row in enumerate(rows))
-
-
-def _measured_alike(rows: Sequence[FilledRow], at: int) -> dict[str, list[tuple[int, Cell]]]:
-    """Numbers and cells of our rows in column `at`, by how they were measured."""
-    groups: dict[str, list[tuple[int, Cell]]] = defaultdict(list)
-    for number, row in enumerate(rows):
-        if row.source != "ours" or not row.alike:
-            continue
-        cell, alike = row.cells[at], row.alike[at]
-        if cell is not None and alike is not None:
-            groups[alike].append((number, cell))
-    return groups
 
 
 def without_repetitions(rows: Sequence[FilledRow]) -> list[FilledRow]:

@@ -1,31 +1,27 @@
-"""A table that is filled in: what every writer takes, free of any form."""
+"""A table that is filled in, as Markdown and as a table for terminals."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Literal
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from motionloom.pipeline.results.paper.schema import Column, PaperTable
 
 Source = Literal["paper", "ours", "missing", "reference"]
 """The paper's row; a model of ours; no model of ours; an answer that needs none."""
 
-
-@dataclass(frozen=True)
-class Head:
-    """A column's heading."""
-
-    group: str
-    name: str
-    unit: str
-    better: Literal["lower", "higher"] | None
-    printed: bool
-    """Whether the paper has it."""
-
-    @property
-    def title(self) -> str:
-        """Group, name and unit in one."""
-        unit = f" ({self.unit})" if self.unit else ""
-        return f"{self.group} {self.name}".strip() + unit
+_WHO = {"paper": "paper", "ours": "ours", "missing": "ours", "reference": "no model"}
+_PAPERS = {"humantomato": "HumanTOMATO", "ude": "UDE"}
+_ARROWS = {"lower": " ↓", "higher": " ↑", None: ""}
+_LONG = 40
+"""What the paper's measuring is called in more letters is not repeated with every difference."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +31,8 @@ class Cell:
     text: str
     mean: float
     spread: float | None = None
+    alike: str = ""
+    """Of a figure of ours: those whose words here are equal were measured alike."""
     best: bool = False
 
 
@@ -52,15 +50,11 @@ class FilledRow:
     stages: tuple[str, ...] = ()
     """Of a model: its stage, or one for each setting."""
     evaluations: tuple[str, ...] = ()
-    alike: tuple[str | None, ...] = ()
-    """By cell: rows whose words here are equal were measured alike."""
 
     def marked(self, best: set[int]) -> FilledRow:
         """With the cells of these columns marked as the best."""
-        cells = tuple(
-            None if cell is None else replace(cell, best=at in best) for at, cell in enumerate(self.cells)
-        )
-        return replace(self, cells=cells)
+        cells = [cell and replace(cell, best=at in best) for at, cell in enumerate(self.cells)]
+        return replace(self, cells=tuple(cells))
 
 
 @dataclass(frozen=True)
@@ -77,62 +71,77 @@ class Difference:
 
 @dataclass(frozen=True)
 class FilledTable:
-    """All of it."""
+    """A paper's table with rows of runs."""
 
     name: str
-    paper: str
-    title: str
-    section: str
-    measured: Mapping[str, str]
-    heads: tuple[Head, ...]
+    table: PaperTable
     rows: tuple[FilledRow, ...]
     differences: tuple[Difference, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     @property
     def caption(self) -> str:
-        section = self.section if self.section.startswith("appendix") else f"section {self.section}"
-        return f"{self.paper}: {self.title} ({section})"
+        paper, _, number = self.name.partition("/")
+        title = f"{_PAPERS.get(paper, paper)} Table {number}" if number else self.name
+        section = self.table.section
+        section = section if section.startswith("appendix") else f"section {section}"
+        return f"{title}: {self.table.title} ({section})"
+
+    def lines_below(self) -> Iterator[str]:
+        """Notes, then what was measured otherwise, one line for each evaluation."""
+        yield from self.notes
+        if alone := [_heading(column, arrow=False) for column in self.table.columns if not column.printed]:
+            yield f"{', '.join(alone)}: not in the paper, a figure of ours alone."
+        known = self.table.measured.dump().values()
+        found: dict[tuple[str, str], list[str]] = {}
+        for one in self.differences:
+            theirs = "the paper does not say" if one.paper is None else f"paper: {one.paper}"
+            if one.paper is not None and len(one.paper) > _LONG and one.paper in known:
+                theirs = "paper: see above"
+            found.setdefault((one.run, one.evaluation), []).append(f"{one.what} {one.ours} ({theirs})")
+        for (run, evaluation), said in found.items():
+            yield f"{run} {evaluation}: {'; '.join(said)}"
+
+    def markdown(self) -> str:
+        """A pipe table, the best figures bold, and what is to be known as a list below."""
+        names = [_plain(_heading(column)) for column in self.table.columns]
+        rows = [["", "", *names], ["---", "---", *("---:" for _ in names)]]
+        for row in self.rows:
+            cells = [_marked(cell, "**", "**") for cell in row.cells]
+            rows.append([_plain(row.label), _WHO[row.source], *cells])
+        body = [f"| {' | '.join(row)} |" for row in rows]
+        below = [f"- {_plain(line)}" for line in self.lines_below()]
+        return "\n".join([f"**{_plain(self.caption)}**", "", *body, "", *below, ""])
+
+    def print(self, console: Console) -> None:
+        """The table on a console: the best figures with a star, ours below the paper's."""
+        grid = Table(title=escape(self.caption), title_justify="left", box=SIMPLE_HEAD)
+        grid.add_column("", overflow="fold")
+        for column in self.table.columns:
+            grid.add_column(escape(_heading(column, "\n")), justify="right", overflow="fold")
+        for row in self.rows:
+            indent = "" if row.source in ("paper", "reference") else "  "
+            cells = [escape(_marked(cell, "", "*")) for cell in row.cells]
+            style = "dim" if row.source == "reference" else None
+            grid.add_row(escape(indent + row.label), *cells, style=style)
+        console.print(grid)
+        for line in self.lines_below():
+            console.print(f"- {escape(line)}")
 
 
-ARROWS = {"lower": " ↓", "higher": " ↑", None: ""}
-
-_LONG = 40
-"""What the paper's measuring is called in more letters is not repeated with every difference."""
-
-
-def heading(head: Head) -> str:
-    """A column's name with its unit and the direction of better."""
-    unit = f" ({head.unit})" if head.unit else ""
-    return f"{head.name}{unit}{ARROWS[head.better]}"
+def _heading(column: Column, between: str = " ", *, arrow: bool = True) -> str:
+    """A column's group and name with its unit and the direction of better."""
+    group = f"{column.group}{between}" if column.group else ""
+    unit = f" ({column.unit})" if column.unit else ""
+    return f"{group}{column.name}{unit}{_ARROWS[column.better] if arrow else ''}"
 
 
-def groups(heads: Sequence[Head]) -> list[tuple[str, int]]:
-    """(title, columns) of neighbouring columns of one group, in order; none where no column has a group."""
-    out: list[tuple[str, int]] = []
-    for head in heads:
-        if out and out[-1][0] == head.group:
-            out[-1] = (head.group, out[-1][1] + 1)
-        else:
-            out.append((head.group, 1))
-    return out if any(title for title, _ in out) else []
+def _marked(cell: Cell | None, before: str, behind: str) -> str:
+    if cell is None:
+        return ""
+    return f"{before}{cell.text}{behind}" if cell.best else cell.text
 
 
-def who(row: FilledRow) -> str:
-    """Whose row it is, in one word."""
-    return {"paper": "paper", "ours": "ours", "missing": "ours", "reference": "no model"}[row.source]
-
-
-def lines_below(table: FilledTable) -> Iterator[str]:
-    """Notes, then what was measured otherwise, one line for each evaluation."""
-    yield from table.notes
-    if alone := [head.title for head in table.heads if not head.printed]:
-        yield f"{', '.join(alone)}: not in the paper, a figure of ours alone."
-    found: dict[tuple[str, str], list[str]] = {}
-    for one in table.differences:
-        theirs = "the paper does not say" if one.paper is None else f"paper: {one.paper}"
-        if one.paper is not None and len(one.paper) > _LONG and one.paper in table.measured.values():
-            theirs = "paper: see above"
-        found.setdefault((one.run, one.evaluation), []).append(f"{one.what} {one.ours} ({theirs})")
-    for (run, evaluation), said in found.items():
-        yield f"{run} {evaluation}: {'; '.join(said)}"
+def _plain(text: str) -> str:
+    """Text that Markdown shows as it is, also in a cell."""
+    return re.sub(r"([\\|*<`\[])", r"\\\1", text.replace("\n", " "))

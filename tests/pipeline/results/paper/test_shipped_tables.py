@@ -40,7 +40,7 @@ def test_no_number_of_the_papers_has_changed() -> None:
 @pytest.mark.parametrize(("name", "method", "column", "wanted"), FEW)
 def test_some_numbers_typed_again(name: str, method: str, column: str, wanted: str) -> None:
     filled = fill(name, paper_table(name))
-    heads = [f"{head.group} {head.name}".strip() for head in filled.heads]
+    heads = [column.title for column in filled.table.columns]
     row = next(row for row in filled.rows if row.method == method)
     cell = row.cells[heads.index(column)]
     assert cell is not None and cell.text == wanted

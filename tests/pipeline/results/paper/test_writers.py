@@ -1,4 +1,4 @@
-"""Each form of a filled table, read back; and what the command line does with it."""
+"""Both forms of a filled table, read back; and what the command line does with it."""
 
 from __future__ import annotations
 
@@ -15,88 +15,59 @@ from rich.console import Console
 from motionloom.pipeline import compare_with_paper
 from motionloom.pipeline.results.paper.compare import paper_table, shipped_tables
 from motionloom.pipeline.results.paper.fill import fill
-from motionloom.pipeline.results.paper.filled import Cell, Difference, FilledRow, FilledTable, Head
-from motionloom.pipeline.results.paper.writers import WRITERS, latex, markdown, print_text
+from motionloom.pipeline.results.paper.filled import Cell, Difference, FilledRow, FilledTable
+from motionloom.pipeline.results.paper.schema import PaperTable
 
+PAPER = PaperTable.parse(
+    {
+        "title": "a & b | 50 %",
+        "section": "4",
+        "measured": {"data": "D"},
+        "columns": [
+            {"group": "G_1", "name": "x", "unit": "mm/frame²", "better": "lower", "figure": "x"},
+            {"group": "G_1", "name": "y", "better": "higher", "figure": "y"},
+            {"name": "z|z", "figure": "z", "printed": False},
+        ],
+        "rows": [{"method": "m_1", "paper": "1.50 ± .20 | -", "why": "none"}],
+    },
+    "p.yaml",
+)
 TABLE = FilledTable(
-    name="p/1",
-    paper="P Table 1",
-    title="a & b | 50 % of #1",
-    section="4",
-    measured={"data": "D"},
-    heads=(
-        Head("G_1", "x", "mm/frame²", "lower", True),
-        Head("G_1", "y", "", "higher", True),
-        Head("", "z|z", "", None, False),
+    "p/1",
+    PAPER,
+    (
+        FilledRow("paper", "m_1", "m_1", (Cell("1.50 ± .20", 1.5, 0.2), None, None)),
+        FilledRow("ours", "m_1", "[red]r a|b", (Cell("2.0", 2.0, best=True), Cell("0.1", 0.1), None)),
+        FilledRow("reference", "", "chance", (None, Cell("0.5", 0.5), None)),
     ),
-    rows=(
-        FilledRow("paper", "m_1 ✗", "m_1 ✗", (Cell("1.50 ± .20", 1.5, 0.2), None, None)),
-        FilledRow(
-            "ours",
-            "m_1 ✗",
-            "r{1} a|b",
-            (Cell("2.0", 2.04, None, True), Cell("0.1", 0.1), Cell("7", 7.0)),
-            "r{1}",
-            ("a|b",),
-            ("e",),
-            ("k", "k", None),
-        ),
-        FilledRow("missing", "m2", "missing", (None, None, None)),
-        FilledRow("reference", "", "chance", (None, Cell("0.5", 0.5), None), "r{1}"),
-    ),
-    differences=(Difference("r{1}", "e", "data", "S", "D"), Difference("r{1}", "e", "clips", "3", None)),
-    notes=("A note of 5 %.",),
+    differences=(Difference("r", "e", "data", "S", "D"), Difference("r", "e", "clips", "3", None)),
+    notes=("A note [n].",),
 )
 
 
 def test_markdown_has_as_many_cells_in_every_row() -> None:
-    lines = markdown(TABLE).splitlines()
-    assert lines[0] == r"**P Table 1: a & b \| 50 % of #1 (section 4)**"
+    lines = TABLE.markdown().splitlines()
+    assert lines[0] == r"**p Table 1: a & b \| 50 % (section 4)**"
     rows = [re.split(r"(?<!\\)\|", line)[1:-1] for line in lines if line.startswith("|")]
-    assert {len(row) for row in rows} == {5} and len(rows) == 6
+    assert {len(row) for row in rows} == {5} and len(rows) == 5
     assert [cell.strip() for cell in rows[0]] == ["", "", "G_1 x (mm/frame²) ↓", "G_1 y ↑", r"z\|z"]
-    assert [cell.strip() for cell in rows[3]] == [r"r{1} a\|b", "ours", "**2.0**", "0.1", "7"]
-    assert (
-        "- A note of 5 %." in lines
-        and "- r{1} e: data S (paper: D); clips 3 (the paper does not say)" in lines
-    )
+    assert [cell.strip() for cell in rows[3]] == [r"\[red]r a\|b", "ours", "**2.0**", "0.1", ""]
+    assert "- r e: data S (paper: D); clips 3 (the paper does not say)" in lines
     assert r"- z\|z: not in the paper, a figure of ours alone." in lines
 
 
-def test_latex_is_escaped_and_balanced() -> None:
-    found = latex(TABLE)
-    assert r"\caption{P Table 1: a \& b \textbar{} 50 \% of \#1 (section 4)}" in found
-    assert r"\multicolumn{2}{c}{G\_1}" in found and r"\cmidrule(lr){2-3}" in found
-    assert r"m\_1 $\times$ & 1.50 $\pm$ .20 &  &  \\" in found
-    assert r"\quad r\{1\} a\textbar{}b & \textbf{2.0} & 0.1 & 7 \\" in found
-    body = found.split(r"\toprule")[1].split(r"\bottomrule")[0]
-    for line in body.splitlines():
-        if line.endswith(r"\\") and "multicolumn" not in line:
-            assert len(re.findall(r"(?<!\\)&", line)) == 3
-    for name in ("table", "tabular", "flushleft"):
-        assert found.count(rf"\begin{{{name}}}") == found.count(rf"\end{{{name}}}") == 1
-    plain = re.sub(r"\\[{}]", "", found)
-    assert plain.count("{") == plain.count("}")
-    assert found.index(r"\midrule" + "\nchance") > 0
-
-
 def test_text_marks_the_best_and_keeps_brackets(capsys: pytest.CaptureFixture[str]) -> None:
-    table = FilledTable(
-        "p/1", "P", "t", "4", {}, (Head("", "[a]", "", "lower", True),),
-        (FilledRow("ours", "m", "[red]r", (Cell("1", 1.0, None, True),)),), (), ("[n]",),
-    )  # fmt: skip
-    print_text(table, Console(width=80))
+    TABLE.print(Console(width=100))
     found = capsys.readouterr().out
-    assert "[a] ↓" in found and re.search(r"\[red\]r +1\*", found) and "- [n]" in found
+    assert re.search(r"\[red\]r a\|b +2.0\*", found) and "- A note [n]." in found
 
 
 @pytest.mark.parametrize("name", list(shipped_tables()))
-def test_every_table_is_written_in_every_form(name: str) -> None:
+def test_every_table_is_written_with_all_its_numbers(name: str) -> None:
     filled = fill(name, paper_table(name))
     numbers = [cell.text.split(" ")[0] for row in filled.rows for cell in row.cells if cell]
-    for form, write in WRITERS.items():
-        written = write(filled)
-        assert numbers and all(number in written for number in numbers), form
+    written = filled.markdown()
+    assert numbers and all(number in written for number in numbers)
 
 
 Call = Callable[..., Any]
@@ -108,10 +79,9 @@ def test_the_command_prints_and_writes(baselines: Callable[..., Path], call: Cal
     assert (
         shown.code == 0 and "one vq" in shown.out and "two tokenizer" in shown.out and "140.66" in shown.out
     )
-    for name, start in (("a.md", "**Human"), ("a.tex", "% needs")):
-        done = call("evaluate", run, "--table", "humantomato/7", "-o", tmp_path / "new" / name)
-        assert done.code == 0 and done.out.strip() == str(tmp_path / "new" / name)
-        assert (tmp_path / "new" / name).read_text(encoding="utf-8").startswith(start)
+    done = call("evaluate", run, "--table", "humantomato/7", "-o", tmp_path / "new/a.md")
+    assert done.code == 0 and done.out.strip() == str(tmp_path / "new/a.md")
+    assert (tmp_path / "new/a.md").read_text(encoding="utf-8").startswith("**Human")
 
 
 def test_the_list_of_tables(call: Call) -> None:
@@ -140,12 +110,11 @@ def test_a_table_of_ones_own(baselines: Callable[..., Path], tmp_path: Path) -> 
     [
         (["--table", "humantomato/70"], "no such table; did you mean 'humantomato/7'?"),
         (["--table", "ude/1", "nowhere"], "nowhere: no such folder"),
-        (["--table", "ude/1", "--format", "latx"], "--format latx: no such format; choose markdown or latex"),
         (["--table", "ude/1", "--clips", "4"], "--clips, --repeats and --device measure anew"),
-        (["--table", "ude/1", "-o", "x.csv"], "x.csv: a table is written as .md or .tex"),
+        (["--table", "ude/1", "-o", "x.csv"], "x.csv: a table is written as Markdown"),
         (["--table", "gone.yaml"], "gone.yaml: cannot be read"),
         (["--tables", "runs"], "--tables lists the tables alone"),
-        (["runs", "-o", "x.md"], "--format and --out are of a table"),
+        (["runs", "-o", "x.md"], "--out is of a table"),
         (["one", "two"], "2 run folders to evaluate; name one"),
         ([], "0 run folders to evaluate; name one"),
     ],
