@@ -11,9 +11,8 @@ import statistics
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -27,42 +26,29 @@ from motionloom.pipeline.store.files import open_own
 from motionloom.pipeline.store.training_log import FLIGHT, read_rows
 
 
-@dataclass
-class WaitTimes:
-    """Seconds that this process has waited, by cause."""
+class WaitTimes(dict[str, float]):
+    """Seconds that this process has waited, by cause.
 
-    data: float = 0.0
-    """For the next batch: what the reader had not prepared while the step before it was computed."""
-    checkpoints: float = 0.0
-    """For copying the state, and for the checkpoint before it if that was still being written."""
-    ranks: float = 0.0
-    """For ranks that came later to a step."""
-    wall: float = 0.0
-    """Seconds that have passed in all."""
+    `data`: for the next batch, what the reader had not prepared while the step before it was computed;
+    `checkpoints`: for copying the state, and for the checkpoint before it if that was still being written;
+    `ranks`: for ranks that came later to a step.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(data=0.0, checkpoints=0.0, ranks=0.0)
 
     @contextmanager
     def waiting_for(self, cause: str) -> Iterator[None]:
-        """Count the time inside as a wait for `cause`, a field."""
+        """Count the time inside as a wait for `cause`."""
         begin = time.perf_counter()
         try:
             yield
         finally:
-            setattr(self, cause, getattr(self, cause) + time.perf_counter() - begin)
+            self[cause] += time.perf_counter() - begin
 
-    def since(self, before: WaitTimes) -> WaitTimes:
-        """What has come since `before`, a copy made earlier."""
-        return WaitTimes(
-            self.data - before.data,
-            self.checkpoints - before.checkpoints,
-            self.ranks - before.ranks,
-            self.wall - before.wall,
-        )
-
-    def shares(self) -> dict[str, float]:
-        """Share of the wall time, 0 to 1, by cause."""
-        wall = max(self.wall, 1e-9)
-        causes = {"data": self.data, "checkpoints": self.checkpoints, "ranks": self.ranks}
-        return {cause: min(1.0, max(0.0, seconds / wall)) for cause, seconds in causes.items()}
+    def shares(self, before: Mapping[str, float], seconds: float) -> dict[str, float]:
+        """Of the last `seconds` what went by waiting since `before`, a copy made then; 0 to 1, by cause."""
+        return {cause: min(1.0, (now - before[cause]) / max(seconds, 1e-9)) for cause, now in self.items()}
 
 
 class Telemetry:
@@ -73,8 +59,9 @@ class Telemetry:
         self.waits = WaitTimes()
         self._log = folder / FLIGHT / f"rank_{rank()}.jsonl"
         self._first = module.step
-        self._start = self._step_start = time.perf_counter()
-        self._row_start = replace(self.waits)
+        self._start = self._step_start = self._row_start = time.perf_counter()
+        self._before = dict(self.waits)
+        """Waits up to the last row."""
         self._seconds: list[float] = []
         """Of the steps since the last row."""
         self._own: list[float] = []
@@ -95,31 +82,32 @@ class Telemetry:
 
     def begin_step(self) -> None:
         """Validations and checkpoints do not count in the time of a step."""
-        self._step_start, self._data_before = time.perf_counter(), self.waits.data
+        self._step_start, self._data_before = time.perf_counter(), self.waits["data"]
 
     def end_step(self) -> None:
         seconds = time.perf_counter() - self._step_start
         self._seconds.append(seconds)
         self._latest.append(seconds)
-        self._own.append(seconds - (self.waits.data - self._data_before))
+        self._own.append(seconds - (self.waits["data"] - self._data_before))
 
     def end_row(self) -> dict[str, float]:
         """Write a row; all ranks call this after the same step. What loggers get of it."""
         late = all_ranks(([0.0] * LOG_EVERY + self._own)[-LOG_EVERY:], self.module.device)
-        self.waits.ranks += waited_in_steps(late, rank())
-        self.waits.wall = time.perf_counter() - self._start
-        waited, self._row_start = self.waits.since(self._row_start), replace(self.waits)
+        self.waits["ranks"] += waited_in_steps(late, rank())
+        now = time.perf_counter()
+        wall, self._row_start = max(now - self._row_start, 1e-9), now
+        waited, self._before = self.waits.shares(self._before, wall), dict(self.waits)
         seconds, self._seconds, self._own = self._seconds, [], []
         units, latest = self._read_lengths(), sorted(self._latest)
         row: dict[str, float] = {
-            "samples_per_second": len(seconds) * self.batch_size / max(waited.wall, 1e-9),
+            "samples_per_second": len(seconds) * self.batch_size / wall,
             "step_seconds": statistics.median(seconds),
             "step_seconds_p95": latest[-(-95 * len(latest) // 100) - 1],
-            **{f"waited/{cause}": share for cause, share in waited.shares().items()},
+            **{f"waited/{cause}": share for cause, share in waited.items()},
             "rss_mib": _rss_mib(),
         }
         if self._unit:
-            row[f"{self._unit}_per_second"] = units * world_size() / max(waited.wall, 1e-9)
+            row[f"{self._unit}_per_second"] = units * world_size() / wall
         if self.module.device.type == "cuda":
             row["cuda_peak_mib"] = torch.cuda.max_memory_allocated(self.module.device) / 2**20
         with open_own(self._log, "a") as file:
@@ -132,17 +120,14 @@ class Telemetry:
         self._read_lengths()
         if not steps:
             return ""
-        self.waits.wall = wall
         speeds = [f"{steps * self.batch_size / wall:,.1f} samples/s"]
         if self._unit:
             speeds.append(f"{self._units * world_size() / wall:,.0f} {self._unit}/s")
-        shares = self.waits.shares()
-        waits = [
-            f"{100 * shares['data']:.1f} % for data",
-            f"{100 * shares['checkpoints']:.1f} % for checkpoints",
-        ]
-        if world_size() > 1:
-            waits.append(f"{100 * shares['ranks']:.1f} % for other ranks")
+        shares = self.waits.shares(WaitTimes(), wall)
+        if world_size() == 1:
+            del shares["ranks"]
+        named = {"ranks": "other ranks"}
+        waits = [f"{100 * share:.1f} % for {named.get(cause, cause)}" for cause, share in shares.items()]
         return f"{', '.join(speeds)}; waited {', '.join(waits)}"
 
     def _read_lengths(self) -> float:

@@ -20,6 +20,7 @@ import torch
 import torch.distributed as dist
 from lightning.fabric import Fabric
 from torch import Tensor
+from torch.profiler import profile
 
 from motionloom.datasets.base.files import remove_temporaries
 from motionloom.datasets.schema import UserError
@@ -58,7 +59,7 @@ from motionloom.pipeline.training.execution import (
 from motionloom.pipeline.training.failures import FailureGuard, StallTimer
 from motionloom.pipeline.training.loggers import Loggers
 from motionloom.pipeline.training.preemption import Agreement, Signals
-from motionloom.pipeline.training.profiler import StepProfiler
+from motionloom.pipeline.training.profiler import step_profiler
 from motionloom.pipeline.training.progress import MetricLog, StepProgress
 from motionloom.pipeline.training.telemetry import Telemetry
 
@@ -146,17 +147,18 @@ class Training:
         self.stall = StallTimer(
             context.folder / CRASHES / f"stalled_rank_{rank()}.txt", hardware.stall_seconds
         )
-        self.profiler: StepProfiler | None = None
-        if hardware.profile:
-            self.profiler = StepProfiler(
-                name, context.folder, hardware.profile, module.step, config.steps, module.device, console
-            )
+        self.profiler: profile | None = None
+        if hardware.profile and module.step < config.steps:
+            left = config.steps - module.step
+            self.profiler = step_profiler(name, context.folder, hardware.profile, left, console)
 
     def run(self) -> None:
         self.log.open()
         self.progress = StepProgress(
             self.context.name, self.module.step, self.config.steps, self.context.console
         )
+        if self.profiler is not None:
+            self.profiler.start()
         with Signals() as self.signals, self.stall.running():
             self.agreement = Agreement(self.signals, world_size())
             try:
@@ -171,7 +173,7 @@ class Training:
             finally:
                 self.progress.close()
                 if self.profiler is not None:
-                    self.profiler.close()
+                    self.profiler.stop()
         summary = self.telemetry.summary()
         if summary:
             self.context.console.print(f"    {self.context.name}: {summary}")
@@ -198,15 +200,13 @@ class Training:
 
     def _step(self, batches: Iterator[Batch]) -> None:
         self.telemetry.begin_step()
-        if self.profiler is not None:
-            self.profiler.begin_step(self.module.step)
         loss = self.module.take_step(self._parts(batches), self.optimizers, self.how)
         step = self.module.step
         if self.average is not None:
             self.average.update(self.module.net)
         self.telemetry.end_step()
         if self.profiler is not None:
-            self.profiler.end_step(step)
+            self.profiler.step()
         if self.failures.due(step):
             self.failures.check(scaled=self.how.scaler is not None)
         if step % LOG_EVERY == 0:
