@@ -71,7 +71,7 @@ def print_comparison(
             console.print(f"{run.label}: missing {'; '.join(lines)}", markup=False, soft_wrap=True)
     for sentence in dict.fromkeys(table.difference for _, _, table in leading if table.difference):
         console.print(sentence, markup=False, soft_wrap=True)
-    keys = [f"{d.stage}.{one.key}" if d.stage else one.key for d in differences for one in d.differences]
+    keys = [f"{one.stage}.{key}" if one.stage else key for one in differences for key in one.differences]
     if keys:
         more = f" and {len(keys) - KEYS} more" if len(keys) > KEYS else ""
         console.print(f"settings that differ: {', '.join(keys[:KEYS])}{more}", markup=False, soft_wrap=True)

@@ -20,12 +20,8 @@ from motionloom.pipeline.store.yaml import setting_text
 NO_PAGES = ("report",)
 """Kinds of stages that nothing compared here comes from."""
 LETTERS = "ABCDEFGH"
-FIRST = ("loss", "recon", "contrastive", "ce", "accuracy")
-"""Curves that are drawn first: what their names begin with, or end in behind the name of a stream."""
 OPEN = 4
 """Charts of a stage that are not folded away."""
-NAMED = 3
-"""So many runs are named in the page's title, more are counted."""
 
 
 def comparison_page(
@@ -33,11 +29,7 @@ def comparison_page(
 ) -> Page:
     """The page of `runs`."""
     names = " and ".join((", ".join(run.label for run in runs[:-1]), runs[-1].label))
-    what = "settings that differ, figures on held-out clips, training curves"
-    if len(runs) <= NAMED:
-        page = Page(f"{names} compared", what.capitalize())
-    else:
-        page = Page(f"{len(runs)} runs compared", f"{names}: {what}")
+    page = Page(f"{names} compared", "Settings that differ, figures on held-out clips, training curves")
     _who(page, runs)
     _settings(page, runs, differences)
     _figures(page, runs, tables)
@@ -87,8 +79,8 @@ def _settings(page: Page, runs: Sequence[ComparedRun], differences: Sequence[Sta
             page.add_text(f"{absent}." if stage.differences else f"{absent}; equal where it is.")
         if stage.differences:
             rows = [
-                [one.key, *(None if value is ABSENT else setting_text(value) for value in one.values)]
-                for one in stage.differences
+                [key, *(None if value is ABSENT else setting_text(value) for value in values)]
+                for key, values in stage.differences.items()
             ]
             page.add_table(["setting", *(_chip(run) for run in runs)], rows, title, pinned=True)
 
@@ -155,48 +147,19 @@ def _curves(page: Page, runs: Sequence[ComparedRun]) -> None:
     )
     for stage in stages:
         page.add_subheading(stage)
-        for line in _remarks(runs, stage):
-            page.add_text(line)
+        kinds = {run.label: state.kind for run in runs if (state := run.state.stage(stage)) is not None}
+        if len(set(kinds.values())) > 1:
+            listed = "; ".join(f"{label}: {kind}" for label, kind in kinds.items())
+            page.add_text(f"Stages of different kinds, so other losses: {listed}.")
         logs = [(run, run.logs.get(stage, [])) for run in runs]
         keys = {key.partition("/")[2] for _, rows in logs for row in rows for key in row if "/" in key}
-        figures = sorted(keys, key=_place)
+        figures = sorted(keys, key=lambda key: ("loss" not in key, key))
         for figure in figures[:OPEN]:
             _chart(page, logs, stage, figure)
         if more := figures[OPEN:]:
             with page.folded(f"{len(more)} more curves of {stage}"):
                 for figure in more:
                     _chart(page, logs, stage, figure)
-
-
-def _place(figure: str) -> tuple[int, str]:
-    for number, name in enumerate(FIRST):
-        if figure == name or figure.startswith(f"{name}_") or figure.endswith(f"_{name}"):
-            return number, figure
-    return len(FIRST), figure
-
-
-def _remarks(runs: Sequence[ComparedRun], stage: str) -> list[str]:
-    """What to know before comparing a stage's curves."""
-    states = {run.label: run.state.stage(stage) for run in runs}
-    kinds: Mapping[str, list[str]] = {}
-    for label, state in states.items():
-        if state is not None:
-            kinds = {**kinds, state.kind: [*kinds.get(state.kind, []), label]}
-    out = []
-    if len(kinds) > 1:
-        listed = "; ".join(f"{kind}: {', '.join(labels)}" for kind, labels in kinds.items())
-        out.append(f"Stages of different kinds, so other losses: {listed}.")
-    without = [run.label for run in runs if stage not in run.logs]
-    going = [
-        f"{label} ({state.say()})"
-        for label, state in states.items()
-        if state is not None and state.progress == "started"
-    ]
-    if without:
-        out.append(f"No curves of: {', '.join(without)}.")
-    if going:
-        out.append(f"Not finished: {', '.join(going)}.")
-    return out
 
 
 def _chart(

@@ -85,22 +85,8 @@ def _labels(places: Sequence[Path]) -> list[str]:
 # Settings in which runs differ, stage by stage.
 
 
-class Absent:
-    """Stands for a setting that a run does not have."""
-
-    def __repr__(self) -> str:
-        return "absent"
-
-
-ABSENT = Absent()
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A setting, and its value in each run, in the runs' order; `ABSENT` where a run does not have it."""
-
-    key: str
-    values: tuple[object, ...]
+ABSENT = "(absent)"
+"""Stands for a setting that a run does not have."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +96,8 @@ class StageDifferences:
     stage: str
     missing: tuple[str, ...]
     """Runs whose recipe has no such stage."""
-    differences: tuple[Difference, ...]
+    differences: Mapping[str, tuple[object, ...]]
+    """Setting -> its value in each run, in the runs' order; `ABSENT` where a run does not have it."""
 
 
 def stage_names(runs: Sequence[ComparedRun]) -> list[str]:
@@ -147,14 +134,13 @@ def _settings(stage: StageState | None) -> Mapping[str, object] | None:
     return {"kind": stage.kind, **flatten({"inputs": stage.inputs}), **flatten(stage.settings)}
 
 
-def _differences(each: Sequence[Mapping[str, object] | None]) -> tuple[Difference, ...]:
+def _differences(each: Sequence[Mapping[str, object] | None]) -> dict[str, tuple[object, ...]]:
     """Keys whose values are not equal in all of `each` that are there."""
     there = [settings for settings in each if settings is not None]
-    out = []
+    out = {}
     for key in dict.fromkeys(key for settings in there for key in settings):
         found = [settings.get(key, ABSENT) for settings in there]
         # Python takes 1 and true for equal.
         if any(value != found[0] or isinstance(value, bool) != isinstance(found[0], bool) for value in found):
-            values = tuple(ABSENT if settings is None else settings.get(key, ABSENT) for settings in each)
-            out.append(Difference(key, values))
-    return tuple(out)
+            out[key] = tuple(ABSENT if settings is None else settings.get(key, ABSENT) for settings in each)
+    return out

@@ -88,7 +88,7 @@ def _table(
     order = list(dict.fromkeys(keys.values()))
     numbers = {label: order.index(key) for label, key in keys.items()}
     subjects = {label: own[MODEL] for label, own in rows.items()}
-    best = _best(subjects)
+    best = _best(subjects, numbers)
     there = [run for run in runs if run.label in rows]
     return ComparedTable(
         title=group,
@@ -101,25 +101,25 @@ def _table(
     )
 
 
-def _best(rows: Mapping[str, Row]) -> dict[str, dict[str, bool]]:
+def _best(rows: Mapping[str, Row], protocols: Mapping[str, int]) -> dict[str, dict[str, bool]]:
     """Of each run the columns in which it is the best of those measured alike, and whether that is sure."""
     out: dict[str, dict[str, bool]] = {label: {} for label in rows}
     for name in dict.fromkeys(name for row in rows.values() for name in row):
-        left = {label: row[name] for label, row in rows.items() if name in row}
-        while left:
-            first = next(iter(left.values()))
+        for protocol in set(protocols.values()):
             alike = {
-                label: figure for label, figure in left.items() if figure.protocol_key == first.protocol_key
+                label: row[name]
+                for label, row in rows.items()
+                if name in row and protocols[label] == protocol
             }
-            left = {label: figure for label, figure in left.items() if label not in alike}
-            winner = _winner(alike, first.better)
+            winner = _winner(alike)
             if winner is not None:
                 out[winner[0]][name] = winner[1]
     return out
 
 
-def _winner(figures: Mapping[str, Figure], better: str) -> tuple[str, bool] | None:
+def _winner(figures: Mapping[str, Figure]) -> tuple[str, bool] | None:
     """The best of two or more, and whether its interval is clear of the others'; None where two are equal."""
+    better = next((one.better for one in figures.values()), "")
     if len(figures) < 2 or not better:
         return None
     sign = 1.0 if better == "lower" else -1.0

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -178,47 +177,3 @@ def test_loose_files_are_checked(call: Callable[..., Any], tmp_path: Path) -> No
     (tmp_path / "bad\x1b[2Jname\n.txt").write_text("")
     bad = call("data", "check", tmp_path, "--layout", "h3d263")
     assert bad.code == 1 and "\x1b" not in bad.out and r"bad\x1b[2Jname\n.txt: no usable text" in bad.out
-
-
-# ---- in a browser
-
-
-@pytest.mark.browser
-@pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 400)])
-def test_it_plays_and_stays_quiet(browser: Any, until: Any, page: Path, scheme: str, width: int) -> None:
-    trouble: list[str] = []
-    sheet = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
-    sheet.on("console", lambda m: trouble.append(m.text) if m.type in ("error", "warning") else None)
-    sheet.on("pageerror", lambda e: trouble.append(str(e)))
-    sheet.on("request", lambda r: trouble.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
-    sheet.goto(page.as_uri())
-    until(sheet, "window.__viewer && window.__viewer.draws > 0")
-    assert sheet.locator("canvas").count() == 12
-    first = sheet.evaluate("__viewer.frame")
-    until(sheet, f"Math.abs(__viewer.frame - {first}) >= 3")
-    sheet.evaluate("() => { __viewer.play(false); __viewer.setFrame(2); }")
-    for number in (0, 11):
-        canvas = sheet.locator("canvas").nth(number)
-        canvas.scroll_into_view_if_needed()
-        sheet.wait_for_timeout(200)
-        before = canvas.screenshot()
-        sheet.evaluate("__viewer.setFrame(30)")
-        sheet.wait_for_timeout(200)
-        assert canvas.screenshot() != before
-        sheet.evaluate("__viewer.setFrame(2)")
-    assert any(NASTY in words for words in sheet.locator("figcaption").all_text_contents())
-    assert sheet.locator("img, b").count() == 0 and sheet.evaluate("window.hacked") is None
-    folded = sheet.locator("details").first
-    assert not folded.locator("table").is_visible()
-    folded.locator("summary").click()
-    assert folded.locator("table").is_visible()
-    assert sheet.evaluate("document.documentElement.scrollWidth") <= width
-    ink, paper = (
-        sheet.evaluate(f"getComputedStyle(document.body).{name}") for name in ("color", "backgroundColor")
-    )
-    light = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
-    assert abs(light[0] - light[1]) > 450 and (light[1] > light[0]) == (scheme == "light")
-    levels = sheet.evaluate("[...document.querySelectorAll('h1, h2, h3')].map(h => Number(h.tagName[1]))")
-    assert levels[0] == 1 and all(deeper - level <= 1 for level, deeper in pairwise(levels))
-    sheet.close()
-    assert not trouble

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -74,21 +73,3 @@ def test_killed_between_the_last_step_and_the_artifact(
     done = call("run", small_run.recipe, "--out", run)
     assert done.code == 0 and "1 of 15 stages to run" in done.out
     assert artifacts(run) == artifacts(small_run.folder)
-
-
-def test_another_checkpoint_interval_changes_no_weight(
-    small_run: Any, tmp_path: Path, call: Callable[..., Any]
-) -> None:
-    run = tmp_path / small_run.folder.name
-    shutil.copytree(small_run.folder, run)
-    folder = run / "stages/tokenizer"
-    shutil.rmtree(folder / "checkpoints")
-    for path in small_run.folder.glob("stages/tokenizer/checkpoints/*24.ckpt"):
-        (folder / "checkpoints").mkdir()
-        shutil.copy(path, folder / "checkpoints")
-    (folder / "artifact.json").unlink()
-    (folder / "model.safetensors").unlink()
-    done = call("run", small_run.recipe, "--out", run, "--set", "tokenizer.train.checkpoint_every=4")
-    assert done.code == 0 and "resuming tokenizer at step 24 of 30" in done.out
-    outputs = [json.loads(artifacts(r)["tokenizer"])["outputs"] for r in (run, small_run.folder)]
-    assert outputs[0]["model.safetensors"] == outputs[1]["model.safetensors"]
