@@ -49,11 +49,9 @@ def log_lines(
     return out
 
 
-def line_chart(
-    lines: Sequence[Line], *, x_label: str = "step", y_label: str = "", log_y: bool = False, title: str = ""
-) -> str:
+def line_chart(lines: Sequence[Line], *, x_label: str = "step", y_label: str = "", title: str = "") -> str:
     """SVG of curves over one pair of axes, with a legend and the data for the page's hover script."""
-    curves = [_finite(line, log_y) for line in lines]
+    curves = [_finite(line) for line in lines]
     filled = [(x, y) for x, y in curves if len(x)]
     if not filled:
         return _svg(title, [_text(WIDTH / 2, HEIGHT / 2, "no data yet", "middle")], None)
@@ -62,7 +60,7 @@ def line_chart(
     low_y = min(float(y.min()) for _, y in filled)
     high_y = max(float(y.max()) for _, y in filled)
     x_axis, y_axis = _Axis(low_x, high_x, LEFT, WIDTH - RIGHT), _Axis(low_y, high_y, HEIGHT - BOTTOM, TOP)
-    parts = _axes(x_axis, y_axis, x_label, y_label, log_y)
+    parts = _axes(x_axis, y_axis, x_label, y_label)
     hover = []
     for index, (line, (x, y)) in enumerate(zip(lines, curves, strict=True)):
         colour = _colour(line, index)
@@ -76,10 +74,7 @@ def line_chart(
             parts.append(f'<polyline class="curve s{colour}" points="{path}"{dash}/>')
         else:
             parts += [f'<circle class="dot s{colour}" cx="{px:g}" cy="{py:g}" r="4"/>' for px, py in points]
-        raw = np.power(10, y) if log_y else y
-        values = [
-            [float(f"{a:.6g}"), float(f"{b:.4g}")] for a, b in zip(x.tolist(), raw.tolist(), strict=True)
-        ]
+        values = [[float(f"{a:.6g}"), float(f"{b:.4g}")] for a, b in zip(x.tolist(), y.tolist(), strict=True)]
         hover.append({"name": line.name, "at": points, "values": values})
     return _svg(title, parts, {"x": x_label, "lines": hover}) + _legend(lines)
 
@@ -103,7 +98,7 @@ def histogram(
     bins = len(next(iter(stacks.values())))
     x_axis = _Axis(*edges, LEFT, WIDTH - RIGHT, nice=False)
     y_axis = _Axis(0.0, tallest, HEIGHT - BOTTOM, TOP)
-    parts = _axes(x_axis, y_axis, x_label, y_label, False)
+    parts = _axes(x_axis, y_axis, x_label, y_label)
     step = (edges[1] - edges[0]) / bins
     below = np.zeros(bins)
     for index, (name, values) in enumerate(stacks.items()):
@@ -149,15 +144,12 @@ class _Axis:
         return [k * self.step for k in range(first, last + 1)]
 
 
-def _finite(line: Line, log_y: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _finite(line: Line) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     x, y = np.asarray(line.x, np.float64).ravel(), np.asarray(line.y, np.float64).ravel()
     if len(x) != len(y):
         raise ValueError(f"line '{line.name}': {len(x)} x values but {len(y)} y values")
     good = np.isfinite(x) & np.isfinite(y)
-    if log_y:
-        good &= y > 0
-    x, y = x[good], y[good]
-    return x, np.log10(y) if log_y else y
+    return x[good], y[good]
 
 
 def _thin(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -170,15 +162,15 @@ def _thin(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.fl
     return x[index], y[index]
 
 
-def _axes(x: _Axis, y: _Axis, x_label: str, y_label: str, log_y: bool, x_ticks: bool = True) -> list[str]:
+def _axes(x: _Axis, y: _Axis, x_label: str, y_label: str) -> list[str]:
     parts = []
     for tick in y.ticks():
         at = y(tick)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
-        parts.append(_text(LEFT - 8, at + 4, _number(10**tick if log_y else tick), "end"))
+        parts.append(_text(LEFT - 8, at + 4, _number(tick), "end"))
     base = HEIGHT - BOTTOM
     parts.append(f'<line class="axis" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{base}" y2="{base}"/>')
-    for tick in x.ticks() if x_ticks else ():
+    for tick in x.ticks():
         parts.append(_text(x(tick), base + 17, _number(tick), "middle"))
     parts.append(_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, x_label, "middle"))
     if y_label:

@@ -122,11 +122,9 @@ class Page:
         self._blocks.append(f'<dl class="facts">{tiles}</dl>')
         return self
 
-    def add_plot(
-        self, lines: Sequence[Line], title: str, x_label: str = "step", y_label: str = "", log_y: bool = False
-    ) -> Page:
+    def add_plot(self, lines: Sequence[Line], title: str, x_label: str = "step", y_label: str = "") -> Page:
         """A line chart; neighbouring charts stand side by side where the window is wide enough."""
-        chart = line_chart(lines, x_label=x_label, y_label=y_label, log_y=log_y, title=title)
+        chart = line_chart(lines, x_label=x_label, y_label=y_label, title=title)
         return self._add_chart(chart, title)
 
     def add_histogram(

@@ -15,7 +15,6 @@ FLIGHT = "flight"
 """Folder of the flight logs, in a stage's."""
 CRASHES = "crash"
 """Folder of what failed steps have read, in a stage's."""
-_DRAWN = 1000
 
 
 def read_training_log(folder: Path) -> list[dict[str, float]]:
@@ -53,10 +52,10 @@ def read_rows(path: Path) -> list[dict[str, float]]:
 
 
 def read_flight(folder: Path) -> dict[int, list[dict[str, float]]]:
-    """The flight logs in a stage's folder, by rank; of a long one about `_DRAWN` rows, evenly."""
+    """The flight logs in a stage's folder, by rank."""
     found = {}
     for path in sorted((folder / FLIGHT).glob("rank_*.jsonl")):
         rank = path.stem.removeprefix("rank_")
         if rank.isdecimal() and (rows := read_rows(path)):
-            found[int(rank)] = rows[:: -(-len(rows) // _DRAWN)]
+            found[int(rank)] = rows
     return found

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.evaluation.cases import Clips
-from motionloom.pipeline.render.charts import Line, log_lines
+from motionloom.pipeline.render.charts import log_lines
 from motionloom.pipeline.render.labels import curve_label
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.store.run_state import RunState
@@ -50,8 +50,6 @@ def draw_curves(page: Page, stages: Sequence[Finished]) -> None:
 # What the flight recorders noted: it holds times, so a page made within a run does not have it.
 
 Rows = Sequence[Mapping[str, float]]
-_MOST = 8
-"""Lines in one chart: as many as there are colours."""
 
 
 def draw_flights(page: Page, state: RunState) -> None:
@@ -61,12 +59,11 @@ def draw_flights(page: Page, state: RunState) -> None:
     if not flights:
         return
     page.add_heading("How the trainings ran")
-    page.add_text(
-        "As the flight recorders saw it: a row every 10 steps, of long trainings fewer in the past."
-    )
-    columns = ["training", "samples/s", "waited for data, %", "for checkpoints, %", "for other ranks, %"]
+    page.add_text("As the flight recorders saw it, a row every 10 steps.")
+    columns = ["training", "samples/s", "s a step", "waited for data, %", "for checkpoints, %"]
+    columns += ["for other ranks, %"]
     table = [[name, *_waits(ranks)] for name, ranks in flights.items()]
-    page.add_table(columns, table, "Speed and waits, means of the rows and ranks", digits=1, pinned=True)
+    page.add_table(columns, table, "Speed and waits, means of the rows and ranks", digits=2, pinned=True)
     crashed = [
         f"{stage.name}: {bundle}"
         for stage in state.stages
@@ -75,27 +72,16 @@ def draw_flights(page: Page, state: RunState) -> None:
     if crashed:
         page.add_text("Batches and tracebacks of what went wrong:")
         page.add_list(crashed)
-    with page.folded("Step times"):
-        for name, ranks in flights.items():
-            page.add_plot(_times(ranks), f"{name}: seconds a step", y_label="s", log_y=True)
 
 
 def _waits(ranks: Mapping[int, Rows]) -> list[float | str | None]:
     rows = [row for own in ranks.values() for row in own]
     shares = [[row.get(f"waited/{cause}", 0.0) for row in rows] for cause in ("data", "checkpoints", "ranks")]
-    speed = _mean([row["samples_per_second"] for row in rows if "samples_per_second" in row])
-    return [speed, *(100 * _mean(share) for share in shares)]
+    speeds = [
+        _mean([row[name] for row in rows if name in row]) for name in ("samples_per_second", "step_seconds")
+    ]
+    return [*speeds, *(100 * _mean(share) for share in shares)]
 
 
 def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else 0.0
-
-
-def _times(ranks: Mapping[int, Rows]) -> list[Line]:
-    out = []
-    for rank, rows in list(ranks.items())[: _MOST // 2]:
-        steps = [row["step"] for row in rows]
-        whose = f", rank {rank}" if len(ranks) > 1 else ""
-        out.append(Line(f"median{whose}", steps, [row["step_seconds"] for row in rows]))
-        out.append(Line(f"95 %{whose}", steps, [row["step_seconds_p95"] for row in rows], dashed=True))
-    return out

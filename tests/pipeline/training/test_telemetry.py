@@ -1,4 +1,4 @@
-"""Flight logs: what they hold, how long they may get, what is left after a kill, and the report's section."""
+"""Flight logs: what they hold, what is left after a kill, and the report's section."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_rank_waits_for_the_one_that_comes_last() -> None:
     assert waits.shares(before, 4.0) == {"data": 0.5, "checkpoints": 0.0, "ranks": 0.0}
 
 
-def test_steps_that_come_again_are_there_once_and_long_logs_in_outline(tmp_path: Path) -> None:
+def test_steps_that_come_again_are_there_once(tmp_path: Path) -> None:
     path = tmp_path / "flight/rank_0.jsonl"
     with pytest.raises(ConnectionResetError):
         train(tmp_path, steps=40, dies_at=33)
@@ -45,10 +45,8 @@ def test_steps_that_come_again_are_there_once_and_long_logs_in_outline(tmp_path:
         file.write('{"step": 40, "t')  # killed here
     train(tmp_path, steps=40)
     assert [row["step"] for row in read_rows(path)] == [10, 20, 30, 40]
-    path.write_text("".join(json.dumps({"step": 10 * k}) + "\n" for k in range(4000)))
     (tmp_path / "flight/rank_x.jsonl").write_text(json.dumps({"step": 1}))
-    found = read_flight(tmp_path)
-    assert list(found) == [0] and len(found[0]) == 1000 and found[0][1]["step"] == 40
+    assert list(read_flight(tmp_path)) == [0]
 
 
 def test_the_report_shows_speed_and_waits(tmp_path: Path) -> None:
@@ -64,4 +62,7 @@ def test_the_report_shows_speed_and_waits(tmp_path: Path) -> None:
     page = Page("title")
     draw_flights(page, state)
     cells = re.findall(r"<td[^>]*>([^<]*)</td>", page.html())
-    assert cells[:5] == ["gpt", "200.0", "20.0", "2.0", "0.0"] and "gpt/crash/step_00000007" in page.html()
+    assert (
+        cells[:6] == ["gpt", "200.00", "0.10", "20.00", "2.00", "0.00"]
+        and "gpt/crash/step_00000007" in page.html()
+    )
