@@ -1,9 +1,9 @@
 """Words that a model has heard, and those it has not [ours].
 
 A sentence's embedding hardly changes with a negation, a number or a verb, and these decide a motion. So
-words are looked at one by one: a word counts as heard if training had it, a slip of one letter aside, or had
-one that means nearly the same. Numbers and words that take others back must have been in training as they
-are.
+words are looked at one by one: a word counts as heard if training had it, or had one that means nearly the
+same. Numbers and words that take others back must have been in training as they are. A word that is none,
+one slip of a letter away from one of training's, is read as that one.
 """
 
 from __future__ import annotations
@@ -27,10 +27,14 @@ _NO_OTHERS = """
 no not never nobody none nor without stop stops refuses zero one two three four five six seven eight nine ten
 eleven twelve twenty hundred thousand many
 """
+_ENDINGS = ("s", "es", "d", "ed", "ing")
+_WORD = r"[\w']+"
 _SMALL, _EXACT = frozenset(_NOTHING_ALONE.split()), frozenset(_NO_OTHERS.split())
 
 Encode = Callable[[Sequence[str]], NDArray[np.float32]]
 """Captions or words to unit-length embeddings [n, E]."""
+Pieces = Callable[[Sequence[str]], NDArray[np.int64]]
+"""Words to the number of pieces [n] that a text encoder cuts each into: it knows English words whole."""
 
 
 def words_of(captions: Collection[str]) -> frozenset[str]:
@@ -39,7 +43,7 @@ def words_of(captions: Collection[str]) -> frozenset[str]:
 
 
 def _split(caption: str) -> list[str]:
-    return re.findall(r"[\w']+", caption.lower())
+    return re.findall(_WORD, caption.lower())
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,23 @@ class HeardWords:
 
     words: frozenset[str]
     encode: Encode
+    pieces: Pieces
+
+    def spelt(self, caption: str) -> str:
+        """A caption whose misspelt words are those of training that they are meant to be."""
+        return re.sub(_WORD, lambda found: self._meant(found[0]), caption) if self.words else caption
+
+    def _meant(self, word: str) -> str:
+        small = word.lower()
+        if small in self.words or small in _SMALL | _EXACT:
+            return word
+        near = sorted(known for known in self.words if one_slip(small, known))
+        return near[0] if near and not self._english(small) else word
+
+    def _english(self, word: str) -> bool:
+        """Whether the encoder knows a word, or what it is a form of, as one that training has not."""
+        forms = {word, *(word.removesuffix(end) for end in _ENDINGS)} - self.words
+        return bool((self.pieces(sorted(forms)) == 1).any())
 
     def unheard(self, caption: str) -> list[str]:
         """Words of a caption that training had nothing like; empty where its words are not known."""
@@ -58,8 +79,6 @@ class HeardWords:
             return True
         if word in _EXACT or "n't" in word or any(letter.isdigit() for letter in word):
             return False
-        if any(one_slip(word, known) for known in self.words):
-            return True
         return bool((self._embeddings @ self.encode([word])[0]).max() >= LIKE)
 
     @cached_property

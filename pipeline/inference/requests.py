@@ -16,6 +16,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt, StreamingGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import MODEL_FILES
 
 if TYPE_CHECKING:
@@ -171,6 +172,9 @@ class PromptEncoder:
 
         `words` are the prompts' texts, about the body or the face; an empty one is no text.
         """
+        source = self._prepared["text"]
+        if isinstance(source, TextSource):
+            words = [source.spelt(text) for text in words]
         rows = [prompt.with_words(text).given for prompt, text in zip(prompts, words, strict=True)]
         out: dict[str, Condition] = {}
         for name, record in MODALITIES.items():

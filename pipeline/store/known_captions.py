@@ -51,13 +51,17 @@ class _Texts(Config):
 
 @dataclass(frozen=True)
 class Unknown:
-    """A caption that is far from all captions of the training."""
+    """A caption that is far from all captions of the training, or that is read as another."""
 
     caption: str
     nearest: tuple[str, ...]
     """Captions of the training, nearest first."""
+    read_as: str = ""
+    """Where only its spelling is unknown: what it is taken for; `nearest` is empty."""
 
     def __str__(self) -> str:
+        if self.read_as:
+            return f"'{printable(self.caption)}' is read as '{printable(self.read_as)}'"
         known = "; ".join(f"'{text}'" for text in self.nearest)
         said = shorten(printable(self.caption), 100, placeholder=" …")
         return (
@@ -76,21 +80,22 @@ class KnownCaptions:
     """All words of the training's captions; empty where they were not kept."""
 
     def unknown(
-        self, captions: Sequence[str], encode: Encode, read: Encode | None = None, count: int = 3
+        self, captions: Sequence[str], heard: HeardWords, read: Encode | None = None, count: int = 3
     ) -> list[Unknown]:
         """Those of `captions` that are not known, in order, each once.
 
         Args:
             captions: What was said.
-            encode: Sentence embeddings, those of these captions.
+            heard: The words of the training, with the embeddings of these captions.
             read: The model's own unit-length readings of captions; without, sentences alone decide.
             count: How many of the nearest to name.
         """
         if not self.captions:
             return []
-        heard, found = HeardWords(self.words, encode), dict[str, Unknown]()
-        cosines = np.asarray(encode(captions), dtype=np.float32) @ self.embeddings.T
-        for caption, row in zip(captions, cosines, strict=True):
+        found = dict[str, Unknown]()
+        meant = [heard.spelt(caption) for caption in captions]
+        cosines = np.asarray(heard.encode(meant), dtype=np.float32) @ self.embeddings.T
+        for said, caption, row in zip(captions, meant, cosines, strict=True):
             nearest = [self.captions[k] for k in np.argsort(-row, kind="stable")]
             near = nearest[: min(NEAREST, int((row >= FAR).sum()))]
             if near and read is not None:
@@ -100,8 +105,10 @@ class KnownCaptions:
                     for text, vector in zip(near, readings[1:], strict=True)
                     if vector @ readings[0] >= ALIKE
                 ]
-            if not near or heard.unheard(caption):
-                found.setdefault(caption, Unknown(caption, tuple(nearest[:count])))
+            if not near or (self.words and heard.unheard(caption)):
+                found.setdefault(said, Unknown(said, tuple(nearest[:count])))
+            elif caption != said:
+                found.setdefault(said, Unknown(said, (), caption))
         return list(found.values())
 
 

@@ -19,7 +19,7 @@ from motionloom.datasets.base.places import hub_is_away
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
-from motionloom.datasets.text.words import Encode
+from motionloom.datasets.text.words import Encode, HeardWords
 from motionloom.pipeline.store.files import copy_files, remove_tree, write_json
 from motionloom.pipeline.store.known_captions import KNOWN_FILES, KnownCaptions, Unknown, load_known
 
@@ -117,9 +117,25 @@ class TextSource:
     ) -> list[Unknown]:
         """Those of `captions` that are unlike all that were trained on; `read` is how the model reads."""
         known = self.known.get("face" if face else "body")
-        if known is None or not captions:
-            return []
-        return known.unknown(captions, lambda texts: self._sentences.encode(texts).sentence, read)
+        return known.unknown(captions, self._heard, read) if known and captions else []
+
+    def spelt(self, caption: str) -> str:
+        """A caption as it is read: misspelt words of the training set right."""
+        return self._heard.spelt(caption)
+
+    @cached_property
+    def _heard(self) -> HeardWords:
+        known = self.known.get("body")
+
+        def pieces(words: Sequence[str]) -> NDArray[np.int64]:
+            mask = self._sentences.encode(words).mask
+            return mask.sum(axis=1, dtype=np.int64) - 2  # [CLS] and [SEP]
+
+        return HeardWords(
+            known.words if known else frozenset(),
+            lambda texts: self._sentences.encode(texts).sentence,
+            pieces,
+        )
 
     @cached_property
     def _sentences(self) -> TextEncoder:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.text.encoder import load_text_encoder
+from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
+from motionloom.datasets.text.words import HeardWords
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.store.known_captions import (
     FAR,
@@ -35,6 +36,15 @@ OTHER_WORDS = (
     "someone strolls ahead slowly",
     "lifts the right arm high",
 )
+
+
+def words(encoder: TextEncoder) -> HeardWords:
+    """Of a training whose words were not kept."""
+    return HeardWords(
+        frozenset(), lambda texts: encoder.encode(texts).sentence, lambda _: np.ones(1, np.int64)
+    )
+
+
 ELSEWHERE = ("a person plays the violin", "a man rides a bicycle", "stock prices fell sharply")
 
 
@@ -68,8 +78,8 @@ def test_fewer_captions_than_are_wanted_all_stand_for_themselves() -> None:
 def test_other_words_are_known_and_other_things_are_not() -> None:
     encoder = load_text_encoder("minilm")
     known = KnownCaptions(TRAINED, encoder.encode(TRAINED).sentence)
-    assert known.unknown(OTHER_WORDS, lambda texts: encoder.encode(texts).sentence) == []
-    found = known.unknown(ELSEWHERE, lambda texts: encoder.encode(texts).sentence)
+    assert known.unknown(OTHER_WORDS, words(encoder)) == []
+    found = known.unknown(ELSEWHERE, words(encoder))
     assert [one.caption for one in found] == list(ELSEWHERE)
     assert "a man rides a bicycle" in str(found[1]) and found[1].nearest[0] in str(found[1])
 
@@ -83,8 +93,8 @@ def test_a_caption_that_the_model_reads_as_something_else_is_unknown() -> None:
         return np.stack([walk if text == said else punch for text in texts])
 
     said = "a person waves with the left hand"
-    assert not known.unknown([said], lambda texts: encoder.encode(texts).sentence)
-    assert known.unknown([said], lambda texts: encoder.encode(texts).sentence, read)
+    assert not known.unknown([said], words(encoder))
+    assert known.unknown([said], words(encoder), read)
 
 
 def test_files_come_back(tmp_path: Path) -> None:
@@ -96,9 +106,12 @@ def test_files_come_back(tmp_path: Path) -> None:
     assert found["body"].captions == ("a", "b") and found["face"].captions == ()
     assert found["body"].words == heard
     np.testing.assert_allclose(found["body"].embeddings, body.embeddings, atol=2**-11)
-    assert found["face"].unknown(["x"], lambda _: unit(1, 8, 5)) == [], (
-        "a model without faces calls no face unknown"
-    )
+    assert (
+        found["face"].unknown(
+            ["x"], HeardWords(heard, lambda _: unit(1, 8, 5), lambda _: np.ones(1, np.int64))
+        )
+        == []
+    ), "a model without faces calls no face unknown"
     assert load_known(tmp_path / "none") == {}
 
 
