@@ -129,7 +129,8 @@ class TextSource:
 
         def pieces(words: Sequence[str]) -> NDArray[np.int64]:
             mask = self._sentences.encode(words).mask
-            return mask.sum(axis=1, dtype=np.int64) - 2  # [CLS] and [SEP]
+            counts: NDArray[np.int64] = mask.sum(axis=1, dtype=np.int64) - 2  # [CLS] and [SEP]
+            return counts
 
         return HeardWords(
             known.words if known else frozenset(),
