@@ -7,7 +7,7 @@ import json
 import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -130,9 +130,13 @@ class Answer:
     file: str = ""
 
 
-def notes_of(model: MotionModel, asked: MotionRequest) -> list[str]:
-    """What a person should know of the motion: captions that are unlike all that the model knows."""
-    return [str(unknown) for unknown in model.unknown(asked.captions, asked.faces)]
+def notes_of(model: MotionModel, asked: MotionRequest) -> dict[str, list[str]]:
+    """What a person should know of the motion: captions that are unlike all that the model knows, and what
+    could be said of the body instead.
+    """
+    unknown = model.unknown(asked.captions, asked.faces)
+    nearest = [text for one in unknown if one.caption in asked.captions for text in one.nearest]
+    return {"notes": [one.what for one in unknown], "nearest": nearest}
 
 
 def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> Answer:
@@ -155,7 +159,7 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
     )[0]
     if asked.format in WRITERS:
         return _file(motion, asked)
-    facts = {**_facts(motion, asked), "notes": notes_of(model, asked)}
+    facts = {**_facts(motion, asked), **notes_of(model, asked)}
     if asked.format == "viewer":
         facts["viewer"] = viewer_data([cell_of(clip_of(motion))])
     else:
@@ -182,10 +186,12 @@ def stream(
     )  # fmt: skip
 
 
-def lines(stream: MotionStream, asked: MotionRequest, model: str, notes: Sequence[str] = ()) -> Iterator[str]:
+def lines(
+    stream: MotionStream, asked: MotionRequest, model: str, notes: Mapping[str, list[str]]
+) -> Iterator[str]:
     """JSON lines of a stream, whose first one names the request and says what there is to note."""
     facts = json.loads(heading(stream.layout, asked.seed, model))
-    yield json.dumps({"request": asked.request, **facts, "notes": list(notes)}) + "\n"
+    yield json.dumps({"request": asked.request, **facts, **notes}) + "\n"
     for chunk in stream:
         yield "".join(frame_lines(chunk))
 

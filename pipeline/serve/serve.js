@@ -75,6 +75,12 @@ function show(answer, body) {
     const line = document.createElement("p");
     line.textContent = words;
     return line;
+  }), ...(answer.nearest || []).map((caption) => {
+    const known = document.createElement("button");
+    known.type = "button";
+    known.textContent = caption;
+    known.addEventListener("click", () => { one("caption").value = caption; generate(); });
+    return known;
   }));
   notes.hidden = !notes.children.length;
 }

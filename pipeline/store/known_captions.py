@@ -59,15 +59,20 @@ class Unknown:
     read_as: str = ""
     """Where only its spelling is unknown: what it is taken for; `nearest` is empty."""
 
-    def __str__(self) -> str:
+    @property
+    def what(self) -> str:
+        """What there is to say of the caption, without the nearest ones."""
         if self.read_as:
             return f"'{printable(self.caption)}' is read as '{printable(self.read_as)}'"
-        known = "; ".join(f"'{text}'" for text in self.nearest)
         said = shorten(printable(self.caption), 100, placeholder=" …")
         return (
             f"'{said}' is unlike all captions that this model was trained on, so the motion may show "
-            f"something else. The nearest it knows: {known}"
+            f"something else"
         )
+
+    def __str__(self) -> str:
+        known = "; ".join(f"'{text}'" for text in self.nearest)
+        return f"{self.what}. The nearest it knows: {known}" if known else self.what
 
 
 @dataclass(frozen=True)
