@@ -33,6 +33,7 @@ from motionloom.pipeline.inference.stream import MotionStream, stream_of
 from motionloom.pipeline.launch.hardware import choose_device, threads_for
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
+from motionloom.pipeline.store.text import TextSource
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -108,6 +109,12 @@ class MotionModel(
                 captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
                 sampling=SamplingConfig.of(sampling), strict=True,
             )  # fmt: skip
+
+    def examples(self, count: int = 6) -> list[str]:
+        """Some captions that it knows, unlike each other; none where it does not say what it knows."""
+        text = getattr(self.bundle.generator, "text", None)
+        known = text.known.get("body") if isinstance(text, TextSource) else None
+        return list(known.captions[:count]) if known else []
 
     def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
         """Captions that are far from all that it was trained on, and what it knows nearest to each."""

@@ -98,6 +98,7 @@ class Site:
                 "model": self.name,
                 "modalities": sorted(self.model.modalities),
                 "face": bool(bundle.faces),
+                "examples": self.model.examples(),
                 "fps": self.model.fps,
                 "joint_names": list(skeleton.joints),
                 "parents": [int(parent) for parent in skeleton.parents],

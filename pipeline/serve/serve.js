@@ -71,11 +71,16 @@ function show(answer, body) {
   shown = window.motionloomViewer(one("viewer"), answer.viewer, { page: false });
   asked = body;
   save.hidden = false;
-  notes.replaceChildren(...(answer.notes || []).map((words) => {
+  note(answer.notes, answer.nearest);
+}
+
+/* Lines of text, and captions to be clicked. */
+function note(lines, captions) {
+  notes.replaceChildren(...lines.map((words) => {
     const line = document.createElement("p");
     line.textContent = words;
     return line;
-  }), ...(answer.nearest || []).map((caption) => {
+  }), ...captions.map((caption) => {
     const known = document.createElement("button");
     known.type = "button";
     known.textContent = caption;
@@ -150,6 +155,7 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   one("sound-field").hidden = !info.modalities.includes("audio");
   const drivers = info.modalities.map((name) => (name === "audio" ? "music" : name)).join(" or ");
   say(`${info.model}: ${drivers} to motion, at most ${info.limits.seconds} s`);
+  if (info.examples.length) note(["It knows, for example:"], info.examples);
   one("caption").focus();
 })();
 })();

@@ -46,9 +46,12 @@ class QuickModel:
             layout=LAYOUT,
             faces={"gpt": None},
             generator=generator,
-            recommended=SamplingConfig(cfg_scale=1.5, top_p=0.9),
+            recommended=SamplingConfig(cfg_scale=1.25, top_p=0.9),
             generate=self.generate,
         )
+
+    def examples(self) -> list[str]:
+        return ["a person bows"]
 
     def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
         """All that is said of a violin."""

@@ -106,7 +106,7 @@ def test_what_the_model_does_not_know_stands_beside_the_motion(visit: Any, until
 
 def test_guidance_is_the_models_until_it_is_changed(visit: Any, until: Any, quick: Any) -> None:
     page = visit()
-    assert page.get_by_label("Guidance").input_value() == "1.5"
+    assert page.get_by_label("Guidance").input_value() == "1.25"
     for caption in ("one", "two"):
         page.get_by_label("What the person does").fill(caption)
         page.keyboard.press("Enter")

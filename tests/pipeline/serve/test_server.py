@@ -70,7 +70,7 @@ def test_the_viewers_data_and_files(served: Any, tmp_path: Path) -> None:
 def test_info_and_page(served: Any) -> None:
     info = served.ask("GET", "/api/info").json
     assert info["model"] == "quick" and info["modalities"] == ["audio", "text"] and info["face"] is True
-    assert info["sampling"] == {"cfg_scale": 1.5, "top_p": 0.9}
+    assert info["sampling"] == {"cfg_scale": 1.25, "top_p": 0.9}
     assert info["limits"]["seconds"] == 5.0 and info["limits"]["waiting"] == 32
     page = served.ask("GET", "/")
     assert page.status == 200 and page.headers["content-type"].startswith("text/html")
