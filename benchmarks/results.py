@@ -101,6 +101,9 @@ TABLES = {
     "ude_noise_music": Table("Table 4, music", _of("music_", NOISE, {}), MUSIC),
     "ude_networks_text": Table("Table 3, captions", _of("text_", NETWORKS, {}), TEXT),
     "ude_networks_music": Table("Table 3, music", _of("music_", NETWORKS, {}), MUSIC),
+    "ude_adversarial_text": Table(
+        "L_adv, captions", _of("text_drawn_", ADVERSARIAL, {}), TEXT
+    ),
     "ude_adversarial": Table(
         "L_adv from the first step on, 200 steps",
         {title: (stage, MODEL) for title, stage in ADVERSARIAL.items()},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -16,7 +17,6 @@ from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of
-from motionloom.pipeline.render.film import wrap
 from motionloom.pipeline.render.scene import SOLE, Actor, Ground, draw_figure
 
 T = TypeVar("T")
@@ -113,7 +113,8 @@ def _words(
         if label:
             draw.text((x, row * pitch + 6), label, fill=LABEL, font=FACE)
             x += float(FACE.getlength(label)) + 14
-        for number, line in enumerate(wrap(caption, sheet.width - x - 10, FACE, 2)):
+        letters = int((sheet.width - x - 10) / FACE.getlength("n"))
+        for number, line in enumerate(textwrap.wrap(caption, letters, max_lines=2, placeholder=" …")):
             draw.text((x, row * pitch + 6 + 18 * number), line, fill=INK, font=FACE)
     for x_at, y_at, text in stamps:
         draw.text((x_at, y_at), text, fill=SOFT, font=tiny)

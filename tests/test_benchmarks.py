@@ -1,4 +1,4 @@
-"""Every script of `benchmarks/` can be loaded and says what it measures: none imports what has moved away."""
+"""Every script of `benchmarks/`, and `docs/pictures.py`, can be loaded: none imports what has moved away."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.recipe import load_recipe
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
-SCRIPTS = sorted(FOLDER.glob("*.py"))
+SCRIPTS = [*sorted(FOLDER.glob("*.py")), FOLDER.parent / "docs" / "pictures.py"]
 
 
 DOCS = sorted([*FOLDER.parent.glob("*.md"), *FOLDER.parent.glob("docs/*.md")])
@@ -42,7 +42,7 @@ In a sentence a script's name alone is none.
 
 
 def loaded(script: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(FOLDER))  # some share functions
+    monkeypatch.syspath_prepend(str(script.parent))  # some share functions
     spec = importlib.util.spec_from_file_location(f"benchmark_{script.stem}", script)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -55,7 +55,7 @@ def loaded(script: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def test_a_benchmark_can_be_loaded(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = loaded(script, monkeypatch)
     assert callable(module.main) and module.__doc__
-    assert f"benchmarks/{script.name}" in module.__doc__, "its command stands in its docstring"
+    assert f"{script.parent.name}/{script.name}" in module.__doc__, "its command stands in its docstring"
 
 
 def test_a_models_card_is_measured_on_the_clips_that_a_run_would_hold_back(
