@@ -29,10 +29,9 @@ from motionloom.datasets.modalities.table import MODALITIES, modality
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.text.cache import TextCache
-from motionloom.datasets.text.reword import Rewordings
 
 # Counters that keep the draws for different purposes apart (arguments of `uniform`).
-_CAPTION, _CROP, _DROP, _REWORD = 2, 3, 4, 4
+_CAPTION, _CROP, _DROP = 2, 3, 4
 
 Captioned = Literal["body", "face"]
 """What the captions are about that every clip must have."""
@@ -165,8 +164,7 @@ class ConditionBatches(Dataset[ConditionBatch]):
     A caption with start and end seconds gives that stretch of the clip; a stretch longer than `max_frames` is
     cropped at random. `balance` decides how often each kind of clip comes, `homogeneous` has every batch hold
     one kind, `drop` makes clips with several modalities come without some now and then (`kinds.py`).
-    `rewordings` stand in for captions now and then; `caption` and `similarity` stay the caption's. Caption,
-    window, drop and rewording are drawn by (seed, turn, clip).
+    Caption, window and drop are drawn by (seed, turn, clip).
     """
 
     def __init__(
@@ -182,7 +180,6 @@ class ConditionBatches(Dataset[ConditionBatch]):
         balance: Mapping[str, float] | None = None,
         drop: Mapping[str, float] | None = None,
         homogeneous: bool = False,
-        rewordings: Rewordings | None = None,
         seed: int = 0,
         rank: int = 0,
         world: int = 1,
@@ -192,14 +189,6 @@ class ConditionBatches(Dataset[ConditionBatch]):
             dataset, stats, readers, max_frames=max_frames, min_frames=min_frames, columns=columns,
             captioned=captioned,
         )  # fmt: skip
-        if rewordings is not None:
-            self.text = cast(TextCache, self.source.readers["text"])
-            if rewordings.cache.encoder != self.text.encoder:
-                raise UserError(
-                    f"{rewordings.folder}: rewordings by the encoder {rewordings.cache.encoder}, captions by "
-                    f"{self.text.encoder}; give both stages the same text stage"
-                )
-        self.rewordings = rewordings
         self.seed, self.rank, self.world = seed, rank, world
         self.drop = drop or {}
         clips = self.source.clips
@@ -215,12 +204,7 @@ class ConditionBatches(Dataset[ConditionBatch]):
         source = self.source
         source.prefetch(clips)
         present, spans = self._spans(turns, clips)
-        batch = source.make(clips, present, spans, uniform(self.seed, _CROP, turns, clips))
-        if self.rewordings is not None:
-            draws = uniform(self.seed, _REWORD, turns, clips)
-            words = self.rewordings.read(batch["caption"], draws, self.text)
-            batch["conditions"]["text"] = Condition(*map(torch.from_numpy, words))
-        return batch
+        return source.make(clips, present, spans, uniform(self.seed, _CROP, turns, clips))
 
     def _spans(
         self, turns: NDArray[np.int64], clips: NDArray[np.int64]

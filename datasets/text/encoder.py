@@ -70,9 +70,6 @@ class MiniLmEncoder:
     def encode(self, captions: Sequence[str]) -> EncodedText:
         return _pack(*self._model(captions))
 
-    def vocabulary(self) -> list[str]:
-        return list(self._model.tokenizer.get_vocab())
-
 
 class SentenceEncoder:
     """A sentence-transformers model: last hidden states and the model's own sentence embedding."""
@@ -88,9 +85,6 @@ class SentenceEncoder:
         features = {key: _to(value, self._model.device) for key, value in features.items()}
         out = self._model(features)
         return _pack(out["sentence_embedding"], out["token_embeddings"], out["attention_mask"])
-
-    def vocabulary(self) -> list[str]:
-        return list(self._model.tokenizer.get_vocab())
 
 
 class ClipEncoder:
@@ -120,9 +114,6 @@ class ClipEncoder:
         last = features["attention_mask"].sum(dim=1) - 1
         sentence = out.text_embeds if same else out.last_hidden_state[rows, last]
         return _pack(sentence, out.last_hidden_state, features["attention_mask"])
-
-    def vocabulary(self) -> list[str]:
-        return list(self._tokenizer.get_vocab())
 
 
 def load_text_encoder(spec: str, *, device: str = "cpu") -> MiniLmEncoder | SentenceEncoder | ClipEncoder:

@@ -62,9 +62,8 @@ class CaptionStage(TrainedStage[C, I, N]):
 
         def train(batch: int, rank: int, world: int) -> Dataset[object]:
             return ConditionBatches(
-                dataset, stats, readers, batch_size=batch, seed=seed, rank=rank, world=world,
-                rewordings=inputs.get("rewordings"), **clips,
-            )  # fmt: skip
+                dataset, stats, readers, batch_size=batch, seed=seed, rank=rank, world=world, **clips
+            )
 
         def validation() -> Dataset[object]:
             return EvalBatches(data.held_out(), stats, readers, batch_size=32, **clips)

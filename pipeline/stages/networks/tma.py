@@ -12,7 +12,6 @@ from pydantic import model_validator
 
 from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.text.reword import Rewordings
 from motionloom.models.tma.losses import TmaLossConfig
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.pipeline.contract.generation import MotionGenerator
@@ -71,7 +70,6 @@ class TmaStageConfig(CaptionStageConfig):
 class TmaInputs(CaptionInputs):
     """What it takes."""
 
-    rewordings: Rewordings | None
     start: LoadedTma | None = filled_by("tma")
 
 

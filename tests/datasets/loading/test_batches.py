@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from rank_shares import require_rows, require_shares
+from rank_shares import require_shares
 from text_samples import WordLengths, caption_batches
 from torch.utils.data import DataLoader
 
@@ -24,7 +24,6 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache
 from motionloom.datasets.text.encoder import EncodedText
-from motionloom.datasets.text.reword import RewordConfig, Rewordings
 
 
 @pytest.fixture(scope="module")
@@ -247,53 +246,3 @@ def test_mistakes_are_named(train: ShardDataset, stats: FeatureStats, text: Text
     other = MotionLayout.named("body133", fps=30.0)
     with pytest.raises(UserError, match=r"feature statistics: holds layout body133 .exact, 30 fps"):
         WindowBatches(train, FeatureStats(stats.mean, stats.std, other), window=16, batch_size=8)
-
-
-class Letters:
-    """One token a letter, its code; the sentence is their mean direction."""
-
-    dim = 2
-
-    def __init__(self, name: str = "letters") -> None:
-        self.name = name
-
-    def encode(self, captions: Sequence[str]) -> EncodedText:
-        tokens = np.zeros((len(captions), max(map(len, captions)), 2), dtype=np.float32)
-        for row, caption in zip(tokens, captions, strict=True):
-            row[: len(caption), 0] = [ord(letter) / 128 for letter in caption]
-            row[: len(caption), 1] = 1
-        sentence = tokens.sum(1) / np.linalg.norm(tokens.sum(1), axis=1, keepdims=True)
-        return EncodedText(sentence, tokens, tokens[..., 1] > 0)
-
-
-def said(batch: ConditionBatch) -> list[str]:
-    """The words that were encoded, read from the tokens."""
-    words = batch["conditions"]["text"]
-    codes = (words.features[..., 0] * 128).round().int()
-    return ["".join(map(chr, row[mask].tolist())) for row, mask in zip(codes, words.mask, strict=True)]
-
-
-def test_rewordings_stand_in_by_clip_and_turn(
-    train: ShardDataset, stats: FeatureStats, tmp_path: Path
-) -> None:
-    """Any number of ranks reads the same ones; a share of 0 is as without; other encoders are refused."""
-    captions = {caption.text for i in range(len(train)) for caption in train.texts(i)}
-    text = build_with_encoder(tmp_path / "text", captions, Letters(), progress=False)
-    how = {"batch_size": 12, "max_frames": 40, "min_frames": 8, "seed": 1}
-
-    def build(share: float, name: str = "letters", **ranks: int) -> ConditionBatches:
-        config = RewordConfig(share=share, drop=0.4, count=3)
-        folder = tmp_path / f"{name}{share}"
-        made = Rewordings.build(folder, captions, Letters(name), [], config, progress=False)
-        return caption_batches(train, stats, text, rewordings=made, **how, **ranks)
-
-    require_shares(lambda rank, world: build(0.6, rank=rank, world=world), worlds=[2])
-    batch, replaced = build(0.6), []
-    for k in (0, 4, 9):
-        whole = batch[k]
-        assert torch.equal(whole["similarity"], torch.from_numpy(text.sentence(whole["caption"])))
-        replaced += [a != b for a, b in zip(said(whole), whole["caption"], strict=True)]
-    assert any(replaced) and not all(replaced)
-    require_rows(caption_batches(train, stats, text, **how)[3], [build(0.0)[3]])
-    with pytest.raises(UserError, match="rewordings by the encoder others, captions by letters"):
-        build(0.5, "others")

