@@ -29,11 +29,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.schema import UserError
-from motionloom.models.layers import random
 from motionloom.models.layers.transformer import StackConfig, Transformer, sinusoid
-
-_RANGE = 16
-"""Bits of a position within its modality, for random numbers by sample."""
 
 
 class MateConfig(StackConfig):
@@ -58,13 +54,10 @@ class Encoded(NamedTuple):
     timed: Tensor | None = None
     """[B, T, E], the part of `seq` that lies on the motion's time line, that of music, a position for
     `stride` frames; zero where a row has none. None = no row has any."""
-    positions: Tensor | None = None
-    """int64 [S], for random numbers by sample: the position of each column of `seq`, which the padding of
-    others does not change."""
 
     def rows(self, index: Tensor | slice) -> Encoded:
         timed = None if self.timed is None else self.timed[index]
-        return Encoded(self.glob[index], self.seq[index], self.mask[index], timed, self.positions)
+        return Encoded(self.glob[index], self.seq[index], self.mask[index], timed)
 
 
 class Mate(nn.Module):
@@ -88,7 +81,7 @@ class Mate(nn.Module):
         self.modality = nn.ParameterDict({name: _token(dim) for name in widths})
         self.aggregate = _token(dim)
         self.aggregate_of = nn.ParameterDict({name: _token(dim) for name in widths})
-        self.dropout = random.Dropout(config.dropout)
+        self.dropout = nn.Dropout(config.dropout)
         self.stack = Transformer(config, config.layers, attention_dropout=config.attention_dropout)
 
     def forward(self, conditions: Conditions, batch: int | None = None) -> Encoded:
@@ -116,13 +109,9 @@ class Mate(nn.Module):
         x = torch.cat([(first + origin)[:, None], *pieces], dim=1)
         mask = torch.cat(masks, dim=1)
         sizes = [piece.shape[1] for piece in pieces]
-        positions = _positions(sizes, x.device) if random.by_sample() else None
-        with random.positions(positions):
-            x = self.stack(self.dropout(x), torch.cat([mask.new_ones(size, 1), mask], dim=1))
+        x = self.stack(self.dropout(x), torch.cat([mask.new_ones(size, 1), mask], dim=1))
         seq = x[:, 1:].masked_fill(~mask[..., None], 0.0)
-        return Encoded(
-            x[:, 0], seq, mask, self._timed(seq, sizes), None if positions is None else positions[1:]
-        )
+        return Encoded(x[:, 0], seq, mask, self._timed(seq, sizes))
 
     def unconditional(self, batch: int) -> Encoded:
         """What rows without any modality are encoded as, S = 0."""
@@ -187,14 +176,6 @@ def drop_conditions(conditions: Conditions, drop: Tensor) -> dict[str, Condition
             None if pooled is None else pooled.masked_fill(drop[:, None], 0.0),
         )
     return out
-
-
-def _positions(sizes: list[int], device: torch.device) -> Tensor:
-    """Positions of the aggregation token and of each modality; every modality has a range of its own, so that
-    the padding of one does not shift another.
-    """
-    ranges = [torch.arange(size, device=device) + (n << _RANGE) for n, size in enumerate(sizes, start=1)]
-    return torch.cat([torch.zeros(1, dtype=torch.int64, device=device), *ranges])
 
 
 def _token(dim: int) -> nn.Parameter:

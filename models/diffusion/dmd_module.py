@@ -11,7 +11,6 @@ from torch import Tensor
 
 from motionloom.models.diffusion.dmd import Dmd, dmd_loss
 from motionloom.models.gpt.frozen import Frozen
-from motionloom.models.layers import random
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 
@@ -38,8 +37,8 @@ class DmdModule(StageModule):
         with torch.no_grad():
             codes = self.tokenizer.module.encode(motion, length, present)
             seen = self.tokenizer.module.coordinates(motion, present)
-        step = random.integers(self.net.config.schedule.steps, len(motion), motion.device)
-        noise = random.normal_like(seen)
+        step = torch.randint(0, self.net.config.schedule.steps, (len(motion),), device=motion.device)
+        noise = torch.randn_like(seen)
         hidden = hidden_stretch(groups, -(-motion.shape[1] // GROUP_FRAMES), self.net.config.hide)
         loss = dmd_loss(
             self.net, self.noiser, seen, codes, length, step, noise, hidden=hidden, present=present
@@ -53,7 +52,7 @@ def hidden_stretch(groups: Tensor, size: int, share: float) -> Tensor | None:
     """
     if not share:
         return None
-    chance, length, place = random.uniforms(3, len(groups), groups.device)
+    chance, length, place = torch.rand(3, len(groups), device=groups.device).unbind()
     count = 1 + (length * (groups // 2)).long().clamp(max=(groups // 2 - 1).clamp(min=0))
     first = (place * (groups - count + 1)).long()
     at = torch.arange(size, device=groups.device)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from motionloom.models.diffusion.network import MotionDiffusion
-from motionloom.models.layers import random
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.distributed import masked_mean
 from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
@@ -29,10 +29,10 @@ class DiffusionModule(StageModule):
         motion, length, text = batch["motion"], batch["length"], batch["conditions"]["text"].pooled
         schedule = self.net.config.schedule
         mask = length_mask(length, motion.shape[1])
-        step = random.integers(schedule.steps, len(motion), motion.device)
-        noise = random.normal_like(motion)
+        step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)
+        noise = torch.randn_like(motion)
         hidden = self.net.config.condition_dropout if self.training else 0.0
-        conditioned = random.uniform(len(motion), device=motion.device) >= hidden
+        conditioned = torch.rand(len(motion), device=motion.device) >= hidden
         noisy = self.noiser.add_noise(motion, noise, step)
         found = self.net(noisy, step, text, mask, conditioned)
         target = motion if schedule.predicts == "sample" else noise

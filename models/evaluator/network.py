@@ -30,7 +30,6 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import Config
-from motionloom.models.layers import random
 from motionloom.models.layers.transformer import length_mask
 
 PART: Part = "bodyhand"
@@ -76,7 +75,7 @@ class MovementEncoder(nn.Module):
         """[B, T, D] -> units [B, T // 4, C]; `dropout` in training mode alone, of the autoencoder."""
         x, drop = x.mT, dropout and self.training
         for layer in (self.first, self.second):
-            x = F.leaky_relu(random.dropout(layer(x), self.rate, drop), _SLOPE)
+            x = F.leaky_relu(F.dropout(layer(x), self.rate, drop), _SLOPE)
         out: Tensor = self.out(x.mT)
         return out
 

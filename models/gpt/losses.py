@@ -18,7 +18,6 @@ from torch import Tensor
 from motionloom.datasets.schema import Config
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import PAD
-from motionloom.models.layers import random
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.training.distributed import masked_mean
 
@@ -68,10 +67,8 @@ def corrupt(tokens: Tensor, kinds: Tensor, ends: Tensor, pkeep: float) -> Tensor
     tokens, kinds int64 [B, L], ends int64 [streams]. End tokens and padding stay.
     """
     end = ends[kinds]
-    replace = (
-        (random.uniform(*tokens.shape, device=tokens.device) >= pkeep) & (tokens != PAD) & (tokens != end)
-    )
-    draw = (random.uniform(*tokens.shape, device=tokens.device) * end).long()
+    replace = (torch.rand(*tokens.shape, device=tokens.device) >= pkeep) & (tokens != PAD) & (tokens != end)
+    draw = (torch.rand(*tokens.shape, device=tokens.device) * end).long()
     return torch.where(replace, torch.minimum(draw, end - 1), tokens)
 
 
@@ -101,7 +98,7 @@ def soft_codes(
         here = steps[:, :, slots, : gpt.num_codes[name]]
         here = torch.where(valid, here, 0.0).flatten(1, 2)
         if sample:
-            out[name] = random.gumbel_softmax(here, temperature)
+            out[name] = F.gumbel_softmax(here, tau=temperature)
         else:
             soft = (here / temperature).softmax(-1)
             out[name] = F.one_hot(here.argmax(-1), here.shape[-1]).to(soft) + soft - soft.detach()

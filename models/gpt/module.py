@@ -12,7 +12,6 @@ from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import GptLossConfig, accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.samples import log_likelihood, policy_loss, rewards, sample
-from motionloom.models.layers import random
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
@@ -62,7 +61,7 @@ class GptModule(StageModule):
         known = batch.get("known")
         inputs, drop = None, None
         if self.training:
-            drop = random.uniform(len(text), device=text.device) < config.condition_dropout
+            drop = torch.rand(len(text), device=text.device) < config.condition_dropout
             if config.pkeep < 1:
                 inputs = corrupt(tokens, kinds, net.ends, config.pkeep)
         logits = net(tokens, kinds, text, inputs=inputs, drop_text=drop, known=known)

@@ -28,7 +28,6 @@ from torch import Tensor, nn
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
-from motionloom.models.layers.random import Dropout
 from motionloom.models.layers.transformer import KVCache, StackConfig, Transformer
 from motionloom.models.tokenizer.base import Stream
 
@@ -76,7 +75,7 @@ class InterleavedGPT(TokenNetwork):
         self.null_text = nn.Parameter(torch.randn(config.dim) * 0.02)
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
         self.embeddings = self._tables(config.dim)
-        self.dropout = Dropout(config.dropout)
+        self.dropout = nn.Dropout(config.dropout)
         self.stack = Transformer(config, config.layers, attention_dropout=config.attention_dropout)
         self.heads = self._outputs(config.dim)
         self._start_tables()

@@ -22,7 +22,6 @@ from motionloom.models.gpt.losses import predicted
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.tokens import PAD, Codes, TokenSequence, interleave
-from motionloom.models.layers import random
 from motionloom.models.tma.losses import false_negatives
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer
@@ -42,7 +41,7 @@ class Samples(NamedTuple):
 def sample(gpt: InterleavedGPT, text: Tensor, count: int) -> Samples:
     """`count` motions for each prior text [B, E], of lengths that the model decides, seeded by `draws`."""
     rows = text.repeat_interleave(count, dim=0)
-    seeds = random.seeds(len(rows))
+    seeds = torch.randint(2**62, (len(rows),)).tolist()
     codes = generate(gpt, rows, seed=seeds)
     return Samples(rows, codes, interleave(codes.codes, gpt.pattern, ends=gpt.num_codes, groups=codes.groups))
 

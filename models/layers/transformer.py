@@ -23,10 +23,9 @@ import torch
 import torch.nn.functional as F
 from pydantic import Field, model_validator
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint, noop_context_fn
+from torch.utils.checkpoint import checkpoint
 
 from motionloom.datasets.schema import Config
-from motionloom.models.layers import random
 
 Norm = Literal["pre", "post"]
 """Position of LayerNorm: before attention and feed-forward, or after their sums."""
@@ -127,9 +126,9 @@ class SelfAttention(nn.Module):
                 mask = seen.tril(diagonal=before)
             # A single new position sees everything stored; a first block is plainly causal.
             causal = causal and before == 0 and length > 1
-        out = random.attention(
-            query, key, value, mask, causal, self.attention_dropout if self.training else 0.0
-        )
+        rate = self.attention_dropout if self.training else 0.0
+        causal = causal and mask is None
+        out = F.scaled_dot_product_attention(query, key, value, mask, dropout_p=rate, is_causal=causal)
         merged: Tensor = self.out(out.transpose(1, 2).reshape(batch, length, dim))
         return merged
 
@@ -147,7 +146,7 @@ class Block(nn.Module):
         self.norm_ff = nn.LayerNorm(dim)
         self.ff_in = nn.Linear(dim, ff)
         self.ff_out = nn.Linear(ff, dim)
-        self.dropout = random.Dropout(dropout)
+        self.dropout = nn.Dropout(dropout)
 
     def forward(
         self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: LayerCache | None = None
@@ -203,8 +202,7 @@ class Transformer(nn.Module):
         again = self.checkpointed and torch.is_grad_enabled() and cache is None
         for index, block in enumerate(self.blocks):
             if again:
-                contexts = random.checkpoint_contexts if random.by_sample() else noop_context_fn
-                x = checkpoint(block, x, mask, causal, use_reentrant=False, context_fn=contexts)
+                x = checkpoint(block, x, mask, causal, use_reentrant=False)
             else:
                 x = block(x, mask, causal, None if cache is None else cache.layers[index])
         out: Tensor = self.norm(x)

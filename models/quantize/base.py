@@ -15,7 +15,6 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from motionloom.datasets.schema import Config
-from motionloom.models.layers.random import hash32
 from motionloom.models.training.distributed import gather_rows, rank, sum_over_ranks
 
 _LAST = 2**62
@@ -182,3 +181,11 @@ def nearest(z: Tensor, codebook: Tensor) -> Tensor:
     """Index of the nearest code by squared distance; z [n, d], codebook [K, d] -> int64 [n]."""
     # |z|^2 does not change the order, so one matmul with |e|^2 as its bias is the whole distance.
     return torch.addmm(codebook.square().sum(1), z, codebook.t(), alpha=-2).argmin(1)
+
+
+def hash32(x: Tensor) -> Tensor:
+    """Avalanche of the low 32 bits of int64 (the finaliser of MurmurHash3): uniform in 0 .. 2^32 - 1."""
+    x = x & 0xFFFFFFFF
+    x = ((x ^ (x >> 16)) * 0x85EBCA6B) & 0xFFFFFFFF
+    x = ((x ^ (x >> 13)) * 0xC2B2AE35) & 0xFFFFFFFF
+    return x ^ (x >> 16)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
-from motionloom.models.layers import random
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tma.losses import TmaLossConfig, info_nce, kl_four, latent_loss, reconstruction_loss
 from motionloom.models.tma.network import Tma
@@ -68,4 +68,4 @@ class TmaModule(StageModule):
     def _sample(self, mu: Tensor, logvar: Tensor) -> Tensor:
         if not self.training:
             return mu
-        return mu + random.normal_like(mu) * (0.5 * logvar).exp()
+        return mu + torch.randn_like(mu) * (0.5 * logvar).exp()

@@ -25,7 +25,6 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.models.layers import random
 from motionloom.models.layers.basis import Basis
 from motionloom.models.layers.transformer import Norm, StackConfig, Transformer, length_mask, sinusoid
 
@@ -102,7 +101,7 @@ def noisy(tokens: Tensor, mask: Tensor, scale: float) -> Tensor:
     (bool [B, S], True = real) does not count.
     """
     squares = tokens.square().mean(-1).masked_fill(~mask, 0.0).sum(1) / mask.sum(1).clamp(min=1)
-    return tokens + scale * squares.sqrt()[:, None, None] * random.normal_like(tokens)
+    return tokens + scale * squares.sqrt()[:, None, None] * torch.randn_like(tokens)
 
 
 def _stack(config: TmaConfig) -> Transformer:

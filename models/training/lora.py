@@ -14,7 +14,6 @@ from pydantic import Field
 from torch import nn
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.models.layers import random
 
 LAYERS = ("attention.qkv", "attention.out", "ff_in", "ff_out")
 """Every linear layer of a transformer block [ours]: attention alone has less room for new motion."""
@@ -53,7 +52,6 @@ def add_lora(net: nn.Module, config: LoraConfig) -> None:
     require_peft()
     from peft import LoraConfig as PeftConfig
     from peft import inject_adapter_in_model
-    from peft.tuners.lora import LoraLayer
 
     names = [name for name, layer in net.named_modules() if isinstance(layer, nn.Linear)]
     for end in config.layers:
@@ -73,10 +71,6 @@ def add_lora(net: nn.Module, config: LoraConfig) -> None:
     inject_adapter_in_model(adapters, net, adapter_name=_NAME)
     for name, parameter in net.named_parameters():
         parameter.requires_grad_("lora_" in name or name.split(".")[0] in config.whole)
-    for layer in net.modules():
-        # Ours draws by sample where the training does (`train.draws`).
-        if isinstance(layer, LoraLayer) and config.dropout:
-            layer.lora_dropout[_NAME] = random.Dropout(config.dropout)
 
 
 def merge_lora(net: nn.Module) -> None:

@@ -20,7 +20,6 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from motionloom.models.layers import random
 from motionloom.models.training.distributed import mean_gradients
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import Batch, Execution, StageModule
@@ -128,14 +127,12 @@ class PlayersModule(StageModule):
         how: Execution,
     ) -> Tensor:
         self.seed_draws(number, turn)
-        self.key_draws(part, number, turn)
         with how.autocast():
             values = self.play(player.name, part, shared[number])
         shared[number] = {name: value.detach() for name, value in shared[number].items()}
         named = _named(player, values)
         self.average({"loss": values["loss"], **named} if turn == 0 else named)
         how.fabric.backward(values["loss"] / self.accumulate)
-        random.end()
         return values["loss"].detach()
 
     def _step(self, player: Player, turn: int, optimizer: Optimizer, how: Execution) -> bool:

@@ -2,7 +2,7 @@
 
 Every random draw of a training step (dropout, latents, Gumbel noise) comes from a generator state that is a
 pure function of (seed, step, rank), so a run that was killed and resumed repeats the undisturbed run bit for
-bit; or of the sample it is for, so that a run repeats it on any number of ranks too (`layers/random.py`).
+bit.
 Codebooks draw by themselves, the same on every rank (`quantize/base.py`).
 """
 
@@ -23,8 +23,7 @@ from torch.distributed.tensor import DTensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim import Optimizer
 
-from motionloom.models.layers import random
-from motionloom.models.training.distributed import alone, rank, world_size
+from motionloom.models.training.distributed import alone, rank
 from motionloom.models.training.optim import OptimConfig as OptimConfig
 
 LOG_EVERY = 10
@@ -100,8 +99,6 @@ class StageModule(L.LightningModule, ABC):
         """Steps that are done."""
         self.accumulate = 1
         """Parts that the batch of a step is cut into."""
-        self.draw_by_sample = False
-        """Whether what a step draws depends on the samples and not on the ranks."""
         self.fused = True
         """Whether the optimizer is one kernel. False for "16-mixed": a fused step also removes the scale of
         the gradients, and they could not be clipped before it."""
@@ -143,7 +140,6 @@ class StageModule(L.LightningModule, ABC):
                 with how.autocast():
                     loss = how.model(batch, number)
                 how.fabric.backward(loss / self.accumulate)
-            random.end()  # not before: the backward pass may repeat draws (activation checkpointing)
         if how.scaler is not None:
             how.scaler.unscale_(optimizer)
         self.gauges = {}
@@ -159,7 +155,6 @@ class StageModule(L.LightningModule, ABC):
     def forward(self, batch: Batch, part: int) -> Tensor:
         """Loss of one part of a step; seeds torch from (seed, step, part, rank) first."""
         self.seed_draws(part)
-        self.key_draws(batch, part)
         values = self.losses(batch)
         self.average(values)
         return values["loss"]
@@ -168,14 +163,6 @@ class StageModule(L.LightningModule, ABC):
         """Seed torch for one part of a step, and one of several losses that are computed on it in turn."""
         key = (self.seed * 1_000_003 + self.step) * 4099 + rank()
         torch.manual_seed((key + (part << 48) + (turn << 56)) % 2**63)
-
-    def key_draws(self, batch: Batch, part: int, turn: int = 0) -> None:
-        """Have the draws of a part of a step depend on its samples, where they do."""
-        if self.draw_by_sample:
-            rows, device = len(batch["length"]), batch["length"].device
-            first = (part * world_size() + rank()) * rows
-            samples = torch.arange(first, first + rows, device=device)
-            random.begin(self.seed, self.step, samples, turn)
 
     @property
     def ends_row(self) -> bool:
@@ -213,7 +200,6 @@ class StageModule(L.LightningModule, ABC):
 
         What a loss draws here depends on (seed, batch) alone, so two validations differ by the weights only.
         """
-        random.end()
         torch.manual_seed((self.seed * 1_000_003 + batch_idx) % 2**63)
         with alone():
             return self.losses(batch)

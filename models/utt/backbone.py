@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from motionloom.models.layers import random
 from motionloom.models.layers.transformer import KVCache, Transformer, length_mask
 
 
@@ -42,20 +41,11 @@ class PrefixTransformer(nn.Module):
         super().__init__()
         self.stack = stack
 
-    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor, positions: Tensor | None = None) -> Tensor:
-        """Prefix [B, S, D], mask bool [B, S], x [B, L, D] -> the states of x, [B, L, D].
-
-        positions: int64 [S] of the prefix's columns, below 2^19, for random numbers by sample
-        (`Encoded.positions`). Those of x follow in the upper half of the range.
-        """
-        size = prefix.shape[1]
+    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor) -> Tensor:
+        """Prefix [B, S, D], mask bool [B, S], x [B, L, D] -> the states of x, [B, L, D]."""
         visible = prefix_mask(mask, x.shape[1])
-        if positions is not None:
-            after = torch.arange(x.shape[1], device=positions.device) + (1 << (random.POSITION_BITS - 1))
-            positions = torch.cat([positions, after])
-        with random.positions(positions):
-            out: Tensor = self.stack(torch.cat([prefix, x], dim=1), visible)
-        return out[:, size:]
+        out: Tensor = self.stack(torch.cat([prefix, x], dim=1), visible)
+        return out[:, prefix.shape[1] :]
 
     def begin(self, prefix: Tensor, mask: Tensor, size: int) -> State:
         """Read the prefix, with room for `size` inputs."""
@@ -79,10 +69,10 @@ class PrefixGru(nn.Module):
         super().__init__()
         self.norms = nn.ModuleList(nn.LayerNorm(dim) for _ in range(layers))
         self.layers = nn.ModuleList(nn.GRU(dim, dim, batch_first=True) for _ in range(layers))
-        self.dropout = random.Dropout(dropout)
+        self.dropout = nn.Dropout(dropout)
         self.norm = nn.LayerNorm(dim)
 
-    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor, positions: Tensor | None = None) -> Tensor:
+    def forward(self, prefix: Tensor, mask: Tensor, x: Tensor) -> Tensor:
         return self.extend(x, self.begin(prefix, mask, x.shape[1]))
 
     def begin(self, prefix: Tensor, mask: Tensor, size: int) -> State:

@@ -21,7 +21,6 @@ from motionloom.models.discriminator.patch import PatchDiscriminator
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.tokens import TokenSequence, interleave
-from motionloom.models.layers import random
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
@@ -93,13 +92,13 @@ class UttModule(PlayersModule):
         conditions, inputs, z = batch["conditions"], None, None
         size, device = len(tokens), tokens.device
         if self.training:
-            drop = random.uniform(size, device=device) < config.condition_dropout
+            drop = torch.rand(size, device=device) < config.condition_dropout
             conditions = drop_conditions(conditions, drop)
             if config.pkeep < 1:
                 inputs = corrupt(tokens, kinds, net.ends, config.pkeep)
         encoded: Encoded = self.net.mate(conditions, size)
         if config.z_dim:
-            z = random.normal(size, config.z_dim, device=device)
+            z = torch.randn(size, config.z_dim, device=device)
         logits = net(tokens, kinds, encoded, z, inputs=inputs)
         ce = cross_entropy(logits, tokens)
         values = {"loss": ce, "ce": ce}

@@ -32,7 +32,6 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded, Mate, MateConfig
 from motionloom.models.gpt.token_network import TokenNetwork
 from motionloom.models.gpt.tokens import closing_length
-from motionloom.models.layers import random
 from motionloom.models.layers.transformer import StackConfig, Transformer
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
 from motionloom.models.utt.backbone import PrefixGru, PrefixTransformer, State
@@ -103,7 +102,7 @@ class Utt(TokenNetwork):
         self.start = nn.Parameter(torch.randn(config.dim) * 0.02)
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
         self.embeddings = self._tables(config.dim)
-        self.dropout = random.Dropout(config.dropout)
+        self.dropout = nn.Dropout(config.dropout)
         self.backbone: PrefixTransformer | PrefixGru
         if config.kind == "gpt":
             stack = Transformer(config, config.layers, attention_dropout=config.attention_dropout)
@@ -142,13 +141,9 @@ class Utt(TokenNetwork):
             float32 [B, L, V]; -inf where a token is illegal. At padded positions the values mean nothing.
         """
         embedded = self.embed_inputs(tokens, kinds, inputs, known, self.config.block_size)
-        positions = condition.positions
-        if positions is not None:
-            positions = torch.cat([positions.new_zeros(1), positions])
-        with random.positions(positions):
-            prefix, mask = self.prefix(condition, z)
+        prefix, mask = self.prefix(condition, z)
         motion = self.motion_inputs(embedded, 0, self.frame_condition(condition))
-        hidden = self.backbone(prefix, mask, motion, positions)
+        hidden = self.backbone(prefix, mask, motion)
         return self.logits(hidden, kinds, self.legal(tokens, kinds))
 
     def prefix(self, condition: Encoded, z: Tensor | None = None) -> tuple[Tensor, Tensor]:

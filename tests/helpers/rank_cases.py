@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -218,36 +218,9 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
 }
 
 
-def drawing_tma() -> tuple[StageModule, Batches]:
-    module, batch = tma()
-    assert isinstance(module.net, Tma)
-    net = Tma(module.net.config.model_copy(update={"text_noise": 0.2, "text_dropout": 0.3}), 20, TEXT)
-    loss = TmaLossConfig(kl=0.1, latent=0.1, contrastive=1.0)
-    return TmaModule(net, OPTIM, seed=0, max_steps=STEPS, loss=loss), batch
-
-
-def drawing_gpt(align_on: Literal["predictions", "samples"]) -> tuple[StageModule, Batches]:
-    module, batch = gpt()
-    assert isinstance(module, GptModule) and module.tokenizer is not None and module.tma is not None
-    config = GptConfig(layers=2, dim=16, heads=2, ff=32, block_size=20, pkeep=0.8, condition_dropout=0.3)
-    book = module.tokenizer.module
-    return GptModule(
-        InterleavedGPT(config, book.streams, book.pattern, text_dim=16), OPTIM, seed=0, max_steps=STEPS,
-        loss=GptLossConfig(align_weight=1.0, align_on=align_on), tokenizer=book, tma=module.tma.module,
-    ), batch  # fmt: skip
-
-
 def drawing_diffusion() -> tuple[StageModule, Batches]:
+    """As trained, with its own noise."""
     net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2, condition_dropout=0.3), 20, TEXT)
     return DiffusionModule(
         net, OPTIM, seed=0, max_steps=STEPS
     ), lambda step: motion(step, 20) | captions(step)
-
-
-ELASTIC: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
-    "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
-    "tma": drawing_tma,
-    "gpt": lambda: drawing_gpt("predictions"),
-    "gpt, samples": lambda: drawing_gpt("samples"),
-    "diffusion": drawing_diffusion,
-}

@@ -14,7 +14,6 @@ from rich.console import Console
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from motionloom.models.layers.random import Dropout
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
 from motionloom.pipeline.contract.stage import StageCache, StageContext
@@ -74,7 +73,7 @@ class Duel(PlayersModule):
         self, *, seed: int, max_steps: int, dropout: float = 0.2, critic: OptimConfig = CRITIC, start: int = 4
     ) -> None:
         torch.manual_seed(seed)
-        net = nn.Sequential(nn.Linear(DIM, 16), nn.Tanh(), Dropout(dropout), nn.Linear(16, DIM))
+        net = nn.Sequential(nn.Linear(DIM, 16), nn.Tanh(), nn.Dropout(dropout), nn.Linear(16, DIM))
         super().__init__(net, GENERATOR, seed=seed, max_steps=max_steps)
         self.critic = nn.Sequential(nn.Linear(DIM, 8), nn.Tanh(), nn.Linear(8, 1))
         self.unused = nn.Parameter(torch.ones(2))

@@ -70,3 +70,16 @@ def test_step_by_step_equals_at_once(norm: Norm) -> None:
     with torch.no_grad():
         steps = torch.cat([net(x[:, k : k + 1], causal=True, cache=cache) for k in range(7)], dim=1)
         torch.testing.assert_close(steps, net(x, causal=True), rtol=1e-10, atol=1e-10)
+
+
+def test_checkpointed_activations_draw_again_what_they_drew() -> None:
+    stack = Transformer(DiffusionConfig(dim=8, heads=2, ff=16, dropout=0.3), 2).double()
+    x = torch.randn(3, 5, 8, dtype=torch.float64)
+    grads = []
+    for stack.checkpointed in (False, True):
+        stack.zero_grad()
+        torch.manual_seed(1)
+        stack(x, torch.ones(3, 5, dtype=torch.bool)).square().sum().backward()
+        grads.append([p.grad.clone() for p in stack.parameters() if p.grad is not None])
+    for one, two in zip(*grads, strict=True):
+        assert torch.equal(one, two)

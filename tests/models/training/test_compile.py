@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from batch_rows import rows_of
-from rank_cases import CASES, ELASTIC
+from rank_cases import CASES, drawing_diffusion
 
 pytestmark = pytest.mark.slow
 
-ONCE = {case: make for case, make in CASES.items() if "," not in case} | {"diffusion": ELASTIC["diffusion"]}
+ONCE = {case: make for case, make in CASES.items() if "," not in case} | {"diffusion": drawing_diffusion}
 
 
 @pytest.mark.parametrize("case", sorted(ONCE.keys() - {"evaluator"}))  # torch.compile takes no GRU

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.layers import random
 from motionloom.models.tokenizer.base import Stream
 from motionloom.models.training.lora import LoraConfig, add_lora, merge_lora, trained_share
 
@@ -89,7 +88,7 @@ def test_dropout_of_adapters_draws_as_the_training_does() -> None:
     net = network()
     add_lora(net, LoraConfig(dropout=0.5))
     found = net.stack.blocks[0].attention.qkv.lora_dropout["default"]
-    assert isinstance(found, random.Dropout) and found.p == 0.5
+    assert isinstance(found, torch.nn.Dropout) and found.p == 0.5
 
 
 def test_names_that_no_layer_has_are_refused() -> None:
