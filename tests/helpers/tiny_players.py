@@ -81,11 +81,7 @@ class Duel(PlayersModule):
         self.critic.register_parameter("idle", self.unused)
         self.critic_optim, self.start = critic, start
         self.readers: set[int] = set()
-
-    def key_draws(self, batch: dict[str, Any], part: int, turn: int = 0) -> None:
-        """Note which process has read the batch."""
-        self.readers.add(int(batch["reader"]))
-        super().key_draws(batch, part, turn)
+        """Processes that have read a batch."""
 
     def players(self) -> Sequence[Player]:
         """Generator, then critic."""
@@ -96,6 +92,7 @@ class Duel(PlayersModule):
 
     def play(self, player: str, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """Least-squares GAN with a reconstruction term."""
+        self.readers.add(int(batch["reader"]))
         x = batch["x"]
         if player == "generator":
             made = self.net(x)
