@@ -19,7 +19,7 @@ from pydantic import Field
 from motionloom.datasets.schema import Config
 from motionloom.datasets.synth.actions.truth import Truth, takes_part
 from motionloom.datasets.synth.dances import DanceTruth
-from motionloom.datasets.synth.genres import GENRES
+from motionloom.datasets.synth.music.genres import GENRES
 
 Wordings = Literal["few", "many", "everyday"]
 Phrases = dict[str, tuple[str, ...]]

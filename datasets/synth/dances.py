@@ -25,9 +25,9 @@ from motionloom.datasets.synth.actions.maths import Array, keys
 from motionloom.datasets.synth.actions.pose import Track
 from motionloom.datasets.synth.actions.truth import Record, Span, Truth, require_known
 from motionloom.datasets.synth.face import express_with
-from motionloom.datasets.synth.genres import GENRES
+from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.hands import grip_hand
-from motionloom.datasets.synth.song import BEATS, Song, draw_song
+from motionloom.datasets.synth.music.song import BEATS, Song, draw_song
 
 Ranges = TypeVar("Ranges", tuple[int, int], list[tuple[int, int]])
 Comes = Literal["text", "audio", "both", "none"]
@@ -68,6 +68,9 @@ class DanceConfig(Config):
     """None = all; otherwise names of `genres.GENRES`. A genre decides the style of its dances."""
     tempo: tuple[int, int] = (80, 160)
     """Slowest and fastest song, beats a minute."""
+    music: Literal["even", "played"] = "even"
+    """Metronomes of the built-in synthesiser, or songs that a band plays and a studio records: with a form,
+    breaks, drifting tempi and real instruments. Those need FluidSynth and a sound font (`music/band.py`)."""
     hold_out_songs: float | None = Field(None, ge=0, lt=1)
     """Share of the songs that only test clips dance to; None = the config's `test_fraction`. Validation has
     songs of its own too, `val_fraction` of them."""
@@ -90,13 +93,16 @@ class DanceConfig(Config):
     @classmethod
     def _ranges(cls, value: Ranges) -> Ranges:
         for low, high in [value] if isinstance(value, tuple) else value:
-            if not 60 <= low <= high <= 170:
-                raise ValueError(f"tempi are [slowest, fastest] within 60 and 170, not {low}, {high}")
+            if not 60 <= low <= high <= 190:
+                raise ValueError(f"tempi are [slowest, fastest] within 60 and 190, not {low}, {high}")
         return value
 
     def song(self, number: int, seed: int) -> Song:
         names = tuple(self.genres or GENRES)
-        return draw_song(number, seed, genres=names, tempo=self.tempo, seconds=self.song_seconds)
+        played = self.music == "played"
+        return draw_song(
+            number, seed, genres=names, tempo=self.tempo, seconds=self.song_seconds, played=played
+        )
 
     def split(self, song: Song, test: float, val: float) -> Split:
         """Split of all clips of a song. Songs come in rounds of all genres, so the first are balanced."""
@@ -123,6 +129,14 @@ class DanceTruth(Truth):
     """Seconds from the start of the clip to its first beat; the others follow each 60 / bpm seconds."""
     bar_beat: int = 0
     """Which beat of the bar that is, from 0."""
+    beats: tuple[float, ...] = ()
+    """Of a played song: seconds of all its beats from the start of the clip; `first_beat` begins them."""
+
+    def record(self, *, hands: bool, face: bool) -> Record:
+        data = super().record(hands=hands, face=face)
+        if not self.beats:
+            del data["beats"]
+        return data
 
 
 @dataclass(frozen=True)
@@ -168,14 +182,17 @@ def plan_dance(number: int, index: int, dances: DanceConfig, seed: int, span: Sp
         song=song.number,
         key=song.key,
         song_start=round(start / fps, 9),
-        first_beat=round(first * song.beat - start / fps, 9),
-        bar_beat=first % BEATS,
+        first_beat=round(float(song.times(first)) - start / fps, 9),
+        bar_beat=first % song.meter,
+        beats=tuple(song.beats_within(start / fps, frames / fps)) if song.played else (),
     )
     return Dance(truth, song, start, frames, dances.conditions.of(number))
 
 
 def beats_of(truth: Record, seconds: float) -> list[float]:
     """Times of the beats inside a clip of `seconds` by its truth record (`ClipMeta.truth`)."""
+    if truth.get("beats"):
+        return [at for at in truth["beats"] if at < seconds]
     beat = 60.0 / truth["bpm"]
     count = max(0, int(np.ceil((seconds - truth["first_beat"]) / beat - 1e-9)))
     return [truth["first_beat"] + k * beat for k in range(count)]

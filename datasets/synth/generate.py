@@ -53,7 +53,7 @@ from motionloom.datasets.synth.dances import (
 )
 from motionloom.datasets.synth.face import express
 from motionloom.datasets.synth.hands import shape_hand
-from motionloom.datasets.synth.song import render_song, song_features
+from motionloom.datasets.synth.music.performance import render_song, song_features
 
 CONVERTER_VERSION = 2  # the face's words are about the body's person
 LICENCE = "CC0-1.0"

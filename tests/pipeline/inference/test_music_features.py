@@ -10,7 +10,7 @@ from motionloom.datasets.audio import lineup
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.dances import DanceConfig
-from motionloom.datasets.synth.song import render_song
+from motionloom.datasets.synth.music.performance import render_song
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.requests import PromptEncoder, prompts_of
 

@@ -1,78 +1,24 @@
-"""Songs: pieces of music with a genre, a tempo, a key and sections, to which several dances are danced.
+"""The built-in band: synthesised drums, a bass and chords, which play a song without anything installed.
 
-A song is a pure function of (seed, number, options). Its first beat lies at 0 and its bars have four beats;
-sections of four bars alternate between two kinds, A and B, which differ in chords, in density and in an upper
-voice, and for the dancer in the arms. `render_song` plays it on synthesised drums, a bass and chords, and
-`song_features` analyses it.
+Every beat can be heard in every genre, and which of them begins a bar.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import numpy as np
 from functools import lru_cache
 
-import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.lineup import motion_frame_features
 from motionloom.datasets.synth.actions.maths import Array
-from motionloom.datasets.synth.genres import GENRES, Genre, Wave
+from motionloom.datasets.synth.music.genres import Wave
+from motionloom.datasets.synth.music.song import BEATS, Song
 
-BEATS = 4
-"""Beats of a bar."""
-SECTION_BARS = 4
-"""Bars of a section."""
-_GOLDEN = 0.6180339887498949
 _LEVEL = {"x": 1.0, "o": 0.45}
 
 
-@dataclass(frozen=True)
-class Song:
-    """One piece of music."""
-
-    number: int
-    seed: int
-    genre: str
-    bpm: int
-    key: int
-    """Semitones of the key note above A."""
-    seconds: float
-
-    @property
-    def beat(self) -> float:
-        return 60.0 / self.bpm
-
-    @property
-    def style(self) -> Genre:
-        """Its line of the table of genres."""
-        return GENRES[self.genre]
-
-    def beat_number(self, start: float) -> int:
-        """Number of the first beat at or after `start` seconds."""
-        return int(np.ceil(start / self.beat - 1e-9))
-
-    def section(self, beat: int) -> int:
-        """Kind of section (0 is A, 1 is B) of a beat by number; beats before the song count as its first."""
-        return (max(beat, 0) // (BEATS * SECTION_BARS)) % 2
-
-
-def draw_song(
-    number: int, seed: int, *, genres: tuple[str, ...], tempo: tuple[int, int], seconds: float
-) -> Song:
-    """Song `number` of a pool: genres in shuffled rounds, each genre's tempi spread evenly over the range."""
-    rounds, place = divmod(number, len(genres))
-    order = np.random.default_rng([seed, rounds, 211]).permutation(len(genres))
-    which = int(order[place])
-    shift = float(np.random.default_rng([seed, which, 223]).random())
-    low, high = tempo
-    bpm = low + int((rounds * _GOLDEN + shift) % 1.0 * (high - low + 1))
-    key = int(np.random.default_rng([seed, number, 227]).integers(12))
-    return Song(number, seed, genres[which], bpm, key, seconds)
-
-
-@lru_cache(maxsize=64)
-def render_song(song: Song, rate: int) -> NDArray[np.float32]:
-    """The whole song as mono samples [seconds * rate] in -1..1; read-only, the same bytes each time."""
+def synthesize(song: Song, rate: int) -> NDArray[np.float32]:
+    """The whole song as mono samples [seconds * rate] in -1..1; the same bytes each time."""
     total = round(song.seconds * rate)
     rng = np.random.default_rng([song.seed, song.number, 229])
     genre = song.style
@@ -102,21 +48,7 @@ def render_song(song: Song, rate: int) -> NDArray[np.float32]:
     out = _equalize(out, rate, genre.tone)
     # A soft limiter; driven hard it is the distortion of rock.
     out = 0.95 * np.tanh(genre.drive * out)
-    samples = np.asarray(out, dtype=np.float32)
-    samples.setflags(write=False)
-    return samples
-
-
-@lru_cache(maxsize=64)
-def song_features(song: Song, rate: int, fps: float) -> NDArray[np.float32]:
-    """Audio features [frames, 438] of a whole song; row t is at t / fps seconds. Read-only.
-
-    Computed from the whole song, like the features of real dances: its beats and loudness are the song's.
-    """
-    rows = motion_frame_features(render_song(song, rate), rate, fps, int(song.seconds * fps))
-    rows = np.ascontiguousarray(rows)
-    rows.setflags(write=False)
-    return rows
+    return np.asarray(out, dtype=np.float32)
 
 
 def _harmony(out: Array, song: Song, degree: int, kind: int, begin: float, rate: int) -> None:
