@@ -25,8 +25,8 @@ from motionloom.datasets.synth.actions.maths import Array, keys
 from motionloom.datasets.synth.actions.pose import Track
 from motionloom.datasets.synth.actions.truth import Record, Span, Truth, require_known
 from motionloom.datasets.synth.face import express_with
-from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.hands import grip_hand
+from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.music.song import BEATS, Song, draw_song
 
 Ranges = TypeVar("Ranges", tuple[int, int], list[tuple[int, int]])

@@ -23,8 +23,8 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth import face as faces
 from motionloom.datasets.synth.actions.maths import Array
 from motionloom.datasets.synth.actions.truth import SIDES, Record
-from motionloom.datasets.synth.music.genres import Style
 from motionloom.datasets.synth.hands import hand_shape
+from motionloom.datasets.synth.music.genres import Style
 from motionloom.datasets.synth.signals import Signals, rise_time, runs, signals_of, tempo
 
 CIRCLE = 4.0

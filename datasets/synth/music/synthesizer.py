@@ -5,13 +5,14 @@ Every beat can be heard in every genre, and which of them begins a bar.
 
 from __future__ import annotations
 
-import numpy as np
 from functools import lru_cache
 
+import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.synth.actions.maths import Array
 from motionloom.datasets.synth.music.genres import Wave
+from motionloom.datasets.synth.music.recording import equalize
 from motionloom.datasets.synth.music.song import BEATS, Song
 
 _LEVEL = {"x": 1.0, "o": 0.45}
@@ -45,7 +46,7 @@ def synthesize(song: Song, rate: int) -> NDArray[np.float32]:
         degree = genre.progressions[kind][bar % 4]
         _harmony(out, song, degree, kind, begin, rate)
     out = out[:total] + genre.air * rng.standard_normal(total)
-    out = _equalize(out, rate, genre.tone)
+    out = equalize(out, rate, genre.tone)
     # A soft limiter; driven hard it is the distortion of rock.
     out = 0.95 * np.tanh(genre.drive * out)
     return np.asarray(out, dtype=np.float32)
@@ -166,16 +167,6 @@ def _note(rate: int, wave: Wave, hertz: float, seconds: float) -> Array:
         if strength:
             out += strength * harmonic.imag
     return out * _envelope(t, _ATTACK[wave], _DECAY[wave]) / sum(_PARTIALS[wave])
-
-
-def _equalize(sound: Array, rate: int, decibels: tuple[float, float, float]) -> Array:
-    """Low, middle and high bands (edges at 250 Hz and 2.5 kHz) of samples made louder by `decibels`."""
-    from scipy import signal
-
-    edges = [signal.butter(1, hertz, fs=rate, output="sos") for hertz in (250.0, 2500.0)]
-    low, below = (np.asarray(signal.sosfilt(edge, sound)) for edge in edges)
-    bands = (low, below - low, sound - below)
-    return sum((10 ** (gain / 20) * band for gain, band in zip(decibels, bands, strict=True)), np.zeros(1))
 
 
 def _envelope(t: Array, attack: float, decay: float) -> Array:
