@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.features import BEAT, AudioSettings, audio_features
+from motionloom.datasets.audio.features import BEAT, DIM, AudioSettings, audio_features
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.audio.spectra import HOP
 from motionloom.datasets.schema import UserError
@@ -39,8 +39,10 @@ def motion_frame_features(
     return rows_at(audio_features(samples, rate, settings), settings.fps, fps, frames)
 
 
-def features_of(sound: Sound, fps: float) -> NDArray[np.float32]:
-    """Features [T, 438] of a sound, a row for each motion frame, by all of the piece that it is a slice of.
+def features_of(sound: Sound, fps: float, width: int = DIM) -> NDArray[np.float32]:
+    """Features [T, width] of a sound, a row for each motion frame, by all of the piece that it is a slice of.
+
+    The width says which: the 438 published ones, or those of `rhythm_features`.
 
     Tempo and beats are read from many seconds around a frame, in training too: a slice heard alone would
     look different. A piece is analysed once; the sound keeps what was found.
@@ -49,13 +51,27 @@ def features_of(sound: Sound, fps: float) -> NDArray[np.float32]:
     # The piece is heard from within a frame's length on, so that its rows lie on the motion's frames.
     first = int(sound.begin * fps + 1e-6)
     lead = max(0.0, sound.begin - first / fps)
-    known = piece.analysed.get((lead, fps))
+    known = piece.analysed.get((lead, fps, width))
     if known is None:
         whole = piece.slice(lead) if round(lead * piece.rate) else piece
-        known = motion_frame_features(whole, None, fps, max(1, round(whole.seconds * fps)))
-        piece.analysed[lead, fps] = known
+        known = _analysed(whole, fps, width)
+        piece.analysed[lead, fps, width] = known
     frames = max(1, round(sound.seconds * fps))
     return known[np.minimum(np.arange(first, first + frames), len(known) - 1)]
+
+
+def _analysed(whole: Sound, fps: float, width: int) -> NDArray[np.float32]:
+    frames = max(1, round(whole.seconds * fps))
+    if width == DIM:
+        return motion_frame_features(whole, None, fps, frames)
+    from motionloom.datasets.audio.rhythm_features import RHYTHM_DIM, rhythm_features
+
+    if width != RHYTHM_DIM:
+        raise UserError(
+            f"this model was trained on {width} features of music; known are {DIM} (published) and "
+            f"{RHYTHM_DIM} (rhythm)"
+        )
+    return rhythm_features(whole, fps, frames)
 
 
 def settings_at(fps: float) -> AudioSettings:

@@ -55,8 +55,8 @@ class Sound:
     """The longer sound that this is a slice of; features of music are made of whole pieces."""
     begin: float = 0.0
     """Second of the piece at which it begins."""
-    analysed: dict[tuple[float, float], NDArray[np.float32]] = field(default_factory=dict, repr=False)
-    """Features of the piece from a second on, at frames a second (`lineup.features_of`)."""
+    analysed: dict[tuple[float, float, int], NDArray[np.float32]] = field(default_factory=dict, repr=False)
+    """Features of the piece from a second on, at frames a second, by width (`lineup.features_of`)."""
 
     def __post_init__(self) -> None:
         samples = np.asarray(self.samples, dtype=np.float32)

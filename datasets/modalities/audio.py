@@ -1,11 +1,16 @@
-"""Music: 438 features a frame (UDE section 4.1; `datasets/audio/features.py`)."""
+"""Music: the 438 published features a frame (UDE section 4.1; `datasets/audio/features.py`), or rhythm's few.
+
+Which of them a data set holds is told by their number. `rhythm` columns (`datasets/audio/rhythm_features.py`)
+say where beats and bars are, and how loud and full the music is: what real songs share with rendered ones
+[ours].
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.modalities.modality import FrameModality
+from motionloom.datasets.modalities.modality import FrameModality, FrameStats
 
 
 class AudioModality(FrameModality):
@@ -15,12 +20,17 @@ class AudioModality(FrameModality):
     members = ("audio.npy", "audio.flac")
     width = 438
 
-    def features(self, given: object, fps: float) -> NDArray[np.float32]:
-        """Analyse a `Sound`, by all of the piece that it is a slice of; arrays are taken as they are."""
+    def features(self, given: object, fps: float, prepared: object = None) -> NDArray[np.float32]:
+        """Analyse a `Sound`, by all of the piece that it is a slice of; arrays are taken as they are.
+
+        The columns are those that the model was trained on: as many as the statistics `prepared` have.
+        """
         from motionloom.datasets.audio.lineup import features_of
         from motionloom.datasets.audio.sound import Sound
 
-        return features_of(given, fps) if isinstance(given, Sound) else super().features(given, fps)
+        if not isinstance(given, Sound):
+            return super().features(given, fps)
+        return features_of(given, fps, prepared.dim if isinstance(prepared, FrameStats) else self.width)
 
     def seconds(self, given: object) -> float | None:
         from motionloom.datasets.audio.sound import Sound
@@ -30,7 +40,11 @@ class AudioModality(FrameModality):
     def ticks(self, given: object, features: NDArray[np.float32], fps: float) -> list[float]:
         from motionloom.datasets.audio.features import BEAT
 
-        return [float(frame / fps) for frame in np.flatnonzero(features[:, BEAT])]
+        if features.shape[1] == self.width:
+            return [float(frame / fps) for frame in np.flatnonzero(features[:, BEAT])]
+        from motionloom.datasets.audio.rhythm_features import beats_of_rows
+
+        return [float(beat) for beat in beats_of_rows(features, fps)]
 
 
 RECORD = AudioModality()

@@ -197,7 +197,7 @@ class FrameModality(Modality):
 
         from motionloom.datasets.conditions import Condition
 
-        found = [None if value is None else self.features(value, fps) for value in given]
+        found = [None if value is None else self.features(value, fps, prepared) for value in given]
         width = next(row.shape[1] for row in found if row is not None)
         longest = max(len(row) for row in found if row is not None)
         features = torch.zeros(len(found), longest, width)
@@ -210,7 +210,7 @@ class FrameModality(Modality):
                 )
         return Condition(features, mask)
 
-    def features(self, given: object, fps: float) -> NDArray[np.float32]:
+    def features(self, given: object, fps: float, prepared: object = None) -> NDArray[np.float32]:
         """Features [T, E] of what a person gives, a row for each frame; an array is taken as it is."""
         if not isinstance(given, np.ndarray) or given.ndim != 2:
             raise UserError(f"{self.name}: give its features, an array [frames, {self.width}]")

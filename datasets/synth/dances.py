@@ -79,6 +79,8 @@ class DanceConfig(Config):
     share: float | None = Field(None, gt=0, le=1)
     """Share of dances among the clips; None = as much as any other action."""
     conditions: DanceConditions = DanceConditions()
+    columns: Literal["public", "rhythm"] = "public"
+    """Features of the music: the 438 published ones, or those of `audio/rhythm_features.py`."""
     sound: bool = True
     """Store the sound beside its features."""
     sample_rate: int = Field(16_000, ge=8_000, le=48_000)
@@ -96,6 +98,14 @@ class DanceConfig(Config):
             if not 60 <= low <= high <= 190:
                 raise ValueError(f"tempi are [slowest, fastest] within 60 and 190, not {low}, {high}")
         return value
+
+    @property
+    def width(self) -> int:
+        """How many columns those are."""
+        from motionloom.datasets.audio.features import DIM
+        from motionloom.datasets.audio.rhythm_features import RHYTHM_DIM
+
+        return DIM if self.columns == "public" else RHYTHM_DIM
 
     def song(self, number: int, seed: int) -> Song:
         names = tuple(self.genres or GENRES)

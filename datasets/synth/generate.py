@@ -265,11 +265,11 @@ def _smpl75(rotations: Array, joints: Array) -> NDArray[np.float32]:
 def _music_of(
     dance: Dance, fps: float, config: SynthConfig
 ) -> tuple[NDArray[np.float32] | None, tuple[NDArray[np.float32], int] | None]:
-    """Features [T, 438] and sound of a dance, where it comes with them."""
+    """Features [T, 438 or RHYTHM_DIM] and sound of a dance, where it comes with them."""
     if config.dances is None or dance.comes not in ("audio", "both"):
         return None, None
     rate = config.dances.sample_rate
-    rows = song_features(dance.song, rate, fps)[dance.start : dance.start + dance.frames]
+    rows = song_features(dance.song, rate, fps, config.dances.width)[dance.start : dance.start + dance.frames]
     if not config.dances.sound:
         return rows, None
     first = round(dance.start / fps * rate)

@@ -123,8 +123,8 @@ class MotionGenerator(Protocol):
         """The modalities it can be conditioned on."""
 
     @property
-    def text(self) -> object | None:
-        """What the modality "text" encodes its words by; None where it takes none."""
+    def prepared(self) -> Mapping[str, object]:
+        """What the stages of its modalities give, by name, such as the text source and music statistics."""
 
     @property
     def settings(self) -> frozenset[str]:

@@ -134,7 +134,7 @@ class Bundle:
     def encoder(self, stage: Finished) -> PromptEncoder:
         """What encodes prompts for a stage."""
         if stage.folder not in self._encoders:
-            self._encoders[stage.folder] = PromptEncoder(self.of(stage).text, self.stage_cache.device)
+            self._encoders[stage.folder] = PromptEncoder(self.of(stage).prepared, self.stage_cache.device)
         return self._encoders[stage.folder]
 
     @cached_property

@@ -159,11 +159,10 @@ def frames_of(
 
 
 class PromptEncoder:
-    """Encodes prompts for one generator, with the text encoder that it was trained with."""
+    """Encodes prompts for one generator, by what it was trained with (`MotionGenerator.prepared`)."""
 
-    def __init__(self, text: object | None, device: torch.device) -> None:
-        self._prepared: dict[str, object] = {"text": text}
-        self._device = device
+    def __init__(self, prepared: Mapping[str, object], device: torch.device) -> None:
+        self._prepared, self._device = prepared, device
 
     def encode(
         self, prompts: Sequence[Prompt], words: Sequence[str], modalities: frozenset[str], fps: float
@@ -172,7 +171,7 @@ class PromptEncoder:
 
         `words` are the prompts' texts, about the body or the face; an empty one is no text.
         """
-        source = self._prepared["text"]
+        source = self._prepared.get("text")
         if isinstance(source, TextSource):
             words = [source.spelt(text) for text in words]
         rows = [prompt.with_words(text).given for prompt, text in zip(prompts, words, strict=True)]

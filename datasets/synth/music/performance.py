@@ -7,7 +7,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.lineup import motion_frame_features
+from motionloom.datasets.audio.features import DIM
+from motionloom.datasets.audio.lineup import features_of
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.synth.music.band import play_band
 from motionloom.datasets.synth.music.recording import record
 from motionloom.datasets.synth.music.song import Song
@@ -23,12 +25,12 @@ def render_song(song: Song, rate: int) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=64)
-def song_features(song: Song, rate: int, fps: float) -> NDArray[np.float32]:
-    """Audio features [frames, 438] of a whole song; row t is at t / fps seconds. Read-only.
+def song_features(song: Song, rate: int, fps: float, width: int = DIM) -> NDArray[np.float32]:
+    """Audio features [frames, width] of a whole song; row t is at t / fps seconds. Read-only.
 
     Computed from the whole song, like the features of real dances: its beats and loudness are the song's.
     """
-    rows = motion_frame_features(render_song(song, rate), rate, fps, int(song.seconds * fps))
+    rows = features_of(Sound(render_song(song, rate), rate), fps, width)[: int(song.seconds * fps)]
     rows = np.ascontiguousarray(rows)
     rows.setflags(write=False)
     return rows

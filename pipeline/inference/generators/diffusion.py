@@ -17,7 +17,6 @@ from motionloom.models.diffusion.schedule import Sampler
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.store.networks import device_of
-from motionloom.pipeline.store.text import TextSource
 
 
 @dataclass(frozen=True)
@@ -35,9 +34,8 @@ class DiffusionFace:
     part: Part = "face"
 
     @property
-    def text(self) -> TextSource | None:
-        text: TextSource | None = self.given.get("text")
-        return text
+    def prepared(self) -> Mapping[str, object]:
+        return {"text": self.given.get("text")}
 
     def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
         """As asked for, or else DDPM in 50 steps."""

@@ -31,7 +31,6 @@ from motionloom.pipeline.store.networks import (
     device_of,
     embed_motions,
 )
-from motionloom.pipeline.store.text import TextSource
 
 T = TypeVar("T")
 
@@ -63,9 +62,8 @@ class GptGenerator:
         return {stream.name: stream.per_group for stream in self.tokenizer.net.streams}
 
     @property
-    def text(self) -> TextSource | None:
-        text: TextSource | None = self.given.get("text")
-        return text
+    def prepared(self) -> Mapping[str, object]:
+        return {"text": self.given.get("text")}
 
     @property
     def part(self) -> Part:
@@ -86,7 +84,7 @@ class GptGenerator:
     @property
     def read(self) -> Encode | None:
         """How it reads captions, where they reach it by way of TMA: unit-length latents [n, Z]."""
-        tma, text = self.reranker, self.text
+        tma, text = self.reranker, self.given.get("text")
         if tma is None or text is None:
             return None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,7 +26,6 @@ from motionloom.pipeline.contract.stage import StageConfig
 from motionloom.pipeline.inference.generators.frames import Frames
 from motionloom.pipeline.inference.generators.timeline import TimelineFlow, TokenTimeline
 from motionloom.pipeline.store.networks import LoadedDmd, LoadedUtt, TrainedTokenizer
-from motionloom.pipeline.store.text import TextSource
 
 
 class UdeConfig(StageConfig):
@@ -74,8 +73,8 @@ class UdeGenerator:
         return self.tokenizer.net.part
 
     @property
-    def text(self) -> TextSource | None:
-        return self.utt.given.get("text")
+    def prepared(self) -> Mapping[str, object]:
+        return {name: self.utt.given.get(name) for name in self.modalities}
 
     @property
     def modalities(self) -> frozenset[str]:
@@ -96,7 +95,7 @@ class UdeGenerator:
             self.utt.net,
             window=self.utt.max_frames // GROUP_FRAMES,
             context=self.config.context_frames // GROUP_FRAMES,
-            prepared={name: self.utt.given.get(name) for name in self.modalities},
+            prepared=self.prepared,
             inject_z=self.config.inject_z,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,6 @@ from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.store.networks import LoadedTma
-from motionloom.pipeline.store.text import TextSource
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,8 @@ class VaeMotion:
         return self.tma.part
 
     @property
-    def text(self) -> TextSource | None:
-        text: TextSource | None = self.tma.given.get("text")
-        return text
+    def prepared(self) -> Mapping[str, object]:
+        return {"text": self.tma.given.get("text")}
 
     @torch.no_grad()
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from pydantic import Field
 
 from motionloom.datasets.loading.statistics import frame_statistics
 from motionloom.datasets.modalities.modality import FrameStats, Modality
 from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import (
     Finished,
     Inputs,
@@ -22,7 +24,11 @@ from motionloom.pipeline.store.files import copy_files
 
 
 class FeaturesConfig(StageConfig):
-    """Nothing to choose: the features are those of the shards."""
+    """The features are those of the shards."""
+
+    width: int | None = Field(None, ge=1)
+    """How many the shards hold, where a modality has several kinds: of music 438, or those of rhythm.
+    None = the modality's usual ones."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +52,17 @@ class FeaturesStage(StageKind[FeaturesConfig]):
 
     def run(self, context: StageContext) -> None:
         stats = frame_statistics(context.given["data"].split("train"), self.modality)
+        wanted = context.config.width or self.width
+        if stats.dim != wanted:
+            raise UserError(
+                f"stage '{context.name}': the shards hold {stats.dim} features of {self.name} a frame, not "
+                f"{wanted}; set width: {stats.dim}"
+            )
         stats.save(context.folder / self.file)
         context.console.print(f"    {stats.frames} frames of {self.name}, {stats.dim} features")
 
     def preview(self, config: FeaturesConfig, given: Inputs) -> FeaturesPreview:
-        return FeaturesPreview(self.width)
+        return FeaturesPreview(config.width or self.width)
 
     def load(self, stage: Finished, given: Inputs, device: torch.device) -> FrameStats:
         return FrameStats.load(stage.folder / self.file)

@@ -13,8 +13,8 @@ from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, facing
 from motionloom.datasets.synth.dances import DanceConditions, DanceConfig, beats_of
 from motionloom.datasets.synth.generate import Clip, SynthConfig, dance_of, make_clip, make_sample, split_of
-from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.measure import agrees, kinetic_beats, measure_dance
+from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.music.performance import render_song
 
 FPS = 20.0

@@ -26,7 +26,7 @@ def song() -> Sound:
 
 
 def heard(sounds: list[Sound]) -> list[np.ndarray]:
-    encoder = PromptEncoder(None, torch.device("cpu"))
+    encoder = PromptEncoder({}, torch.device("cpu"))
     prompts = [Prompt(sound=sound) for sound in sounds]
     found = encoder.encode(prompts, [""] * len(sounds), frozenset({"audio"}), FPS)["audio"]
     return [f[m].numpy() for f, m in zip(found.features, found.mask, strict=True)]
@@ -72,7 +72,7 @@ def test_pieces_are_heard_once(song: Sound, monkeypatch: pytest.MonkeyPatch) -> 
 def test_known_features_are_taken_as_they_are(song: Sound) -> None:
     rows = np.random.default_rng(0).normal(size=(30, 438)).astype(np.float32)
     prompts = prompts_of(None, None, [song, song], {"audio": [rows, None]})
-    found = PromptEncoder(None, torch.device("cpu")).encode(prompts, ["", ""], frozenset({"audio"}), FPS)
+    found = PromptEncoder({}, torch.device("cpu")).encode(prompts, ["", ""], frozenset({"audio"}), FPS)
     assert found["audio"].mask.sum(1).tolist() == [30, round(song.seconds * FPS)]
     assert np.array_equal(found["audio"].features[0, :30].numpy(), rows)
     with pytest.raises(UserError, match="2 sounds but 1 audio"):
