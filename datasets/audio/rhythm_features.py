@@ -1,0 +1,169 @@
+"""A small description of music for dances, the same for a rendered song and for a recording.
+
+| columns | what |
+|---|---|
+| beat, two-beat and bar phase | cosine and sine; 0 on the beat and on the downbeat, even in between |
+| activation, tempo, confidence | of beats; octaves above 120 beats a minute; of the piece (`tracker`) |
+| loudness, low, middle, high | decibels against the piece's median, in units of its range; -2..2 |
+| onset | rise over the bands, in units of the piece's strong ones; 0..2 |
+| slow loudness, novelty | loudness over two seconds; how much the four seconds that follow are louder |
+| brightness, bass, dynamics | of the piece: balance of its bands, and its range |
+
+Everything is relative to the whole piece, so gain does not count and an equaliser counts in the last columns
+alone. Where no beat was found, phases are 0, which is no point of the circle.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.audio.bands import ROWS, band_from, band_power
+from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.audio.tracker import Beats, track_power
+from motionloom.datasets.schema import UserError
+
+COLUMNS = (
+    "beat_cos", "beat_sin", "two_beat_cos", "two_beat_sin", "bar_cos", "bar_sin",
+    "activation", "tempo", "confidence",
+    "loudness", "low", "middle", "high", "onset", "slow_loudness", "novelty",
+    "brightness", "bass", "dynamics",
+)  # fmt: skip
+RHYTHM_DIM = len(COLUMNS)
+VERSION = 1
+"""Raised whenever the same sound gives other numbers."""
+
+_SPLIT = (band_from(250.0), band_from(2500.0))
+"""The bands from which on is middle and high."""
+_SILENCE = 1e-7
+"""Power against the piece's loudest row: 70 dB below it is silence."""
+_SMALLEST_RANGE = 6.0
+"""Decibels; music that is louder and softer by less is not stretched."""
+
+
+def rhythm_features(sound: Sound, fps: float, frames: int) -> NDArray[np.float32]:
+    """A whole piece -> float32 [frames, 19]; row k is at k / fps seconds, the last one repeats at the end."""
+    if frames < 1 or fps <= 0:
+        raise UserError(f"features cannot be lined up with {frames} frames at {fps:g} a second")
+    power = band_power(sound)
+    beats = track_power(power)
+    at = np.minimum(np.arange(frames) / fps, max(0.0, sound.seconds))
+    out = np.empty((frames, RHYTHM_DIM), dtype=np.float32)
+    out[:, 0:6] = _phases(beats, at)
+    out[:, 6] = _peaks_at(beats.activation, at, fps)
+    out[:, 7] = _tempo(beats, at)
+    out[:, 8] = beats.confidence
+    out[:, 9:16], dynamics = _dynamics(power, at, fps)
+    out[:, 16:18] = _balance(power)
+    out[:, 18] = dynamics
+    return out
+
+
+def _phases(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[F, 6] of seconds [F]."""
+    if len(beats.times) < 2:
+        return np.zeros((len(at), 6))
+    number = _beat_numbers(beats.times, at)
+    before = np.clip(np.floor(number).astype(np.int64), 0, len(beats.times) - 1)
+    in_bar = beats.bar_places[before] + number - before
+    # Of three beats a bar, pairs go on across the bars.
+    first = int(np.argmax(beats.bar_places == 0))
+    in_pair = in_bar if beats.meter % 2 == 0 else number - first
+    turns = np.stack([number, in_pair / 2, in_bar / beats.meter], axis=1) * 2 * np.pi
+    return np.stack([np.cos(turns), np.sin(turns)], axis=2).reshape(len(at), 6)
+
+
+def _beat_numbers(times: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Beats since the first at seconds [F]; before the first and after the last they go on as beside it."""
+    inside = np.interp(at, times, np.arange(len(times)))
+    before = np.minimum(at - times[0], 0.0) / (times[1] - times[0])
+    after = np.maximum(at - times[-1], 0.0) / (times[-1] - times[-2])
+    return np.asarray(inside + before + after)
+
+
+def _tempo(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Octaves above 120 beats a minute, by the median of nine beats around."""
+    if len(beats.times) < 2:
+        return np.zeros(len(at))
+    steps = np.pad(np.diff(beats.times), 4, mode="edge")
+    around = np.median(np.lib.stride_tricks.sliding_window_view(steps, 9), axis=1)
+    middle = (beats.times[1:] + beats.times[:-1]) / 2
+    return np.asarray(np.interp(at, middle, np.log2(0.5 / around)))
+
+
+def _dynamics(
+    power: NDArray[np.float32], at: NDArray[np.float64], fps: float
+) -> tuple[NDArray[np.float64], float]:
+    """[F, 7] of loudness by bands, onsets and changes, and the piece's range in units of 20 dB."""
+    low, high = _SPLIT
+    loudness = _decibels(power.sum(axis=1))
+    lowest, median, highest = np.percentile(loudness, (5, 50, 95))
+    wide = max(highest - lowest, _SMALLEST_RANGE)
+    parts = [loudness] + [_decibels(part.sum(axis=1)) for part in np.split(power, (low, high), axis=1)]
+    columns = [_relative(part) for part in parts]
+    columns.append(_onsets(power))
+    slow = _moving_mean(loudness, 2 * ROWS)
+    columns.append(np.clip((slow - median) / wide, -2, 2))
+    half = 2 * ROWS
+    padded = np.pad(slow, half, mode="edge")
+    columns.append(np.clip((padded[2 * half :] - padded[: -2 * half]) / wide, -2, 2))
+    rows = [_means_at(part, at, fps) for part in columns]
+    rows[4] = _peaks_at(columns[4], at, fps)
+    return np.stack(rows, axis=1), float(min(wide / 20, 3.0))
+
+
+def _balance(power: NDArray[np.float32]) -> tuple[float, float]:
+    """How bright the piece is and how much bass it has, -1..1: shares of decibels above the silence."""
+    mean = power.mean(axis=0)
+    if mean.max() <= 0:
+        return 0.0, 0.0
+    shares = np.log10(mean / mean.max() + 1e-6) / 6 + 1
+    low, high = _SPLIT
+    middle = shares[low:high].mean()
+    return float(shares[high:].mean() - middle), float(shares[:low].mean() - middle)
+
+
+def _decibels(power: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Of rows [T], smoothed over a tenth of a second, above the silence of the piece."""
+    loudest = float(power.max(initial=0.0))
+    if loudest <= 0:
+        return np.zeros(len(power))
+    return 10 * np.log10(_moving_mean(power / loudest, ROWS // 10) + _SILENCE)
+
+
+def _relative(decibels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Against the median, in units of the range of the piece; -2..2."""
+    lowest, median, highest = np.percentile(decibels, (5, 50, 95))
+    return np.clip((decibels - median) / max(highest - lowest, _SMALLEST_RANGE), -2, 2)
+
+
+def _onsets(power: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Rises over the bands [T], 1 what one row in fifty exceeds."""
+    loudest = float(power.max(initial=0.0))
+    if loudest <= 0:
+        return np.zeros(len(power))
+    decibels = np.log10(power / loudest + _SILENCE)
+    rise = np.maximum(np.diff(decibels, axis=0, prepend=decibels[:1]), 0).mean(axis=1)
+    return np.asarray(np.clip(rise / max(float(np.percentile(rise, 98)), 1e-3), 0, 2))
+
+
+def _moving_mean(values: NDArray[np.floating], width: int) -> NDArray[np.float64]:
+    """Of the rows [T] around each, fewer at the ends."""
+    sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
+    rows = np.arange(len(values))
+    first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))
+    return np.asarray((sums[last] - sums[first]) / (last - first))
+
+
+def _means_at(values: NDArray[np.float64], at: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
+    """Rows [T] at seconds [F]: means over a frame."""
+    smooth = _moving_mean(values, max(1, round(ROWS / fps)))
+    return np.interp(at * ROWS, np.arange(len(smooth)), smooth)
+
+
+def _peaks_at(values: NDArray[np.floating], at: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
+    """Rows [T] at seconds [F]: the largest within a frame, so that none is missed at few frames a second."""
+    reach = max(1, round(ROWS / fps)) // 2
+    padded = np.pad(values, reach, mode="edge")
+    largest = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
+    return np.interp(at * ROWS, np.arange(len(largest)), largest)
