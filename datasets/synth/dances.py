@@ -2,13 +2,6 @@
 
 Plan: everything is a pure function of (config, number). Clips of one song are all of one split, so that the
 songs, and with `hold_out_tempi` whole ranges of tempi, are new to whoever learned from the training split.
-
-Choreography: legs, arms, hands and face follow the genre, every pose on a beat of the music. Between two
-beats the body eases from pose to pose with a minimum-jerk curve, which has no speed at its ends: every beat
-is a minimum of the body's speed, which is what Beat Align looks for (UDE section 4.3). The first beat of a
-bar is always down and to the left, the section of the song picks the pair of arm poses, and hands and face
-are at their strongest on the first beat of a bar, so that all of it can be heard. Size, posture and whether
-the arms go together are the dancer's own.
 """
 
 from __future__ import annotations
@@ -20,12 +13,9 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from motionloom.datasets.schema import Config, Split
-from motionloom.datasets.synth.actions.arms import Hold, play
-from motionloom.datasets.synth.actions.maths import Array, keys
 from motionloom.datasets.synth.actions.pose import Track
 from motionloom.datasets.synth.actions.truth import Record, Span, Truth, require_known
-from motionloom.datasets.synth.face import express_with
-from motionloom.datasets.synth.hands import grip_hand
+from motionloom.datasets.synth.choreography import choreograph
 from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.music.song import BEATS, Song, draw_song
 
@@ -208,52 +198,6 @@ def beats_of(truth: Record, seconds: float) -> list[float]:
     return [truth["first_beat"] + k * beat for k in range(count)]
 
 
-# ---- choreography
-
-_LEGS = {
-    # Metres aside and down, radians of the pelvis' roll and of the spine's twist.
-    "step": (0.0, 0.05, 0.05, 0.2),
-    "bounce": (0.0, 0.13, 0.0, 0.1),
-    "sway": (0.1, 0.045, 0.09, 0.25),
-}
-_STEP = 0.13
-"""Metres to either side."""
-
-
-def choreograph(song: Song, start: float, frames: int, fps: float, rng: np.random.Generator) -> Track:
-    """A dance of `frames` frames to the music from `start` seconds of a song on."""
-    genre = song.style
-    track = Track.standing(frames / fps, fps, rng, width=rng.uniform(0.0, 0.05))
-    first = song.beat_number(start)
-    numbers = np.arange(first - first % BEATS - BEATS, first + int(frames / fps / song.beat) + 3)
-    beats: Array = np.asarray(numbers * song.beat - start, dtype=np.float64)
-    amount = rng.uniform(0.85, 1.15)
-    aside, down, roll, twist = (amount * value for value in _LEGS[genre.style])
-    turns = np.where(numbers % 2 == 0, 1.0, -1.0)
-    side = keys(track.t, beats, turns)
-    if genre.style == "step":
-        _side_steps(track, beats, song.beat, _STEP * amount)
-    track.root[:, 0] += aside * side
-    track.root[:, 1] -= 0.03 + down * (0.5 + 0.5 * side)
-    track.pelvis[:, 2] += roll * side
-    track.spine[:, 2] -= 2.0 * roll * side
-    track.spine[:, 1] += twist * side
-    # The head nods deeper where a bar begins.
-    nods = np.where(numbers % BEATS == 0, 1.0, np.where(numbers % 2 == 0, 0.6, 0.0))
-    track.head[:, 0] += rng.uniform(0.12, 0.2) * keys(track.t, beats, nods)
-    track.knee_out += 0.1 * (0.5 + 0.5 * side)
-    together = rng.random() < 0.5
-    for hand in (0, 1):
-        holds: list[Hold] = []
-        for number, at in zip(numbers.tolist(), beats.tolist(), strict=True):
-            pair = genre.arms[song.section(number)]
-            even = (number % 2 == 0) != (hand == 1 and not together)
-            holds.append((at, *pair[1 if even else 0]))
-        play(track, hand, holds)
-    track.lower_to_reach(0.5 / fps)
-    return track
-
-
 def dance(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
     """A dance without music of the tempo and style that `truth` has, by one of the style's genres."""
     genres = [genre.name for genre in GENRES.values() if genre.style == truth.style]
@@ -261,43 +205,3 @@ def dance(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     song = Song(0, 0, genres[int(rng.integers(len(genres)))], truth.bpm or 120, 0, seconds)
     start = rng.uniform(0.0, 8 * BEATS * song.beat)  # within both kinds of section
     return choreograph(song, start, round(seconds * fps), fps, rng)
-
-
-def dancing_hands(song: Song, start: float, t: Array, rng: np.random.Generator) -> Array:
-    """Finger rotations [2, T, 15, 3, 3]: the genre's hand shape, loosened in the second half of each bar."""
-    shape = song.style.hand
-    grip = _accents(song, start, t, 1.0, 0.7)
-    hands = [grip_hand(shape, t, grip, rng) for _ in (0, 1)]
-    return np.stack(hands)
-
-
-def dancing_face(song: Song, start: float, t: Array, rng: np.random.Generator) -> Array:
-    """Expression values [T, 50]: the genre's emotion, lighting up where a bar begins."""
-    return express_with(song.style.face, t, rng.uniform(0.9, 1.1) * _accents(song, start, t, 1.1, 0.5), rng)
-
-
-def _accents(song: Song, start: float, t: Array, high: float, low: float) -> Array:
-    """A curve [T]: `high` on the first beat of each bar, falling to `low` on the third, and back."""
-    end = start + float(t[-1])
-    bar = BEATS * song.beat
-    halves = np.arange(int(np.floor(start / bar)) * 2, int(np.ceil(end / bar)) * 2 + 2)
-    at = np.asarray(halves * (bar / 2), dtype=np.float64)
-    return keys(t + start, at, np.where(halves % 2 == 0, high, low))
-
-
-def _side_steps(track: Track, beats: Array, beat: float, far: float) -> None:
-    """Step out with one foot and bring the other to it, two beats each way; each foot lands on its beat."""
-    where = np.zeros((2, len(beats)))
-    for k in range(1, len(beats)):
-        where[:, k] = where[:, k - 1]
-        turn = k % 4
-        # Beats 0, 1 go left (left foot, then right foot closes), beats 2, 3 go right.
-        foot = 0 if turn in (0, 3) else 1
-        where[foot, k] = far if turn in (0, 1) else -far
-        mine = (track.t >= beats[k - 1]) & (track.t < beats[k])
-        phase = np.where(mine, (track.t - beats[k - 1]) / beat, 0.0)
-        track.ball[foot, :, 1] += 0.06 * np.sin(np.pi * phase) ** 2
-        track.foot_pitch[foot] += 0.35 * np.sin(np.pi * phase) ** 2
-    for foot in (0, 1):
-        track.ball[foot, :, 0] += keys(track.t, beats, where[foot])
-    track.root[:, 0] += keys(track.t, beats, where.mean(0))

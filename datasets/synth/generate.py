@@ -41,16 +41,8 @@ from motionloom.datasets.synth.actions.truth import (
 )
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions
 from motionloom.datasets.synth.chain import animate_in_turn
-from motionloom.datasets.synth.dances import (
-    Dance,
-    DanceConfig,
-    DanceTruth,
-    choreograph,
-    dance,
-    dancing_face,
-    dancing_hands,
-    plan_dance,
-)
+from motionloom.datasets.synth.choreography import choreograph, dancing_face, dancing_hands
+from motionloom.datasets.synth.dances import Dance, DanceConfig, DanceTruth, dance, plan_dance
 from motionloom.datasets.synth.face import express
 from motionloom.datasets.synth.hands import shape_hand
 from motionloom.datasets.synth.music.performance import render_song, song_features
