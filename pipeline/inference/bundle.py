@@ -394,7 +394,8 @@ def unknown_captions(
     out: list[Unknown] = []
     for stage, given in ((bundle.main, captions), (bundle.choose_face(face_model), face)):
         part = None if stage is None else bundle.of(stage)
-        if part is not None and isinstance(part.text, TextSource):
+        source = None if part is None else part.prepared.get("text")
+        if isinstance(source, TextSource):
             said, read = [caption for caption in given if caption.strip()], getattr(part, "read", None)
-            out += part.text.unknown(said, face=given is face, read=read)
+            out += source.unknown(said, face=given is face, read=read)
     return out

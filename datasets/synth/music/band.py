@@ -15,7 +15,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -276,7 +276,7 @@ def _sound_font() -> Path:
     return path
 
 
-def _synthesizer(rate: int) -> fluidsynth.Synth:  # noqa: F821
+def _synthesizer(rate: int) -> Any:
     try:
         import fluidsynth
     except ImportError as error:  # the binding, or the library that it binds

@@ -84,7 +84,8 @@ class GptGenerator:
     @property
     def read(self) -> Encode | None:
         """How it reads captions, where they reach it by way of TMA: unit-length latents [n, Z]."""
-        tma, text = self.reranker, self.given.get("text")
+        tma = self.reranker
+        text: TextSource | None = self.given.get("text")
         if tma is None or text is None:
             return None
 
