@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.files import remove_temporaries, write_text
 from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
@@ -41,6 +41,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     with _lock(run, needed=leads):
         team = Team.start(recipe.hardware) if joint else Team()
         if leads:
+            remove_temporaries(run)
             write_text(run / "recipe.yaml", recipe.to_yaml(run))
             request = next((row.request for row in todo if row.request is not None), None)
             if request is None:
