@@ -1,58 +1,201 @@
-"""Does a UDE run dance to songs of its user? Beat Align under the own song and under the others.
+"""Is a real song followed? Dances on their own songs, on the same beats shifted, and on each other's songs.
 
-    python benchmarks/real_songs.py runs/ude-learning song.ogg another.mp3 third.wav
+    python benchmarks/real_songs.py MODEL song.ogg another.mp3 third.wav
+    python benchmarks/real_songs.py MODEL songs... --train SHARDS --record benchmarks/records/real_songs.json
 
-Ten-second stretches of each song, one dance to each; the beats of every song are librosa's. A dance that
-does not hear its song aligns as well with another one: that is the trivial answer. Synthetic test songs of
-the run's data stand beside, their beats tracked likewise.
+Stretches of every song are danced to, from several seeds. The beats are librosa's of the whole song, whatever
+the model itself hears, and no part of any choice. Beat Align is UDE's (each of the music's beats looks for
+the nearest of the dance's).
+
+- *own against shifted*: the score over that of the same beats moved by a random part of a beat; 1 is a dance
+  that does not hear. *any octave* takes the best of the beats, every second one and twice as many, for both.
+- *own song wins*: pairs of stretches of two songs, each dance scored under both; how often its own is ahead.
+- *energy*: rank correlation of the music's loudness and the body's speed, over windows of two seconds.
+- *variety*: mean distance of kinetic features of four-second windows of a song's dance, in those of
+  recorded dances that are chosen at random (1 is as varied as a medley of them).
+- *skating*: share of steps in which a foot slides.
+
+Rivals: a recorded training dance stretched to the tempo of our tracker with its beats on the song's and
+repeated, a random training dance, and standing still.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import spearmanr
 
-from motionloom.datasets.audio.features import beats
+from motionloom.datasets.audio.features import beats as librosa_beats
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.audio.tracker import track
+from motionloom.datasets.base.files import write_json
+from motionloom.datasets.motion.canonical import resample
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.models.metrics.dance_beats import beat_align
-from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import StageCache
-from motionloom.pipeline.evaluation.dances import dances_of
-from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.models.metrics.dance import foot_skating
+from motionloom.models.metrics.dance_beats import alignment, motion_beats
+from motionloom.models.metrics.dance_features import kinetic_features, zero_start
+from motionloom.pipeline.evaluation.dances import dance_at, with_music
+from motionloom.pipeline.evaluation.estimate import estimate
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import read_music
 
-SECONDS = 10.0
+Array = NDArray[np.float64]
+SIGMA = 3 / 60
+"""Seconds, of UDE's formula."""
+SHIFTS = 20
 
 
-def stretches(song: Sound, most: int) -> list[Sound]:
-    """Slices of ten seconds from the third second on, `most` of them, spread evenly."""
-    room = max(0.0, song.seconds - SECONDS - 3.0)
-    count = min(most, 1 + int(room // SECONDS))
-    return [song.slice(3.0 + room * k / count, 3.0 + room * k / count + SECONDS) for k in range(count)]
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A part of a song that is danced to."""
+
+    song: str
+    sound: Sound
+    beats: Array
+    """Seconds, librosa's of the whole song."""
+    heard: Array
+    """Seconds, our tracker's."""
+
+    @property
+    def beat(self) -> float:
+        return float(np.median(np.diff(self.beats)))
 
 
-def scores(
-    joints: Sequence[NDArray[np.float64]], heard: Sequence[tuple[str, NDArray[np.float64]]], fps: float
-) -> dict[str, Mapping[str, float]]:
-    """Mean Beat Align by each definition of dances under their own stretch, and under other songs'."""
-    out: dict[str, Mapping[str, float]] = {}
-    for definition in ("ude", "mint"):
-        own, other = [], []
-        for k, (name, _) in enumerate(heard):
-            for m, (another, times) in enumerate(heard):
-                inside = times[times < (len(joints[k]) - 1) / fps]
-                if (k == m or name != another) and len(inside):
-                    score = beat_align(joints[k][:, :BODY_JOINTS], inside, fps, definition)
-                    (own if k == m else other).append(score)
-        out[definition] = {"own": float(np.mean(own)), "other": float(np.mean(other))}
+def stretches(path: Path, most: int, seconds: float) -> list[Stretch]:
+    """Parts of a song from its third second on, spread evenly; those without four beats are left out."""
+    song = read_music(path)
+    times, heard = librosa_beats(song.samples, song.rate), track(song).times
+    room = max(0.0, song.seconds - seconds - 3.0)
+    count = min(most, 1 + int(room // seconds))
+    out = []
+    for k in range(count):
+        begin = 3.0 + room * k / max(1, count - 1)
+        inside = [of[(of >= begin) & (of < begin + seconds)] - begin for of in (times, heard)]
+        if len(inside[0]) > 3:
+            out.append(Stretch(path.name, song.slice(begin, begin + seconds), *inside))
+    return out
+
+
+def octaves(beats: Array) -> list[Array]:
+    """Beats, every second one from the first and from the second on, and twice as many."""
+    return [beats, beats[::2], beats[1::2], np.sort(np.concatenate([beats, (beats[1:] + beats[:-1]) / 2]))]
+
+
+def score(beats: Array, danced: Array, any_octave: bool) -> float:
+    found = [alignment(some, danced, "music", SIGMA) for some in (octaves(beats) if any_octave else [beats])]
+    return max(found)
+
+
+def shifted(stretch: Stretch, danced: Array, any_octave: bool, rng: np.random.Generator) -> float:
+    """The score of the same beats a random part of a beat later, going round at the end."""
+    seconds = stretch.sound.seconds
+    moves = rng.uniform(0, stretch.beat, SHIFTS)
+    return float(
+        np.mean([score(np.sort((stretch.beats + move) % seconds), danced, any_octave) for move in moves])
+    )
+
+
+def energy(joints: Array, fps: float, sound: Sound) -> float:
+    """Rank correlation of loudness and speed over windows of two seconds."""
+    width = round(2 * fps)
+    speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).mean(1) * fps
+    windows = range(0, len(speed) - width + 1, width // 2)
+    moving = [speed[k : k + width].mean() for k in windows]
+    loud = [
+        np.sqrt(np.square(sound.slice(k / fps, (k + width) / fps).samples, dtype=np.float64).mean())
+        for k in windows
+    ]
+    return float(spearmanr(moving, loud).statistic)
+
+
+def kinetics(joints: Array, fps: float) -> list[Array]:
+    """Kinetic features of windows of four seconds."""
+    width = round(4 * fps)
+    cut = [joints[k : k + width] for k in range(0, len(joints) - width + 1, width // 2)]
+    return [kinetic_features(zero_start(resample(part[:, :BODY_JOINTS], fps, 60.0))) for part in cut]
+
+
+def spread(rows: Sequence[Array], scale: Array) -> float:
+    """Mean distance of all pairs, columns in units of `scale`."""
+    table = np.stack(rows) / scale
+    far = np.linalg.norm(table[:, None] - table[None], axis=-1)
+    return float(far[np.triu_indices(len(table), 1)].mean())
+
+
+class Training:
+    """Recorded training dances, and what rivals make of them."""
+
+    def __init__(self, dataset: ClipDataset, count: int = 60) -> None:
+        chosen = np.random.default_rng(0).permutation(np.flatnonzero(with_music(dataset)))[:count]
+        self.clips = [clip for i in chosen.tolist() if (clip := dance_at(dataset, i)) is not None]
+        self.fps = dataset.layout.fps
+        rows = [kinetics(clip.joints, self.fps)[0] for clip in self.clips if clip.seconds >= 4]
+        self.scale = np.maximum(np.stack(rows).std(0), 1e-6)
+        self.variety = spread(rows, self.scale)
+
+    def random(self, stretch: Stretch, rng: np.random.Generator) -> Array:
+        """A training dance, and another behind it, until the stretch is full."""
+        frames, out = round(stretch.sound.seconds * self.fps), []
+        while sum(map(len, out)) < frames:
+            out.append(self.clips[int(rng.integers(len(self.clips)))].joints[:, :BODY_JOINTS])
+        return np.concatenate(out)[:frames]
+
+    def stretched(self, stretch: Stretch, rng: np.random.Generator) -> Array:
+        """A training dance whose beats are moved onto those of our tracker, over and over."""
+        able = [clip for clip in self.clips if len(clip.beats) > 4]
+        clip = able[int(rng.integers(len(able)))]
+        frames = round(stretch.sound.seconds * self.fps)
+        loop = (len(clip.beats) - 1) // 2 * 2
+        numbers = np.interp(
+            np.arange(frames) / self.fps, stretch.heard, np.arange(len(stretch.heard)), left=0.0
+        )
+        at = np.interp(numbers % loop, np.arange(len(clip.beats)), clip.beats) * self.fps
+        low = np.clip(np.floor(at).astype(int), 0, len(clip.joints) - 2)
+        weight = (at - low)[:, None, None]
+        body = clip.joints[:, :BODY_JOINTS]
+        return np.asarray((1 - weight) * body[low] + weight * body[low + 1])
+
+    def standing(self, stretch: Stretch, rng: np.random.Generator) -> Array:
+        """A first frame that is held."""
+        frame = self.clips[int(rng.integers(len(self.clips)))].joints[:1, :BODY_JOINTS]
+        return np.repeat(frame, round(stretch.sound.seconds * self.fps), axis=0)
+
+
+def figures(
+    parts: Sequence[Stretch], dances: Sequence[Array], fps: float, training: Training, seed: int
+) -> dict[str, float]:
+    """All figures of one dance for each stretch."""
+    rng = np.random.default_rng(seed)
+    beats = [motion_beats(dance[:, :BODY_JOINTS], fps, "ude") for dance in dances]
+    out: dict[str, float] = {}
+    for name, octave in (("", False), (", any octave", True)):
+        own = np.mean([score(part.beats, found, octave) for part, found in zip(parts, beats, strict=True)])
+        moved = np.mean([shifted(part, found, octave, rng) for part, found in zip(parts, beats, strict=True)])
+        out |= {f"own{name}": float(own), f"shifted{name}": float(moved)}
+        out[f"ratio{name}"] = float(own / moved) if moved else 1.0
+    pairs = [(a, b) for a in range(len(parts)) for b in range(len(parts)) if parts[a].song != parts[b].song]
+    ahead = []
+    for a, b in pairs:
+        mine, other = (
+            score(parts[k].beats, beats[a], True) / max(1e-9, shifted(parts[k], beats[a], True, rng))
+            for k in (a, b)
+        )
+        ahead.append(1.0 if mine > other else 0.5 if mine == other else 0.0)
+    out["own song wins"] = float(np.mean(ahead)) if ahead else float("nan")
+    with_sound = [energy(dance, fps, part.sound) for part, dance in zip(parts, dances, strict=True)]
+    out["energy"] = float(np.nanmean(with_sound)) if np.isfinite(with_sound).any() else 0.0
+    varied = [spread(rows, training.scale) for dance in dances if len(rows := kinetics(dance, fps)) > 1]
+    out["variety"] = float(np.mean(varied)) / training.variety
+    out["skating"] = float(np.mean([foot_skating(dance, fps) for dance in dances]))
     return out
 
 
@@ -60,33 +203,55 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", type=Path)
+    parser.add_argument("model", help="a run, an export, or a model of the package")
     parser.add_argument("songs", type=Path, nargs="+")
-    parser.add_argument("--stretches", type=int, default=5, help="of each song, at most")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--train", type=Path, required=True, help="shards of dances that it was trained on")
+    parser.add_argument("--stretches", type=int, default=4, help="of each song, at most")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--record", type=Path, help="a JSON file for docs/results.md")
     args = parser.parse_args()
-    bundle = Bundle.from_run(args.run)
-    dataset = StageCache().get(finished_stages(args.run)["data"]).held_out(prefer="test")
-    fps = bundle.generator.layout.fps
-    real = [
-        (path.name, piece) for path in args.songs for piece in stretches(read_music(path), args.stretches)
-    ]
-    made = [(clip.song, clip.sound) for clip in dances_of(dataset, len(real))]
+    model = MotionModel.from_pretrained(args.model)
+    training = Training(ShardDataset(args.train, "train"))
+    parts = [part for song in args.songs for part in stretches(song, args.stretches, args.seconds)]
+    sounds = [part.sound for part in parts]
+
+    def generated(seed: int) -> list[Array]:
+        made = model.generate(sounds=sounds, seconds=[sound.seconds for sound in sounds], seed=seed)
+        return [np.asarray(motion.joints, np.float64) for motion in made]
+
+    def rival(make: Callable[[Stretch, np.random.Generator], Array]) -> Callable[[int], list[Array]]:
+        return lambda seed: [make(part, np.random.default_rng([seed, k])) for k, part in enumerate(parts)]
+
+    rows: Mapping[str, Callable[[int], list[Array]]] = {
+        "generated": generated,
+        "training dance, stretched": rival(training.stretched),
+        "random training dance": rival(training.random),
+        "standing": rival(training.standing),
+    }
+    found: dict[str, dict[str, list[float]]] = {}
+    for name, make in rows.items():
+        each = [figures(parts, make(seed), training.fps, training, seed) for seed in range(args.seeds)]
+        found[name] = {figure: [one[figure] for one in each] for figure in each[0]}
+    columns = list(next(iter(found.values())))
     table = Table(
-        "", "dances", "UDE, Bailando, EDGE: own song", "other songs", "MINT: own song", "other songs"
+        "", *columns, title=f"{len(parts)} stretches of {len(args.songs)} songs, {args.seeds} seeds"
     )
-    for title, sounds in (("real songs", real), ("synthetic test songs", made)):
-        motions = bundle.generate(
-            sounds=[sound for _, sound in sounds],
-            seconds=[sound.seconds for _, sound in sounds],
-            seed=args.seed,
-            sampling=SamplingConfig(temperature=0.8, top_p=0.9),
-        )
-        heard = [(name, np.asarray(beats(sound.samples, sound.rate))) for name, sound in sounds]
-        found = scores([motion.joints for motion in motions], heard, fps)
-        cells = [f"{found[name][key]:.3f}" for name in ("ude", "mint") for key in ("own", "other")]
-        table.add_row(title, str(len(sounds)), *cells)
-    Console(width=130).print(table)
+    for name, values in found.items():
+        cells = [
+            f"{e.value:.3f} ± {e.interval:.3f}" if (e := estimate(values[c])).interval else f"{e.value:.3f}"
+            for c in columns
+        ]
+        table.add_row(name, *cells)
+    Console(width=220).print(table)
+    if args.record is not None:
+        protocol = {
+            "songs": len(args.songs),
+            "stretches": len(parts),
+            "seconds": args.seconds,
+            "seeds": args.seeds,
+        }
+        write_json(args.record, {"protocol": protocol, "rows": found})
 
 
 if __name__ == "__main__":
