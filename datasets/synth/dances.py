@@ -54,6 +54,8 @@ class DanceConfig(Config):
     """Songs in the pool."""
     song_seconds: float = Field(40.0, ge=2, le=600)
     """Length of a song."""
+    in_a_row: int = Field(1, ge=1)
+    """Dances, one after another, to the same song, each from its own start; more save playing it again."""
     genres: list[str] | None = None
     """None = all; otherwise names of `genres.GENRES`. A genre decides the style of its dances."""
     tempo: tuple[int, int] = (80, 160)
@@ -156,8 +158,10 @@ class Dance:
 
 
 def song_of(number: int, dances: DanceConfig, seed: int) -> Song:
-    """The song of dance `number`: all songs of the pool once, in shuffled order, before any comes again."""
-    turn, place = divmod(number, dances.songs)
+    """The song of dance `number`: all songs of the pool once, in shuffled order, before any comes again (for
+    `in_a_row` dances each).
+    """
+    turn, place = divmod(number // dances.in_a_row, dances.songs)
     order = np.random.default_rng([seed, turn, 233]).permutation(dances.songs)
     return dances.song(int(order[place]), seed)
 
