@@ -36,8 +36,10 @@ _BODY: dict[Style, tuple[float, float, float, float, float]] = {
     "bounce": (0.09, 0.0, 0.13, 0.0, 0.1),
     "sway": (0.09, 0.1, 0.045, 0.09, 0.25),
 }
-_DEEPEST = 0.2
+_DEEPEST = 0.17
 """Metres that a dancer goes down at most: below is a squat."""
+_WIDE = 0.22
+"""Metres that a foot is set aside for the accent after a break."""
 _TURN = 0.45
 """Radians of a turn to one side."""
 _LIFT, _SHUFFLE = 0.09, 0.024
@@ -144,8 +146,8 @@ def _plan(song: Song, start: float, end: float, rng: np.random.Generator) -> _Pl
     energy = np.array([song.energy(number) for number in numbers])
     still = energy == 0
     accent = ~still & np.concatenate([[False], still[:-1]])
-    quick = min(1.0, song.beat / _SHORT_BEAT)
-    size = rng.uniform(0.87, 1.13) * quick * np.maximum(energy / _EVEN, 0.35) * np.where(accent, 1.4, 1.0)
+    dancer = rng.uniform(0.87, 1.13) * min(1.0, song.beat / _SHORT_BEAT)
+    size = dancer * np.maximum((energy / _EVEN) ** 1.3, 0.35) * np.where(accent, 1.4, 1.0)
     return _Plan(
         song=song,
         numbers=numbers,
@@ -253,7 +255,7 @@ def _places(plan: _Plan) -> tuple[Array, Array]:
             ways = np.abs(places[:, k] - before).sum(-1) + 9.0 * (before[:, 2] > 0)
             other = int(np.argmin(ways))
             places[other, k], moved[other] = before[other], False
-        away = np.linalg.norm((places[:, k] - before) * [1, 1, 0, 0.15], axis=-1)
+        away = np.linalg.norm((places[:, k] - before) * [1, 1, 0, 0.12], axis=-1)
         far = away > _SLOW * (plan.seconds[k] - plan.seconds[k - 1])
         grounded = (before[:, 2] == 0) & (places[:, k, 2] == 0)
         high = _LIFT * np.clip(0.5 + 0.5 * plan.size[k], 0.6, 1.1)
@@ -264,8 +266,8 @@ def _places(plan: _Plan) -> tuple[Array, Array]:
 def _targets(plan: _Plan, k: int, beat: int, base: float) -> Array:
     """Places [2, 4] of both feet on beat `k`, which is `beat` of its phrase, for a dancer headed `base`."""
     phrase, size = plan.phrases[k], plan.size[k]
-    step = _BODY[plan.song.style.style][0]
-    if step < 0.2:
+    step = size * _BODY[plan.song.style.style][0]
+    if plan.song.style.style != "step":
         step = min(step, 0.9 * _SLOW * plan.song.beat)
     mirrored = (beat // 4 + plan.lead) % 2
     sign = -1.0 if mirrored else 1.0
@@ -278,9 +280,9 @@ def _targets(plan: _Plan, k: int, beat: int, base: float) -> Array:
         moves = moves[::-1] if mirrored else moves
         turns = _TURN * min(size, 1.0) * moves[:, 3]
     if plan.accent[k]:
-        moves[mirrored, 0] = sign * 0.7 * max(1.0, 0.2 / step)
+        moves[mirrored, 0] = sign * _WIDE / step
     heading = base + turns
-    aside, forward = size * step * moves[:, :2].T
+    aside, forward = step * moves[:, :2].T
     x = aside * np.cos(heading) + forward * np.sin(heading)
     z = forward * np.cos(heading) - aside * np.sin(heading)
     return np.stack([x, z, _KNEE * size * moves[:, 2], heading], axis=-1)

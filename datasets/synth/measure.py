@@ -330,7 +330,7 @@ def _both(hands: NDArray[np.bool_]) -> str | None:
 # ---- dances
 
 STEP_LIFT = 0.03
-"""Metres that the ball of a foot is lifted at least by someone who steps."""
+"""Metres that the ball of a foot is lifted at least by someone who steps, for a seventh of the time."""
 _WRIST_HEIGHTS: dict[str, tuple[float, str, str]] = {
     # Mean height of the wrists over the shoulders, in arm lengths: limit, genre below, genre above.
     "step": (-0.1, "house", "disco"),
@@ -374,7 +374,7 @@ def kinetic_beats(joints: NDArray[np.floating], fps: float) -> Array:
 
 
 def _style(s: Signals) -> Style:
-    if float(np.percentile(s.balls, 95)) > STEP_LIFT:
+    if float(np.percentile(s.balls, 85)) > STEP_LIFT:
         return "step"
     root = s.joints[:, 0]
     aside = (root[:, 0] - root[:, 0].mean()) * np.cos(s.heading)
