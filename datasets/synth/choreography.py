@@ -357,5 +357,5 @@ def _between(pair: ArmPair, share: float, size: float) -> ArmPose:
     (from_, near, bend), (to, far, other) = pair
     share = 0.5 + min(size, 1.3) * (share - 0.5)
     x, y, z = (a + share * (b - a) for a, b in zip(from_, to, strict=True))
-    folds = tuple(a + share * (b - a) for a, b in zip(bend, other, strict=True))
-    return (x, y + 0.2 * max(size - 1.0, 0.0), z), min(max(near + share * (far - near), 0.4), 0.97), folds
+    u, v, w = (a + share * (b - a) for a, b in zip(bend, other, strict=True))
+    return (x, y + 0.2 * max(size - 1.0, 0.0), z), min(max(near + share * (far - near), 0.4), 0.97), (u, v, w)
