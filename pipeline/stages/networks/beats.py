@@ -1,0 +1,110 @@
+"""The stage that trains the network of beats (`datasets/audio/beat_net.py`) on songs whose beats are known.
+
+The weights in the package are those of the recipe `beats`:
+
+    motionloom run beats -o runs/beats
+    python -c "from pathlib import Path; from motionloom.pipeline.stages.networks.beats import put_into_package; \\
+        put_into_package(Path('runs/beats/stages/beats'))"
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from motionloom.datasets.audio.bands import BANDS, ROWS
+from motionloom.datasets.audio.beat_net import WEIGHTS, BeatNet, BeatNetConfig, write_beat_net
+from motionloom.datasets.synth.music.tapped import TappedBatches
+from motionloom.models.training.optim import OptimConfig
+from motionloom.models.training.stage_module import StageModule
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import Inputs, register
+from motionloom.pipeline.stages.data.songs import SongPool
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts, load_weights
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+
+_NO_MOTION = LayoutFacts(name="none", fps=ROWS, family="none")
+
+
+class BeatsConfig(TrainedStageConfig):
+    """A recipe's `kind: beats`."""
+
+    net: BeatNetConfig = BeatNetConfig()
+    window_seconds: float = Field(10.0, gt=0)
+    """Of a song, in training."""
+    optim: OptimConfig = OptimConfig(lr=2e-3, warmup_steps=50, schedule="cosine")
+    train: TrainConfig = TrainConfig(steps=2000, batch_size=16)
+
+    @property
+    def rows(self) -> int:
+        """Rows of a training window."""
+        return round(self.window_seconds * ROWS)
+
+
+class BeatsInputs(Inputs):
+    """What it takes."""
+
+    songs: SongPool
+
+
+class BeatsModule(StageModule):
+    """Binary cross-entropies of beats and of downbeats."""
+
+    net: BeatNet
+
+    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Each beat counts two rows beside it by half, as hands and rows are not exact."""
+        both = binary_cross_entropy_with_logits(self.net(batch["levels"]), batch["targets"], reduction="none")
+        beat, downbeat = both.mean(dim=(0, 1)).unbind()
+        return {"loss": beat + downbeat, "beat": beat, "downbeat": downbeat}
+
+
+class BeatsStage(TrainedStage[BeatsConfig, BeatsInputs, BeatNet]):
+    """Music to beats."""
+
+    name = "beats"
+    summary = "beats and downbeats of music"
+    config = BeatsConfig
+    inputs = BeatsInputs
+    curves = (Curve("beat", "cross-entropy of beats"), Curve("downbeat", "cross-entropy of downbeats"))
+
+    def facts(self, config: BeatsConfig, inputs: BeatsInputs) -> ModelFacts:
+        return ModelFacts(kind=self.name, config=config.net.dump(), layout=_NO_MOTION)
+
+    def network(self, facts: ModelFacts, inputs: BeatsInputs) -> BeatNet:
+        return BeatNet(BeatNetConfig.parse(facts.config, facts.where))
+
+    def module(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int) -> BeatsModule:
+        return BeatsModule(net, config.optim, seed=seed, max_steps=config.train.steps)
+
+    def batches(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int, log: Log) -> Batches:
+        trained, kept = (inputs.songs.songs(validation=which) for which in (False, True))
+        rows = config.rows
+
+        def train(batch: int, rank: int, world: int) -> TappedBatches:
+            return TappedBatches(trained, rows, batch, seed, rank, world)
+
+        return Batches(train, lambda: TappedBatches(kept, rows, min(16, len(kept)), seed, augment=False))
+
+    def example(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, batch: int) -> Example:
+        rows = config.rows
+        levels, targets = torch.empty(batch, rows, BANDS), torch.empty(batch, rows, 2)
+        example = {"levels": levels, "targets": targets, "length": torch.full((batch,), rows)}
+        return Example(example, f"{rows} rows")
+
+
+def put_into_package(stage: Path, target: Path = WEIGHTS) -> None:
+    """Write the network of a finished stage, from its folder, where `load_beat_net` reads it."""
+    facts = load_facts(stage)
+    net = BeatNet(BeatNetConfig.parse(facts.config, facts.where))
+    load_weights(stage, net)
+    write_beat_net(net, target)
+
+
+register(BeatsStage())
