@@ -1,7 +1,7 @@
 """Which metric notices which fault: figures of recorded motion that is made worse on purpose.
 
-    motionloom run ude-learning
-    python benchmarks/perturbation.py runs/ude-learning
+    motionloom run ude-dance
+    python benchmarks/perturbation.py runs/ude-dance
 
 Recorded test clips, each with a fault of `FAULTS`, or with another clip's motion, are
 judged as generated motion is. Distances are to as many training clips, so that recorded motion has a value

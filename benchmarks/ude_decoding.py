@@ -1,7 +1,7 @@
 """What DMD's samplers cost and give, and whether scripts change over smoothly: two proofs of a UDE run.
 
-    motionloom run ude-learning
-    python benchmarks/ude_decoding.py runs/ude-learning --samplers --transitions
+    motionloom run ude-dance
+    python benchmarks/ude_decoding.py runs/ude-dance --samplers --transitions
 
 `--samplers`: true tokens of one window of held-out dances decoded by 20 steps of DPM-Solver++, by DDIM and by
 all of DDPM's steps, several times each: distance to what was recorded, Beat Align, feet, roughness, seconds.

@@ -1,7 +1,7 @@
 """Where a UDE run loses what music and captions ask for, station by station.
 
-    motionloom run ude-learning
-    python benchmarks/ude_stations.py runs/ude-learning --utt utt prefix_7 gru_7
+    motionloom run ude-dance
+    python benchmarks/ude_stations.py runs/ude-dance
 
 Held-out clips as they are recorded; their true tokens decoded by the tokenizer and by DMD; tokens that each
 UTT makes for their music or caption, with and without z, decoded by both and drawn twice. Beat Align of

@@ -244,7 +244,7 @@ def test_the_commands_settings_reach_the_sampling(
 def test_the_stage_s_sampler_runs_unless_another_is_set(tmp_path: Path) -> None:
     """Through a recipe with some sampling settings, and through what a run writes down of it."""
     again = tmp_path / "recipe.yaml"
-    for recipe in ("ude-learning", again):
+    for recipe in ("ude-dance", again):
         resolved = load_recipe(recipe, strict=False)
         stages = {one.name: one.config for one in resolved.stages}
         halves: list[Any] = [SimpleNamespace(modalities={"audio"}, given={}), SimpleNamespace()]
