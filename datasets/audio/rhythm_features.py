@@ -59,6 +59,19 @@ def rhythm_features(sound: Sound, fps: float, frames: int) -> NDArray[np.float32
     return out
 
 
+def beats_of_rows(rows: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
+    """Features [F, 19] -> seconds of the beats that their phases pass; none where no beat was found."""
+    if len(rows) < 2 or not rows[:, :2].any():
+        return np.empty(0)
+    phase = np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2 * np.pi) % 1.0
+    step = np.diff(phase) % 1.0
+    # A phase of a hair below 1 is a beat on the frame itself.
+    phase = np.where(phase > 1 - 1e-6, 0.0, phase)
+    passes = np.flatnonzero((phase[:-1] + step >= 1.0 - 1e-9) | (phase[:-1] == 0.0))
+    ahead = np.where(phase[passes] == 0.0, 0.0, (1.0 - phase[passes]) / np.maximum(step[passes], 1e-9))
+    return np.asarray((passes + ahead) / fps)
+
+
 def _phases(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """[F, 6] of seconds [F]."""
     if len(beats.times) < 2:
@@ -158,7 +171,7 @@ def _moving_mean(values: NDArray[np.floating], width: int) -> NDArray[np.float64
 def _means_at(values: NDArray[np.float64], at: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
     """Rows [T] at seconds [F]: means over a frame."""
     smooth = _moving_mean(values, max(1, round(ROWS / fps)))
-    return np.interp(at * ROWS, np.arange(len(smooth)), smooth)
+    return np.asarray(np.interp(at * ROWS, np.arange(len(smooth)), smooth))
 
 
 def _peaks_at(values: NDArray[np.floating], at: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
@@ -166,4 +179,4 @@ def _peaks_at(values: NDArray[np.floating], at: NDArray[np.float64], fps: float)
     reach = max(1, round(ROWS / fps)) // 2
     padded = np.pad(values, reach, mode="edge")
     largest = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
-    return np.interp(at * ROWS, np.arange(len(largest)), largest)
+    return np.asarray(np.interp(at * ROWS, np.arange(len(largest)), largest))

@@ -31,6 +31,7 @@ from motionloom.pipeline.store.networks import (
     device_of,
     embed_motions,
 )
+from motionloom.pipeline.store.text import TextSource
 
 T = TypeVar("T")
 

@@ -45,9 +45,7 @@ class SongsStage(StageKind[SongsConfig]):
 
     def run(self, context: StageContext) -> None:
         config: SongsConfig = context.config
-        missing = [
-            number for number in range(config.songs) if not _path(context.folder, number).is_file()
-        ]
+        missing = [number for number in range(config.songs) if not _path(context.folder, number).is_file()]
         with Workers(context.hardware.convert_workers) as workers:
             for _ in workers.run(partial(_render, config, context.folder), missing):
                 pass
