@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 from learning import Shares, judge
+from results import read_records, table_of
 from rich.console import Console
 from rich.table import Table
 
@@ -57,6 +58,12 @@ ASKED = 60
 """Clips whose captions are asked about: each is read beside dozens of known ones."""
 
 CARD = Path(__file__).with_suffix(".md")
+
+MUSIC = {
+    "real_songs": "Dances to real songs that took no part in anything (`benchmarks/real_songs.py`)",
+    "dances": "Dances to unheard played songs (`evaluate_dances` of the recipe)",
+}
+"""Records of a model of music, by title."""
 
 
 def words_of(truth: Mapping[str, Any], words: Mapping[str, Any], rng: np.random.Generator) -> tuple[str, str]:
@@ -295,6 +302,13 @@ def single_draws(single: Mapping[str, Shares]) -> str:
     return f" Of the first draw alone, `every` and `whole` of held-out clips are: {'; '.join(rows)}."
 
 
+def music_section() -> str:
+    """What the records say of dances to songs that were played for it, and of real ones."""
+    records = read_records()
+    parts = [(MUSIC[name], records[name]) for name in MUSIC if name in records]
+    return "".join(f"### {title}\n\n{table_of(record)}\n\n" for title, record in parts)
+
+
 def card_of(
     figures: Mapping[str, Any], recipe: Recipe, data: SynthConfig, bundle: Bundle,
     other: Sequence[tuple[str, str]], model: Path, licence: str,
@@ -308,8 +322,16 @@ def card_of(
     recommended = bundle.recommended.model_dump(mode="json", exclude_unset=True)
     recipe_file = figures["recipe"]
     settings = "".join(f" --set '{one}'" for one in figures["settings"])
+    heard = "audio" in bundle.generator.modalities
+    words = '"a person waves with the left hand"'
+    uses = [f'{words} --face "a person looks happy"' if bundle.faces else words]
+    uses = ["--audio song.mp3", f"{words} --audio song.mp3@0:30-1:00", *uses] if heard else uses
     return CARD.read_text(encoding="utf-8").format(
         licence=licence,
+        examples_of_use="\n".join(f"motionloom generate {figures['name']} {use}{options}" for use in uses),
+        songs=" and dances to songs that FluidSynth played" if heard else "",
+        or_music=" and no recorded music" if heard else "",
+        music=music_section() if heard else "",
         name=figures["name"],
         description=recipe.description,
         options="" if sampling == recommended else options,

@@ -24,6 +24,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -245,13 +246,18 @@ def main() -> None:
         table.add_row(name, *cells)
     Console(width=220).print(table)
     if args.record is not None:
-        protocol = {
-            "songs": len(args.songs),
-            "stretches": len(parts),
-            "seconds": args.seconds,
-            "seeds": args.seeds,
+        protocol = {"songs": len(args.songs), "stretches": len(parts), "seconds each": args.seconds}
+        record = {
+            "title": "Dances to real songs",
+            "measured": f"{datetime.now(UTC):%Y-%m-%d}",
+            "command": f"python benchmarks/real_songs.py {args.model} SONGS --train SHARDS",
+            "columns": [{"title": c, "figure": c, "digits": 2, "scale": 1.0} for c in columns],
+            "rows": [
+                {"title": name, "cells": values, "seeds": list(range(args.seeds)), "protocol": protocol}
+                for name, values in found.items()
+            ],
         }
-        write_json(args.record, {"protocol": protocol, "rows": found})
+        write_json(args.record, record)
 
 
 if __name__ == "__main__":

@@ -63,13 +63,12 @@ def beats_of_rows(rows: NDArray[np.floating], fps: float) -> NDArray[np.float64]
     """Features [F, 19] -> seconds of the beats that their phases pass; none where no beat was found."""
     if len(rows) < 2 or not rows[:, :2].any():
         return np.empty(0)
-    phase = np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2 * np.pi) % 1.0
+    turns = np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2 * np.pi)
+    phase = np.round(turns, 6) % 1.0
     step = np.diff(phase) % 1.0
-    # A phase of a hair below 1 is a beat on the frame itself.
-    phase = np.where(phase > 1 - 1e-6, 0.0, phase)
-    passes = np.flatnonzero((phase[:-1] + step >= 1.0 - 1e-9) | (phase[:-1] == 0.0))
-    ahead = np.where(phase[passes] == 0.0, 0.0, (1.0 - phase[passes]) / np.maximum(step[passes], 1e-9))
-    return np.asarray((passes + ahead) / fps)
+    passes = np.flatnonzero(phase[:-1] + step >= 1.0 - 1e-9)
+    found = (passes + (1.0 - phase[passes]) / step[passes]) / fps
+    return np.concatenate([[0.0], found]) if phase[0] == 0.0 else found
 
 
 def _phases(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:
