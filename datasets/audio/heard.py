@@ -41,8 +41,8 @@ BEAT = 0.3
 take its place when it tells them apart as well."""
 STEADY = 0.3
 NOISE_STEADY = 0.1
-SYLLABLES = 0.36
-GAPS = 0.15
+SYLLABLES = 0.33
+GAPS = 0.2
 FLATNESS_DB = 2.0
 
 
