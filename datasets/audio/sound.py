@@ -19,11 +19,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.audio.excerpt import Excerpt
 from motionloom.datasets.schema import UserError
 
 MAX_SECONDS = 3600
@@ -39,6 +40,8 @@ MAX_PEAK = 8.0
 _BLOCK = 2**18
 _UNKNOWN = 2**63 - 1
 """libsndfile's length of a pipe."""
+
+_OTHER = "wav, flac, ogg and mp3 are read; convert others, as by: ffmpeg -i song.m4a song.wav"
 
 _WAV_SUFFIXES = (".wav", ".wave")
 
@@ -69,10 +72,14 @@ class Sound:
         object.__setattr__(self, "samples", samples)
 
     @classmethod
-    def read(cls, path: Path | str, rate: int | None = None) -> Self:
-        """A sound file, at its own sample rate or another one; `UserError` as of `read_sound`."""
-        samples, found = read_sound(Path(path), rate=rate)
-        return cls(np.clip(samples, -1.0, 1.0), found)
+    def read(cls, path: Path | str, rate: int | None = None) -> Sound:
+        """A sound file or a part of one, as `song.mp3@0:30-1:00` (`excerpt.py`), at its own sample rate or
+        another one; `UserError` as of `read_sound`, and where the file is shorter.
+        """
+        part = Excerpt.named(path)
+        samples, found = read_sound(part.path, rate=rate)
+        sound = cls(np.clip(samples, -1.0, 1.0), found)
+        return sound if part.whole else sound.slice(*part.within(sound.seconds, path))
 
     @property
     def seconds(self) -> float:
@@ -120,16 +127,6 @@ def read_sound(
     if len(samples) < wanted:
         raise UserError(f"{name}: cut short: {len(samples)} samples of {wanted}")
     return samples[:wanted], rate
-
-
-def require_audible(samples: NDArray[np.float32], path: Path | str, *, quietest: float = 1e-4) -> None:
-    """`UserError` naming the file where no sample [n] reaches `quietest` (-80 dB of full scale, **[ours]**).
-
-    Only for music that a motion is asked for: features of silence can be computed, and data may hold it.
-    """
-    peak = float(max(samples.max(), -samples.min())) if len(samples) else 0.0
-    if peak < quietest:
-        raise UserError(f"{path}: silent (its loudest sample is {peak:.2g}): give music that can be heard")
 
 
 def sound_seconds(path: Path, name: str | None = None) -> float:
@@ -323,8 +320,10 @@ def _missing_mp3_bytes(file: BinaryIO, head: bytes, size: int) -> int:
 
 
 def _reason(error: Exception) -> str:
-    """libsndfile's own words, without the path that soundfile puts before them, and clearer for two."""
+    """libsndfile's own words, without the path that soundfile puts before them, and clearer for some."""
     words = str(getattr(error, "error_string", error)).rstrip(".")
-    if words.startswith("File does not exist"):
-        return "of no known format"
+    if words.startswith(("File does not exist", "Format not recognised")):
+        return f"of no known format; {_OTHER}"
+    if words.startswith("Supported file format"):
+        return f"damaged, or of an unknown kind; {_OTHER}"
     return "damaged or cut short" if words.startswith("Unspecified internal error") else words

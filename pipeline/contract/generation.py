@@ -41,7 +41,10 @@ class Prompt:
 
     @property
     def given(self) -> dict[str, object]:
-        own = {"text": self.text if self.text.strip() else None, "audio": self.sound}
+        text = self.text if self.text.strip() else None
+        # Words are not spoilt by a sound that is no music; without any, the sound says how long to stand.
+        sound = None if text is not None and self.unheard else self.sound
+        own = {"text": text, "audio": sound}
         pairs = [*own.items(), *self.conditions.items()]
         return {name: value for name, value in pairs if value is not None}
 
@@ -54,6 +57,26 @@ class Prompt:
         """Length of what it brings, such as its music; None where that has none."""
         found = [MODALITIES[name].seconds(value) for name, value in self.given.items() if name in MODALITIES]
         return min((length for length in found if length is not None), default=None)
+
+    @property
+    def unheard(self) -> str:
+        """Why its sound is no music, in a few words; empty where it is, or there is none."""
+        if self.sound is None:
+            return ""
+        from motionloom.datasets.audio.heard import heard
+
+        return heard(self.sound).sentence
+
+    @property
+    def stands(self) -> bool:
+        """Whether nothing drives it but a sound that is no music."""
+        return self.modalities == {"audio"} and not self.conditions and bool(self.unheard)
+
+    @property
+    def remark(self) -> str:
+        """One sentence on a sound that is no music; else empty."""
+        does = "the figure stands" if self.stands else "its words alone drive the motion"
+        return f"{self.unheard}: {does}" if self.unheard else ""
 
     def with_words(self, text: str) -> Prompt:
         return replace(self, text=text)

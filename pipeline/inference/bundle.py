@@ -48,6 +48,7 @@ from motionloom.pipeline.inference.requests import (
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model, say_model
+from motionloom.pipeline.inference.standing import Standing
 from motionloom.pipeline.render.score import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.known_captions import Unknown
@@ -265,18 +266,27 @@ class Bundle:
             )
             for segment, count in zip(segments, frames, strict=True)
         ]
-        body = generator.drive(stretches, seeds[:samples], sampling)
+        stands = [segment.prompt.stands for segment in segments]
+        body = [
+            self._standing(motion, stands, frames)
+            for motion in generator.drive(stretches, seeds[:samples], sampling)
+        ]
         faces = self._faces(segments, frames, seeds[samples:], sampling)
         starts = np.concatenate([[0], np.cumsum(frames)]) / fps
         bands = tuple(
-            Segment(float(a), float(b), s.label, "text" if s.prompt.sound is None else "music")
+            Segment(
+                float(a),
+                float(b),
+                f"{s.label} ({s.prompt.remark})" if s.prompt.remark else s.label,
+                "text" if s.prompt.sound is None else "music",
+            )
             for s, a, b in zip(segments, starts, starts[1:], strict=False)
         )
         beats = tuple(
             float(start + tick)
             for segment, stretch, start, count in zip(segments, stretches, starts, frames, strict=False)
             for tick in ticks_of(segment.prompt, stretch.conditions, 0, fps)
-            if tick < count / fps
+            if tick < count / fps and not segment.prompt.stands
         )
         sound = sound_of(list(zip(segments, frames, strict=True)), fps)
         whole = Prompt(text="; ".join(segment.label for segment in segments), sound=sound)
@@ -284,6 +294,16 @@ class Bundle:
             replace(self._motion(whole, motion, face, bands), seed=seed, beats=beats)
             for motion, face in zip(body, faces, strict=True)
         ]
+
+    def _standing(
+        self, motion: NDArray[np.float32], stands: Sequence[bool], frames: Sequence[int]
+    ) -> NDArray[np.float32]:
+        """A motion [T, C] that stands where its stretches, so many frames each, say so."""
+        if not any(stands):
+            return motion
+        standing = Standing(self.layout, self.generator.part)
+        pieces = np.split(motion, np.cumsum(frames)[:-1])
+        return np.concatenate([standing(piece, calm) for piece, calm in zip(pieces, stands, strict=True)])
 
     def _repeated(self, stage: Finished, prompt: Prompt, words: str, count: int) -> Conditions:
         """The conditions of one prompt, encoded once, for `count` rows."""
@@ -342,11 +362,17 @@ class Bundle:
             )
             # The face takes the body's length, so that both share one time line.
             face = maker.generate(GenerationRequest(words, [len(m) for m in body], seeds[1], sampling))
+        body = [
+            self._standing(motion, [prompt.stands], [len(motion)])
+            for motion, prompt in zip(body, prompts, strict=True)
+        ]
         made = [self._motion(*row) for row in zip(prompts, body, face, strict=True)]
         return [
             replace(
                 one,
-                beats=tuple(t for t in ticks_of(one.prompt, conditions, row, layout.fps) if t < one.seconds),
+                beats=()
+                if one.prompt.stands
+                else tuple(t for t in ticks_of(one.prompt, conditions, row, layout.fps) if t < one.seconds),
             )
             for row, one in enumerate(made)
         ]

@@ -26,7 +26,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.requests import caption_list, weight_bytes
+from motionloom.pipeline.inference.requests import caption_list, remarks_of, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
 from motionloom.pipeline.inference.stream import MotionStream, stream_of
@@ -97,7 +97,8 @@ class MotionModel(
         """Motions for captions, sounds or both, in order; equal arguments give equal motions.
 
         A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
-        a motion is as long as its sound, or else the model decides. `sampling` is a `SamplingConfig` or a
+        a motion is as long as its sound, or else the model decides. To a sound that is no music it stands, or
+        does what the words say, and it warns. `sampling` is a `SamplingConfig` or a
         mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused; of a caption
         that is far from all it was trained on, it warns. What `sampling` leaves out is as the model's export
         recommends, or the default.
@@ -105,10 +106,13 @@ class MotionModel(
         for unknown in self.unknown(caption_list(captions or ()), caption_list(face or ())):
             warnings.warn(str(unknown), stacklevel=2)
         with threads_for(len(sounds or captions or ()), weight_bytes(self.bundle.stages)):
-            return self.bundle.generate(
+            motions = self.bundle.generate(
                 captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
                 sampling=SamplingConfig.of(sampling), strict=True,
             )  # fmt: skip
+        for remark in remarks_of(motion.prompt for motion in motions):
+            warnings.warn(remark, stacklevel=2)
+        return motions
 
     def examples(self, count: int = 6) -> list[str]:
         """Some captions that it knows, unlike each other; none where it does not say what it knows."""
@@ -136,6 +140,8 @@ class MotionModel(
             segments = script.open(Path())
         else:
             segments = Script.read(Path(script)).open(Path(script).parent, str(script))
+        for remark in remarks_of(segment.prompt for segment in segments):
+            warnings.warn(remark, stacklevel=2)
         return self.bundle.perform(segments, samples=samples, seed=seed, sampling=SamplingConfig.of(sampling))
 
     def stream(
@@ -216,6 +222,6 @@ class MotionModel(
         return cls(folder, device)
 
 
-def _warn(unknown: Unknown) -> None:
-    """Warn of a stream's caption, at the loop that takes the chunks."""
+def _warn(unknown: Unknown | str) -> None:
+    """Warn of a stream's caption or sound, at the loop that takes the chunks."""
     warnings.warn(str(unknown), stacklevel=6)

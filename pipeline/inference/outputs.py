@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import unicodedata
 from collections.abc import Callable, Sequence
 from html import escape
@@ -24,7 +23,10 @@ WRITTEN = ".motionloom"
 
 def file_stem(number: int, name: str) -> str:
     """A safe file name: number and the first words of a caption or a song, in any script."""
-    words = re.sub(r"[\W_]+", "-", unicodedata.normalize("NFKC", name).lower()).strip("-")[:48].strip("-")
+    plain = unicodedata.normalize("NFKC", name).lower()
+    # Vowel signs of Indian and other scripts are marks, which are no \w.
+    kept = "".join(letter if unicodedata.category(letter)[0] in "LMN" else " " for letter in plain)
+    words = "-".join(kept.split())[:48].strip("-")
     return f"{number:02d}-{words or 'motion'}"
 
 

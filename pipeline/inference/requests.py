@@ -48,6 +48,11 @@ def require_words(captions: Iterable[str], name: str = "captions") -> None:
             raise UserError(f"{name}[{row}] is empty; say what the person does")
 
 
+def remarks_of(prompts: Iterable[Prompt]) -> list[str]:
+    """What there is to say of prompts whose sound is no music, each once."""
+    return list(dict.fromkeys(prompt.remark for prompt in prompts if prompt.remark))
+
+
 def require_seed(seed: int) -> None:
     """Refuse what is no seed."""
     if not isinstance(seed, Integral) or seed < 0:

@@ -6,19 +6,21 @@
       - {music: song.ogg, start: 30, end: 42}
       - {text: a person waves with the right hand, seconds: 3}
 
-`music` is a file beside the script, of any rate and length; `text` beside `music` drives the segment by both.
+`music` is a file beside the script, of any rate and length; `song.ogg@0:30-0:42` is another way to say start
+and end. `text` beside `music` drives the segment by both.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from motionloom.datasets.audio.sound import Sound, require_audible
+from motionloom.datasets.audio.excerpt import Excerpt
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.store.yaml import read_yaml
@@ -55,11 +57,15 @@ class ScriptSegment(Config):
             raise ValueError(f"end {self.end:g} is not after start {self.start:g}")
         return self
 
-    @property
-    def label(self) -> str:
-        """A few words for the time line."""
-        name = Path(self.music).stem if self.music is not None else ""
-        return " + ".join(filter(None, (self.text, name)))
+    def excerpt(self, file: Path, where: str) -> Excerpt:
+        """The part of the music that it asks for; `file` may name one itself, `where` is for errors."""
+        named = Excerpt.named(file)
+        if named.whole:
+            end = self.start + self.seconds if self.seconds is not None else self.end
+            return replace(named, start=self.start, end=end)
+        if self.start or self.end is not None or (self.seconds is not None and named.end is not None):
+            raise UserError(f"{where}: {self.music} says itself which part is meant; leave start and end out")
+        return named if self.seconds is None else replace(named, end=named.start + self.seconds)
 
 
 class Script(Config):
@@ -77,19 +83,21 @@ class Script(Config):
 
     def open(self, folder: Path, name: str = "script") -> list[DrivenSegment]:
         """The segments with their sounds; `folder` is where files are looked for, `name` is for errors."""
-        sounds: dict[str, Sound] = {}
+        sounds: dict[Path, Sound] = {}
         out = []
         for number, segment in enumerate(self.segments):
             if segment.music is None:
-                out.append(
-                    DrivenSegment(Prompt(segment.text, segment.face), segment.seconds or 0.0, segment.label)
-                )
+                prompt = Prompt(segment.text, segment.face)
+                out.append(DrivenSegment(prompt, segment.seconds or 0.0, segment.text))
                 continue
-            if segment.music not in sounds:
-                sounds[segment.music] = read_music(folder / segment.music)
-            sound = _cut(sounds[segment.music], segment, f"{name}: segments.{number}")
-            prompt = Prompt(segment.text, segment.face, sound)
-            out.append(DrivenSegment(prompt, sound.seconds, segment.label))
+            where = f"{name}: segments.{number}"
+            part = segment.excerpt(folder / segment.music, where)
+            if part.path not in sounds:
+                sounds[part.path] = read_music(part.path)
+            whole = sounds[part.path]
+            sound = whole.slice(*part.within(whole.seconds, f"{where}: {segment.music}"))
+            label = " + ".join(filter(None, (segment.text, part.path.stem)))
+            out.append(DrivenSegment(Prompt(segment.text, segment.face, sound), sound.seconds, label))
         return out
 
 
@@ -115,24 +123,10 @@ def segment_frames(generator: MotionGenerator, segment: DrivenSegment, number: i
 
 
 def read_music(path: Path) -> Sound:
-    """A sound file to drive by; silence is refused."""
-    if not path.is_file():
-        raise UserError(f"{path}: no such sound file")
-    sound = Sound.read(path)
-    require_audible(sound.samples, path)
-    return sound
-
-
-def _cut(sound: Sound, segment: ScriptSegment, where: str) -> Sound:
-    end = segment.end
-    if end is None and segment.seconds is not None:
-        end = segment.start + segment.seconds
-    if segment.start >= sound.seconds or (end is not None and end > sound.seconds + 0.5):
-        asked = f"{segment.start:g} s to {'its end' if end is None else f'{end:g} s'}"
-        raise UserError(
-            f"{where}: {segment.music} is {sound.seconds:.1f} s long and {asked} was asked for; shorten it"
-        )
-    return sound.slice(segment.start, None if end is None else min(end, sound.seconds))
+    """A sound file to drive by, or a part of one (`song.mp3@0:30-1:00`)."""
+    if not (file := Excerpt.named(path).path).is_file():
+        raise UserError(f"{file}: no such sound file")
+    return Sound.read(path)
 
 
 def sound_of(segments: list[tuple[DrivenSegment, int]], fps: float) -> Sound | None:

@@ -33,6 +33,7 @@ from motionloom.pipeline.inference.bundle import Bundle, split_columns, unknown_
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import require_driven, require_seed, require_used, weight_bytes
 from motionloom.pipeline.inference.script import DrivenSegment, Script, segment_frames
+from motionloom.pipeline.inference.standing import Standing
 from motionloom.pipeline.launch.hardware import threads_for
 from motionloom.pipeline.render.score import Driver, Segment
 from motionloom.pipeline.store.known_captions import Unknown
@@ -109,7 +110,8 @@ class MotionStream(Iterator[MotionChunk]):
         seed: Equal seeds, segments and settings give equal motions.
         sampling: How tokens are drawn.
         config: How much at a time.
-        notice: Is given each caption that the model does not know, once, when its segment begins.
+        notice: Is given each caption that the model does not know and what is said of a sound that is no
+            music, once, when its segment begins.
     """
 
     def __init__(
@@ -120,7 +122,7 @@ class MotionStream(Iterator[MotionChunk]):
         seed: int,
         sampling: SamplingConfig,
         config: StreamConfig,
-        notice: Callable[[Unknown], object] | None = None,
+        notice: Callable[[Unknown | str], object] | None = None,
     ) -> None:
         require_seed(seed)
         self.layout, self.seed = bundle.layout, seed
@@ -133,6 +135,7 @@ class MotionStream(Iterator[MotionChunk]):
         self._body = _Maker(bundle, bundle.main, seeds[0], sampling, config)
         face = _streaming_face(bundle, sampling)
         self._face = None if face is None else _Maker(bundle, face, seeds[1], sampling, config)
+        self._standing = Standing(bundle.layout, self._body.generator.part)
         self._joints = JointFlow(bundle.layout)
         self._least = config.chunk_frames
         self._bounds: deque[tuple[int, Prompt]] = deque()
@@ -176,7 +179,7 @@ class MotionStream(Iterator[MotionChunk]):
             self._bounds.popleft()
         if len(self._bounds) > 1:
             count = min(count, self._bounds[1][0] - self._given)
-        body = self._body.take(count)
+        body = self._standing(self._body.take(count), self._bounds[0][1].stands)
         features, with_it = split_columns(body, self._body.generator, self.layout)
         face = with_it if self._face is None else self._face.take(count)
         chunk = MotionChunk(
@@ -220,9 +223,12 @@ class MotionStream(Iterator[MotionChunk]):
             self._face.condition(segment.prompt, segment.prompt.words)
 
     def _look(self, prompt: Prompt) -> None:
-        """Give notice of words that the model does not know."""
+        """Give notice of words that the model does not know, and of a sound that is no music."""
         if self._notice is None:
             return
+        if prompt.remark and prompt.remark not in self._noticed:
+            self._noticed.add(prompt.remark)
+            self._notice(prompt.remark)
         for unknown in unknown_captions(self._bundle, [prompt.text], [prompt.face_text], self._face_model):
             if unknown.caption not in self._noticed:
                 self._noticed.add(unknown.caption)
@@ -318,7 +324,7 @@ def stream_of(
     seed: int = 0,
     sampling: SamplingConfig | None = None,
     streaming: StreamConfig | Mapping[str, object] | None = None,
-    notice: Callable[[Unknown], object] | None = None,
+    notice: Callable[[Unknown | str], object] | None = None,
 ) -> MotionStream:
     """A stream of `MotionModel.stream`'s arguments; `notice` is given captions that are unknown."""
     sampling = sampling or SamplingConfig()

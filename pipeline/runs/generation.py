@@ -15,7 +15,7 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
-from motionloom.pipeline.inference.requests import caption_list, require_seed, require_words
+from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, require_words
 from motionloom.pipeline.inference.writers import WRITERS, default_formats
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device, threads_for
@@ -91,6 +91,7 @@ def generate_motions(
     From captions, sound files, or both side by side (the first caption with the first file, and so on), or
     from one script. `samples` motions of each. `figure` are the keys of `FigureOptions`.
     """
+    from motionloom.datasets.audio.excerpt import Excerpt
     from motionloom.pipeline.inference.bundle import unknown_captions
     from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
     from motionloom.pipeline.inference.script import Script, read_music
@@ -137,9 +138,12 @@ def generate_motions(
         said = captions if segments is None else [segment.prompt.text for segment in segments]
         for unknown in unknown_captions(bundle, said, face or (), sampling.face_model):
             _print_note(aside, unknown)
+        driven = motions if segments is None else segments
+        for remark in remarks_of(one.prompt for one in driven):
+            _print_note(aside, remark)
         title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
         note = page_note(len(motions), folder.resolve().name, seed)
-        named = [path.stem for path in audio for _ in range(samples)]
+        named = [Excerpt.named(path).path.stem for path in audio for _ in range(samples)]
         with film_progress(aside) as progress:
             paths = write_motions(
                 out,

@@ -133,7 +133,7 @@ class Site:
         def work() -> None:
             try:
                 made = stream(self.model, asked, sound, self.config)
-                for piece in lines(made, asked, self.name, notes_of(self.model, asked)):
+                for piece in lines(made, asked, self.name, notes_of(self.model, asked, sound)):
                     loop.call_soon_threadsafe(pieces.put_nowait, piece)
                     if gone or self.worker.stopped:
                         break

@@ -15,12 +15,14 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from motionloom.datasets.audio.sound import Sound, read_sound, require_audible, sound_seconds
+from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
 from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of, file_stem
+from motionloom.pipeline.inference.requests import remarks_of
 from motionloom.pipeline.inference.stream import MotionStream, stream_of
 from motionloom.pipeline.inference.stream_lines import frame_lines, heading, rounded
 from motionloom.pipeline.inference.writers import WRITERS, cell_of
@@ -130,13 +132,14 @@ class Answer:
     file: str = ""
 
 
-def notes_of(model: MotionModel, asked: MotionRequest) -> dict[str, list[str]]:
-    """What a person should know of the motion: captions that are unlike all that the model knows, and what
-    could be said of the body instead.
+def notes_of(model: MotionModel, asked: MotionRequest, sound: Sound | None) -> dict[str, list[str]]:
+    """What a person should know of the motion: captions that are unlike all that the model knows, what could
+    be said of the body instead, and that a sound is no music.
     """
     unknown = model.unknown(asked.captions, asked.faces)
     nearest = [text for one in unknown if one.caption in asked.captions for text in one.nearest]
-    return {"notes": [one.what for one in unknown], "nearest": nearest}
+    remarks = remarks_of([Prompt(asked.caption, sound=sound)])
+    return {"notes": [*(one.what for one in unknown), *remarks], "nearest": nearest}
 
 
 def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> Answer:
@@ -159,7 +162,7 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
     )[0]
     if asked.format in WRITERS:
         return _file(motion, asked)
-    facts = {**_facts(motion, asked), **notes_of(model, asked)}
+    facts = {**_facts(motion, asked), **notes_of(model, asked, sound)}
     if asked.format == "viewer":
         facts["viewer"] = viewer_data([cell_of(clip_of(motion))])
     else:
@@ -224,7 +227,7 @@ class Sounds:
         self._lock, self._decoding = threading.Lock(), threading.Lock()
 
     def add(self, data: bytes) -> tuple[str, Sound]:
-        """Decode a file's bytes and keep them; `UserError` for what is no sound, silent or too long."""
+        """Decode a file's bytes and keep them; `UserError` for what is no sound or too long."""
         if not data:
             raise UserError(f"{_SOUND}: empty (0 bytes)")
         name = hashlib.sha256(data).hexdigest()[:24]
@@ -255,5 +258,4 @@ class Sounds:
             if seconds > longest:
                 raise UserError(f"{_SOUND} lasts {seconds:.0f} s; this server takes at most {longest:g} s")
             samples, rate = read_sound(path, _SOUND)
-        require_audible(samples, _SOUND)
         return Sound(np.clip(samples, -1.0, 1.0), rate)

@@ -11,7 +11,7 @@ import pytest
 import soundfile
 
 from motionloom.datasets.audio import sound
-from motionloom.datasets.audio.sound import Sound, read_sound, require_audible, resample_sound, sound_seconds
+from motionloom.datasets.audio.sound import Sound, read_sound, resample_sound, sound_seconds
 from motionloom.datasets.schema import UserError
 
 RATE = 16_000
@@ -200,14 +200,6 @@ def test_what_is_no_sound(samples: np.ndarray, rate: int, reason: str) -> None:
         Sound(samples, rate)
 
 
-def test_silence_can_be_refused(tone: np.ndarray) -> None:
-    require_audible(tone, "tone.wav")
-    require_audible(0.001 * tone, "tone.wav")
-    for silent in (np.zeros(100, np.float32), 1e-4 * tone, tone[:0]):
-        with pytest.raises(UserError, match=r"tone\.wav: silent"):
-            require_audible(silent, Path("tone.wav"))
-
-
 def mp3(path: Path, samples: np.ndarray, rate: int = 44100, **how: Any) -> bytes:
     soundfile.write(path, samples, rate, **how)
     return path.read_bytes()
@@ -279,4 +271,4 @@ def test_real_songs(shared: Path) -> None:
         samples, rate = read_sound(path)
         assert rate in (44100, 48000)
         assert len(samples) / rate == pytest.approx(sound_seconds(path))
-        require_audible(samples, path)
+        assert np.abs(samples).max() > 1e-4

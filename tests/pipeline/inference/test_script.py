@@ -57,15 +57,29 @@ segments:
   - {music: song.wav, start: 1, seconds: 2.5}
   - {music: song.wav, start: 1, end: 5.25, text: a person spins}
   - {music: song.wav, start: 4, end: 6.4}
+  - {music: "song.wav@0:02-"}
+  - {music: "song.wav@-3.5", text: a person spins}
+  - {music: "song.wav@1-", seconds: 2.5}
 """)
     found = opened(path)
-    assert [s.seconds for s in found] == pytest.approx([4, 1.5, 6, 4, 3, 2.5, 4.25, 2])
+    assert [s.seconds for s in found] == pytest.approx([4, 1.5, 6, 4, 3, 2.5, 4.25, 2, 4, 3.5, 2.5])
     assert [s.label for s in found] == [
         "a person walks", "a person bows", "song", "song", "song", "song", "a person spins + song", "song",
+        "song", "a person spins + song", "song",
     ]  # fmt: skip
     assert found[1].prompt.face_text == found[1].prompt.words == "a person smiles"
-    assert [s.prompt.sound is None for s in found] == [True, True, *[False] * 6]
-    bounds = [(0, 6), (2, 6), (0, 3), (1, 3.5), (1, 5.25), (4, 6)]  # none beyond the music
+    assert [s.prompt.sound is None for s in found] == [True, True, *[False] * 9]
+    bounds = [
+        (0, 6),
+        (2, 6),
+        (0, 3),
+        (1, 3.5),
+        (1, 5.25),
+        (4, 6),
+        (2, 6),
+        (0, 3.5),
+        (1, 3.5),
+    ]  # none beyond the music
     whole = Sound.read(path.parent / "song.wav").samples
     for segment, (first, last) in zip(found[2:], bounds, strict=True):
         sound = segment.prompt.sound
@@ -96,6 +110,8 @@ MISTAKES = {
     "segments: [{text: a, seconds: 1}, {music: song.wav, start: 9}]":
         r"show\.yaml: segments\.1: song.wav is 6.0 s long and 9 s to its end was asked for; shorten it",
     "segments: [{music: song.wav, start: 5, seconds: 4}]": r"segments\.0: song.wav .* 5 s to 9 s",
+    "segments: [{music: song.wav@2-, start: 1}]": r"segments\.0: song.wav@2- says itself which part",
+    "segments: [{music: song.wav@2-20}]": r"segments\.0: song.wav@2-20 is 6.0 s long",
     "segments: [{music: other.wav}]": "other.wav: no such sound file",
     "segments: [{music: .}]": "no such sound file",
     "segments: [{music: show.wav}]": "show.wav",
