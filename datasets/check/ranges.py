@@ -2,17 +2,6 @@
 
 Two limits a field. Beyond the first, no person does it, but a glitch of one frame may: a warning. Beyond ten
 times the first, it is no motion in metres and radians at all: an error (a wrong unit, scale or layout).
-
-| field | first limit | because |
-|---|---|---|
-| root_yaw_velocity | 40 rad/s | six turns a second, a figure skater's record spin |
-| root_xz_velocity | 15 m/s | sprinters reach 12.4 |
-| root_height, positions | 4 m | heights are absolute: a jump with raised arms |
-| velocities | 40 m/s | the fastest hand stays below 30 |
-| rotations_6d, foot_contacts | 1.001 | components of unit vectors; 0 or 1 |
-| face, face_shape, betas | 10 | coefficients with a deviation near 1 |
-| trans | 30 m | a capture hall; AIST++ before its scaling is beyond it |
-| axis-angles | 2 pi | more than one full turn says nothing new |
 """
 
 from __future__ import annotations
@@ -39,23 +28,20 @@ def require_sensible(what: str, values: NDArray[np.floating]) -> None:
         raise ValueError(f"{what}: absurd value in row {int(far.argmax())}; at most {LARGEST:g} is sensible")
 
 
-_PER_SECOND = {"root_yaw_velocity": 40.0, "root_xz_velocity": 15.0, "velocities": 40.0}
+_PER_SECOND = {
+    "root_yaw_velocity": 40.0,  # six turns a second, a figure skater's record spin
+    "root_xz_velocity": 15.0,  # sprinters reach 12.4
+    "velocities": 40.0,  # the fastest hand stays below 30
+}
 """Limits of columns that hold a change per frame, given a second."""
 
 _PLAIN = {
-    "root_height": 4.0,
-    "positions": 4.0,
-    "rotations_6d": 1.001,
-    "foot_contacts": 1.001,
-    "face": 10.0,
-    "face_shape": 10.0,
-    "betas": 10.0,
-    "trans": 30.0,
-    "pose": 2 * math.pi,
-    "root_orient": 2 * math.pi,
-    "pose_body": 2 * math.pi,
-    "pose_hand": 2 * math.pi,
-    "pose_jaw": 2 * math.pi,
+    **dict.fromkeys(("root_height", "positions"), 4.0),  # heights are absolute: a jump with raised arms
+    **dict.fromkeys(("rotations_6d", "foot_contacts"), 1.001),  # parts of unit vectors; 0 or 1
+    **dict.fromkeys(("face", "face_shape", "betas"), 10.0),  # coefficients with a deviation near 1
+    "trans": 30.0,  # a capture hall; AIST++ before its scaling is beyond it
+    # More than one full turn says nothing new.
+    **dict.fromkeys(("pose", "root_orient", "pose_body", "pose_hand", "pose_jaw"), 2 * math.pi),
 }
 
 
@@ -78,17 +64,10 @@ def beyond(
     if not ratio[column] > factor:
         return ""
     frame = int(np.abs(motion[:, column]).argmax())
-    field, at = _field_of(column, layout)
+    field = next(name for name, _ in layout.fields if column < layout.slice(name).stop)
+    at = column - layout.slice(field).start
     value, most, unit = float(motion[frame, column]), float(limits[column]), ""
     if field in _PER_SECOND:
         unit = " rad/s" if field == "root_yaw_velocity" else " m/s"
         value, most = value * layout.fps, most * layout.fps
     return f"{field}[{at}] is {value:.4g}{unit} at frame {frame}; at most {most:.4g} is sensible"
-
-
-def _field_of(column: int, layout: MotionLayout) -> tuple[str, int]:
-    for field, size in layout.fields:
-        if column < size:
-            return field, column
-        column -= size
-    raise IndexError(column)

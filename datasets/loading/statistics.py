@@ -1,4 +1,5 @@
-"""Mean and standard deviation of each column of motion (`FeatureStats`) and of a modality, in one pass.
+"""Mean and standard deviation of each column of motion (`FeatureStats`, as models normalise by them) and of a
+modality, in one pass.
 
 A column counts the clips that hold it: what a clip without hands or face stores there is ignored. A column
 that no clip holds gets mean 0 and standard deviation 1.
@@ -10,20 +11,93 @@ decides that by the dataset it passes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.progress import track
+from torch import Tensor
 
-from motionloom.datasets.loading.feature_stats import FeatureStats
-from motionloom.datasets.modalities.modality import FrameStats, Modality
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
+from motionloom.datasets.motion.layout import Family, MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, in_order
 
 STD_FLOOR = 1e-4
 """Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
+
+
+Values = TypeVar("Values", NDArray[np.float32], Tensor)
+Columns = NDArray[np.int64] | slice
+"""Columns of a layout: by number, or a field's slice."""
+
+
+@dataclass(frozen=True)
+class FeatureStats:
+    """Mean and std, [D] float32, of the columns of a layout."""
+
+    mean: NDArray[np.float32]
+    std: NDArray[np.float32]
+    layout: MotionLayout
+    frames: int = 0
+    """Frames they were computed from."""
+    _tensors: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def normalize(self, values: Values, columns: Columns | None = None) -> Values:
+        """(values - mean) / std over the last axis; numpy or torch. `columns`: which ones `values` holds."""
+        if isinstance(values, Tensor):
+            mean, std = self._on(values, columns)
+            return (values - mean) / std
+        return (values - self._take(self.mean, columns)) / self._take(self.std, columns)
+
+    def denormalize(self, values: Values, columns: Columns | None = None) -> Values:
+        """values * std + mean over the last axis; numpy or torch, differentiable."""
+        if isinstance(values, Tensor):
+            mean, std = self._on(values, columns)
+            return values * std + mean
+        return values * self._take(self.std, columns) + self._take(self.mean, columns)
+
+    def save(self, path: Path) -> None:
+        """Write a safetensors file, with the layout in its metadata, atomically."""
+        layout = self.layout
+        facts = {"layout": layout.name, "family": layout.family, "fps": repr(layout.fps)}
+        save_columns(path, self.mean, self.std, self.frames, **facts)
+
+    @staticmethod
+    def load(path: Path) -> FeatureStats:
+        """Read what `save` wrote; `UserError` when it is not that."""
+        stage = "the statistics stage"
+        mean, std, frames, about = load_columns(path, stage)
+        try:
+            family = cast(Family, about["family"])  # a wrong one fits no data set
+            layout = MotionLayout.named(about["layout"], fps=float(about["fps"]), family=family)
+        except (KeyError, ValueError) as error:
+            raise UserError(f"{path}: not a statistics file ({error}); run {stage} again") from None
+        if len(mean) != layout.dim:
+            raise UserError(f"{path}: {len(mean)} columns, not {layout.dim}; run {stage} again")
+        return FeatureStats(mean, std, layout, frames)
+
+    def _on(self, like: Tensor, columns: Columns | None) -> tuple[Tensor, Tensor]:
+        key = (like.device, like.dtype)
+        if key not in self._tensors:
+            self._tensors[key] = (torch.from_numpy(self.mean).to(like), torch.from_numpy(self.std).to(like))
+        mean, std = self._tensors[key]
+        if columns is None:
+            return mean, std
+        chosen = columns if isinstance(columns, slice) else torch.as_tensor(columns, device=like.device)
+        return mean[chosen], std[chosen]
+
+    @staticmethod
+    def _take(values: NDArray[np.float32], columns: Columns | None) -> NDArray[np.float32]:
+        return values if columns is None else values[columns]
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_tensors": {}}
 
 
 @dataclass(frozen=True)
@@ -94,18 +168,12 @@ def from_moments(moments: Moments, layout: MotionLayout, *, group: bool = False)
     std, counted = moments.std, moments.count > 0
     if group:
         for name, _ in layout.fields:
-            field = counted & _columns_of(layout, name)
-            if field.any():
+            field = np.arange(layout.dim)[layout.slice(name)]
+            field = field[counted[field]]
+            if len(field):
                 std[field] = std[field].mean()
     std = np.where(counted, np.maximum(std, STD_FLOOR), 1.0)
     return FeatureStats(moments.mean.astype(np.float32), std.astype(np.float32), layout, frames)
-
-
-def _columns_of(layout: MotionLayout, name: str) -> NDArray[np.bool_]:
-    """Mask [D] of one field."""
-    mask = np.zeros(layout.dim, dtype=np.bool_)
-    mask[layout.slice(name)] = True
-    return mask
 
 
 _CONSTANT = 1e-6

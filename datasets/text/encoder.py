@@ -8,7 +8,6 @@ model is never run.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -24,7 +23,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.text.minilm import MiniLm
+from motionloom.datasets.text.minilm import MiniLm, weights_digest
 
 if TYPE_CHECKING:
     from sentence_transformers import SentenceTransformer
@@ -76,7 +75,7 @@ class SentenceEncoder:
 
     def __init__(self, spec: str, model: SentenceTransformer) -> None:
         self._model = model.eval()
-        self.name = f"{spec}:{_weights_digest(model)}"
+        self.name = f"{spec}:{weights_digest(model.state_dict())}"
         self.dim = int(model.get_embedding_dimension() or 0)
 
     @torch.inference_mode()
@@ -99,7 +98,7 @@ class ClipEncoder:
     ) -> None:
         self._model = model.eval()  # type: ignore[no-untyped-call]
         self._tokenizer = tokenizer
-        self.name = f"{spec}:{_weights_digest(model)}"
+        self.name = f"{spec}:{weights_digest(model.state_dict())}"
         self.dim = int(model.config.hidden_size)
 
     @torch.inference_mode()
@@ -158,17 +157,14 @@ def _model_type(folder: Path) -> str:
 def _sentence_model(where: Path | str, *, device: str, local: bool) -> SentenceTransformer:
     from sentence_transformers import SentenceTransformer
 
-    try:
-        with _no_progress_bars():
-            return SentenceTransformer(
-                str(where),
-                device=device,
-                local_files_only=local or hub_is_away(),
-                trust_remote_code=False,
-                model_kwargs={"use_safetensors": True},
-            )
-    except Exception as error:  # every library below raises its own kind for a bad folder or no network
-        raise _not_loadable(where, local, error) from error
+    with _loading(where, local):
+        return SentenceTransformer(
+            str(where),
+            device=device,
+            local_files_only=local or hub_is_away(),
+            trust_remote_code=False,
+            model_kwargs={"use_safetensors": True},
+        )
 
 
 def _clip_model(
@@ -177,40 +173,35 @@ def _clip_model(
     from transformers import AutoTokenizer, CLIPTextModelWithProjection
 
     here = local or hub_is_away()
-    try:
-        with _no_progress_bars():
-            model = CLIPTextModelWithProjection.from_pretrained(
-                str(where), local_files_only=here, use_safetensors=True
-            )
+    with _loading(where, local):
+        model = CLIPTextModelWithProjection.from_pretrained(
+            str(where), local_files_only=here, use_safetensors=True
+        )
         tokenizer = AutoTokenizer.from_pretrained(str(where), local_files_only=here, trust_remote_code=False)
-    except Exception as error:  # as above
-        raise _not_loadable(where, local, error) from error
     nn.Module.to(model, device)
     return model, tokenizer
 
 
 @contextmanager
-def _no_progress_bars() -> Iterator[None]:
-    """The library draws a bar for every model it loads, even one that takes 50 ms."""
+def _loading(where: Path | str, local: bool) -> Iterator[None]:
+    """No bar, which the library draws even for 50 ms; what it raises becomes a sentence."""
     from transformers.utils import logging
 
     shown = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()  # type: ignore[no-untyped-call]
     try:
         yield
+    except Exception as error:  # every library below raises its own kind for a bad folder or no network
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        if local:
+            raise UserError(f"{where}: not a readable text model: {reason}") from error
+        raise UserError(
+            f"text encoder '{where}': no such folder, and the hub does not give it ({reason}); "
+            f"download the model and name its folder, or use 'minilm'"
+        ) from error
     finally:
         if shown:
             logging.enable_progress_bar()  # type: ignore[no-untyped-call]
-
-
-def _not_loadable(where: Path | str, local: bool, error: Exception) -> UserError:
-    reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-    if local:
-        return UserError(f"{where}: not a readable text model: {reason}")
-    return UserError(
-        f"text encoder '{where}': no such folder, and the hub does not give it ({reason}); "
-        f"download the model and name its folder, or use 'minilm'"
-    )
 
 
 def _pack(sentence: Tensor, tokens: Tensor, mask: Tensor) -> EncodedText:
@@ -222,12 +213,3 @@ def _pack(sentence: Tensor, tokens: Tensor, mask: Tensor) -> EncodedText:
 
 def _to(value: object, device: torch.device) -> object:
     return value.to(device) if isinstance(value, Tensor) else value
-
-
-def _weights_digest(model: nn.Module) -> str:
-    """Twelve hex digits of the weights' sha256: other weights of the same name do not share a cache."""
-    digest = hashlib.sha256()
-    for name, value in sorted(model.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
-    return digest.hexdigest()[:12]

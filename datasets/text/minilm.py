@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,15 @@ from motionloom.datasets.schema import UserError
 
 _PREFIX = "0.model."
 """Prefix of the weights' names in sentence-transformers, which the digest is made of."""
+
+
+def weights_digest(weights: Mapping[str, Tensor]) -> str:
+    """Twelve hex digits of the weights' sha256: other weights of the same name do not share a cache."""
+    digest = hashlib.sha256()
+    for name, value in sorted(weights.items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()[:12]
 
 
 class MiniLm:
@@ -45,12 +54,7 @@ class MiniLm:
 
     @cached_property
     def digest(self) -> str:
-        """Twelve hex digits of the sha256 of all weights."""
-        digest = hashlib.sha256()
-        for name, value in sorted(self._weights.items()):
-            digest.update((_PREFIX + name).encode())
-            digest.update(value.cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
-        return digest.hexdigest()[:12]
+        return weights_digest({_PREFIX + name: value for name, value in self._weights.items()})
 
     @torch.inference_mode()
     def __call__(self, captions: Sequence[str]) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,13 +1,5 @@
 """AMASS (SMPL-H or SMPL-X .npz) -> shards: parameters to joints without the mesh, joints to features.
 
-| in the file | in the sample |
-|---|---|
-| `poses` [T, 156 or 165], or `root_orient`, `pose_body`, `pose_hand` | `motion.npy` |
-| `trans` | the path of the root in `motion.npy` |
-| `betas`, `gender` | bone lengths, when a body model is given |
-| `mocap_framerate` or `mocap_frame_rate` | resampled by time to `fps` |
-| captions of your own, or HumanML3D's texts | `texts.json` |
-
 Z up becomes Y up. Jaw, eyes, soft tissue (`dmpls`) and markers are not used. `smpl75` keeps the parameters,
 without a shape; its two hand joints are SMPL's, at rest for SMPL-H and SMPL-X, which have none.
 """

@@ -139,18 +139,17 @@ def list_files(source: Path) -> tuple[list[AmassFile], list[Dropped]]:
 
 
 def read_headers(
-    files: Sequence[AmassFile], settings: PlanSettings
-) -> tuple[list[tuple[AmassFile, MotionHeader]], list[Dropped]]:
-    """The files that can be read, with what they state, and the others."""
+    files: Sequence[AmassFile], settings: PlanSettings, draft: Draft
+) -> list[tuple[AmassFile, MotionHeader]]:
+    """The files that can be read, with what they state; the others are broken."""
     out: list[tuple[AmassFile, MotionHeader]] = []
-    broken: list[Dropped] = []
     headers = read_in_threads(_read, files, workers=settings.workers, progress=settings.progress)
     for file, header in zip(files, headers, strict=True):
         if isinstance(header, UserError):
-            broken.append(drop(file.label, header))
+            draft.fail(file.label, header)
         else:
             out.append((file, header))
-    return out, broken
+    return out
 
 
 def _read(file: AmassFile) -> MotionHeader | UserError:
@@ -217,9 +216,8 @@ def _whole_clips(
     config: AmassConfig, files: list[AmassFile], draft: Draft, settings: PlanSettings
 ) -> Iterator[tuple[AmassClip, str]]:
     """Every file as one clip, and why it must be left out."""
-    headers, broken = read_headers(files, settings)
+    headers = read_headers(files, settings, draft)
     listing = config.listing([file.label for file in files])
-    draft.broken += broken
     draft.notes += listing.notes
     seen: dict[str, str] = {}
     for file, header in headers:
@@ -246,9 +244,7 @@ def _index_clips(
         keep_mirrors_together(listed, original_of, config.splits)
         draft.notes += notes
     by_file = _rows_by_file(rows, files, draft)
-    headers, broken = read_headers([file for file in files if file.label in by_file], settings)
-    draft.broken += broken
-    for file, header in headers:
+    for file, header in read_headers([file for file in files if file.label in by_file], settings, draft):
         fps = _rate(config, file, header, draft)
         for row in by_file[file.label] if fps else ():
             first, last = row.cut(header.frames, fps)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.bvh.plan import (
-    SUFFIX,
     BvhClip,
     BvhConfig,
     JointMaps,
@@ -127,7 +126,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         batch = clip.batch
         if batch.archive is None:  # no need to read the loose files before it
             batch = Batch(batch.root, None, (clip.found.path,))
-        for file in batch.read(SUFFIX):
+        for file in batch.read():
             if file.path == clip.found.path and not file.error:
                 return file.data
         raise UserError(f"{clip.label()}: no longer in the source")
@@ -141,7 +140,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     ) -> Iterator[tuple[str, NDArray[np.float32] | Dropped]]:
         waiting = set(labels)
         try:
-            for file in batch.read(SUFFIX):
+            for file in batch.read():
                 if file.label not in waiting:  # a second member of the same name finds nothing
                     continue
                 waiting.remove(file.label)

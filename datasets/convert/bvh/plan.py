@@ -36,7 +36,6 @@ MapChoice = Annotated[
 ]
 """A map file or a folder of them, or `auto` (from the command line also as a path) for guesses."""
 
-SUFFIX = (".bvh", ".amc")
 MAPS_FOLDER = "joint_maps"
 """In the folder of the shards: the maps that were guessed, one for each skeleton."""
 
@@ -127,7 +126,7 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
     for batch, labels in wanted.items():
         missing = set(labels.values()) - set(found)
         with suppress(UserError):  # a damaged archive; its clips are reported when they are converted
-            for file in batch.read(SUFFIX) if missing else ():
+            for file in batch.read() if missing else ():
                 if labels.get(file.label) in missing:
                     with suppress(UserError):  # likewise; the next clip of this skeleton may be whole
                         found[labels[file.label]] = read_motion(file.data, file.label)
@@ -139,13 +138,13 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
 
 def guess_source(source: Path, target: Skeleton) -> JointGuess:
     """The guess for the first clip of a .bvh file, of a folder of such files, or of an archive."""
-    batches = list_batches(source, SUFFIX)
+    batches = list_batches(source)
     for batch in batches:
-        for file in batch.read(SUFFIX):
+        for file in batch.read():
             if file.error:
                 raise UserError(f"{file.label}: {file.error}")
             return guess_joint_map(read_motion(file.data, file.label), target)
-    raise UserError(f"{source}: no {' or '.join(SUFFIX)} file in it")
+    raise UserError(f"{source}: no motion file in it")
 
 
 def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
@@ -229,9 +228,9 @@ def plan_bvh(
     config: BvhConfig, given: Sequence[JointMap], settings: PlanSettings
 ) -> tuple[ConversionPlan[BvhClip], JointMaps]:
     """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
-    batches = list_batches(config.source, SUFFIX)
+    batches = list_batches(config.source)
     scans = scan_batches(
-        batches, SUFFIX, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
+        batches, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
     )
     draft = _decide(config, batches, scans)
     joints = {key: names for scan in scans for key, names in scan.joints.items()}

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import PlanSettings
@@ -29,11 +30,11 @@ from motionloom.datasets.convert.common.splits import (
 )
 from motionloom.datasets.convert.motionx.files import (
     HUMANML,
+    SOURCE,
     Kind,
     MotionXFiles,
     find_files,
     official_id,
-    read_motionx_captions,
     read_sentences,
     subset_of,
 )
@@ -251,10 +252,10 @@ def _scan(source: Path, files: MotionXFiles, clip_id: str) -> _Scanned:
         problems.extend([f"{file}: {'; '.join(wrong)}"] if wrong else [])
         return texts
 
-    seconds, subset = frames / FPS, subset_of(clip_id)
-    texts = sentences(
-        "captions", lambda path, name: read_motionx_captions(path, subset=subset, seconds=seconds, name=name)
-    )
+    read: Callable[..., tuple[list[Caption], list[str]]] = read_sentences
+    if subset_of(clip_id) == HUMANML:
+        read = partial(read_humanml_captions, seconds=frames / FPS)
+    texts = sentences("captions", lambda path, name: read(path, source=SOURCE, name=name))
     face_texts = sentences("face texts", lambda path, name: read_sentences(path, source="face", name=name))
     face = files.by_kind["face motion"].get(clip_id)
     if face is not None:

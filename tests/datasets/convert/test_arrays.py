@@ -18,27 +18,6 @@ def npy(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return shared / "data/broken/npy"
 
 
-@pytest.mark.parametrize(
-    ("name", "by_values"),
-    [
-        ("nan", True),
-        ("huge_values", True),
-        ("truncated", False),
-        ("object_dtype", False),
-        ("transposed", False),
-    ],
-)
-def test_the_header_tells_all_but_values(npy: Path, tmp_path: Path, name: str, by_values: bool) -> None:
-    if by_values:
-        assert check_array_header(npy / f"{name}.npy", width=322) == 12
-    else:
-        with pytest.raises(UserError):
-            check_array_header(npy / f"{name}.npy", width=322)
-    with pytest.raises(UserError):
-        load_array(npy / f"{name}.npy", width=322, limit=1000.0)
-    assert not list(tmp_path.iterdir())
-
-
 def test_storage_variants_are_equal(npy: Path) -> None:
     control = load_array(npy / "control_ok.npy", width=322, limit=1000.0)
     assert control.shape == (12, 322)

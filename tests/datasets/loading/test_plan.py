@@ -165,15 +165,6 @@ def test_ranks_share_every_global_batch_out_alike(order: str) -> None:
 
 
 @pytest.mark.usefixtures("no_files")
-def test_shards_of_a_group_come_together() -> None:
-    """What a streamed order asks of the storage at once: the clips of a batch lie in few groups of shards."""
-    shards, plan = shards_of(SHARDS, 8), plans()["streamed"]
-    for k in (0, 30, 90):
-        assert len(np.unique(shards[plan.batch(k)[1]])) <= 16 * (BATCH // (8 * 16) + 2)
-    assert len(np.unique(shards[plans()["global"].batch(0)[1]])) > 600
-
-
-@pytest.mark.usefixtures("no_files")
 def test_a_million_samples_fit_into_little_memory() -> None:
     """A streamed epoch's order and a batch of it (32 MiB here), and the step to the next epoch."""
     shards = shards_of(SHARDS, 100)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.motion.canonical import turn
-from motionloom.datasets.motion.features.flow import JointFlow
-from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
+from motionloom.datasets.motion.features.joints import JointFlow, joints_of, local_joints_of
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, make_sample

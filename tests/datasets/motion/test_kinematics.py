@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
-from motionloom.datasets.motion.rotation import swing
+from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations, swing
 from motionloom.datasets.motion.skeleton import Skeleton
 
 NAMES = ["smpl22", "smplx52"]

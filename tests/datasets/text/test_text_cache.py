@@ -19,7 +19,7 @@ from sentence_transformers import SentenceTransformer
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text import build as build_module
 from motionloom.datasets.text.build import build_text_cache, build_with_encoder
-from motionloom.datasets.text.cache import TextCache, key_of
+from motionloom.datasets.text.cache import TextCache
 from motionloom.datasets.text.encoder import EncodedText, MiniLmEncoder, SentenceEncoder, load_text_encoder
 from motionloom.datasets.text.minilm import MiniLm
 
@@ -252,22 +252,6 @@ def test_same_bytes_for_any_number_of_workers(
         np.testing.assert_array_equal(mask, alone.mask)
         np.testing.assert_allclose(tokens, alone.tokens, atol=5e-3)
         np.testing.assert_allclose(caches[1].sentence([caption]), alone.sentence, atol=1e-5)
-
-
-def test_parts_of_other_captions_or_encoders_are_not_taken(tmp_path: Path) -> None:
-    """What a killed run left for another caption set or encoder is ignored and removed."""
-    folder = tmp_path / "a"
-    build_with_encoder(folder, ["jump"], Counting(), progress=False)
-    for name in ("counting", "another"):
-        kept = Counting(name=name)
-        (part,) = build_module._parts([key_of("fly")], {key_of("fly"): "fly"}, tmp_path, name)
-        build_module._encode_part(part, kept)
-        (folder / "parts").mkdir()
-        part.path.rename(folder / "parts" / part.path.name)
-        fresh = Counting()
-        assert len(build_with_encoder(folder, ["jump", "fly", name], fresh, progress=False)) >= 3
-        assert sorted(fresh.asked) == sorted({"fly", name} if name == "counting" else {name})
-        assert not (folder / "parts").exists()
 
 
 def test_a_killed_build_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
