@@ -30,7 +30,6 @@ class CheckedClip:
 
     meta: ClipMeta
     motion: NDArray[np.floating]
-    captions: int
     audio_width: int | None
     oddities: list[tuple[str, str]] = field(default_factory=list)
 
@@ -73,17 +72,17 @@ def check_clip(
     strange = beyond(motion, layout, limits)
     if strange:
         oddities.append(("beyond what a person can do", f"motion.npy: {strange}"))
-    captions = 0
+    captioned = False
     for name in ("texts.json", "face_texts.json"):
         if name in clip.members:
             found = captions_from_json(read_member(file, clip, name), f"{path}: '{clip.key}.{name}'")
-            captions += len(found) if name == "texts.json" else 0
+            captioned |= name == "texts.json" and bool(found)
             oddities += _check_captions(name, found, meta.frames / layout.fps)
-    if captions == 0:
+    if not captioned:
         oddities.append(("no captions", "no captions"))
     if not meta.licence.strip():
         oddities.append(("no licence", "meta.json states no licence"))
-    return CheckedClip(meta, motion, captions, _check_audio(file, path, clip), oddities)
+    return CheckedClip(meta, motion, _check_audio(file, path, clip), oddities)
 
 
 def _check_captions(name: str, captions: list[Caption], seconds: float) -> Iterator[tuple[str, str]]:

@@ -27,11 +27,11 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.files import write_with
+from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.npz import NpzFile, read_npy_header
 from motionloom.datasets.schema import INDEX_FILE, PRESENT_ALL, Config, Dropped, ShardInfo, Split, UserError
 from motionloom.datasets.shards.sample import MEMBERS
-from motionloom.datasets.shards.tar import TarClip, scan_tar
+from motionloom.datasets.shards.tar import scan_tar
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "frames": (np.int32, 1),
@@ -87,14 +87,11 @@ def index_path(tar: Path) -> Path:
     return tar.with_name(tar.name.removesuffix(".tar") + ".index.json")
 
 
-def clip_entries(
-    path: Path, written: list[Written], *, clips: list[TarClip] | None = None
-) -> list[ClipEntry]:
+def clip_entries(path: Path, written: list[Written]) -> list[ClipEntry]:
     """Index rows of a tar as it lies on the disk; `written` says the rest of its clips, in order."""
-    clips = scan_tar(path) if clips is None else clips
     entries = []
     with path.open("rb") as file:
-        for clip, about in zip(clips, written, strict=True):
+        for clip, about in zip(scan_tar(path), written, strict=True):
             start, size = clip.members["motion.npy"]
             file.seek(start)
             header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'", size)
@@ -168,7 +165,8 @@ class SplitIndex:
 def save_index(root: Path, splits: dict[Split, SplitIndex]) -> None:
     """Write `index.npz` atomically; zip entries carry a fixed date, so equal content is equal bytes."""
     arrays = {f"{split}.{name}": getattr(index, name) for split, index in splits.items() for name in _ARRAYS}
-    write_with(root / INDEX_FILE, lambda file: np.savez(file, allow_pickle=False, **arrays))
+    with atomic_file(root / INDEX_FILE) as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def load_index(root: Path, split: Split, shards: list[ShardInfo]) -> SplitIndex:

@@ -8,22 +8,24 @@ model is never run.
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors.torch import load_file
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.text.minilm import MiniLm, weights_digest
 
 if TYPE_CHECKING:
     from sentence_transformers import SentenceTransformer
@@ -54,20 +56,77 @@ class TextEncoder(Protocol):
         """Encode a batch. A caption's result does not depend on its neighbours beyond float noise."""
 
 
+_PREFIX = "0.model."
+"""Prefix of the weights' names in sentence-transformers, which the digest is made of."""
+
+
 class MiniLmEncoder:
-    """MiniLM as it comes with the installation, without the libraries of other encoders (`minilm.py`)."""
+    """MiniLM from the folder of the model, as it comes with the installation.
+
+    The libraries of other encoders take several seconds on one core to import, for a network of six layers;
+    so it stands here in full: BERT (Devlin et al. 2019, section 3) and the mean over the caption's tokens.
+    Numbers are those of sentence-transformers, within the noise of float32.
+    """
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
-        self._model = MiniLm(folder, device)
-        self.dim = self._model.dim
+        try:
+            facts = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+            longest = json.loads((folder / "sentence_bert_config.json").read_text(encoding="utf-8"))
+            self._heads, self._layers = int(facts["num_attention_heads"]), int(facts["num_hidden_layers"])
+            self.dim, self._eps = int(facts["hidden_size"]), float(facts["layer_norm_eps"])
+            weights = load_file(folder / "model.safetensors")
+            self._tokenizer = _tokenizer(folder, int(longest["max_seq_length"]))
+        except Exception as error:  # a missing file, no JSON, no weights: each library raises its own kind
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise UserError(f"{folder}: not a readable text model: {reason}") from error
+        self._weights = {name: x.to(device) for name, x in weights.items() if x.is_floating_point()}
+        self._device = device
 
     @cached_property
     def name(self) -> str:
         """Name of the model with a digest of its weights, computed on first use."""
-        return f"minilm:{self._model.digest}"
+        return f"minilm:{_weights_digest({_PREFIX + name: value for name, value in self._weights.items()})}"
 
+    @torch.inference_mode()
     def encode(self, captions: Sequence[str]) -> EncodedText:
-        return _pack(*self._model(captions))
+        read = self._tokenizer.encode_batch(list(captions))
+        numbers = torch.tensor([row.ids for row in read]).to(self._device)
+        mask = torch.tensor([row.attention_mask for row in read]).to(self._device)
+        states = self._states(numbers, mask.bool())
+        weight = mask[..., None].float()
+        mean = (states * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-9)
+        return _pack(F.normalize(mean, dim=-1), states, mask)
+
+    def _states(self, numbers: Tensor, mask: Tensor) -> Tensor:
+        """Last hidden states [B, S, E] of token numbers [B, S]."""
+        words, kinds, places = (
+            self._weights[f"embeddings.{name}_embeddings.weight"]
+            for name in ("word", "token_type", "position")
+        )
+        x = words[numbers] + kinds[0] + places[: numbers.shape[1]]
+        x = self._norm("embeddings", x)
+        seen = None if bool(mask.all()) else mask[:, None, None, :].expand(-1, -1, mask.shape[1], -1)
+        for layer in range(self._layers):
+            at = f"encoder.layer.{layer}"
+            q, k, v = (self._heads_of(f"{at}.attention.self.{name}", x) for name in ("query", "key", "value"))
+            heads = F.scaled_dot_product_attention(q, k, v, attn_mask=seen)
+            attended = heads.transpose(1, 2).reshape(x.shape)
+            attended = self._linear(f"{at}.attention.output.dense", attended)
+            x = self._norm(f"{at}.attention.output", attended + x)
+            hidden = F.gelu(self._linear(f"{at}.intermediate.dense", x))
+            x = self._norm(f"{at}.output", self._linear(f"{at}.output.dense", hidden) + x)
+        return x
+
+    def _heads_of(self, name: str, x: Tensor) -> Tensor:
+        """One projection [B, S, E], split into heads [B, H, S, E / H]."""
+        return self._linear(name, x).view(*x.shape[:2], self._heads, -1).transpose(1, 2)
+
+    def _linear(self, name: str, x: Tensor) -> Tensor:
+        return F.linear(x, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
+
+    def _norm(self, name: str, x: Tensor) -> Tensor:
+        weight, bias = (self._weights[f"{name}.LayerNorm.{part}"] for part in ("weight", "bias"))
+        return F.layer_norm(x, (self.dim,), weight, bias, self._eps)
 
 
 class SentenceEncoder:
@@ -75,7 +134,7 @@ class SentenceEncoder:
 
     def __init__(self, spec: str, model: SentenceTransformer) -> None:
         self._model = model.eval()
-        self.name = f"{spec}:{weights_digest(model.state_dict())}"
+        self.name = f"{spec}:{_weights_digest(model.state_dict())}"
         self.dim = int(model.get_embedding_dimension() or 0)
 
     @torch.inference_mode()
@@ -98,7 +157,7 @@ class ClipEncoder:
     ) -> None:
         self._model = model.eval()  # type: ignore[no-untyped-call]
         self._tokenizer = tokenizer
-        self.name = f"{spec}:{weights_digest(model.state_dict())}"
+        self.name = f"{spec}:{_weights_digest(model.state_dict())}"
         self.dim = int(model.config.hidden_size)
 
     @torch.inference_mode()
@@ -206,10 +265,29 @@ def _loading(where: Path | str, local: bool) -> Iterator[None]:
 
 def _pack(sentence: Tensor, tokens: Tensor, mask: Tensor) -> EncodedText:
     keep = mask.bool()
-    sentence = nn.functional.normalize(sentence.float(), dim=-1)
+    sentence = F.normalize(sentence.float(), dim=-1)
     tokens = tokens.float() * keep[..., None]
     return EncodedText(sentence.cpu().numpy(), tokens.cpu().numpy(), keep.cpu().numpy())
 
 
 def _to(value: object, device: torch.device) -> object:
     return value.to(device) if isinstance(value, Tensor) else value
+
+
+def _tokenizer(folder: Path, longest: int) -> Any:
+    """The tokenizer's file, cutting at the model's length and padding to the longest of a batch."""
+    from tokenizers import Tokenizer
+
+    tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
+    tokenizer.enable_truncation(longest)
+    tokenizer.enable_padding(pad_id=tokenizer.token_to_id("[PAD]"), pad_token="[PAD]")
+    return tokenizer
+
+
+def _weights_digest(weights: Mapping[str, Tensor]) -> str:
+    """Twelve hex digits of the weights' sha256: other weights of the same name do not share a cache."""
+    digest = hashlib.sha256()
+    for name, value in sorted(weights.items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()[:12]

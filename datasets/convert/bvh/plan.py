@@ -40,18 +40,8 @@ MAPS_FOLDER = "joint_maps"
 """In the folder of the shards: the maps that were guessed, one for each skeleton."""
 
 
-@dataclass(frozen=True)
-class JointMaps:
-    """The joint maps of a conversion."""
-
-    by_skeleton: Mapping[str, JointMap]
-    """By `skeleton_key`."""
-
-    def of(self, motion: BvhMotion) -> JointMap:
-        try:
-            return self.by_skeleton[skeleton_key(motion.joints, motion.parents)]
-        except KeyError:
-            raise UserError(f"{motion.name}: its skeleton has no joint map") from None
+JointMaps = Mapping[str, JointMap]
+"""The joint maps of a conversion, by `skeleton_key`."""
 
 
 def load_maps(choice: Path | str, target: Skeleton) -> list[JointMap]:
@@ -113,7 +103,7 @@ def choose_maps(
     plan.notes += doubts.values()
     for clip in left:
         plan.reject(clip.label(), f"no certain joint map for its skeleton ({doubts[clip.found.skeleton]})")
-    return JointMaps(maps)
+    return maps
 
 
 def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str, BvhMotion]:

@@ -65,7 +65,6 @@ def read_amc(asf: bytes, amc: bytes, *, name: str) -> BvhMotion:
     numbers, frames = _frames(amc, skeleton.bones, name)
     names, parents = tuple(skeleton.bones), skeleton.parents
     ends = [skeleton.bones[bone].end for bone in names]
-    leaves = [joint for joint in range(len(names)) if joint not in parents]
     turned = [
         _turned(bone, numbers.get(key), frames, skeleton.degree) for key, bone in skeleton.bones.items()
     ]
@@ -78,11 +77,7 @@ def read_amc(asf: bytes, amc: bytes, *, name: str) -> BvhMotion:
         offsets=np.array([ends[parent] if parent >= 0 else np.zeros(3) for parent in parents]),
         channels=(_ROOT, *[_CHANNELS] * (len(names) - 1)),
         values=np.concatenate([*moved, *turned], axis=1),
-        frame_time=1 / FPS,
         fps=FPS,
-        end_sites=tuple(
-            (leaf, (float(x), float(y), float(z))) for leaf in leaves for x, y, z in [ends[leaf]]
-        ),
     )
 
 

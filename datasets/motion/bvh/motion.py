@@ -53,11 +53,8 @@ class BvhMotion:
     """Channel names of every joint, in file order."""
     values: Floats
     """The motion block [T, total channels]: lengths and degrees."""
-    frame_time: float
     fps: float
     """1 / frame time, snapped to a whole number where the printed digits allow one (0.0333333 is 30)."""
-    end_sites: tuple[tuple[int, tuple[float, float, float]], ...] = ()
-    """(joint, offset) of every End Site."""
 
     @property
     def frames(self) -> int:
@@ -155,9 +152,7 @@ def read_bvh(source: Path | str | bytes, *, name: str | None = None) -> BvhMotio
         offsets=np.array(joints.offsets, dtype=np.float64),
         channels=tuple(joints.channels),
         values=read_values(data, section.body, section.frames, width, where),
-        frame_time=section.frame_time,
         fps=section.fps,
-        end_sites=tuple((joint, (x, y, z)) for joint, (x, y, z) in joints.end_sites),
     )
 
 
