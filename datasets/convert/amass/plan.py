@@ -28,7 +28,7 @@ from motionloom.datasets.convert.common.splits import (
     original_of,
     read_split_files,
 )
-from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
 
 SUFFIX = ".npz"
@@ -40,6 +40,8 @@ freer, but the fits are AMASS's: non-commercial research only, and not to be pas
 
 class AmassConfig(CaptionConfig):
     """AMASS, or any folder tree of SMPL, SMPL-H or SMPL-X clips in .npz files (`SUBSET/subject/clip.npz`)."""
+
+    layouts = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
 
     name: str = "amass"
     """Name of the data set; part of the shards' file names."""
@@ -79,14 +81,6 @@ class AmassConfig(CaptionConfig):
     @property
     def has_captions(self) -> bool:
         return self.captions is not None or self.humanml_texts is not None
-
-    def motion_layout(self) -> MotionLayout:
-        layout = super().motion_layout()
-        if layout.has("face") or (layout.family == "raw" and layout.name != "smpl75"):
-            raise UserError(
-                f"layout {self.layout} cannot be made from AMASS; use body133, wholebody313, h3d263 or smpl75"
-            )
-        return layout
 
 
 @dataclass(frozen=True)

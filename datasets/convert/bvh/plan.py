@@ -27,7 +27,6 @@ from motionloom.datasets.motion.bvh.asf import FPS, JOINED, count_frames, read_a
 from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy, require_all_frames
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Split, UserError
 
@@ -154,6 +153,8 @@ def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
 class BvhConfig(CaptionConfig):
     """Options of the BVH converter."""
 
+    layouts = ("body133", "wholebody313", "wholebody363", "h3d263", "tomato623")
+
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""
     joint_map: MapChoice = "auto"
@@ -179,12 +180,6 @@ class BvhConfig(CaptionConfig):
     """Of layouts with hands: the files have them (`recorded`, which needs a joint map with fingers); they
     have none, and each clip gets hands at rest, which count as motion (`resting`) or do not (`missing`).
     """
-
-    def motion_layout(self) -> MotionLayout:
-        layout = super().motion_layout()
-        if layout.family == "raw":
-            raise UserError(f"layout {self.layout} cannot be made from joints; use body133 or h3d263")
-        return layout
 
     def mapped_skeleton(self) -> Skeleton:
         """The skeleton that the joint map reads: without fingers where the files have none."""

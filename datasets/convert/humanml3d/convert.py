@@ -50,7 +50,6 @@ from motionloom.datasets.shards.sample import Sample
 FPS = 20.0
 VECS, JOINTS = "new_joint_vecs", "new_joints"
 WIDTHS: dict[str, int | tuple[int, ...]] = {VECS: 263, JOINTS: (22, 3)}
-LAYOUTS = ("h3d263", "body133")
 LICENCE = (
     "HumanML3D: motion derived from AMASS (non-commercial research only, no redistribution) and HumanAct12; "
     "captions MIT"
@@ -62,6 +61,8 @@ AGREEMENT = 0.01
 
 class HumanMl3dConfig(ConvertConfig):
     """Options of the HumanML3D converter; `source` is the folder HumanML3D/ of the release."""
+
+    layouts = ("h3d263", "body133")
 
     name: str = "humanml3d"
     """Name of the data set; part of the shards' file names."""
@@ -76,11 +77,6 @@ class HumanMl3dConfig(ConvertConfig):
     """Give every clip the bone lengths of the layout's skeleton (published vectors are then made again)."""
     uncaptioned: Literal["drop", "keep"] = "drop"
     """What to do with clips that have no usable caption."""
-
-    def motion_layout(self) -> MotionLayout:
-        if self.layout not in LAYOUTS:
-            raise UserError(f"layout {self.layout} cannot be made from HumanML3D; use {' or '.join(LAYOUTS)}")
-        return super().motion_layout()
 
     @property
     def keeps_vectors(self) -> bool:

@@ -40,11 +40,9 @@ from motionloom.datasets.convert.motionx.files import (
 )
 from motionloom.datasets.convert.motionx.parameters import FACE_WIDTH, RAW, aist_scale
 from motionloom.datasets.motion.body.smpl import SkeletonName
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
 
 FPS = 30.0
-LAYOUTS = ("wholebody363", "wholebody313", "body133", "tomato623", "h3d263", "smplx322")
 AIST = "aist"
 MOCAP = ("humanml", "EgoBody", "GRAB")
 """Subsets whose faces come in files of their own."""
@@ -70,6 +68,8 @@ class MotionXConfig(ConvertConfig):
     """Options of the Motion-X converter. `source` is the folder that holds motion_data/ and texts/, under
     any of the names they have had."""
 
+    layouts = ("wholebody363", "wholebody313", "body133", "tomato623", "h3d263", "smplx322")
+
     name: str = "motionx"
     layout: str = "wholebody363"
     fps: float = FPS
@@ -89,11 +89,6 @@ class MotionXConfig(ConvertConfig):
     frame_texts: bool = False
     """Add the sentences about single frames (body_texts, hand_texts) as captions of 1/30 s and longer, with
     source `body` and `hand`. They are many: about one a frame."""
-
-    def motion_layout(self) -> MotionLayout:
-        if self.layout not in LAYOUTS:
-            raise UserError(f"layout {self.layout} cannot be made from Motion-X; use {', '.join(LAYOUTS)}")
-        return super().motion_layout()
 
     @property
     def skeleton(self) -> SkeletonName:

@@ -357,7 +357,7 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
         prepare(config(copy, source=tmp_path / "nothing"))
     with pytest.raises(UserError, match="no such file or folder"):
         prepare(config(copy, source=tmp_path / "none"))
-    with pytest.raises(UserError, match="cannot be made from joints"):
+    with pytest.raises(UserError, match="layout smpl75 cannot be made"):
         convert(config(copy, layout="smpl75"), tmp_path / "raw")
 
 
