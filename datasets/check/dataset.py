@@ -1,7 +1,7 @@
 """`check`: read a whole dataset as a stranger would and list everything wrong with it.
 
 Errors: manifest or index absent or contradicting the tars, stray or missing shards, size and sha256, tar
-structure, members that do not parse, NaN, values no motion can have (`ranges.py`), figures that are no people
+structure, members that do not parse, NaN, values no motion can have (`clip.py`), figures that are no people
 standing on a floor in more than half of the clips (`datasets/motion/plausibility.py`; in more than a fifth a
 warning), empty captions, sound that cannot be read, and clips that leak from one split into another
 (`duplicates.py`).

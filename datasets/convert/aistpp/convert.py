@@ -3,7 +3,7 @@
 Choices:
 - Metres are smpl_trans / smpl_scaling. The floor of the source is anywhere: like every other source, a clip
   is moved to the canonical place (floor 0, first root above the origin, first heading +Z).
-- `smpl75` keeps the parameters, turned and moved to that place (`common/smpl75.py`).
+- `smpl75` keeps the parameters, turned and moved to that place (`common/features.py`).
 - Audio features are made once for a whole piece of music and cut to the motion; row 0 belongs to frame 0.
   Beats and loudness are then the piece's, not the cut's.
 """
@@ -31,11 +31,16 @@ from motionloom.datasets.convert.aistpp.plan import (
     plan_aistpp,
 )
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
-from motionloom.datasets.convert.common.features import body_of, features_of, require_human
+from motionloom.datasets.convert.common.features import (
+    SMPL_JOINTS,
+    body_of,
+    canonical_smpl75,
+    features_of,
+    require_human,
+)
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.smpl75 import SMPL_JOINTS, canonical_smpl75
 from motionloom.datasets.motion.body.smpl import smpl_joints
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, UserError

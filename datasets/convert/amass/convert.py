@@ -14,10 +14,15 @@ from numpy.typing import NDArray
 from motionloom.datasets.convert.amass.plan import LICENCE, AmassClip, AmassConfig, plan_amass
 from motionloom.datasets.convert.amass.smpl_npz import SmplMotion, read_motion
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
-from motionloom.datasets.convert.common.features import features_of, require_human
+from motionloom.datasets.convert.common.features import (
+    canonical_smpl75,
+    features_of,
+    mirrored,
+    require_human,
+    upright,
+)
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.smpl75 import canonical_smpl75, mirrored, upright
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from motionloom.datasets.check.clip import ABSURD, beyond, human_limits
 from motionloom.datasets.check.dataset import CheckReport, check, examine
 from motionloom.datasets.check.files import FileRules, check_file, check_folder
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.check.leaks import find_leaks, leaks_across
-from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from motionloom.datasets.convert.common.smpl75 import canonical_smpl75
+from motionloom.datasets.convert.common.features import canonical_smpl75
 from motionloom.datasets.motion.body.resting_hands import relaxed_fingers, with_resting_hands
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import (

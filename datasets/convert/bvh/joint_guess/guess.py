@@ -16,8 +16,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from motionloom.datasets.convert.bvh.joint_guess.conventions import CONVENTIONS
-from motionloom.datasets.convert.bvh.joint_guess.figure import Figure
+from motionloom.datasets.convert.bvh.joint_guess.figure import CONVENTIONS, Figure
 from motionloom.datasets.convert.bvh.joint_guess.limbs import (
     How,
     Kind,

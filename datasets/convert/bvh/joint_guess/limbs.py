@@ -11,8 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from motionloom.datasets.convert.bvh.joint_guess.conventions import CONVENTIONS, FINGERS
-from motionloom.datasets.convert.bvh.joint_guess.figure import Figure
+from motionloom.datasets.convert.bvh.joint_guess.figure import CONVENTIONS, FINGERS, Figure
 
 Kind = Literal["leg", "arm"]
 How = Literal["name", "hierarchy", "mean"]
