@@ -11,9 +11,10 @@ decides that by the dataset it passes.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -50,17 +51,13 @@ class FeatureStats:
 
     def normalize(self, values: Values, columns: Columns | None = None) -> Values:
         """(values - mean) / std over the last axis; numpy or torch. `columns`: which ones `values` holds."""
-        if isinstance(values, Tensor):
-            mean, std = self._on(values, columns)
-            return (values - mean) / std
-        return (values - self._take(self.mean, columns)) / self._take(self.std, columns)
+        mean, std = self._like(values, columns)
+        return (values - mean) / std
 
     def denormalize(self, values: Values, columns: Columns | None = None) -> Values:
         """values * std + mean over the last axis; numpy or torch, differentiable."""
-        if isinstance(values, Tensor):
-            mean, std = self._on(values, columns)
-            return values * std + mean
-        return values * self._take(self.std, columns) + self._take(self.mean, columns)
+        mean, std = self._like(values, columns)
+        return values * std + mean
 
     def save(self, path: Path) -> None:
         """Write a safetensors file, with the layout in its metadata, atomically."""
@@ -82,19 +79,18 @@ class FeatureStats:
             raise UserError(f"{path}: {len(mean)} columns, not {layout.dim}; run {stage} again")
         return FeatureStats(mean, std, layout, frames)
 
-    def _on(self, like: Tensor, columns: Columns | None) -> tuple[Tensor, Tensor]:
-        key = (like.device, like.dtype)
-        if key not in self._tensors:
-            self._tensors[key] = (torch.from_numpy(self.mean).to(like), torch.from_numpy(self.std).to(like))
-        mean, std = self._tensors[key]
-        if columns is None:
-            return mean, std
-        chosen = columns if isinstance(columns, slice) else torch.as_tensor(columns, device=like.device)
-        return mean[chosen], std[chosen]
-
-    @staticmethod
-    def _take(values: NDArray[np.float32], columns: Columns | None) -> NDArray[np.float32]:
-        return values if columns is None else values[columns]
+    def _like(self, values: Values, columns: Columns | None) -> tuple[Values, Values]:
+        """Mean and std of the columns, as numpy or torch."""
+        mean: Any = self.mean
+        std: Any = self.std
+        if isinstance(values, Tensor):
+            key = (values.device, values.dtype)
+            if key not in self._tensors:
+                self._tensors[key] = (torch.from_numpy(mean).to(values), torch.from_numpy(std).to(values))
+            mean, std = self._tensors[key]
+            if isinstance(columns, np.ndarray):
+                columns = torch.as_tensor(columns, device=values.device)
+        return (mean, std) if columns is None else (mean[columns], std[columns])
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_tensors": {}}
@@ -147,17 +143,30 @@ def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -
     field's joints keep their relative sizes. In a mix each data set counts as often as its weight has it
     drawn: with weights equal to the numbers of clips this is the statistics of all clips together.
     """
-    layout, parts = dataset.layout, dataset.parts()
-    moments = Moments.none(layout.dim)
-    total = sum(weight for _, weight in parts)
-    for part, weight in parts:
-        own = Moments.none(layout.dim)
+    layout = dataset.layout
+
+    def moments_of(part: ClipDataset) -> Iterator[Moments]:
         clips = in_order(part, "motion.npy")
         for i in track(clips, "feature statistics", total=len(part), disable=not progress):
-            own = own.merge(Moments.of(part.motion(i), layout.present_columns[part.present[i]]))
-        times = weight / total * len(dataset) / len(part)
-        moments = moments.merge(own.counted(times) if len(parts) > 1 else own)
-    return from_moments(moments, layout, group=group)
+            yield Moments.of(part.motion(i), layout.present_columns[part.present[i]])
+
+    return from_moments(_pooled(dataset, moments_of) or Moments.none(layout.dim), layout, group=group)
+
+
+def _pooled(dataset: ClipDataset, moments_of: Callable[[ClipDataset], Iterator[Moments]]) -> Moments | None:
+    """The moments of all clips; in a mix each data set counts as often as its weight has it drawn."""
+    parts = dataset.parts()
+    total = sum(weight for _, weight in parts)
+    pooled: Moments | None = None
+    for part, weight in parts:
+        own: Moments | None = None
+        for found in moments_of(part):
+            own = found if own is None else own.merge(found)
+        if own is not None:
+            if len(parts) > 1:
+                own = own.counted(weight / total * len(dataset) / len(part))
+            pooled = own if pooled is None else pooled.merge(own)
+    return pooled
 
 
 def from_moments(moments: Moments, layout: MotionLayout, *, group: bool = False) -> FeatureStats:
@@ -183,35 +192,27 @@ _CONSTANT = 1e-6
 def frame_statistics(dataset: ClipDataset, modality: Modality, progress: bool = False) -> FrameStats:
     """Statistics of a modality's features over every clip of `dataset` that has them, in one pass.
 
-    In a mix each data set counts as often as its weight has it drawn, as in `statistics.compute`.
+    In a mix each data set counts as often as its weight has it drawn, as in `compute`.
     """
-    parts, member = dataset.parts(), modality.members[0]
-    total = sum(weight for _, weight in parts)
-    moments: Moments | None = None
-    for part, weight in parts:
-        own: Moments | None = None
+    member = modality.members[0]
+    widths: set[int] = set()
+
+    def moments_of(part: ClipDataset) -> Iterator[Moments]:
         heard = np.flatnonzero(part.has(member)).tolist()
-        for i in track(
-            in_order(part, member, clips=heard),
-            f"{modality.name} statistics",
-            total=len(heard),
-            disable=not progress,
-        ):
+        clips = in_order(part, member, clips=heard)
+        for i in track(clips, f"{modality.name} statistics", total=len(heard), disable=not progress):
             rows = part.array(i, member)
             if rows is None:
                 continue
-            found = Moments.of(rows)
-            if own is not None and len(own.mean) != len(found.mean):
+            widths.add(rows.shape[1])
+            if len(widths) > 1:
                 raise UserError(
-                    f"{part.where}: clip {part.ids[i]} has {len(found.mean)} {modality.name} features a "
-                    f"frame, others {len(own.mean)}; convert the data set again"
+                    f"{part.where}: clip {part.ids[i]} has {rows.shape[1]} {modality.name} features a "
+                    f"frame, others {min(widths - {rows.shape[1]})}; convert the data set again"
                 )
-            own = found if own is None else own.merge(found)
-        if own is None:
-            continue
-        if len(parts) > 1:
-            own = own.counted(weight / total * len(dataset) / len(part))
-        moments = own if moments is None else moments.merge(own)
+            yield Moments.of(rows)
+
+    moments = _pooled(dataset, moments_of)
     if moments is None:
         raise UserError(
             f"{dataset.where}: no clip of split '{dataset.split}' has {modality.name} features; convert a "

@@ -56,6 +56,8 @@ class TextEncoder(Protocol):
         """Encode a batch. A caption's result does not depend on its neighbours beyond float noise."""
 
 
+_CLIP_TYPES = ("clip", "clip_text_model")
+
 _PREFIX = "0.model."
 """Prefix of the weights' names in sentence-transformers, which the digest is made of."""
 
@@ -179,17 +181,16 @@ def load_text_encoder(spec: str, *, device: str = "cpu") -> MiniLmEncoder | Sent
     if spec == "minilm":
         return MiniLmEncoder(_minilm_folder(), device)
     folder = Path(spec).expanduser()
-    if folder.is_dir():
-        if (folder / "modules.json").exists():
-            return SentenceEncoder(folder.name, _sentence_model(folder, device=device, local=True))
-        kind = _model_type(folder)
-        if kind in ("clip", "clip_text_model"):
-            return ClipEncoder(folder.name, *_clip_model(folder, device=device, local=True))
-        return SentenceEncoder(folder.name, _sentence_model(folder, device=device, local=True))
-    require_hub_name(spec)
-    if "clip" in spec.lower() and not spec.startswith("sentence-transformers/"):
-        return ClipEncoder(spec, *_clip_model(spec, device=device, local=False))
-    return SentenceEncoder(spec, _sentence_model(spec, device=device, local=False))
+    local = folder.is_dir()
+    if local:
+        is_clip = not (folder / "modules.json").exists() and _model_type(folder) in _CLIP_TYPES
+    else:
+        require_hub_name(spec)
+        is_clip = "clip" in spec.lower() and not spec.startswith("sentence-transformers/")
+    where, name = (folder, folder.name) if local else (spec, spec)
+    if is_clip:
+        return ClipEncoder(name, *_clip_model(where, device=device, local=local))
+    return SentenceEncoder(name, _sentence_model(where, device=device, local=local))
 
 
 def _minilm_folder() -> Path:
