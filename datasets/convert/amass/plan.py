@@ -235,7 +235,7 @@ def _index_clips(
     listed: dict[str, Split] = {}
     if config.splits is not None:
         listed, notes = read_split_files(config.splits, SplitNames(config.splits_map))
-        keep_mirrors_together(listed, original_of, config.splits)
+        keep_mirrors_together(listed, config.splits)
         draft.notes += notes
     by_file = _rows_by_file(rows, files, draft)
     for file, header in read_headers([file for file in files if file.label in by_file], settings, draft):

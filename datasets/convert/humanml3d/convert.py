@@ -268,7 +268,7 @@ def _read_splits(config: HumanMl3dConfig, ids: list[str]) -> tuple[dict[str, Spl
     if not SplitNames().files(config.source):
         return hash_splits(ids)
     splits, notes = read_split_files(config.source)
-    keep_mirrors_together(splits, original_of, config.source)
+    keep_mirrors_together(splits, config.source)
     return splits, notes
 
 

@@ -25,7 +25,6 @@ from motionloom.datasets.convert.common.splits import (
     SplitNames,
     hash_splits,
     keep_mirrors_together,
-    original_of,
     read_split_files,
 )
 from motionloom.datasets.convert.motionx.files import (
@@ -214,7 +213,7 @@ def _read_splits(
     if folder is None:
         return hash_splits(ids)
     listed, notes = read_split_files(folder)
-    keep_mirrors_together(listed, original_of, folder)
+    keep_mirrors_together(listed, folder)
     splits: dict[str, Split] = {}
     for clip_id, split in listed.items():
         official = official_id(clip_id.removesuffix(".npy"))

@@ -1,4 +1,4 @@
-"""The batch plan: pure, complete, the same for every number of ranks, also of mixes and of ten thousand shards."""
+"""The batch plan: pure, complete, the same for every number of ranks, of mixes and of ten thousand shards."""
 
 from __future__ import annotations
 
