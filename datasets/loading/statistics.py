@@ -83,14 +83,15 @@ class FeatureStats:
         """Mean and std of the columns, as numpy or torch."""
         mean: Any = self.mean
         std: Any = self.std
+        chosen: Any = columns
         if isinstance(values, Tensor):
             key = (values.device, values.dtype)
             if key not in self._tensors:
                 self._tensors[key] = (torch.from_numpy(mean).to(values), torch.from_numpy(std).to(values))
             mean, std = self._tensors[key]
             if isinstance(columns, np.ndarray):
-                columns = torch.as_tensor(columns, device=values.device)
-        return (mean, std) if columns is None else (mean[columns], std[columns])
+                chosen = torch.as_tensor(columns, device=values.device)
+        return (mean, std) if columns is None else (mean[chosen], std[chosen])
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_tensors": {}}

@@ -315,11 +315,6 @@ def drops(*reasons: str) -> list[Dropped]:
     return [Dropped(source=f"take/{k}.bvh", reason=reason) for k, reason in enumerate(reasons)]
 
 
-def test_twenty_identical_messages_are_one_line() -> None:
-    (group,) = grouped(drops(*["no captions"] * 20))
-    assert str(group) == "20 x no captions (the first: take/0.bvh)" and group.count == 20
-
-
 def test_reasons_stay_apart_the_largest_first_and_single_ones_whole() -> None:
     groups = grouped(drops("in no split file", "NaN at frame 3", "in no split file"))
     assert list(map(str, groups)) == [
