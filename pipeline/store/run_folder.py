@@ -10,11 +10,9 @@ weights.
 from __future__ import annotations
 
 import os
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.places import no_such_folder
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.files import fingerprint_of, read_record
@@ -22,6 +20,9 @@ from motionloom.pipeline.store.yaml import read_yaml
 
 BUNDLE_FILE = "bundle.json"
 """At the top of an export."""
+
+STAGE_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+"""A stage's name is that of its folder."""
 
 UNFINISHED = "unfinished"
 """The identity of a stage that has been begun and is not finished."""
@@ -55,8 +56,6 @@ def place_from(run: Path, stage: Path) -> str:
 
 def identity_of(stage: Path) -> str | None:
     """Tells what a stage's folder holds from all else it might hold; None where nothing is there."""
-    if in_export(stage):
-        return _exported_identity(stage)
     artifact = stage / "artifact.json"
     if not artifact.is_file():
         return UNFINISHED if (stage / "started.json").is_file() else None
@@ -64,39 +63,6 @@ def identity_of(stage: Path) -> str | None:
     outputs = record.get("outputs")
     files = {name: file.get("sha256") for name, file in outputs.items()} if isinstance(outputs, dict) else {}
     return fingerprint_of({"fingerprint": record.get("fingerprint"), "files": files})
-
-
-def _exported_identity(stage: Path, above: tuple[str, ...] = ()) -> str | None:
-    """An export has no list of checksums, so its files are read; only those inside it."""
-    bundle = stage.parent / BUNDLE_FILE
-    entries = read_record(bundle).get("stages")
-    entry = entries.get(stage.name) if isinstance(entries, dict) else None
-    if not isinstance(entry, dict) or not stage.is_dir():
-        return None
-    if stage.name in above:
-        raise UserError(f"{bundle}: stage '{stage.name}' needs itself; export the run again")
-    inputs = entry.get("inputs")
-    names = {role: Path(str(name)).name for role, name in inputs.items()} if isinstance(inputs, dict) else {}
-    over = (*above, stage.name)
-    facts = {
-        "stage": {key: value for key, value in entry.items() if key != "inputs"},
-        "inputs": {role: _exported_identity(stage.parent / name, over) for role, name in names.items()},
-        "files": {path.relative_to(stage).as_posix(): _digest(path) for path in sorted(stage.rglob("*"))},
-    }
-    return fingerprint_of(facts)
-
-
-def _digest(path: Path) -> str | None:
-    if not path.is_file():
-        return None
-    state = path.stat()
-    return _digest_of(path, state.st_size, state.st_mtime_ns)
-
-
-@lru_cache(maxsize=256)
-def _digest_of(path: Path, size: int, changed: int) -> str:
-    """sha256 of a file, read again only when its size or time changes."""
-    return sha256_of(path)
 
 
 def stage_folder(run: Path, name: str) -> Path:
