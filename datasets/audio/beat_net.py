@@ -62,7 +62,7 @@ class BeatNet(nn.Module):
     @property
     def reach(self) -> int:
         """Rows to each side of one that its logits depend on."""
-        return self.config.kernel // 2 * 2**self.config.layers
+        return self.config.kernel // 2 * (1 << self.config.layers)
 
     def forward(self, levels: Tensor) -> Tensor:
         """Silence, which is what levels of 0 stand for, continues both ends."""

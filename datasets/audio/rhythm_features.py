@@ -146,7 +146,7 @@ def _decibels(power: NDArray[np.float32]) -> NDArray[np.float64]:
 def _relative(decibels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Against the median, in units of the range of the piece; -2..2."""
     lowest, median, highest = np.percentile(decibels, (5, 50, 95))
-    return np.clip((decibels - median) / max(highest - lowest, _SMALLEST_RANGE), -2, 2)
+    return np.asarray(np.clip((decibels - median) / max(highest - lowest, _SMALLEST_RANGE), -2, 2))
 
 
 def _onsets(power: NDArray[np.float32]) -> NDArray[np.float64]:

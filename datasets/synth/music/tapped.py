@@ -188,7 +188,7 @@ def _changed(heard: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np
         out = np.roll(out, int(rng.integers(-3, 4)), axis=1)
     if rng.random() < 0.3:
         width = int(rng.integers(2, BANDS // 2))
-        start = int(rng.choice([0, rng.integers(BANDS - width), BANDS - width]))
+        start = int(rng.choice([0, int(rng.integers(BANDS - width)), BANDS - width]))
         out[:, start : start + width] = 0
     if rng.random() < 0.3:
         length = int(rng.integers(6, 90))
@@ -206,7 +206,7 @@ def _no_music(rows: int, rng: np.random.Generator) -> NDArray[np.float32]:
         smooth = (float(np.exp(rng.uniform(-1.0, 3.0))), float(np.exp(rng.uniform(-1.0, 3.0))))
         part = gaussian_filter(rng.standard_normal(out.shape), smooth)
         out += rng.uniform(0.05, 0.8) * part / max(float(part.std()), 1e-6)
-    return (out - out.mean(axis=0)).astype(np.float32)
+    return np.asarray(out - out.mean(axis=0), dtype=np.float32)
 
 
 def _curve(at: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:

@@ -3,8 +3,8 @@
 The weights in the package are those of the recipe `beats`:
 
     motionloom run beats -o runs/beats
-    python -c "from pathlib import Path; from motionloom.pipeline.stages.networks.beats import put_into_package; \\
-        put_into_package(Path('runs/beats/stages/beats'))"
+    python -c "from motionloom.pipeline.stages.networks import beats; from pathlib import Path; \\
+        beats.put_into_package(Path('runs/beats/stages/beats'))"
 """
 
 from __future__ import annotations
