@@ -100,8 +100,9 @@ def heard(sound: Sound) -> Heard:
 
 
 def evidence(sound: Sound) -> Evidence:
-    """Measured on at most eight windows of a sound of three seconds or more."""
+    """Measured on at most eight windows of a sound of three seconds or more that is not silent."""
     samples = sound.resampled(RATE).samples
+    samples = samples / np.sqrt(np.square(samples).mean())  # how loud it is plays no part
     length = min(_WINDOW * _HOP + _FFT, len(samples))
     count = min(_MOST, max(1, len(samples) // length))
     starts = np.linspace(0, len(samples) - length, count).astype(int)
