@@ -125,7 +125,8 @@ def real(paths: list[Path], references: list[str]) -> None:
         beats = sum(map(len, runs))
         if beats:
             rows.append(row)
-        print(f"| {path.stem} | {ours.confidence:.2f} | {_bpm(ours.times):.0f} | {_bpm(theirs):.0f} | {beats} "
+        tempi = f"{_bpm(ours.times):.0f} | {_bpm(theirs):.0f}"
+        print(f"| {path.stem} | {ours.confidence:.2f} | {tempi} | {beats} "
               f"| {row[0]:.2f} ({row[1]:.2f}) | {row[2]:.2f} ({row[3]:.2f}) |", flush=True)  # fmt: skip
     mean = np.mean(rows, axis=0)
     print(f"{len(rows)} real songs, F: ours {mean[0]:.3f} (any {mean[1]:.3f}), librosa {mean[2]:.3f} "
