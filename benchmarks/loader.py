@@ -22,8 +22,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from motionloom.datasets.loading.batches import WindowBatches
-from motionloom.datasets.loading.feature_stats import FeatureStats
-from motionloom.datasets.loading.statistics import compute
+from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Split
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions

@@ -10,7 +10,7 @@ import secrets
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -108,12 +108,6 @@ def write_json(path: Path, data: object, *, sort_keys: bool = False, allow_nan: 
     """
     text = json.dumps(data, indent=1, ensure_ascii=False, sort_keys=sort_keys, allow_nan=allow_nan)
     write_text(path, text + "\n")
-
-
-def write_with(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write` fill a file that then appears atomically."""
-    with atomic_file(path) as file:
-        write(file)
 
 
 def sync_folder(folder: Path) -> None:

@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from multiprocessing.connection import wait
 from types import TracebackType
 from typing import Self, TypeVar
@@ -77,19 +76,13 @@ class Workers:
 
 def on_one_thread(work: Callable[[T], R], task: T) -> R:
     """Sums in numerical libraries depend on their thread count; one thread makes bytes reproducible."""
-    with _one_thread():
-        return work(task)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
     torch = sys.modules.get("torch")
     before = torch.get_num_threads() if torch else 0
     with threadpoolctl.threadpool_limits(1):
         if torch:
             torch.set_num_threads(1)
         try:
-            yield
+            return work(task)
         finally:
             if torch:
                 torch.set_num_threads(before)

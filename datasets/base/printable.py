@@ -14,8 +14,9 @@ def printable(text: str) -> str:
     Newlines, ESC, other control characters, bidirectional overrides and lone surrogates become `\n`, `\x1b`,
     `\u202e`, `\ud800`; letters and spaces of all scripts stay.
     """
-    return "".join(c if _is_harmless(c) else c.encode("unicode_escape").decode("ascii") for c in text)
-
-
-def _is_harmless(character: str) -> bool:
-    return character.isprintable() or character in _JOINERS or unicodedata.category(character) == "Zs"
+    return "".join(
+        c
+        if c.isprintable() or c in _JOINERS or unicodedata.category(c) == "Zs"
+        else c.encode("unicode_escape").decode("ascii")
+        for c in text
+    )

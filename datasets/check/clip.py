@@ -1,11 +1,14 @@
 """One sample as a stranger reads it: every member is parsed, nothing is believed.
 
-The first thing that makes the clip unusable raises; what is merely odd is returned.
+The first thing that makes the clip unusable raises; what is merely odd is returned. Values have two limits a
+field. Beyond the first, no person does it, but a glitch of one frame may: a warning. Beyond ten times the
+first, it is no motion in metres and radians at all: an error (a wrong unit, scale or layout).
 """
 
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,11 +17,69 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits, require_sensible
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, ClipMeta, ShardInfo
 from motionloom.datasets.shards.sample import captions_from_json, meta_from_json, require_finite
 from motionloom.datasets.shards.tar import TarClip, npy_from_bytes
+
+ABSURD = 10.0
+"""An error is this many times the first limit."""
+LARGEST = 1e6
+"""No feature of motion or music is larger, whatever it means."""
+
+
+def require_sensible(what: str, values: NDArray[np.floating]) -> None:
+    """`ValueError` naming the first row of [..., E] that holds NaN, infinity or a number beyond `LARGEST`."""
+    require_finite(what, values)
+    far = (np.abs(values) > LARGEST).any(axis=-1)
+    if far.any():
+        raise ValueError(f"{what}: absurd value in row {int(far.argmax())}; at most {LARGEST:g} is sensible")
+
+
+_PER_SECOND = {
+    "root_yaw_velocity": 40.0,  # six turns a second, a figure skater's record spin
+    "root_xz_velocity": 15.0,  # sprinters reach 12.4
+    "velocities": 40.0,  # the fastest hand stays below 30
+}
+"""Limits of columns that hold a change per frame, given a second."""
+
+_PLAIN = {
+    **dict.fromkeys(("root_height", "positions"), 4.0),  # heights are absolute: a jump with raised arms
+    **dict.fromkeys(("rotations_6d", "foot_contacts"), 1.001),  # parts of unit vectors; 0 or 1
+    **dict.fromkeys(("face", "face_shape", "betas"), 10.0),  # coefficients with a deviation near 1
+    "trans": 30.0,  # a capture hall; AIST++ before its scaling is beyond it
+    # More than one full turn says nothing new.
+    **dict.fromkeys(("pose", "root_orient", "pose_body", "pose_hand", "pose_jaw"), 2 * math.pi),
+}
+
+
+def human_limits(layout: MotionLayout) -> NDArray[np.float64]:
+    """Largest absolute value a person reaches, for every column [D]."""
+    out = np.empty(layout.dim)
+    for name, _ in layout.fields:
+        out[layout.slice(name)] = _PER_SECOND[name] / layout.fps if name in _PER_SECOND else _PLAIN[name]
+    return out
+
+
+def beyond(
+    motion: NDArray[np.floating], layout: MotionLayout, limits: NDArray[np.float64], factor: float = 1.0
+) -> str:
+    """What in motion [T, D] is beyond `factor` times the limits [D]: the worst value and its place, or ""."""
+    if motion.size == 0:
+        return ""
+    ratio = np.abs(motion).max(axis=0) / limits
+    column = int(ratio.argmax())
+    if not ratio[column] > factor:
+        return ""
+    frame = int(np.abs(motion[:, column]).argmax())
+    part = next(name for name, _ in layout.fields if column < layout.slice(name).stop)
+    at = column - layout.slice(part).start
+    value, most, unit = float(motion[frame, column]), float(limits[column]), ""
+    if part in _PER_SECOND:
+        unit = " rad/s" if part == "root_yaw_velocity" else " m/s"
+        value, most = value * layout.fps, most * layout.fps
+    return f"{part}[{at}] is {value:.4g}{unit} at frame {frame}; at most {most:.4g} is sensible"
+
 
 END_TOLERANCE = 0.5
 """Seconds a caption may reach past its clip: sources round their times."""
@@ -30,7 +91,6 @@ class CheckedClip:
 
     meta: ClipMeta
     motion: NDArray[np.floating]
-    captions: int
     audio_width: int | None
     oddities: list[tuple[str, str]] = field(default_factory=list)
 
@@ -73,17 +133,17 @@ def check_clip(
     strange = beyond(motion, layout, limits)
     if strange:
         oddities.append(("beyond what a person can do", f"motion.npy: {strange}"))
-    captions = 0
+    captioned = False
     for name in ("texts.json", "face_texts.json"):
         if name in clip.members:
             found = captions_from_json(read_member(file, clip, name), f"{path}: '{clip.key}.{name}'")
-            captions += len(found) if name == "texts.json" else 0
+            captioned |= name == "texts.json" and bool(found)
             oddities += _check_captions(name, found, meta.frames / layout.fps)
-    if captions == 0:
+    if not captioned:
         oddities.append(("no captions", "no captions"))
     if not meta.licence.strip():
         oddities.append(("no licence", "meta.json states no licence"))
-    return CheckedClip(meta, motion, captions, _check_audio(file, path, clip), oddities)
+    return CheckedClip(meta, motion, _check_audio(file, path, clip), oddities)
 
 
 def _check_captions(name: str, captions: list[Caption], seconds: float) -> Iterator[tuple[str, str]]:

@@ -1,7 +1,7 @@
 """`check`: read a whole dataset as a stranger would and list everything wrong with it.
 
 Errors: manifest or index absent or contradicting the tars, stray or missing shards, size and sha256, tar
-structure, members that do not parse, NaN, values no motion can have (`ranges.py`), figures that are no people
+structure, members that do not parse, NaN, values no motion can have (`clip.py`), figures that are no people
 standing on a floor in more than half of the clips (`datasets/motion/plausibility.py`; in more than a fifth a
 warning), empty captions, sound that cannot be read, and clips that leak from one split into another
 (`duplicates.py`).
@@ -198,7 +198,7 @@ def _against_manifest(
 def _indexed_present(path: Path) -> list[int]:
     """What a shard's index says its clips hold; an unreadable index is reported with the indices."""
     try:
-        return [clip.present for clip in ShardIndex.load_json(index_path(path)).clips]
+        return [clip.held for clip in ShardIndex.load_json(index_path(path)).clips]
     except (UserError, OSError):
         return []
 
@@ -226,7 +226,7 @@ def _sound_indices(root: Path, shards: list[ShardInfo], findings: Findings) -> I
         path = root / shard.name
         try:
             stored = ShardIndex.load_json(index_path(path))
-            written = [Written(clip.id, clip.present, clip.source, clip.made_from) for clip in stored.clips]
+            written = [Written(clip.id, clip.held, clip.source, clip.made_from) for clip in stored.clips]
             entries = clip_entries(path, written)
         except (UserError, OSError, ValueError) as error:
             findings.error("index", index_path(path).name, f"does not fit its tar: {error}")

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio.sound import read_sound
-from motionloom.datasets.check.ranges import ABSURD, beyond, human_limits, require_sensible
+from motionloom.datasets.check.clip import ABSURD, beyond, human_limits, require_sensible
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions

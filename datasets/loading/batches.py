@@ -18,8 +18,8 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.loading.crops import Crops
-from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 

@@ -9,7 +9,7 @@ everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Literal, NotRequired, cast
 
 import numpy as np
@@ -22,8 +22,8 @@ from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.loading.batches import ENDLESS, MotionBatch
 from motionloom.datasets.loading.crops import CaptionSpan, Crops, caption_spans
-from motionloom.datasets.loading.feature_stats import FeatureStats
-from motionloom.datasets.loading.kinds import KindPlan, drop_some, kind_of
+from motionloom.datasets.loading.kinds import KindPlan, drop_some
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import Rows
 from motionloom.datasets.modalities.table import MODALITIES, modality
 from motionloom.datasets.schema import UserError
@@ -203,22 +203,17 @@ class ConditionBatches(Dataset[ConditionBatch]):
         turns, clips = self.plan.local(k, self.rank, self.world)
         source = self.source
         source.prefetch(clips)
-        present, spans = self._spans(turns, clips)
-        return source.make(clips, present, spans, uniform(self.seed, _CROP, turns, clips))
-
-    def _spans(
-        self, turns: NDArray[np.int64], clips: NDArray[np.int64]
-    ) -> tuple[NDArray[np.bool_], list[CaptionSpan]]:
-        source, draws = self.source, uniform(self.seed, _DROP, turns, clips)
+        draws = uniform(self.seed, _DROP, turns, clips)
         present = drop_some(self.drop, source.present[clips], source.names, draws)
-        return present, source.spans(clips, present, uniform(self.seed, _CAPTION, turns, clips))
+        spans = source.spans(clips, present, uniform(self.seed, _CAPTION, turns, clips))
+        return source.make(clips, present, spans, uniform(self.seed, _CROP, turns, clips))
 
 
 class EvalBatches(Dataset[ConditionBatch]):
     """Every qualifying clip of a split once, in order: first caption, first `max_frames` frames.
 
-    `kinds` None takes all; otherwise only clips of these kinds. Each rank gets the same number of rows; where
-    the clips do not divide, the last batch repeats its last clip with `valid` false.
+    Each rank gets the same number of rows; where the clips do not divide, the last batch repeats its last
+    clip with `valid` false.
     """
 
     def __init__(
@@ -231,7 +226,6 @@ class EvalBatches(Dataset[ConditionBatch]):
         max_frames: int,
         min_frames: int = 1,
         captioned: Captioned | None = None,
-        kinds: Collection[str] | None = None,
         rank: int = 0,
         world: int = 1,
         columns: NDArray[np.int64] | None = None,
@@ -243,15 +237,6 @@ class EvalBatches(Dataset[ConditionBatch]):
             captioned=captioned,
         )  # fmt: skip
         self.clips = self.source.clips
-        if kinds is not None:
-            found = self.source.present[self.clips]
-            wanted = [[name in kind_of(key) for name in self.source.names] for key in kinds]
-            self.clips = self.clips[np.any([(found == one).all(1) for one in wanted], axis=0)]
-            if not len(self.clips):
-                raise UserError(
-                    f"{dataset.where}: no usable clip of split '{dataset.split}' is of kind "
-                    f"{' or '.join(kinds)}"
-                )
         self.batch_size, self.rank, self.world = batch_size, rank, world
 
     def __len__(self) -> int:

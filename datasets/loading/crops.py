@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import require_layout
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.clips import ClipDataset

@@ -19,6 +19,7 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.layout import require_layout
 from motionloom.datasets.schema import Caption, ClipMeta, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.order import Source
@@ -36,12 +37,7 @@ class MixedDataset:
         for other, weight in parts:
             if not 0 < weight < float("inf"):
                 raise UserError(f"{other.where}: weight {weight} in a mix; weights are positive numbers")
-            have, want = ((d.layout.name, d.layout.family, d.layout.fps) for d in (other, one))
-            if have != want:
-                raise UserError(
-                    f"a mix needs one layout: {one.where} holds {want[0]} ({want[1]}, {want[2]:g} fps), "
-                    f"{other.where} holds {have[0]} ({have[1]}, {have[2]:g} fps); convert one of them again"
-                )
+            require_layout(other.layout, one.layout, other.where)
         self.where = " + ".join(dataset.where for dataset in self._datasets)
         self.split = one.split
         self.layout = one.layout

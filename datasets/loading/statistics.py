@@ -1,4 +1,5 @@
-"""Mean and standard deviation of each column of motion (`FeatureStats`) and of a modality, in one pass.
+"""Mean and standard deviation of each column of motion (`FeatureStats`, as models normalise by them) and of a
+modality, in one pass.
 
 A column counts the clips that hold it: what a clip without hands or face stores there is ignored. A column
 that no clip holds gets mean 0 and standard deviation 1.
@@ -10,20 +11,90 @@ decides that by the dataset it passes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.progress import track
+from torch import Tensor
 
-from motionloom.datasets.loading.feature_stats import FeatureStats
-from motionloom.datasets.modalities.modality import FrameStats, Modality
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
+from motionloom.datasets.motion.layout import Family, MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, in_order
 
 STD_FLOOR = 1e-4
 """Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
+
+
+Values = TypeVar("Values", NDArray[np.float32], Tensor)
+Columns = NDArray[np.int64] | slice
+"""Columns of a layout: by number, or a field's slice."""
+
+
+@dataclass(frozen=True)
+class FeatureStats:
+    """Mean and std, [D] float32, of the columns of a layout."""
+
+    mean: NDArray[np.float32]
+    std: NDArray[np.float32]
+    layout: MotionLayout
+    frames: int = 0
+    """Frames they were computed from."""
+    _tensors: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def normalize(self, values: Values, columns: Columns | None = None) -> Values:
+        """(values - mean) / std over the last axis; numpy or torch. `columns`: which ones `values` holds."""
+        mean, std = self._like(values, columns)
+        return (values - mean) / std
+
+    def denormalize(self, values: Values, columns: Columns | None = None) -> Values:
+        """values * std + mean over the last axis; numpy or torch, differentiable."""
+        mean, std = self._like(values, columns)
+        return values * std + mean
+
+    def save(self, path: Path) -> None:
+        """Write a safetensors file, with the layout in its metadata, atomically."""
+        layout = self.layout
+        facts = {"layout": layout.name, "family": layout.family, "fps": repr(layout.fps)}
+        save_columns(path, self.mean, self.std, self.frames, **facts)
+
+    @staticmethod
+    def load(path: Path) -> FeatureStats:
+        """Read what `save` wrote; `UserError` when it is not that."""
+        stage = "the statistics stage"
+        mean, std, frames, about = load_columns(path, stage)
+        try:
+            family = cast(Family, about["family"])  # a wrong one fits no data set
+            layout = MotionLayout.named(about["layout"], fps=float(about["fps"]), family=family)
+        except (KeyError, ValueError) as error:
+            raise UserError(f"{path}: not a statistics file ({error}); run {stage} again") from None
+        if len(mean) != layout.dim:
+            raise UserError(f"{path}: {len(mean)} columns, not {layout.dim}; run {stage} again")
+        return FeatureStats(mean, std, layout, frames)
+
+    def _like(self, values: Values, columns: Columns | None) -> tuple[Values, Values]:
+        """Mean and std of the columns, as numpy or torch."""
+        mean: Any = self.mean
+        std: Any = self.std
+        chosen: Any = columns
+        if isinstance(values, Tensor):
+            key = (values.device, values.dtype)
+            if key not in self._tensors:
+                self._tensors[key] = (torch.from_numpy(mean).to(values), torch.from_numpy(std).to(values))
+            mean, std = self._tensors[key]
+            if isinstance(columns, np.ndarray):
+                chosen = torch.as_tensor(columns, device=values.device)
+        return (mean, std) if columns is None else (mean[chosen], std[chosen])
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_tensors": {}}
 
 
 @dataclass(frozen=True)
@@ -73,17 +144,30 @@ def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -
     field's joints keep their relative sizes. In a mix each data set counts as often as its weight has it
     drawn: with weights equal to the numbers of clips this is the statistics of all clips together.
     """
-    layout, parts = dataset.layout, dataset.parts()
-    moments = Moments.none(layout.dim)
-    total = sum(weight for _, weight in parts)
-    for part, weight in parts:
-        own = Moments.none(layout.dim)
+    layout = dataset.layout
+
+    def moments_of(part: ClipDataset) -> Iterator[Moments]:
         clips = in_order(part, "motion.npy")
         for i in track(clips, "feature statistics", total=len(part), disable=not progress):
-            own = own.merge(Moments.of(part.motion(i), layout.present_columns[part.present[i]]))
-        times = weight / total * len(dataset) / len(part)
-        moments = moments.merge(own.counted(times) if len(parts) > 1 else own)
-    return from_moments(moments, layout, group=group)
+            yield Moments.of(part.motion(i), layout.present_columns[part.present[i]])
+
+    return from_moments(_pooled(dataset, moments_of) or Moments.none(layout.dim), layout, group=group)
+
+
+def _pooled(dataset: ClipDataset, moments_of: Callable[[ClipDataset], Iterator[Moments]]) -> Moments | None:
+    """The moments of all clips; in a mix each data set counts as often as its weight has it drawn."""
+    parts = dataset.parts()
+    total = sum(weight for _, weight in parts)
+    pooled: Moments | None = None
+    for part, weight in parts:
+        own: Moments | None = None
+        for found in moments_of(part):
+            own = found if own is None else own.merge(found)
+        if own is not None:
+            if len(parts) > 1:
+                own = own.counted(weight / total * len(dataset) / len(part))
+            pooled = own if pooled is None else pooled.merge(own)
+    return pooled
 
 
 def from_moments(moments: Moments, layout: MotionLayout, *, group: bool = False) -> FeatureStats:
@@ -94,18 +178,12 @@ def from_moments(moments: Moments, layout: MotionLayout, *, group: bool = False)
     std, counted = moments.std, moments.count > 0
     if group:
         for name, _ in layout.fields:
-            field = counted & _columns_of(layout, name)
-            if field.any():
+            field = np.arange(layout.dim)[layout.slice(name)]
+            field = field[counted[field]]
+            if len(field):
                 std[field] = std[field].mean()
     std = np.where(counted, np.maximum(std, STD_FLOOR), 1.0)
     return FeatureStats(moments.mean.astype(np.float32), std.astype(np.float32), layout, frames)
-
-
-def _columns_of(layout: MotionLayout, name: str) -> NDArray[np.bool_]:
-    """Mask [D] of one field."""
-    mask = np.zeros(layout.dim, dtype=np.bool_)
-    mask[layout.slice(name)] = True
-    return mask
 
 
 _CONSTANT = 1e-6
@@ -115,35 +193,27 @@ _CONSTANT = 1e-6
 def frame_statistics(dataset: ClipDataset, modality: Modality, progress: bool = False) -> FrameStats:
     """Statistics of a modality's features over every clip of `dataset` that has them, in one pass.
 
-    In a mix each data set counts as often as its weight has it drawn, as in `statistics.compute`.
+    In a mix each data set counts as often as its weight has it drawn, as in `compute`.
     """
-    parts, member = dataset.parts(), modality.members[0]
-    total = sum(weight for _, weight in parts)
-    moments: Moments | None = None
-    for part, weight in parts:
-        own: Moments | None = None
+    member = modality.members[0]
+    widths: set[int] = set()
+
+    def moments_of(part: ClipDataset) -> Iterator[Moments]:
         heard = np.flatnonzero(part.has(member)).tolist()
-        for i in track(
-            in_order(part, member, clips=heard),
-            f"{modality.name} statistics",
-            total=len(heard),
-            disable=not progress,
-        ):
+        clips = in_order(part, member, clips=heard)
+        for i in track(clips, f"{modality.name} statistics", total=len(heard), disable=not progress):
             rows = part.array(i, member)
             if rows is None:
                 continue
-            found = Moments.of(rows)
-            if own is not None and len(own.mean) != len(found.mean):
+            widths.add(rows.shape[1])
+            if len(widths) > 1:
                 raise UserError(
-                    f"{part.where}: clip {part.ids[i]} has {len(found.mean)} {modality.name} features a "
-                    f"frame, others {len(own.mean)}; convert the data set again"
+                    f"{part.where}: clip {part.ids[i]} has {rows.shape[1]} {modality.name} features a "
+                    f"frame, others {min(widths - {rows.shape[1]})}; convert the data set again"
                 )
-            own = found if own is None else own.merge(found)
-        if own is None:
-            continue
-        if len(parts) > 1:
-            own = own.counted(weight / total * len(dataset) / len(part))
-        moments = own if moments is None else moments.merge(own)
+            yield Moments.of(rows)
+
+    moments = _pooled(dataset, moments_of)
     if moments is None:
         raise UserError(
             f"{dataset.where}: no clip of split '{dataset.split}' has {modality.name} features; convert a "

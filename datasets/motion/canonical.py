@@ -110,7 +110,7 @@ def turn(joints: NDArray[Float], angle: float) -> NDArray[Float]:
 
 def mirror(joints: NDArray[Float], skeleton: Skeleton) -> NDArray[Float]:
     """Mirror image of joints [..., N, 3]: left and right swapped, x negated."""
-    _check_joints(joints, skeleton)
+    skeleton.require_joints(joints)
     mirrored: NDArray[Float] = joints[..., skeleton.mirror, :] * np.array([-1, 1, 1], dtype=joints.dtype)
     return mirrored
 
@@ -176,7 +176,7 @@ def retarget(
     own); the root path is scaled by the ratio of leg lengths, measured in the first frame. A bone without
     length in the source keeps none, since it has no direction.
     """
-    _check_joints(joints, skeleton)
+    skeleton.require_joints(joints)
     lengths = np.linalg.norm(skeleton.offsets if offsets is None else offsets, axis=-1)
     # Joint-first in memory ([3, N, ..., T], time contiguous): four times faster, and h3d goes on like this.
     points = np.array(np.moveaxis(joints, (-1, -2), (0, 1)), dtype=np.float64, order="C")
@@ -188,10 +188,3 @@ def retarget(
     for joint, parent in enumerate(skeleton.parents[1:], start=1):
         np.add(points[:, parent], bones[:, joint - 1], out=points[:, joint])
     return np.moveaxis(points, (0, 1), (-1, -2))
-
-
-def _check_joints(joints: NDArray[np.floating], skeleton: Skeleton) -> None:
-    if joints.ndim < 2 or joints.shape[-2:] != (len(skeleton), 3):
-        raise UserError(
-            f"skeleton {skeleton.name} needs joints [..., {len(skeleton)}, 3], not {list(joints.shape)}"
-        )

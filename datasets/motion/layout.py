@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import FACE, HANDS, PRESENT_ALL, ClipMeta, Split, UserError
+from motionloom.datasets.schema import FACE, HANDS, PRESENT_ALL, ClipMeta, UserError
 
 Family = Literal["exact", "h3d", "raw"]
 Part = Literal["all", "bodyhand", "body", "hand", "face"]
@@ -92,34 +92,15 @@ class MotionLayout:
         layout = MotionLayout(name, skeleton, usual_fps, usual_family, fields)
         return replace(layout, fps=fps or layout.fps, family=family or layout.family)
 
-    def clip_meta(
-        self,
-        clip_id: str,
-        *,
-        source: str,
-        split: Split,
-        frames: int,
-        licence: str,
-        has_hands: bool = True,
-        has_face: bool = True,
-        mirror_of: str | None = None,
-        truth: dict[str, Any] | None = None,
-    ) -> ClipMeta:
-        """`meta.json` of a clip in this layout: what the layout says is filled in here, once."""
+    def clip_meta(self, clip_id: str, **facts: Any) -> ClipMeta:
+        """`meta.json` of a clip in this layout; `facts` are the fields that the layout does not know."""
         return ClipMeta(
             id=clip_id,
-            source=source,
-            split=split,
             layout=self.name,
             family=self.family,
             fps=self.fps,
             skeleton=self.skeleton_name,
-            frames=frames,
-            licence=licence,
-            has_hands=has_hands,
-            has_face=has_face,
-            mirror_of=mirror_of,
-            truth=truth,
+            **facts,
         )
 
     @cached_property

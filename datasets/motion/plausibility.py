@@ -98,24 +98,6 @@ class FigureMeasure:
     """How far the feet point to where the figure faces, -1 to 1: negative where left and right are
     swapped."""
 
-    @property
-    def is_person_size(self) -> bool:
-        """Whether a person can be so tall."""
-        return PERSON_METRES[0] <= self.height <= PERSON_METRES[1]
-
-    @property
-    def is_upright(self) -> bool:
-        return self.up[1] > UPRIGHT
-
-    @property
-    def is_upside_down(self) -> bool:
-        return self.up[1] < -UPRIGHT
-
-    @property
-    def is_on_floor(self) -> bool:
-        """Whether some joint is near the clip's floor most of the time."""
-        return self.above_floor <= FLOOR_METRES
-
 
 def measure(joints: NDArray[np.floating], fps: float) -> FigureMeasure:
     """Measure a clip of joints [T, N, 3], Y up, the first 22 those of the body skeleton."""
@@ -177,59 +159,58 @@ class PlausibilityStats:
     """Many clips together, in 24 bytes each."""
 
     def __init__(self) -> None:
-        self._height, self._up, self._floor = array("f"), array("f"), array("f")
-        self._above, self._forward, self._toes = array("f"), array("f"), array("f")
+        self._rows = array("f")
 
     def __len__(self) -> int:
-        return len(self._height)
+        return len(self._rows) // 6
 
     def add(self, clip: FigureMeasure) -> None:
-        self._height.append(clip.height)
-        self._up.append(clip.up[1])
-        self._floor.append(clip.floor)
-        self._above.append(clip.above_floor)
-        self._forward.append(float("nan") if clip.forward is None else clip.forward)
-        self._toes.append(clip.toes)
+        forward = float("nan") if clip.forward is None else clip.forward
+        self._rows.extend((clip.height, clip.up[1], clip.floor, clip.above_floor, forward, clip.toes))
+
+    def _columns(self) -> list[NDArray[np.float64]]:
+        """Height, upward part, floor, distance from it, way and toes of the clips, each [n]."""
+        return list(np.array(self._rows, dtype=np.float64).reshape(-1, 6).T)
 
     @property
     def height(self) -> float:
         """Median height of the figures in metres; NaN without any."""
-        return float(np.median(_values(self._height))) if len(self) else float("nan")
+        return float(np.median(self._columns()[0])) if len(self) else float("nan")
 
     @property
     def upright(self) -> float:
         """Share of the clips whose head is above the pelvis; NaN without any."""
-        return float(np.mean(_values(self._up) > UPRIGHT)) if len(self) else float("nan")
+        return float(np.mean(self._columns()[1] > UPRIGHT)) if len(self) else float("nan")
 
     @property
     def above_floor(self) -> float:
         """Median distance of a figure from the floor of its clip, metres; NaN without any."""
-        return float(np.median(_values(self._above))) if len(self) else float("nan")
+        return float(np.median(self._columns()[3])) if len(self) else float("nan")
 
     @property
     def walking(self) -> int:
         """Clips in which the figure goes somewhere."""
-        return int(np.isfinite(_values(self._forward)).sum())
+        return int(np.isfinite(self._columns()[4]).sum())
 
     @property
     def backwards(self) -> int:
         """Of these, clips in which it goes backwards."""
-        return int((_values(self._forward) < _BACKWARDS).sum())
+        return int((self._columns()[4] < _BACKWARDS).sum())
 
-    def oddities(self, *, least: float = ODD, floor_at_zero: bool = False) -> list[Oddity]:
-        """What more than the share `least` of the clips have, the most serious first.
+    def oddities(self, *, floor_at_zero: bool = False) -> list[Oddity]:
+        """What more than a few of the clips have, the most serious first.
 
         `floor_at_zero` for canonical motion, whose floor must be at height 0.
         """
         if not len(self):
             return []
-        height, up, above = _values(self._height), _values(self._up), _values(self._above)
+        height, up, floor, above, forward, toes = self._columns()
         small, tall = PERSON_METRES
         found: list[Oddity] = []
 
         def count(kind: Kind, odd: NDArray[np.bool_], text: str, of: int | None = None) -> None:
             number, total = int(odd.sum()), of or len(self)
-            if number > least * total:
+            if number > ODD * total:
                 share = f"{number} of {total} clips ({number / total:.0%})"
                 found.append(Oddity(kind, number, total, f"{share} {text}"))
 
@@ -250,7 +231,7 @@ class PlausibilityStats:
         upright = up > UPRIGHT
         standing = int(upright.sum())
         if standing:  # the others have no floor and face nowhere
-            floor = _values(self._floor) if floor_at_zero else np.zeros(len(self))
+            floor = floor if floor_at_zero else np.zeros(len(self))
             low = floor < -FLOOR_METRES
             count(
                 "floating",
@@ -266,19 +247,10 @@ class PlausibilityStats:
             )
             count(
                 "left and right",
-                upright & (_values(self._toes) < 0),
+                upright & (toes < 0),
                 "show feet that point backwards (left and right swapped?)",
                 standing,
             )
         if self.walking >= _LEAST_WALKS and self.backwards > MOST * self.walking:
-            count(
-                "backwards",
-                _values(self._forward) < _BACKWARDS,
-                "in which somebody walks go backwards",
-                self.walking,
-            )
+            count("backwards", forward < _BACKWARDS, "in which somebody walks go backwards", self.walking)
         return sorted(found, key=lambda oddity: not oddity.is_error)
-
-
-def _values(stored: array[float]) -> NDArray[np.float64]:
-    return np.array(stored, dtype=np.float64)

@@ -61,6 +61,19 @@ class Skeleton:
             out[joint] = out[parent] + self.offsets[joint]
         return out
 
+    def bones(self, joints: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Bones [N, 3] of joints [N, 3], parent to child; the root's is 0."""
+        out = np.zeros(joints.shape)
+        out[1:] = joints[1:] - joints[list(self.parents[1:])]
+        return out
+
+    def require_joints(self, joints: NDArray[np.floating]) -> None:
+        """`UserError` unless joints are [..., N, 3]."""
+        if joints.ndim < 2 or joints.shape[-2:] != (len(self), 3):
+            raise UserError(
+                f"skeleton {self.name} needs joints [..., {len(self)}, 3], not {list(joints.shape)}"
+            )
+
     def index(self, joint: str) -> int:
         try:
             return self.joints.index(joint)

@@ -16,7 +16,7 @@ import io
 import mmap
 import tarfile
 from collections import OrderedDict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import BinaryIO
 
 from motionloom.datasets.schema import ShardInfo, UserError
@@ -49,9 +49,6 @@ class MappedShards:
         else:
             self.maps.move_to_end(shard)
         return found, int(self._offsets[clip, column])
-
-    def prefetch(self, places: Sequence[tuple[int, int]], members: Collection[str]) -> None:
-        """Announce the (shard, clip) of a batch and the members it will read; here the kernel reads ahead."""
 
     def _map(self, shard: int) -> mmap.mmap:
         info = self._shards[shard]
@@ -95,11 +92,12 @@ class StreamedShards:
         self._load({shard})
         return self._held[shard][clip - self._first[shard]][name], 0
 
-    def prefetch(self, places: Sequence[tuple[int, int]], members: Collection[str]) -> None:
+    def prefetch(self, shards: set[int], members: Collection[str]) -> None:
+        """Read the shards of a batch, with the members it will ask for."""
         if not self._members.issuperset(members):
             self._members.update(members)
             self._held.clear()
-        self._load({shard for shard, _ in places})
+        self._load(shards)
 
     def _load(self, wanted: set[int]) -> None:
         for shard in sorted(wanted):

@@ -28,12 +28,6 @@ _PART = ".part"
 _LOCKS = ".locks"
 
 
-def default_folder() -> Path:
-    """`motionloom/shards` in the user's cache folder."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "motionloom" / "shards"
-
-
 class CacheConfig(Config):
     """Where shards from a server are kept on this machine. Folders are read in place, without a cache."""
 
@@ -51,7 +45,8 @@ class FileCache:
     """Files by name. Nothing is created before the first one is asked for."""
 
     def __init__(self, config: CacheConfig) -> None:
-        self.folder = Path(config.folder).expanduser() if config.folder else default_folder()
+        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        self.folder = Path(config.folder or Path(cache, "motionloom", "shards")).expanduser()
         self.limit = config.limit
 
     def find(self, name: str) -> BinaryIO | None:
@@ -107,7 +102,9 @@ class FileCache:
                 if not entry.is_file() or not _OURS.fullmatch(whole):
                     continue
                 if part:
-                    self._remove_abandoned(entry.name)
+                    with self._lock(whole, wait=False) as mine:
+                        if mine:
+                            (self.folder / entry.name).unlink(missing_ok=True)
                 try:
                     status = entry.stat()
                 except FileNotFoundError:  # another process was faster
@@ -120,11 +117,6 @@ class FileCache:
                 break
             (self.folder / name).unlink(missing_ok=True)
             used -= length
-
-    def _remove_abandoned(self, part: str) -> None:
-        with self._lock(part.removeprefix(".").removesuffix(_PART), wait=False) as mine:
-            if mine:
-                (self.folder / part).unlink(missing_ok=True)
 
     @contextmanager
     def _lock(self, name: str, *, wait: bool = True) -> Iterator[bool]:

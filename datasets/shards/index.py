@@ -26,19 +26,18 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
 
-from motionloom.datasets.base.files import write_with
+from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.npz import NpzFile, read_npy_header
 from motionloom.datasets.schema import INDEX_FILE, PRESENT_ALL, Config, Dropped, ShardInfo, Split, UserError
 from motionloom.datasets.shards.sample import MEMBERS
-from motionloom.datasets.shards.tar import TarClip, scan_tar
+from motionloom.datasets.shards.tar import scan_tar
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "frames": (np.int32, 1),
     "data": (np.int64, 1),
     "itemsize": (np.uint8, 1),
-    "present": (np.uint8, 1),
+    "held": (np.uint8, 1),
     "offsets": (np.int64, 2),
     "sizes": (np.uint32, 2),
     "id_ends": (np.int64, 1),
@@ -46,14 +45,10 @@ _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
 }
 _MOST_ID_BYTES = 4096
 """Of one clip's id."""
-_STORED_AS = {"present": "held"}
-"""Names that files have kept since the first data sets."""
 
 
 class ClipEntry(Config):
     """One clip of a shard: member name -> (offset, size), and where its motion values start."""
-
-    model_config = ConfigDict(validate_by_name=True, validate_by_alias=True, serialize_by_alias=True)
 
     key: str
     id: str
@@ -61,7 +56,7 @@ class ClipEntry(Config):
     """The item it was made of, as reports name it."""
     made_from: str
     """Digest of all that its bytes depend on."""
-    present: int = Field(alias="held")
+    held: int
     """Bits of `ClipMeta.present`."""
     frames: int
     motion_data: int
@@ -73,7 +68,7 @@ class Written(NamedTuple):
     """What the writer knows of a clip and its tar does not."""
 
     id: str
-    present: int
+    held: int
     source: str
     made_from: str
 
@@ -87,24 +82,16 @@ class ShardIndex(Config):
     dropped: list[Dropped]
 
 
-def shard_stem(name: str, split: Split, number: int) -> str:
-    """File name of a shard without its ending."""
-    return f"{name}-{split}-{number:06d}"
-
-
 def index_path(tar: Path) -> Path:
     """The JSON index beside a tar."""
     return tar.with_name(tar.name.removesuffix(".tar") + ".index.json")
 
 
-def clip_entries(
-    path: Path, written: list[Written], *, clips: list[TarClip] | None = None
-) -> list[ClipEntry]:
+def clip_entries(path: Path, written: list[Written]) -> list[ClipEntry]:
     """Index rows of a tar as it lies on the disk; `written` says the rest of its clips, in order."""
-    clips = scan_tar(path) if clips is None else clips
     entries = []
     with path.open("rb") as file:
-        for clip, about in zip(clips, written, strict=True):
+        for clip, about in zip(scan_tar(path), written, strict=True):
             start, size = clip.members["motion.npy"]
             file.seek(start)
             header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'", size)
@@ -128,7 +115,7 @@ class SplitIndex:
     frames: NDArray[np.int32]
     data: NDArray[np.int64]
     itemsize: NDArray[np.uint8]
-    present: NDArray[np.uint8]
+    held: NDArray[np.uint8]
     offsets: NDArray[np.int64]
     sizes: NDArray[np.uint32]
     id_ends: NDArray[np.int64]
@@ -158,7 +145,7 @@ class SplitIndex:
                 "frames": [entry.frames for entry in shard.clips],
                 "data": [entry.motion_data for entry in shard.clips],
                 "itemsize": [entry.motion_itemsize for entry in shard.clips],
-                "present": [entry.present for entry in shard.clips],
+                "held": [entry.held for entry in shard.clips],
                 "offsets": places[..., 0],
                 "sizes": places[..., 1],
                 "id_ends": ends,
@@ -177,14 +164,9 @@ class SplitIndex:
 
 def save_index(root: Path, splits: dict[Split, SplitIndex]) -> None:
     """Write `index.npz` atomically; zip entries carry a fixed date, so equal content is equal bytes."""
-    arrays = {
-        _stored_name(split, name): getattr(index, name) for split, index in splits.items() for name in _ARRAYS
-    }
-    write_with(root / INDEX_FILE, lambda file: np.savez(file, allow_pickle=False, **arrays))
-
-
-def _stored_name(split: Split, name: str) -> str:
-    return f"{split}.{_STORED_AS.get(name, name)}"
+    arrays = {f"{split}.{name}": getattr(index, name) for split, index in splits.items() for name in _ARRAYS}
+    with atomic_file(root / INDEX_FILE) as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def load_index(root: Path, split: Split, shards: list[ShardInfo]) -> SplitIndex:
@@ -208,7 +190,7 @@ def read_index(file: BinaryIO, where: str, split: Split, shards: list[ShardInfo]
         with NpzFile(file, where) as stored:
             limits = {"id_bytes": _MOST_ID_BYTES, "offsets": 8 * len(MEMBERS), "sizes": 4 * len(MEMBERS)}
             arrays = {
-                name: stored.array(_stored_name(split, name), limit=clips * limits.get(name, 8) + 4096)
+                name: stored.array(f"{split}.{name}", limit=clips * limits.get(name, 8) + 4096)
                 for name in _ARRAYS
             }
     except UserError as error:
@@ -232,9 +214,8 @@ def _index_problem(index: SplitIndex, shards: list[ShardInfo]) -> str | None:
     for name, (kind, rank) in _ARRAYS.items():
         values = getattr(index, name)
         if values.dtype != kind or values.ndim != rank or (name != "id_bytes" and len(values) != count):
-            found = f"array '{_STORED_AS.get(name, name)}' is {values.dtype} {list(values.shape)}"
-            return f"{found}, the manifest has {count} clips"
-    if (index.present > PRESENT_ALL).any():
+            return f"array '{name}' is {values.dtype} {list(values.shape)}, the manifest has {count} clips"
+    if (index.held > PRESENT_ALL).any():
         return f"array 'held' has values above {PRESENT_ALL}"
     if index.offsets.shape[1] != len(MEMBERS) or index.sizes.shape[1] != len(MEMBERS):
         return f"offsets are not for {len(MEMBERS)} members"

@@ -66,14 +66,14 @@ def grouped(dropped: Iterable[Dropped]) -> list[Group]:
     return [Group(kind, tuple(members)) for kind, members in ranked]
 
 
-def grouped_notes(notes: Sequence[str], *, least: int = 4) -> list[str]:
-    """Notes in their order; from `least` of one kind on, one line with their number and the first of them."""
+def grouped_notes(notes: Sequence[str]) -> list[str]:
+    """Notes in their order; four or more of one kind are one line with their number and the first of them."""
     kinds: dict[str, list[str]] = defaultdict(list)
     for note in notes:
         kinds[kind_of_reason(note)].append(note)
     out: list[str] = []
     for same in kinds.values():
-        out += same if len(same) < least else [f"{same[0]} (and {len(same) - 1} more like it)"]
+        out += same if len(same) < 4 else [f"{same[0]} (and {len(same) - 1} more like it)"]
     return out
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.layout import MotionLayout, require_layout
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import (
     INDEX_FILE,
     MANIFEST_FILE,
@@ -100,21 +100,23 @@ class ShardDataset:
                 self._index = read_index(file, store.where(INDEX_FILE), split, self._shards)
         except MissingFileError as error:
             raise UserError(f"{error}; convert the dataset again") from None
-        self._access = self._make_access()
+        self._access: Access
+        if reading.mode == "streamed":
+            self._access = StreamedShards(
+                store, self._shards, self._index, self._first, reading.shards_per_group
+            )
+        else:
+            room = 0 if isinstance(store, LocalStore) else reading.cache.limit
+            self._access = MappedShards(store, self._shards, self._index, room)
 
     @staticmethod
     def open(
-        root: Path | str,
-        split: str,
-        *,
-        expect: MotionLayout | None = None,
-        verify: bool = False,
-        reading: Reading | None = None,
+        root: Path | str, split: str, *, verify: bool = False, reading: Reading | None = None
     ) -> ShardDataset:
         """Open one split of a folder or URL (`file:`, `http:`, `https:`, `s3:`).
 
-        `expect` refuses another layout, family or fps. In a folder every shard's size is checked and, with
-        `verify`, its sha256; on a server a shard is checked when it is first read (`reading` says how).
+        In a folder every shard's size is checked and, with `verify`, its sha256; on a server a shard is
+        checked when it is first read (`reading` says how).
         """
         reading = reading or Reading()
         known = next((name for name in SPLITS if name == split), None)
@@ -122,8 +124,6 @@ class ShardDataset:
             raise UserError(f"no split '{split}'; known: {', '.join(SPLITS)}")
         store = open_store(root, reading.cache)
         manifest, digest = read_manifest(store)
-        if expect is not None:
-            require_layout(manifest_layout(manifest), expect, store.place)
         shards = [shard for shard in manifest.shards if shard.split == known]
         if not shards:
             raise UserError(f"{store.place}: split '{split}' has no clips")
@@ -143,15 +143,13 @@ class ShardDataset:
 
     @property
     def present(self) -> NDArray[np.uint8]:
-        """What every clip holds beside its body, bits of `ClipMeta.present`, [n]."""
-        return self._index.present
+        return self._index.held
 
     @cached_property
     def ids(self) -> list[str]:
         return [self._index.id(i) for i in range(len(self))]
 
     def has(self, member: str) -> NDArray[np.bool_]:
-        """Which clips hold a member such as `texts.json`, [n], without reading them."""
         return self._index.sizes[:, MEMBERS.index(member)] > 0
 
     def motion(self, i: int) -> NDArray[np.float32]:
@@ -174,12 +172,10 @@ class ShardDataset:
         return self._captions(i, "face_texts.json")
 
     def array(self, i: int, member: str) -> NDArray[np.float32] | None:
-        """A modality's features of clip `i`, [L, E], if it has any."""
         raw = self._member(i, member)
         return npy_from_bytes(raw, self._where(i, member)).astype(np.float32) if raw else None
 
     def wav(self, i: int) -> tuple[NDArray[np.float32], int] | None:
-        """Sound of clip `i`: (mono samples [S], rate in Hz), if it has any."""
         raw = self._member(i, "audio.flac")
         if not raw:
             return None
@@ -196,8 +192,8 @@ class ShardDataset:
         return captions_from_json(raw, self._where(i, member)) if raw else []
 
     def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
-        if self._ahead:
-            self._access.prefetch([(self._shard_of(i), i) for i in clips], members)
+        if isinstance(self._access, StreamedShards):
+            self._access.prefetch({self._shard_of(i) for i in clips}, members)
 
     def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
         """One source: `clips` (all when None), with their shards if the order is the streamed one."""
@@ -214,16 +210,6 @@ class ShardDataset:
 
     def parts(self) -> list[tuple[ClipDataset, float]]:
         return [(self, 1.0)]
-
-    def _make_access(self) -> Access:
-        reading, shards, index = self.reading, self._shards, self._index
-        self._ahead = True
-        if reading.mode == "streamed":
-            group = reading.shards_per_group
-            return StreamedShards(self._store, shards, index, self._first, group)
-        self._ahead = False
-        local = isinstance(self._store, LocalStore)
-        return MappedShards(self._store, shards, index, room=0 if local else reading.cache.limit)
 
     def _member(self, i: int, member: str) -> bytes:
         column = MEMBERS.index(member)

@@ -128,15 +128,16 @@ class RemoteStore:
 
     def open_index(self, digest: str) -> BinaryIO:
         """The manifest holds the shards' checksums, so its own decides the index's content."""
-        return self.cache.get(f"{digest}.index.npz", 0, lambda path: self._download(INDEX_FILE, path))
+        url = self.where(INDEX_FILE)
+
+        def fetch(path: Path) -> None:
+            persist(url, lambda: self._system().get_file(url, str(path)))
+
+        return self.cache.get(f"{digest}.index.npz", 0, fetch)
 
     def open_shard(self, shard: ShardInfo) -> BinaryIO:
         """A shard in the cache was checked against the manifest's sha256 when it arrived."""
         return self.cache.get(f"{shard.sha256}.tar", shard.bytes, lambda path: self._fetch(shard, path))
-
-    def _download(self, name: str, path: Path) -> None:
-        url = self.where(name)
-        persist(url, lambda: self._system().get_file(url, str(path)))
 
     def _fetch(self, shard: ShardInfo, path: Path) -> None:
         url = self.where(shard.name)
@@ -227,7 +228,9 @@ def persist(what: str, action: Callable[[], T]) -> T:
         try:
             return action()
         except Exception as error:
-            if isinstance(error, UserError) or not _from_outside(error):
+            # Only the network's and the disk's errors may pass, no mistake in a program.
+            library = type(error).__module__.partition(".")[0]
+            if isinstance(error, UserError) or not (isinstance(error, OSError) or library in _LIBRARIES):
                 raise
             refusal = _refusal(error)
             if isinstance(error, FileNotFoundError) or refusal == _ABSENT:
@@ -237,11 +240,6 @@ def persist(what: str, action: Callable[[], T]) -> T:
             failure = error
     reason = " ".join(str(failure).split()) or type(failure).__name__
     raise UserError(f"{what}: {reason[:300]} (tried {ATTEMPTS} times)") from None
-
-
-def _from_outside(error: Exception) -> bool:
-    """Whether an error is the network's or the disk's, not a mistake in a program."""
-    return isinstance(error, OSError) or type(error).__module__.partition(".")[0] in _LIBRARIES
 
 
 def _refusal(error: Exception) -> str | None:

@@ -18,14 +18,7 @@ from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SPLITS, Dropped, MotionType, ShardInfo, Split, UserError
-from motionloom.datasets.shards.index import (
-    ClipEntry,
-    ShardIndex,
-    Written,
-    clip_entries,
-    index_path,
-    shard_stem,
-)
+from motionloom.datasets.shards.index import ClipEntry, ShardIndex, Written, clip_entries, index_path
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import DropClip, Sample, encode_sample
 
@@ -91,7 +84,7 @@ def plan_shards(
                 for i in order[first : first + how.clips_per_shard]
             )
             fingerprint = sha256_of_json([facts.name, split, number, [item.made_from for item in chosen]])
-            path = out / f"{shard_stem(facts.name, split, number)}.tar"
+            path = out / f"{facts.name}-{split}-{number:06d}.tar"
             tasks.append(
                 ShardTask(
                     path, split, number, chosen, facts.layout, facts.motion_type, how.strict, fingerprint
@@ -149,7 +142,7 @@ def _kept(tar: Path, made_from: str) -> Encoded:
             for name, (start, size) in clip.members.items():
                 file.seek(start)
                 members[name] = file.read(size)
-            out.append((clip.id, clip.present, members))
+            out.append((clip.id, clip.held, members))
     return out
 
 

@@ -18,7 +18,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -62,20 +62,15 @@ def build_text_cache(
     folder, captions = Path(folder), set(captions)
     workers = workers if device == "cpu" else 1
     encoder = load_text_encoder(encoder_name, device=device)
-    _build(folder, captions, encoder, encoder_name, workers, progress)
+    build_with_encoder(folder, captions, encoder, progress, encoder_name, workers)
     if similarity in (None, encoder_name):
         shutil.rmtree(folder / SIMILARITY, ignore_errors=True)
     else:
         other = load_sentences(similarity, device=device)
-        _build(folder / SIMILARITY, captions, other, similarity, workers, progress, load_sentences)
+        build_with_encoder(
+            folder / SIMILARITY, captions, other, progress, similarity, workers, load_sentences
+        )
     return TextCache.open(folder)
-
-
-def build_with_encoder(
-    folder: Path, captions: Iterable[str], encoder: TextEncoder, progress: bool = True
-) -> TextCache:
-    """The same in this process, with an encoder that is loaded already."""
-    return _build(folder, captions, encoder, "", 1, progress)
 
 
 class SentencesOnly:
@@ -106,40 +101,16 @@ class _Part:
     captions: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _EncodeWith:
-    """Encodes parts with an encoder at hand."""
-
-    encoder: TextEncoder
-
-    def __call__(self, part: _Part) -> None:
-        _encode_part(part, self.encoder)
-
-
-@dataclass(frozen=True)
-class _EncodeByName:
-    """Encodes parts in another process: the encoder is loaded there, once."""
-
-    load: Load
-    spec: str
-    expected: str
-
-    def __call__(self, part: _Part) -> None:
-        encoder = _loaded(self.load, self.spec)
-        if encoder.name != self.expected:
-            raise UserError(f"text encoder '{self.spec}' changed while captions were encoded; run again")
-        _encode_part(part, encoder)
-
-
-def _build(
+def build_with_encoder(
     folder: Path,
     captions: Iterable[str],
     encoder: TextEncoder,
-    spec: str,
-    workers: int,
-    progress: bool,
+    progress: bool = True,
+    spec: str = "",
+    workers: int = 1,
     load: Load = load_text_encoder,
 ) -> TextCache:
+    """The same with an encoder that is loaded already; further `workers` get theirs by `load(spec)`."""
     folder.mkdir(parents=True, exist_ok=True)
     wanted = {key_of(text): text for text in captions}
     if not wanted:
@@ -155,7 +126,9 @@ def _build(
     parts = _parts(new, wanted, place, encoder.name)
     missing = [part for part in parts if not _finished(part, encoder.dim)]
     workers = min(workers, len(missing) // PARTS_A_WORKER)
-    encode = _EncodeByName(load, spec, encoder.name) if workers > 1 else _EncodeWith(encoder)
+    encode: Callable[[_Part], None] = partial(_encode_part, encoder=encoder)
+    if workers > 1:
+        encode = partial(_encode_elsewhere, load, spec, encoder.name)
     with Workers(workers) as pool:
         done = pool.run(encode, missing)
         for _ in track(done, "encoding captions", total=len(missing), disable=not progress):
@@ -164,6 +137,14 @@ def _build(
     _merge(folder, texts, new, parts, old, encoder)
     shutil.rmtree(place)
     return TextCache.open(folder)
+
+
+def _encode_elsewhere(load: Load, spec: str, expected: str, part: _Part) -> None:
+    """Encode a part in another process: the encoder is loaded there, once."""
+    encoder = _loaded(load, spec)
+    if encoder.name != expected:
+        raise UserError(f"text encoder '{spec}' changed while captions were encoded; run again")
+    _encode_part(part, encoder)
 
 
 @lru_cache(maxsize=1)

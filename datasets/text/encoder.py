@@ -10,21 +10,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors.torch import load_file
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.text.minilm import MiniLm
 
 if TYPE_CHECKING:
     from sentence_transformers import SentenceTransformer
@@ -55,20 +56,79 @@ class TextEncoder(Protocol):
         """Encode a batch. A caption's result does not depend on its neighbours beyond float noise."""
 
 
+_CLIP_TYPES = ("clip", "clip_text_model")
+
+_PREFIX = "0.model."
+"""Prefix of the weights' names in sentence-transformers, which the digest is made of."""
+
+
 class MiniLmEncoder:
-    """MiniLM as it comes with the installation, without the libraries of other encoders (`minilm.py`)."""
+    """MiniLM from the folder of the model, as it comes with the installation.
+
+    The libraries of other encoders take several seconds on one core to import, for a network of six layers;
+    so it stands here in full: BERT (Devlin et al. 2019, section 3) and the mean over the caption's tokens.
+    Numbers are those of sentence-transformers, within the noise of float32.
+    """
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
-        self._model = MiniLm(folder, device)
-        self.dim = self._model.dim
+        try:
+            facts = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+            longest = json.loads((folder / "sentence_bert_config.json").read_text(encoding="utf-8"))
+            self._heads, self._layers = int(facts["num_attention_heads"]), int(facts["num_hidden_layers"])
+            self.dim, self._eps = int(facts["hidden_size"]), float(facts["layer_norm_eps"])
+            weights = load_file(folder / "model.safetensors")
+            self._tokenizer = _tokenizer(folder, int(longest["max_seq_length"]))
+        except Exception as error:  # a missing file, no JSON, no weights: each library raises its own kind
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise UserError(f"{folder}: not a readable text model: {reason}") from error
+        self._weights = {name: x.to(device) for name, x in weights.items() if x.is_floating_point()}
+        self._device = device
 
     @cached_property
     def name(self) -> str:
         """Name of the model with a digest of its weights, computed on first use."""
-        return f"minilm:{self._model.digest}"
+        return f"minilm:{_weights_digest({_PREFIX + name: value for name, value in self._weights.items()})}"
 
+    @torch.inference_mode()
     def encode(self, captions: Sequence[str]) -> EncodedText:
-        return _pack(*self._model(captions))
+        read = self._tokenizer.encode_batch(list(captions))
+        numbers = torch.tensor([row.ids for row in read]).to(self._device)
+        mask = torch.tensor([row.attention_mask for row in read]).to(self._device)
+        states = self._states(numbers, mask.bool())
+        weight = mask[..., None].float()
+        mean = (states * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-9)
+        return _pack(F.normalize(mean, dim=-1), states, mask)
+
+    def _states(self, numbers: Tensor, mask: Tensor) -> Tensor:
+        """Last hidden states [B, S, E] of token numbers [B, S]."""
+        words, kinds, places = (
+            self._weights[f"embeddings.{name}_embeddings.weight"]
+            for name in ("word", "token_type", "position")
+        )
+        x = words[numbers] + kinds[0] + places[: numbers.shape[1]]
+        x = self._norm("embeddings", x)
+        seen = None if bool(mask.all()) else mask[:, None, None, :].expand(-1, -1, mask.shape[1], -1)
+        for layer in range(self._layers):
+            at = f"encoder.layer.{layer}"
+            q, k, v = (self._heads_of(f"{at}.attention.self.{name}", x) for name in ("query", "key", "value"))
+            heads = F.scaled_dot_product_attention(q, k, v, attn_mask=seen)
+            attended = heads.transpose(1, 2).reshape(x.shape)
+            attended = self._linear(f"{at}.attention.output.dense", attended)
+            x = self._norm(f"{at}.attention.output", attended + x)
+            hidden = F.gelu(self._linear(f"{at}.intermediate.dense", x))
+            x = self._norm(f"{at}.output", self._linear(f"{at}.output.dense", hidden) + x)
+        return x
+
+    def _heads_of(self, name: str, x: Tensor) -> Tensor:
+        """One projection [B, S, E], split into heads [B, H, S, E / H]."""
+        return self._linear(name, x).view(*x.shape[:2], self._heads, -1).transpose(1, 2)
+
+    def _linear(self, name: str, x: Tensor) -> Tensor:
+        return F.linear(x, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
+
+    def _norm(self, name: str, x: Tensor) -> Tensor:
+        weight, bias = (self._weights[f"{name}.LayerNorm.{part}"] for part in ("weight", "bias"))
+        return F.layer_norm(x, (self.dim,), weight, bias, self._eps)
 
 
 class SentenceEncoder:
@@ -76,7 +136,7 @@ class SentenceEncoder:
 
     def __init__(self, spec: str, model: SentenceTransformer) -> None:
         self._model = model.eval()
-        self.name = f"{spec}:{_weights_digest(model)}"
+        self.name = f"{spec}:{_weights_digest(model.state_dict())}"
         self.dim = int(model.get_embedding_dimension() or 0)
 
     @torch.inference_mode()
@@ -99,7 +159,7 @@ class ClipEncoder:
     ) -> None:
         self._model = model.eval()  # type: ignore[no-untyped-call]
         self._tokenizer = tokenizer
-        self.name = f"{spec}:{_weights_digest(model)}"
+        self.name = f"{spec}:{_weights_digest(model.state_dict())}"
         self.dim = int(model.config.hidden_size)
 
     @torch.inference_mode()
@@ -121,17 +181,16 @@ def load_text_encoder(spec: str, *, device: str = "cpu") -> MiniLmEncoder | Sent
     if spec == "minilm":
         return MiniLmEncoder(_minilm_folder(), device)
     folder = Path(spec).expanduser()
-    if folder.is_dir():
-        if (folder / "modules.json").exists():
-            return SentenceEncoder(folder.name, _sentence_model(folder, device=device, local=True))
-        kind = _model_type(folder)
-        if kind in ("clip", "clip_text_model"):
-            return ClipEncoder(folder.name, *_clip_model(folder, device=device, local=True))
-        return SentenceEncoder(folder.name, _sentence_model(folder, device=device, local=True))
-    require_hub_name(spec)
-    if "clip" in spec.lower() and not spec.startswith("sentence-transformers/"):
-        return ClipEncoder(spec, *_clip_model(spec, device=device, local=False))
-    return SentenceEncoder(spec, _sentence_model(spec, device=device, local=False))
+    local = folder.is_dir()
+    if local:
+        is_clip = not (folder / "modules.json").exists() and _model_type(folder) in _CLIP_TYPES
+    else:
+        require_hub_name(spec)
+        is_clip = "clip" in spec.lower() and not spec.startswith("sentence-transformers/")
+    where, name = (folder, folder.name) if local else (spec, spec)
+    if is_clip:
+        return ClipEncoder(name, *_clip_model(where, device=device, local=local))
+    return SentenceEncoder(name, _sentence_model(where, device=device, local=local))
 
 
 def _minilm_folder() -> Path:
@@ -158,17 +217,14 @@ def _model_type(folder: Path) -> str:
 def _sentence_model(where: Path | str, *, device: str, local: bool) -> SentenceTransformer:
     from sentence_transformers import SentenceTransformer
 
-    try:
-        with _no_progress_bars():
-            return SentenceTransformer(
-                str(where),
-                device=device,
-                local_files_only=local or hub_is_away(),
-                trust_remote_code=False,
-                model_kwargs={"use_safetensors": True},
-            )
-    except Exception as error:  # every library below raises its own kind for a bad folder or no network
-        raise _not_loadable(where, local, error) from error
+    with _loading(where, local):
+        return SentenceTransformer(
+            str(where),
+            device=device,
+            local_files_only=local or hub_is_away(),
+            trust_remote_code=False,
+            model_kwargs={"use_safetensors": True},
+        )
 
 
 def _clip_model(
@@ -177,45 +233,40 @@ def _clip_model(
     from transformers import AutoTokenizer, CLIPTextModelWithProjection
 
     here = local or hub_is_away()
-    try:
-        with _no_progress_bars():
-            model = CLIPTextModelWithProjection.from_pretrained(
-                str(where), local_files_only=here, use_safetensors=True
-            )
+    with _loading(where, local):
+        model = CLIPTextModelWithProjection.from_pretrained(
+            str(where), local_files_only=here, use_safetensors=True
+        )
         tokenizer = AutoTokenizer.from_pretrained(str(where), local_files_only=here, trust_remote_code=False)
-    except Exception as error:  # as above
-        raise _not_loadable(where, local, error) from error
     nn.Module.to(model, device)
     return model, tokenizer
 
 
 @contextmanager
-def _no_progress_bars() -> Iterator[None]:
-    """The library draws a bar for every model it loads, even one that takes 50 ms."""
+def _loading(where: Path | str, local: bool) -> Iterator[None]:
+    """No bar, which the library draws even for 50 ms; what it raises becomes a sentence."""
     from transformers.utils import logging
 
     shown = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()  # type: ignore[no-untyped-call]
     try:
         yield
+    except Exception as error:  # every library below raises its own kind for a bad folder or no network
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        if local:
+            raise UserError(f"{where}: not a readable text model: {reason}") from error
+        raise UserError(
+            f"text encoder '{where}': no such folder, and the hub does not give it ({reason}); "
+            f"download the model and name its folder, or use 'minilm'"
+        ) from error
     finally:
         if shown:
             logging.enable_progress_bar()  # type: ignore[no-untyped-call]
 
 
-def _not_loadable(where: Path | str, local: bool, error: Exception) -> UserError:
-    reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-    if local:
-        return UserError(f"{where}: not a readable text model: {reason}")
-    return UserError(
-        f"text encoder '{where}': no such folder, and the hub does not give it ({reason}); "
-        f"download the model and name its folder, or use 'minilm'"
-    )
-
-
 def _pack(sentence: Tensor, tokens: Tensor, mask: Tensor) -> EncodedText:
     keep = mask.bool()
-    sentence = nn.functional.normalize(sentence.float(), dim=-1)
+    sentence = F.normalize(sentence.float(), dim=-1)
     tokens = tokens.float() * keep[..., None]
     return EncodedText(sentence.cpu().numpy(), tokens.cpu().numpy(), keep.cpu().numpy())
 
@@ -224,10 +275,20 @@ def _to(value: object, device: torch.device) -> object:
     return value.to(device) if isinstance(value, Tensor) else value
 
 
-def _weights_digest(model: nn.Module) -> str:
+def _tokenizer(folder: Path, longest: int) -> Any:
+    """The tokenizer's file, cutting at the model's length and padding to the longest of a batch."""
+    from tokenizers import Tokenizer
+
+    tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
+    tokenizer.enable_truncation(longest)
+    tokenizer.enable_padding(pad_id=tokenizer.token_to_id("[PAD]"), pad_token="[PAD]")
+    return tokenizer
+
+
+def _weights_digest(weights: Mapping[str, Tensor]) -> str:
     """Twelve hex digits of the weights' sha256: other weights of the same name do not share a cache."""
     digest = hashlib.sha256()
-    for name, value in sorted(model.state_dict().items()):
+    for name, value in sorted(weights.items()):
         digest.update(name.encode())
-        digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
+        digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()[:12]

@@ -25,7 +25,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from motionloom.datasets.base.randomness import uniform
-from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import Config, UserError

@@ -3,14 +3,9 @@
 Choices:
 - Metres are smpl_trans / smpl_scaling. The floor of the source is anywhere: like every other source, a clip
   is moved to the canonical place (floor 0, first root above the origin, first heading +Z).
-- `body133` and `h3d263` are made from the joints of the SMPL parameters. `smpl75` keeps the parameters: the
-  root's orientation and translation are turned and moved so that forward kinematics of the stored columns
-  gives just those canonical joints; rotations are resampled on the sphere and stored as the shortest
-  axis-angle (at most pi).
+- `smpl75` keeps the parameters, turned and moved to that place (`common/features.py`).
 - Audio features are made once for a whole piece of music and cut to the motion; row 0 belongs to frame 0.
-  Beats and loudness are then the piece's, not the cut's. Many sequences share a piece, so each worker keeps
-  the last ones.
-- Music is the condition, so clips have no captions unless `caption_genre` asks for one.
+  Beats and loudness are then the piece's, not the cut's.
 """
 
 from __future__ import annotations
@@ -36,11 +31,16 @@ from motionloom.datasets.convert.aistpp.plan import (
     plan_aistpp,
 )
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
-from motionloom.datasets.convert.common.features import body_of, features_of, require_human
+from motionloom.datasets.convert.common.features import (
+    SMPL_JOINTS,
+    body_of,
+    canonical_smpl75,
+    features_of,
+    require_human,
+)
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.smpl75 import SMPL_JOINTS, canonical_smpl75
 from motionloom.datasets.motion.body.smpl import smpl_joints
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, UserError
@@ -113,7 +113,11 @@ class Aistpp(Converter[AistppConfig, AistClip]):
         else:
             motion = features_of(joints, FPS, layout)
         rows, wav = self._music(clip.sound, len(motion)) if clip.sound is not None else (None, None)
-        texts = [_genre_caption(clip.id)] if self.config.caption_genre else []
+        texts = []
+        if self.config.caption_genre:
+            genre = genre_of(clip.id)
+            text = f"a dancer performs {GENRES.get(genre, f'{genre} dance')}"
+            texts.append(Caption(text=text, source="genre"))
         meta = self.meta(clip, motion, licence=clip.licence).model_copy(update={"song": music_of(clip.id)})
         return Sample(meta=meta, motion=motion, texts=texts, audio=rows, wav=wav)
 
@@ -163,8 +167,3 @@ def piece_of_music(
         if shared is not None:
             shared.setflags(write=False)  # every clip of the piece gets the same array
     return features, kept
-
-
-def _genre_caption(sequence: str) -> Caption:
-    genre = genre_of(sequence)
-    return Caption(text=f"a dancer performs {GENRES.get(genre, f'{genre} dance')}", source="genre")

@@ -23,6 +23,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.convert.common.arrays import check_values
 from motionloom.datasets.schema import UserError
 
 POSE_WIDTH = 72
@@ -86,20 +87,16 @@ def read_aist_motion(path: Path, name: str | None = None) -> AistMotion:
     factor = float(scaling.reshape(-1)[0])
     if not np.isfinite(factor) or factor <= 0:
         raise UserError(f"{name}: smpl_scaling is {factor:g}; it must be a positive number")
-    _check_range(name, "smpl_poses", poses, MAX_RADIANS, "rad")
-    _check_range(name, "smpl_trans", trans / np.float64(factor), MAX_METRES, "m")
+    check_values(poses, MAX_RADIANS, f"{name}: smpl_poses")
+    check_values(trans / factor, MAX_METRES, f"{name}: smpl_trans")
     return AistMotion(poses.astype(np.float32), trans.astype(np.float32), factor)
 
 
-def _array(name: str, data: dict[str, object], key: str, width: int) -> NDArray[np.floating]:
+def _array(name: str, data: dict[str, object], key: str, width: int) -> NDArray[np.float64]:
     values = _values(name, data, key)
     if values.ndim != 2 or values.shape[1] != width or not len(values):
         raise UserError(f"{name}: {key} is {list(values.shape)}, not [T, {width}]")
-    bad = ~np.isfinite(values)
-    if bad.any():
-        frame, column = np.argwhere(bad)[0]
-        raise UserError(f"{name}: NaN or infinity in {key} at frame {frame}, column {column}")
-    return values
+    return values.astype(np.float64)
 
 
 def _values(name: str, data: dict[str, object], key: str) -> NDArray[np.floating]:
@@ -111,13 +108,6 @@ def _values(name: str, data: dict[str, object], key: str) -> NDArray[np.floating
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
         raise UserError(f"{name}: {key} is not an array of numbers")
     return value
-
-
-def _check_range(name: str, key: str, values: NDArray[np.floating], limit: float, unit: str) -> None:
-    far = np.abs(values) > limit
-    if far.any():
-        frame, column = np.argwhere(far)[0]
-        raise UserError(f"{name}: {key} at frame {frame}, column {column} is beyond {limit:g} {unit}")
 
 
 def load_aist_pickle(path: Path, name: str | None = None) -> dict[str, object]:

@@ -22,7 +22,6 @@ from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.splits import hash_split, join_splits, read_ids
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
 
 _SUFFIXES = (".json", ".pkl")
@@ -76,7 +75,6 @@ def read_lists(config: AistppConfig) -> SequenceLists:
 
 
 FPS = 60.0
-LAYOUTS = ("body133", "h3d263", "smpl75")
 MOTION_LICENCE = "CC-BY-4.0"
 MUSIC_LICENCE = "CC-BY-4.0 AND LicenseRef-AIST-Dance-DB"
 """Annotations: CC BY 4.0. Music: the terms of use of the AIST Dance Video Database, which no converter can
@@ -91,6 +89,8 @@ SEQUENCE = re.compile(r"g([A-Z]{2})_s([A-Z]{2})_c(?:All|\d\d)_d(\d+)_m([A-Z]{2}\
 
 class AistppConfig(ConvertConfig):
     """Options of the AIST++ converter; `source` is the folder of the annotations, with motions/ in it."""
+
+    layouts = ("body133", "h3d263", "smpl75")
 
     name: str = "aistpp"
     """Name of the data set; part of the shards' file names."""
@@ -122,11 +122,6 @@ class AistppConfig(ConvertConfig):
     """Give every clip the caption "a dancer performs ...", by the genre in its name."""
     body_model: Path | None = None
     """SMPL model (.npz) for the bone lengths; default: the package's neutral skeleton."""
-
-    def motion_layout(self) -> MotionLayout:
-        if self.layout not in LAYOUTS:
-            raise UserError(f"layout {self.layout} cannot be made from AIST++; use {', '.join(LAYOUTS)}")
-        return super().motion_layout()
 
     @property
     def sound_folder(self) -> Path:

@@ -1,13 +1,5 @@
 """AMASS (SMPL-H or SMPL-X .npz) -> shards: parameters to joints without the mesh, joints to features.
 
-| in the file | in the sample |
-|---|---|
-| `poses` [T, 156 or 165], or `root_orient`, `pose_body`, `pose_hand` | `motion.npy` |
-| `trans` | the path of the root in `motion.npy` |
-| `betas`, `gender` | bone lengths, when a body model is given |
-| `mocap_framerate` or `mocap_frame_rate` | resampled by time to `fps` |
-| captions of your own, or HumanML3D's texts | `texts.json` |
-
 Z up becomes Y up. Jaw, eyes, soft tissue (`dmpls`) and markers are not used. `smpl75` keeps the parameters,
 without a shape; its two hand joints are SMPL's, at rest for SMPL-H and SMPL-X, which have none.
 """
@@ -22,10 +14,15 @@ from numpy.typing import NDArray
 from motionloom.datasets.convert.amass.plan import LICENCE, AmassClip, AmassConfig, plan_amass
 from motionloom.datasets.convert.amass.smpl_npz import SmplMotion, read_motion
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
-from motionloom.datasets.convert.common.features import features_of, require_human
+from motionloom.datasets.convert.common.features import (
+    canonical_smpl75,
+    features_of,
+    mirrored,
+    require_human,
+    upright,
+)
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.smpl75 import canonical_smpl75, mirrored, upright
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS

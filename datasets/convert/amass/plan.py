@@ -28,7 +28,7 @@ from motionloom.datasets.convert.common.splits import (
     original_of,
     read_split_files,
 )
-from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
 
 SUFFIX = ".npz"
@@ -40,6 +40,8 @@ freer, but the fits are AMASS's: non-commercial research only, and not to be pas
 
 class AmassConfig(CaptionConfig):
     """AMASS, or any folder tree of SMPL, SMPL-H or SMPL-X clips in .npz files (`SUBSET/subject/clip.npz`)."""
+
+    layouts = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
 
     name: str = "amass"
     """Name of the data set; part of the shards' file names."""
@@ -79,14 +81,6 @@ class AmassConfig(CaptionConfig):
     @property
     def has_captions(self) -> bool:
         return self.captions is not None or self.humanml_texts is not None
-
-    def motion_layout(self) -> MotionLayout:
-        layout = super().motion_layout()
-        if layout.has("face") or (layout.family == "raw" and layout.name != "smpl75"):
-            raise UserError(
-                f"layout {self.layout} cannot be made from AMASS; use body133, wholebody313, h3d263 or smpl75"
-            )
-        return layout
 
 
 @dataclass(frozen=True)
@@ -139,18 +133,17 @@ def list_files(source: Path) -> tuple[list[AmassFile], list[Dropped]]:
 
 
 def read_headers(
-    files: Sequence[AmassFile], settings: PlanSettings
-) -> tuple[list[tuple[AmassFile, MotionHeader]], list[Dropped]]:
-    """The files that can be read, with what they state, and the others."""
+    files: Sequence[AmassFile], settings: PlanSettings, draft: Draft
+) -> list[tuple[AmassFile, MotionHeader]]:
+    """The files that can be read, with what they state; the others are broken."""
     out: list[tuple[AmassFile, MotionHeader]] = []
-    broken: list[Dropped] = []
     headers = read_in_threads(_read, files, workers=settings.workers, progress=settings.progress)
     for file, header in zip(files, headers, strict=True):
         if isinstance(header, UserError):
-            broken.append(drop(file.label, header))
+            draft.fail(file.label, header)
         else:
             out.append((file, header))
-    return out, broken
+    return out
 
 
 def _read(file: AmassFile) -> MotionHeader | UserError:
@@ -217,9 +210,8 @@ def _whole_clips(
     config: AmassConfig, files: list[AmassFile], draft: Draft, settings: PlanSettings
 ) -> Iterator[tuple[AmassClip, str]]:
     """Every file as one clip, and why it must be left out."""
-    headers, broken = read_headers(files, settings)
+    headers = read_headers(files, settings, draft)
     listing = config.listing([file.label for file in files])
-    draft.broken += broken
     draft.notes += listing.notes
     seen: dict[str, str] = {}
     for file, header in headers:
@@ -243,12 +235,10 @@ def _index_clips(
     listed: dict[str, Split] = {}
     if config.splits is not None:
         listed, notes = read_split_files(config.splits, SplitNames(config.splits_map))
-        keep_mirrors_together(listed, original_of, config.splits)
+        keep_mirrors_together(listed, config.splits)
         draft.notes += notes
     by_file = _rows_by_file(rows, files, draft)
-    headers, broken = read_headers([file for file in files if file.label in by_file], settings)
-    draft.broken += broken
-    for file, header in headers:
+    for file, header in read_headers([file for file in files if file.label in by_file], settings, draft):
         fps = _rate(config, file, header, draft)
         for row in by_file[file.label] if fps else ():
             first, last = row.cut(header.frames, fps)

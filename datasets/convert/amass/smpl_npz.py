@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.convert.common.arrays import check_values
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.schema import UserError
@@ -92,21 +93,22 @@ def read_motion(
 
     `UserError` for values that are not finite or absurd, naming frame and column.
     """
+    first = frames.start or 0
     with NpzFile(path, label) as file:
         if "poses" in file.names:
             poses = file.numbers("poses")[frames]
-            _check(label, "poses", poses, MAX_ANGLE, frames)
+            check_values(poses, MAX_ANGLE, f"{label}: poses", first_frame=first)
             parts = [poses[:, :BODY], poses[:, -HANDS:]]
             extra = poses[:, BODY:72] if poses.shape[1] == 72 else np.zeros((len(poses), 6))
         else:
             parts = []
             for name in _PARTS if hands else ("root_orient", "pose_body"):
                 parts.append(file.numbers(name)[frames])
-                _check(label, name, parts[-1], MAX_ANGLE, frames)
+                check_values(parts[-1], MAX_ANGLE, f"{label}: {name}", first_frame=first)
             parts = [np.concatenate(parts[:2], axis=1), *parts[2:]]
             extra = np.zeros((len(parts[0]), 6))
         trans = file.numbers("trans")[frames]
-        _check(label, "trans", trans, MAX_METRES, frames)
+        check_values(trans, MAX_METRES, f"{label}: trans", first_frame=first)
         betas = _betas(file) if "betas" in file.names else None
     rotations = np.concatenate(parts, axis=1) if hands else parts[0]
     if palms:
@@ -153,17 +155,7 @@ def _gender(file: NpzFile) -> str:
 def _betas(file: NpzFile) -> NDArray[np.float64]:
     """One shape [B]; a clip that changes its shape is two people."""
     betas = np.atleast_2d(file.numbers("betas", limit=2**27))
-    _check(file.label, "betas", betas, 1e3, slice(None))
+    check_values(betas, 1e3, f"{file.label}: betas")
     if not len(betas) or (betas != betas[0]).any():
         raise UserError(f"{file.label}: betas change during the clip ({len(betas)} rows); give one shape")
     return np.asarray(betas[0])
-
-
-def _check(label: str, name: str, values: NDArray[np.float64], limit: float, frames: slice) -> None:
-    good = np.abs(values) <= limit  # false for NaN
-    if not good.all():
-        frame, column = (int(index) for index in np.argwhere(~good)[0])
-        value = values[frame, column]
-        reason = f"at most {limit:g} is sensible" if np.isfinite(value) else "not a number"
-        at = frame + (frames.start or 0)
-        raise UserError(f"{label}: {name} is {value:.4g} at frame {at}, column {column}; {reason}")

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.bvh.plan import (
-    SUFFIX,
     BvhClip,
     BvhConfig,
     JointMaps,
@@ -30,6 +29,8 @@ from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.bvh.joint_map import JointMap, skeleton_key
+from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.sample import Sample
@@ -46,12 +47,11 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     summary = "BVH (and ASF/AMC) files of any skeleton, loose or in tar archives, to shards."
     example = "mocap shards --captions captions.jsonl --licence CC-BY-4.0"
     config_class = BvhConfig
-    features_first = True
 
     def __init__(self, config: BvhConfig) -> None:
         super().__init__(config)
         self.given = load_maps(config.joint_map, config.mapped_skeleton())  # a wrong one fails here
-        self.maps = JointMaps({})
+        self.maps: JointMaps = {}
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[BvhClip]:
         plan, self.maps = plan_bvh(self.config, self.given, settings)
@@ -62,7 +62,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     def _content(self, clip: BvhClip) -> str:
         """Digest of a clip's file and of how its joints are read."""
-        used = self.maps.by_skeleton.get(clip.found.skeleton)
+        used = self.maps.get(clip.found.skeleton)
         return sha256_of_json([clip.found.sha256, [used.sources, used.unit, used.up] if used else None])
 
     def licence(self, plan: ConversionPlan[BvhClip]) -> str:
@@ -93,7 +93,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     def joints(self, clip: BvhClip) -> SourceJoints:
         """The joints as the map reads them, and the joints that no row of it names."""
         motion = read_motion(self._read(clip), clip.label())
-        joint_map = self.maps.of(motion)
+        joint_map = self._map_of(motion)
         joints = joint_map.apply(motion, unit=self.config.unit, up=self.config.up)
         used = {name for names in joint_map.sources for name in names}
         free = [name for name in motion.joints if name not in used and name not in joint_map.unmapped]
@@ -111,7 +111,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         """Features [T', D] of one file; `label` names it in errors."""
         config = self.config
         motion = read_motion(data, label)
-        joint_map = self.maps.of(motion)
+        joint_map = self._map_of(motion)
         joints = joint_map.apply(motion, unit=config.unit, up=config.up)
         try:
             if len(self.layout.skeleton) > joints.shape[1]:
@@ -123,11 +123,17 @@ class Bvh(Converter[BvhConfig, BvhClip]):
             unit, up = joint_map.unit or config.unit, joint_map.up or config.up
             raise UserError(f"{label}: {error} (read with unit '{unit}', up '{up}')") from None
 
+    def _map_of(self, motion: BvhMotion) -> JointMap:
+        try:
+            return self.maps[skeleton_key(motion.joints, motion.parents)]
+        except KeyError:
+            raise UserError(f"{motion.name}: its skeleton has no joint map") from None
+
     def _read(self, clip: BvhClip) -> bytes:
         batch = clip.batch
         if batch.archive is None:  # no need to read the loose files before it
             batch = Batch(batch.root, None, (clip.found.path,))
-        for file in batch.read(SUFFIX):
+        for file in batch.read():
             if file.path == clip.found.path and not file.error:
                 return file.data
         raise UserError(f"{clip.label()}: no longer in the source")
@@ -141,7 +147,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     ) -> Iterator[tuple[str, NDArray[np.float32] | Dropped]]:
         waiting = set(labels)
         try:
-            for file in batch.read(SUFFIX):
+            for file in batch.read():
                 if file.label not in waiting:  # a second member of the same name finds nothing
                     continue
                 waiting.remove(file.label)

@@ -27,7 +27,6 @@ from motionloom.datasets.motion.bvh.asf import FPS, JOINED, count_frames, read_a
 from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy, require_all_frames
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Split, UserError
 
@@ -36,23 +35,12 @@ MapChoice = Annotated[
 ]
 """A map file or a folder of them, or `auto` (from the command line also as a path) for guesses."""
 
-SUFFIX = (".bvh", ".amc")
 MAPS_FOLDER = "joint_maps"
 """In the folder of the shards: the maps that were guessed, one for each skeleton."""
 
 
-@dataclass(frozen=True)
-class JointMaps:
-    """The joint maps of a conversion."""
-
-    by_skeleton: Mapping[str, JointMap]
-    """By `skeleton_key`."""
-
-    def of(self, motion: BvhMotion) -> JointMap:
-        try:
-            return self.by_skeleton[skeleton_key(motion.joints, motion.parents)]
-        except KeyError:
-            raise UserError(f"{motion.name}: its skeleton has no joint map") from None
+JointMaps = Mapping[str, JointMap]
+"""The joint maps of a conversion, by `skeleton_key`."""
 
 
 def load_maps(choice: Path | str, target: Skeleton) -> list[JointMap]:
@@ -114,7 +102,7 @@ def choose_maps(
     plan.notes += doubts.values()
     for clip in left:
         plan.reject(clip.label(), f"no certain joint map for its skeleton ({doubts[clip.found.skeleton]})")
-    return JointMaps(maps)
+    return maps
 
 
 def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str, BvhMotion]:
@@ -127,7 +115,7 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
     for batch, labels in wanted.items():
         missing = set(labels.values()) - set(found)
         with suppress(UserError):  # a damaged archive; its clips are reported when they are converted
-            for file in batch.read(SUFFIX) if missing else ():
+            for file in batch.read() if missing else ():
                 if labels.get(file.label) in missing:
                     with suppress(UserError):  # likewise; the next clip of this skeleton may be whole
                         found[labels[file.label]] = read_motion(file.data, file.label)
@@ -139,13 +127,13 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
 
 def guess_source(source: Path, target: Skeleton) -> JointGuess:
     """The guess for the first clip of a .bvh file, of a folder of such files, or of an archive."""
-    batches = list_batches(source, SUFFIX)
+    batches = list_batches(source)
     for batch in batches:
-        for file in batch.read(SUFFIX):
+        for file in batch.read():
             if file.error:
                 raise UserError(f"{file.label}: {file.error}")
             return guess_joint_map(read_motion(file.data, file.label), target)
-    raise UserError(f"{source}: no {' or '.join(SUFFIX)} file in it")
+    raise UserError(f"{source}: no motion file in it")
 
 
 def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
@@ -164,6 +152,8 @@ def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
 
 class BvhConfig(CaptionConfig):
     """Options of the BVH converter."""
+
+    layouts = ("body133", "wholebody313", "wholebody363", "h3d263", "tomato623")
 
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""
@@ -190,12 +180,6 @@ class BvhConfig(CaptionConfig):
     """Of layouts with hands: the files have them (`recorded`, which needs a joint map with fingers); they
     have none, and each clip gets hands at rest, which count as motion (`resting`) or do not (`missing`).
     """
-
-    def motion_layout(self) -> MotionLayout:
-        layout = super().motion_layout()
-        if layout.family == "raw":
-            raise UserError(f"layout {self.layout} cannot be made from joints; use body133 or h3d263")
-        return layout
 
     def mapped_skeleton(self) -> Skeleton:
         """The skeleton that the joint map reads: without fingers where the files have none."""
@@ -229,9 +213,9 @@ def plan_bvh(
     config: BvhConfig, given: Sequence[JointMap], settings: PlanSettings
 ) -> tuple[ConversionPlan[BvhClip], JointMaps]:
     """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
-    batches = list_batches(config.source, SUFFIX)
+    batches = list_batches(config.source)
     scans = scan_batches(
-        batches, SUFFIX, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
+        batches, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
     )
     draft = _decide(config, batches, scans)
     joints = {key: names for scan in scans for key, names in scan.joints.items()}

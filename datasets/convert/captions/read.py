@@ -1,14 +1,8 @@
 """Captions that people bring for their clips, in any of five forms that are recognised by themselves.
 
-| form | by |
-|---|---|
-| one JSON object a line | `{` |
-| a JSON list of such objects | `[` |
-| CSV, TSV with a header | anything else that is a file |
-| a folder of .txt files with the clips' names, a caption a line | a folder |
-| the same with HumanML3D's lines `caption#tokens#start#end` | the first lines |
-
-Every error about such a file begins with `FILE:LINE`, and what the record says passes through pydantic.
+JSON lines begin with `{`, a JSON list with `[`, a folder of .txt files is HumanML3D's where a first line has
+its grammar, and any other file is CSV or TSV with a header (docs/sources.md). Every error begins with
+`FILE:LINE`, and what a record says passes through pydantic.
 """
 
 from __future__ import annotations
@@ -171,20 +165,13 @@ def _records(path: Path) -> Iterator[tuple[str, dict[str, object]]]:
     text = read_text_file(path)
     start = text.lstrip()[:1]
     if start == "[" or (start and path.suffix.lower() == ".json" and start != "{"):
-        return _of_list(path, text)
-    return _of_lines(path, text) if start in ("{", "") else _of_table(path, text)
-
-
-def _of_list(path: Path, text: str) -> Iterator[tuple[str, dict[str, object]]]:
-    values = _decode(str(path), text)
-    for number, value in enumerate(values if isinstance(values, list) else [values], start=1):
-        yield _record(f"{path}: record {number}", value)
-
-
-def _of_lines(path: Path, text: str) -> Iterator[tuple[str, dict[str, object]]]:
-    for number, line in enumerate(text.split("\n"), start=1):
-        if line.strip():
-            yield _record(f"{path}:{number}", _decode(f"{path}:{number}", line))
+        values = _decode(str(path), text)
+        listed = enumerate(values if isinstance(values, list) else [values], start=1)
+        return (_record(f"{path}: record {number}", value) for number, value in listed)
+    if start not in ("{", ""):
+        return _of_table(path, text)
+    places = ((f"{path}:{n}", line) for n, line in enumerate(text.split("\n"), start=1) if line.strip())
+    return (_record(place, _decode(place, line)) for place, line in places)
 
 
 def _record(where: str, value: object) -> tuple[str, dict[str, object]]:

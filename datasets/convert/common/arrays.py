@@ -41,7 +41,7 @@ def load_array(
     except OSError as error:
         raise UserError(f"{label}: cannot be read ({error.strerror or error})") from None
     values = np.ascontiguousarray(found, dtype=header.dtype.newbyteorder("="))
-    _check_values(values, limit, label)
+    check_values(values, limit, label)
     return values
 
 
@@ -85,23 +85,25 @@ def _check_header(header: ArrayHeader, width: int | tuple[int, ...], label: str)
     raise UserError(f"{label}: expected [T, {wanted}], found {list(shape)}{hint}")
 
 
-def _check_values(values: NDArray[np.floating], limit: Limit | None, label: str) -> None:
-    """`UserError` for the first value (in time order) that is not finite or beyond the limit."""
-    finite = np.isfinite(values)
-    if not finite.all():
-        where = np.argwhere(~finite)[0]
-        raise UserError(f"{label}: {values[tuple(where)]} at {_place(where)}")
+def check_values(
+    values: NDArray[np.floating], limit: Limit | None, label: str, *, first_frame: int = 0
+) -> None:
+    """`UserError` for the first value (in time order) of [T, ...] that is not finite or beyond the limit."""
+    wrong = ~np.isfinite(values)
+    if wrong.any():
+        at = np.argwhere(wrong)[0]
+        raise UserError(f"{label}: {values[tuple(at)]} at {_place(at, first_frame)}")
     if limit is None:
         return
     # Compared in pieces of the array's own type: no float64 copy of a float32 array.
     over = np.abs(values) > np.broadcast_to(np.asarray(limit, dtype=values.dtype), values.shape)
     if over.any():
-        where = np.argwhere(over)[0]
-        most = float(np.broadcast_to(limit, values.shape)[tuple(where)])
-        value = f"{values[tuple(where)]:.4g}"
-        raise UserError(f"{label}: absurd value {value} at {_place(where)}; at most {most:g} is sensible")
+        at = np.argwhere(over)[0]
+        most = float(np.broadcast_to(limit, values.shape)[tuple(at)])
+        found = f"absurd value {values[tuple(at)]:.4g} at {_place(at, first_frame)}"
+        raise UserError(f"{label}: {found}; at most {most:g} is sensible")
 
 
-def _place(where: NDArray[np.int64]) -> str:
-    frame, *rest = (int(index) for index in where)
-    return f"frame {frame}, column {', '.join(str(index) for index in rest)}"
+def _place(at: NDArray[np.int64], first_frame: int) -> str:
+    frame, *rest = (int(index) for index in at)
+    return f"frame {first_frame + frame}, column {', '.join(str(index) for index in rest)}"

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
+from typing import ClassVar, get_args
 
 from pydantic import ConfigDict, Field
 from pydantic.fields import FieldInfo
 
-from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config, MotionType
+from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
+from motionloom.datasets.schema import Config, MotionType, UserError
 
 
 class ConvertConfig(Config):
     """Options that every converter has. The docstrings of the fields are the command line's help."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
+    layouts: ClassVar[tuple[str, ...]] = LAYOUTS
+    """Layouts that can be made from the source."""
 
     source: Path
     """Folder of the source, as its authors publish it."""
@@ -46,6 +48,10 @@ class ConvertConfig(Config):
     what is left of it is written."""
 
     def motion_layout(self) -> MotionLayout:
+        if self.layout not in self.layouts:
+            raise UserError(
+                f"layout {self.layout} cannot be made from this source; use {', '.join(self.layouts)}"
+            )
         return MotionLayout.named(self.layout, fps=self.fps)
 
     def options(self) -> dict[str, object]:

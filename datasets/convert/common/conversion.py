@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import operator
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,6 @@ from typing import Any, Generic
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter
-from motionloom.datasets.convert.common.feature_step import FeatureStep
 from motionloom.datasets.convert.common.look import Look, look_at
 from motionloom.datasets.convert.common.plan import C, ConversionPlan, limited
 from motionloom.datasets.schema import Manifest, UserError
@@ -54,10 +53,6 @@ class Conversion(Generic[C]):
         """What the output depends on, as plain JSON; never a local path."""
         content = [self.converter.depends_on(clip) for _, clip in self.plan.items]
         return self.converter.options() | {"source_sha256": sha256_of_json(content)}
-
-    def features(self, clips: Sequence[C]) -> FeatureStep[C] | None:
-        """The step before the shards of these clips; None for sources whose clips are read one by one."""
-        return self.converter.features(clips) if self.converter.features_first else None
 
     def facts(self) -> DatasetFacts:
         audio = self.converter.audio()
@@ -107,7 +102,7 @@ class Conversion(Generic[C]):
         return plan
 
     def _tasks(self) -> int:
-        if (features := self.features([clip for _, clip in self.plan.items])) is not None:
+        if (features := self.converter.features([clip for _, clip in self.plan.items])) is not None:
             return len(features.batches)
         return sum(-(-count // _CLIPS_PER_SHARD) for count in self.plan.counts().values())
 
@@ -116,9 +111,8 @@ class Conversion(Generic[C]):
         if not self.plan.items:
             return None
         start = time.perf_counter()
-        if (features := self.features([clip for _, clip in self.plan.items])) is not None:
-            number = features.number_of(self.plan.items[0][1])
-            batch = next(batch for batch in features.batches if batch.number == number)
+        if (features := self.converter.features([clip for _, clip in self.plan.items])) is not None:
+            batch = features.batches[0]
             batch.trial(0.0)  # pays for imports
             first, start = time.perf_counter() - start, time.perf_counter()
             clips = batch.trial(_TRIAL_SECONDS)
@@ -165,7 +159,7 @@ def run_conversion(
         raise UserError(f"{plan.name}: say under which licence the clips are: --licence CC-BY-4.0 (licence)")
     if strict:
         plan.require_whole()
-    if not conversion.converter.features_first and how.features_only:
+    if how.features_only and conversion.converter.features([]) is None:
         raise UserError(
             f"{conversion.converter.name}: this source has no features step; run the parts of 'shards'"
         )
@@ -181,7 +175,7 @@ def run_conversion(
                 seen.require_people(plan.name)
                 for warning in seen.warnings:
                     say(f"warning: {warning}")
-        if (features := conversion.features(writer.pending())) is not None:
+        if (features := conversion.converter.features(writer.pending())) is not None:
             convert = features.make(writer.pending(), writer.work_folder, writer.pool, how, say)
         manifest = writer.write(convert)
     if part is None:

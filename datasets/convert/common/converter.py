@@ -56,8 +56,6 @@ class Converter(ABC, Generic[Cfg, C]):
     config_class: ClassVar[type[ConvertConfig]]
     version: ClassVar[int] = 1
     """Raised when the same source gives other samples: finished shards are then made again."""
-    features_first: ClassVar[bool] = False
-    """Whether its clips are decoded in a step of their own before the first shard (`features`)."""
 
     def __init__(self, config: Cfg) -> None:
         self.config = config
@@ -104,12 +102,12 @@ class Converter(ABC, Generic[Cfg, C]):
         """Whether the first clips of a clip's subset are the cheapest to read, as in an archive."""
         return False
 
-    def features(self, clips: Sequence[C]) -> FeatureStep[C]:
-        """How clips are decoded together, where they cannot be read one by one (`features_first`).
+    def features(self, clips: Sequence[C]) -> FeatureStep[C] | None:
+        """The step before the shards that decodes clips together; None where they are read one by one.
 
         The samples must be those of `convert`.
         """
-        raise NotImplementedError
+        return None
 
     def meta(
         self,

@@ -72,7 +72,10 @@ def suggest(clips: list[SeenClip], config: ConvertConfig, names: Names, up: str)
     if now.upright <= MOST:
         axis = head_axis(clips, up)
         clips = [replace(clip, joints=_turned(clip.joints, up, axis)) for clip in clips]
-        out.append(_axis_suggestion(axis, config))
+        why = f"the head is above the pelvis along the {axis} axis of the files"
+        turn = Suggestion("source", "turn the files so that y or z points up", why)
+        is_option = hasattr(config, "up") and axis in ("+y", "+z")
+        out.append(Suggestion("up", axis[1], why) if is_option else turn)
         now = stats_of(clips)
     if not PERSON_METRES[0] <= now.height <= PERSON_METRES[1]:
         factor, suggestion = _unit_suggestion(now.height, config)
@@ -83,13 +86,6 @@ def suggest(clips: list[SeenClip], config: ConvertConfig, names: Names, up: str)
         plain = Suggestion("source", "exchange left and right in the source", mapped.why)
         out.append(mapped if names else plain)
     return out
-
-
-def _axis_suggestion(axis: str, config: ConvertConfig) -> Suggestion:
-    why = f"the head is above the pelvis along the {axis} axis of the files"
-    if hasattr(config, "up") and axis in ("+y", "+z"):
-        return Suggestion("up", axis[1], why)
-    return Suggestion("source", "turn the files so that y or z points up", why)
 
 
 def _unit_suggestion(height: float, config: ConvertConfig) -> tuple[float, Suggestion]:

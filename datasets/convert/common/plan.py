@@ -16,6 +16,7 @@ from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
+from motionloom.datasets.base.progress import duration
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import Look
 from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
@@ -145,7 +146,7 @@ class ConversionPlan(Generic[C]):
         if self.bytes_needed is not None:
             table.add_row("disk", "", "", f"{self.bytes_needed / 2**20:,.1f} MiB")
         if self.seconds_needed is not None:
-            table.add_row("time", "", "", _duration(self.seconds_needed))
+            table.add_row("time", "", "", f"about {duration(self.seconds_needed)}")
         for note in self.notes:
             table.add_row("note", "", "", escape(printable(note)))
         if self.stop:
@@ -207,12 +208,6 @@ def drop(label: str, error: Exception) -> Dropped:
     """The manifest's record of a clip that failed."""
     text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     return Dropped(source=label, reason=text.removeprefix(f"{label}: "))
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"about {seconds:.0f} s"
-    return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"
 
 
 def _some(lines: Sequence[object], limit: int = 5) -> str:

@@ -31,9 +31,7 @@ MAX_FILE_BYTES = 1 << 30
 """A motion file beyond this is refused unread: a few hours of text, or a bomb."""
 
 
-Suffix = str | tuple[str, ...]
-
-
+SUFFIX = (".bvh", ".amc")
 MAX_SKELETON_BYTES = 1 << 20
 
 
@@ -70,20 +68,20 @@ class Batch:
                 out.append((name, -1, 0))
         return out
 
-    def read(self, suffix: Suffix) -> Iterator[SourceFile]:
-        """Every file with `suffix`, in archive order. `UserError` when the archive is damaged there.
+    def read(self) -> Iterator[SourceFile]:
+        """Every motion file, in archive order. `UserError` when the archive is damaged there.
 
         The data of an .amc file come behind those of its .asf skeleton and `JOINED`.
         """
         if self.archive is not None:
-            yield from _read_archive(self.root / self.archive, self.archive, suffix)
+            yield from _read_archive(self.root / self.archive, self.archive)
             return
         for name in self.files:
             path = self.root / name
             try:
                 problem = _too_large(path.stat().st_size)
                 data = b"" if problem else path.read_bytes()
-                if _needs_skeleton(name) and not problem:
+                if name.lower().endswith(".amc") and not problem:
                     beside = [path.with_name(PurePosixPath(one).name) for one in _skeleton_names(name)]
                     skeletons = {str(one): one.read_bytes() for one in beside if one.is_file()}
                     data, problem = _with_skeleton(str(path), data, skeletons)
@@ -92,7 +90,7 @@ class Batch:
                 yield SourceFile(name, name, b"", f"cannot read ({error.strerror})")
 
 
-def list_batches(source: Path, suffix: Suffix) -> list[Batch]:
+def list_batches(source: Path) -> list[Batch]:
     """Batches under `source` (a folder, a motion file or an archive), in name order."""
     if source.is_file():
         names, root = [source.name], source.parent
@@ -102,39 +100,36 @@ def list_batches(source: Path, suffix: Suffix) -> list[Batch]:
     else:
         raise UserError(f"{source}: no such file or folder")
     archives = [name for name in names if name.lower().endswith(ARCHIVES)]
-    loose = [name for name in names if name.lower().endswith(suffix)]
+    loose = [name for name in names if name.lower().endswith(SUFFIX)]
     batches = [Batch(root, name) for name in archives]
     for first in range(0, len(loose), LOOSE_FILES_PER_BATCH):
         batches.append(Batch(root, None, tuple(loose[first : first + LOOSE_FILES_PER_BATCH])))
     if not batches:
-        wanted = suffix if isinstance(suffix, str) else " or ".join(suffix)
-        raise UserError(f"{source}: no {wanted} file and no archive ({', '.join(ARCHIVES)}) in it")
+        raise UserError(
+            f"{source}: no {' or '.join(SUFFIX)} file and no archive ({', '.join(ARCHIVES)}) in it"
+        )
     return batches
 
 
-def _read_archive(path: Path, label: str, suffix: Suffix) -> Iterator[SourceFile]:
+def _read_archive(path: Path, label: str) -> Iterator[SourceFile]:
     last = "the start"
     skeletons: dict[str, bytes] | None = None
     try:
         with tarfile.open(path, "r|*") as archive:
             for member in archive:
-                if not member.isreg() or not member.name.lower().endswith(suffix):
+                if not member.isreg() or not member.name.lower().endswith(SUFFIX):
                     continue
                 where = f"{label}/{member.name}"
                 problem = _too_large(member.size)
                 file = None if problem else archive.extractfile(member)
                 data = file.read() if file else b""
-                if _needs_skeleton(member.name) and not problem:
+                if member.name.lower().endswith(".amc") and not problem:
                     skeletons = _skeletons(path) if skeletons is None else skeletons
                     data, problem = _with_skeleton(member.name, data, skeletons)
                 yield SourceFile(where, member.name.removeprefix("./"), data, problem)
                 last = f"'{member.name}'"
     except (tarfile.TarError, EOFError, OSError, lzma.LZMAError, zlib.error) as error:
         raise UserError(f"{label}: damaged archive after {last} ({error or type(error).__name__})") from None
-
-
-def _needs_skeleton(name: str) -> bool:
-    return name.lower().endswith(".amc")
 
 
 def _skeleton_names(name: str) -> list[str]:
@@ -212,20 +207,19 @@ class _Memory(Config):
 
 def scan_batches(
     batches: list[Batch],
-    suffix: Suffix,
     header: Header,
     *,
     keep: Path | None = None,
     workers: int = 1,
     progress: bool = False,
 ) -> list[BatchScan]:
-    """Read the header of every file with `suffix`, in batch order; `keep` is the file that remembers."""
-    keys = [sha256_of_json([_VERSION, suffix, batch.state()]) for batch in batches]
+    """Read the header of every motion file, in batch order; `keep` is the file that remembers."""
+    keys = [sha256_of_json([_VERSION, SUFFIX, batch.state()]) for batch in batches]
     known = _load(keep)
     kept = {key: known[key] for key in keys if key in known}
     todo = [(key, batch) for key, batch in zip(keys, batches, strict=True) if key not in kept]
     found, saved = dict(kept), time.monotonic()
-    read = partial(_scan, suffix, header)
+    read = partial(_scan, header)
     new = [batch for _, batch in todo]
     scans = read_in_threads(read, new, workers=workers, progress=progress, before=len(kept))
     for (key, _), (scan, certain) in zip(todo, scans, strict=True):
@@ -255,13 +249,13 @@ def _save(path: Path | None, batches: dict[str, BatchScan]) -> None:
             write_json(path, _Memory(batches=batches).dump())
 
 
-def _scan(suffix: Suffix, header: Header, batch: Batch) -> tuple[BatchScan, bool]:
+def _scan(header: Header, batch: Batch) -> tuple[BatchScan, bool]:
     """What a batch holds, and whether that depends on the files alone (and not on a right to read them)."""
     files: list[FoundFile] = []
     joints: dict[str, tuple[str, ...]] = {}
     certain = True
     try:
-        for file in batch.read(suffix):
+        for file in batch.read():
             frames, fps, skeleton, problem = 0, 0.0, "", file.error
             certain = certain and not file.error
             try:
@@ -270,18 +264,8 @@ def _scan(suffix: Suffix, header: Header, batch: Batch) -> tuple[BatchScan, bool
                     joints.setdefault(skeleton, names)
             except UserError as error:
                 problem = str(error)
-            sha256 = hashlib.sha256(file.data).hexdigest()
-            files.append(
-                FoundFile(
-                    label=file.label,
-                    path=file.path,
-                    sha256=sha256,
-                    frames=frames,
-                    fps=fps,
-                    skeleton=skeleton,
-                    problem=problem,
-                )
-            )
+            about = {"label": file.label, "path": file.path, "sha256": hashlib.sha256(file.data).hexdigest()}
+            files.append(FoundFile(**about, frames=frames, fps=fps, skeleton=skeleton, problem=problem))
     except UserError as error:
         return BatchScan(files=files, problem=drop(batch.label, error), joints=joints), False
     return BatchScan(files=files, problem=None, joints=joints), certain

@@ -164,16 +164,13 @@ def original_of(clip_id: str) -> str | None:
     return found[1] + found[2] if found else None
 
 
-def keep_mirrors_together(
-    splits: Mapping[str, Split], mirror_of: Callable[[str], str | None], folder: Path | None = None
-) -> None:
+def keep_mirrors_together(splits: Mapping[str, Split], folder: Path) -> None:
     """`UserError` when a mirrored clip is in another split than its original: the test set would leak.
 
-    `mirror_of` says which clip an id mirrors (`original_of`), None for none; originals without a split are
-    fine. `folder` of the split files lets the error name both lines.
+    Originals without a split are fine. The error names both lines of the split files in `folder`.
     """
     for clip_id, split in splits.items():
-        original = mirror_of(clip_id)
+        original = original_of(clip_id)
         there = splits.get(original) if original is not None else None
         if original is not None and there is not None and there != split:
             raise UserError(
@@ -182,9 +179,7 @@ def keep_mirrors_together(
             )
 
 
-def _line_of(clip_id: str, split: Split, folder: Path | None) -> str:
-    if folder is None:
-        return f"{split}.txt"
+def _line_of(clip_id: str, split: Split, folder: Path) -> str:
     for path in (path for found, path in SplitNames().files(folder) if found == split):
         lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
         if clip_id in lines:

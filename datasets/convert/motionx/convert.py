@@ -1,18 +1,13 @@
 """Motion-X -> shards: 322 SMPL-X columns at 30 fps to whole-body features with hands and face.
 
-Choices:
+Choices, beside those of docs/sources.md:
 - Joints come from the pose alone: forward kinematics on the user's body model with each clip's shape, or on a
   neutral skeleton, where shapes have no effect. Heading, floor and origin are made canonical for every clip,
   since video subsets lie about in their camera's world.
 - The face is the 50 expression columns. Jaw and face shape are not features (HumanTOMATO section 4.2); layout
   `smplx322` keeps all columns.
-- Nothing is invented: a clip whose expression is all zero and that has no face motion file says
-  `has_face = False`, one whose finger poses are all zero `has_hands = False`. Zero is what the sources of
-  Motion-X hold where they know nothing (EgoBody's hands, for instance).
-- Face motion files are written in at conversion, stretched over the clip; GRAB keeps its own jaw.
-- Translations of `aist/` become metres exactly once, whether or not the user ran Motion-X's script.
-- 30 fps is believed. Motion-X's scripts thin AMASS by whole steps, so clips from 100 Hz sources really have
-  33.3 fps and play a tenth too slowly here; the files do not say which.
+- Nothing is invented: zero is what the sources of Motion-X hold where they know nothing (EgoBody's hands, for
+  instance), so clips with nothing but zeros there have `has_face` or `has_hands` False.
 """
 
 from __future__ import annotations

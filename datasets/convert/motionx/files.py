@@ -22,7 +22,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.files import check_id, inside, read_text_file
 from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.schema import Caption, Dropped, UserError
@@ -30,18 +29,6 @@ from motionloom.datasets.text.clean import clean_caption, usable_caption
 
 HUMANML = "humanml"
 SOURCE = "motionx"
-
-
-def read_motionx_captions(
-    path: Path, *, subset: str, seconds: float, name: str
-) -> tuple[list[Caption], list[str]]:
-    """The usable captions of one clip, and what is wrong with the other lines (`line N: ...`).
-
-    `UserError` when the file cannot be read or is not UTF-8; `name` stands for it in messages.
-    """
-    if subset == HUMANML:
-        return read_humanml_captions(path, seconds=seconds, source=SOURCE, name=name)
-    return read_sentences(path, source=SOURCE, name=name)
 
 
 def read_sentences(path: Path, *, source: str, name: str) -> tuple[list[Caption], list[str]]:

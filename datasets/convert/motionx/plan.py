@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import PlanSettings
@@ -24,26 +25,23 @@ from motionloom.datasets.convert.common.splits import (
     SplitNames,
     hash_splits,
     keep_mirrors_together,
-    original_of,
     read_split_files,
 )
 from motionloom.datasets.convert.motionx.files import (
     HUMANML,
+    SOURCE,
     Kind,
     MotionXFiles,
     find_files,
     official_id,
-    read_motionx_captions,
     read_sentences,
     subset_of,
 )
 from motionloom.datasets.convert.motionx.parameters import FACE_WIDTH, RAW, aist_scale
 from motionloom.datasets.motion.body.smpl import SkeletonName
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
 
 FPS = 30.0
-LAYOUTS = ("wholebody363", "wholebody313", "body133", "tomato623", "h3d263", "smplx322")
 AIST = "aist"
 MOCAP = ("humanml", "EgoBody", "GRAB")
 """Subsets whose faces come in files of their own."""
@@ -69,6 +67,8 @@ class MotionXConfig(ConvertConfig):
     """Options of the Motion-X converter. `source` is the folder that holds motion_data/ and texts/, under
     any of the names they have had."""
 
+    layouts = ("wholebody363", "wholebody313", "body133", "tomato623", "h3d263", "smplx322")
+
     name: str = "motionx"
     layout: str = "wholebody363"
     fps: float = FPS
@@ -88,11 +88,6 @@ class MotionXConfig(ConvertConfig):
     frame_texts: bool = False
     """Add the sentences about single frames (body_texts, hand_texts) as captions of 1/30 s and longer, with
     source `body` and `hand`. They are many: about one a frame."""
-
-    def motion_layout(self) -> MotionLayout:
-        if self.layout not in LAYOUTS:
-            raise UserError(f"layout {self.layout} cannot be made from Motion-X; use {', '.join(LAYOUTS)}")
-        return super().motion_layout()
 
     @property
     def skeleton(self) -> SkeletonName:
@@ -218,7 +213,7 @@ def _read_splits(
     if folder is None:
         return hash_splits(ids)
     listed, notes = read_split_files(folder)
-    keep_mirrors_together(listed, original_of, folder)
+    keep_mirrors_together(listed, folder)
     splits: dict[str, Split] = {}
     for clip_id, split in listed.items():
         official = official_id(clip_id.removesuffix(".npy"))
@@ -251,10 +246,10 @@ def _scan(source: Path, files: MotionXFiles, clip_id: str) -> _Scanned:
         problems.extend([f"{file}: {'; '.join(wrong)}"] if wrong else [])
         return texts
 
-    seconds, subset = frames / FPS, subset_of(clip_id)
-    texts = sentences(
-        "captions", lambda path, name: read_motionx_captions(path, subset=subset, seconds=seconds, name=name)
-    )
+    read: Callable[..., tuple[list[Caption], list[str]]] = read_sentences
+    if subset_of(clip_id) == HUMANML:
+        read = partial(read_humanml_captions, seconds=frames / FPS)
+    texts = sentences("captions", lambda path, name: read(path, source=SOURCE, name=name))
     face_texts = sentences("face texts", lambda path, name: read_sentences(path, source="face", name=name))
     face = files.by_kind["face motion"].get(clip_id)
     if face is not None:

@@ -87,13 +87,6 @@ class ArkitBases:
         wanted = np.asarray(values, np.float64) @ (source @ shapes.T)
         return bounded_least_squares(gram, wanted)
 
-    def residual(self, values: NDArray[np.floating], weights: Floats) -> float:
-        """Share of the source's displacement (root mean square) that the weights do not make."""
-        meant = np.asarray(values, np.float64) @ self.source.reshape(len(self.source), -1)
-        made = weights @ self.arkit.reshape(len(ARKIT), -1)
-        size = float(np.sqrt(np.square(meant).mean()))
-        return float(np.sqrt(np.square(meant - made).mean())) / size if size else 0.0
-
 
 def bounded_least_squares(gram: Floats, wanted: Floats) -> Floats:
     """The w in 0..1 with the least `w' G w / 2 - b' w`, for each row b of `wanted` [T, M]; gram G is [M, M].

@@ -139,12 +139,10 @@ def smpl_joints(
             f"{list(rotvecs.shape)} and {list(trans.shape)}"
         )
     rest = body.rest_joints(betas)
-    parents = body.skeleton.parents
-    offsets = np.zeros_like(rest)
-    offsets[1:] = rest[1:] - rest[list(parents[1:])]
+    offsets = body.skeleton.bones(rest)
     # scipy's conversion takes a quarter of roma's time for one clip, which small torch calls make up.
     local = Rotation.from_rotvec(rotvecs.reshape(-1, 3)).as_matrix().reshape(*rotvecs.shape, 3)
-    return forward_kinematics(local, rest[0] + trans, offsets, parents)[0]
+    return forward_kinematics(local, rest[0] + trans, offsets, body.skeleton.parents)[0]
 
 
 def _choose(path: Path, tree: NDArray[np.float64], skeleton: Skeleton) -> tuple[str, list[int]]:

@@ -48,8 +48,7 @@ def smplx_parameters(
         raise UserError(f"the body model has {len(body.skeleton)} joints, the motion {count}: use SMPL-X")
     rest = body.rest_joints()[:count]
     parents = motion.skeleton.parents
-    offsets = np.zeros_like(rest)
-    offsets[1:] = rest[1:] - rest[list(parents[1:])]
+    offsets = motion.skeleton.bones(rest)
     targets = retarget(motion.joints, motion.skeleton, offsets)
     turned, root = solve_poses(targets, offsets, parents, motion.rotations, targets[:, 0])
     error = FitError.between(forward_kinematics(turned, root, offsets, parents)[0], targets)

@@ -65,22 +65,19 @@ def read_amc(asf: bytes, amc: bytes, *, name: str) -> BvhMotion:
     numbers, frames = _frames(amc, skeleton.bones, name)
     names, parents = tuple(skeleton.bones), skeleton.parents
     ends = [skeleton.bones[bone].end for bone in names]
-    leaves = [joint for joint in range(len(names)) if joint not in parents]
     turned = [
         _turned(bone, numbers.get(key), frames, skeleton.degree) for key, bone in skeleton.bones.items()
     ]
+    order = skeleton.bones["root"].dof
+    moved = [numbers["root"][:, [order.index(axis)]] * skeleton.unit for axis in ("tx", "ty", "tz")]
     return BvhMotion(
         name=name,
         joints=names,
         parents=parents,
         offsets=np.array([ends[parent] if parent >= 0 else np.zeros(3) for parent in parents]),
         channels=(_ROOT, *[_CHANNELS] * (len(names) - 1)),
-        values=np.concatenate([_moved(skeleton, numbers["root"]), *turned], axis=1),
-        frame_time=1 / FPS,
+        values=np.concatenate([*moved, *turned], axis=1),
         fps=FPS,
-        end_sites=tuple(
-            (leaf, (float(x), float(y), float(z))) for leaf in leaves for x, y, z in [ends[leaf]]
-        ),
     )
 
 
@@ -116,12 +113,6 @@ def _turned(bone: _Bone, numbers: Floats | None, frames: int, degree: float) -> 
     with warnings.catch_warnings():  # at a gimbal lock one of the many equal answers is as good as another
         warnings.simplefilter("ignore", UserWarning)
         return np.asarray(turn.as_euler("ZXY", degrees=True), dtype=np.float64)
-
-
-def _moved(skeleton: _Skeleton, numbers: Floats) -> Floats:
-    """Position of the root [T, 3], in centimetres."""
-    dof = skeleton.bones["root"].dof
-    return np.stack([numbers[:, dof.index(axis)] * skeleton.unit for axis in ("tx", "ty", "tz")], axis=1)
 
 
 def _skeleton(text: bytes, where: str) -> _Skeleton:

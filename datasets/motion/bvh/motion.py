@@ -53,11 +53,8 @@ class BvhMotion:
     """Channel names of every joint, in file order."""
     values: Floats
     """The motion block [T, total channels]: lengths and degrees."""
-    frame_time: float
     fps: float
     """1 / frame time, snapped to a whole number where the printed digits allow one (0.0333333 is 30)."""
-    end_sites: tuple[tuple[int, tuple[float, float, float]], ...] = ()
-    """(joint, offset) of every End Site."""
 
     @property
     def frames(self) -> int:
@@ -70,12 +67,11 @@ class BvhMotion:
         out[:, joints, axes] = self.values[:, columns]
         return out
 
-    def local_rotations(self) -> Floats:
-        """Rotation of every joint against its parent [T, N, 3, 3]; identity without rotation channels."""
-        return np.ascontiguousarray(np.moveaxis(self._rotations(range(len(self.joints))), 0, 1))
+    def local_rotations(self, wanted: Sequence[int]) -> Floats:
+        """Rotations of some joints against their parents, joint first [M, T, 3, 3].
 
-    def _rotations(self, wanted: Sequence[int]) -> Floats:
-        """Local rotations of some joints, joint first [M, T, 3, 3]."""
+        Identity without rotation channels.
+        """
         from scipy.spatial.transform import Rotation  # half a second, which reading a header need not take
 
         out = np.broadcast_to(np.eye(3), (len(wanted), self.frames, 3, 3)).copy()
@@ -97,7 +93,7 @@ class BvhMotion:
         # in one piece: products of whole clips are then three times faster than batches of small matrices.
         # Rotations of joints without children move nothing.
         inner = sorted({parent for parent in self.parents if parent >= 0})
-        local = np.ascontiguousarray(np.moveaxis(self._rotations(inner), 1, -1))
+        local = np.ascontiguousarray(np.moveaxis(self.local_rotations(inner), 1, -1))
         rotation = dict(zip(inner, local, strict=True))
         world = np.ascontiguousarray(np.moveaxis(self.local_offsets(), 0, -1))
         for joint, parent in enumerate(self.parents):
@@ -106,14 +102,6 @@ class BvhMotion:
                 if joint in rotation:
                     rotation[joint] = np.einsum("ijt,jkt->ikt", rotation[parent], rotation[joint])
         return np.ascontiguousarray(np.moveaxis(world, -1, 0))
-
-    def rest_positions(self) -> Floats:
-        """Joint positions of the rest pose [N, 3]: the OFFSETs with no rotation."""
-        out = self.offsets.copy()
-        for joint, parent in enumerate(self.parents):
-            if parent >= 0:
-                out[joint] += out[parent]
-        return out
 
 
 @dataclass(frozen=True)
@@ -164,9 +152,7 @@ def read_bvh(source: Path | str | bytes, *, name: str | None = None) -> BvhMotio
         offsets=np.array(joints.offsets, dtype=np.float64),
         channels=tuple(joints.channels),
         values=read_values(data, section.body, section.frames, width, where),
-        frame_time=section.frame_time,
         fps=section.fps,
-        end_sites=tuple((joint, (x, y, z)) for joint, (x, y, z) in joints.end_sites),
     )
 
 

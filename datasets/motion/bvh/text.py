@@ -39,7 +39,6 @@ class MotionSection:
     start: int
     body: int
     frames: int
-    frame_time: float
     fps: float
 
 
@@ -51,7 +50,6 @@ class Hierarchy:
     parents: list[int] = field(default_factory=list)
     offsets: list[list[float]] = field(default_factory=list)
     channels: list[tuple[str, ...]] = field(default_factory=list)
-    end_sites: list[tuple[int, list[float]]] = field(default_factory=list)
 
 
 def load_text(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
@@ -90,20 +88,16 @@ def find_motion(data: bytes, where: str) -> MotionSection:
         raise UserError(
             f"{where}: line {line}: expected 'Frames: <count>' and 'Frame Time: <seconds>' after MOTION"
         )
-    frame_time, fps = _frame_time(header.group(2), where)
-    return MotionSection(marker.start(), header.end(), _frame_count(header.group(1), where), frame_time, fps)
-
-
-def _frame_count(text: bytes, where: str) -> int:
-    if not text.isdigit() or len(text) > 12:
-        raise UserError(f"{where}: 'Frames: {_shown(text)}' is not a whole number")
-    if int(text) == 0:
+    frames, fps = header.group(1), _frame_rate(header.group(2), where)
+    if not frames.isdigit() or len(frames) > 12:
+        raise UserError(f"{where}: 'Frames: {_shown(frames)}' is not a whole number")
+    if int(frames) == 0:
         raise UserError(f"{where}: 'Frames: 0': the file has no frames")
-    return int(text)
+    return MotionSection(marker.start(), header.end(), int(frames), fps)
 
 
-def _frame_time(text: bytes, where: str) -> tuple[float, float]:
-    """Seconds and fps. 0.0333 and 0.033333 both mean 30 fps; 0.033367 is 29.97."""
+def _frame_rate(text: bytes, where: str) -> float:
+    """Frames a second of a frame time. 0.0333 and 0.033333 both mean 30 fps; 0.033367 is 29.97."""
     try:
         exact = Decimal(text.decode("ascii", "replace"))
     except InvalidOperation:
@@ -119,7 +113,7 @@ def _frame_time(text: bytes, where: str) -> tuple[float, float]:
         digit = Decimal(1).scaleb(max(int(exact.as_tuple().exponent), -12))
         near = {(Decimal(1) / whole).quantize(digit, mode) for mode in (ROUND_DOWN, ROUND_HALF_UP)}
         fps = float(whole) if exact.quantize(digit) in near else fps
-    return float(exact), fps
+    return fps
 
 
 def read_values(data: bytes, start: int, frames: int, width: int, where: str) -> Floats:
@@ -255,13 +249,9 @@ class _HierarchyParser:
         elif key == "JOINT" and block is not None and in_joint and len(words) > 1:
             self.pending = self._add(piece, block)
         elif key == "END" and block is not None and in_joint:
-            self.out.end_sites.append((block, [0.0, 0.0, 0.0]))
             self.pending = -1
         elif key == "OFFSET" and block is not None:
-            if in_joint:
-                self.offsets[block] = self._offset(words)
-            else:
-                self.out.end_sites[-1] = (self.out.end_sites[-1][0], self._offset(words))
+            self.offsets[block] = self._offset(words)  # of an End Site, -1, only checked
         elif key == "CHANNELS" and block is not None and in_joint:
             self.channels[block] = self._channel_names(words)
         else:

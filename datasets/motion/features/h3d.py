@@ -36,8 +36,8 @@ from motionloom.datasets.motion.canonical import (
     retarget,
 )
 from motionloom.datasets.motion.features.exact import place
+from motionloom.datasets.motion.kinematics import multiply, swing
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.rotation import multiply, swing
 from motionloom.datasets.motion.skeleton import Skeleton
 
 SMOOTH_FRAMES = 20

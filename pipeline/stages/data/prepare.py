@@ -6,8 +6,7 @@ from pathlib import Path
 
 import torch
 
-from motionloom.datasets.loading.feature_stats import FeatureStats
-from motionloom.datasets.loading.statistics import compute
+from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
 from motionloom.pipeline.contract.stage import (

@@ -12,7 +12,7 @@ from torch import nn
 from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
-from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError

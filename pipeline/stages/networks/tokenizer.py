@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
-from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer

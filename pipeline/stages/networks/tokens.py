@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.pipeline.contract.showing import Bars, Showing

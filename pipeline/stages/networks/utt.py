@@ -10,8 +10,8 @@ from pydantic import Field, field_validator
 from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
-from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.loading.kinds import Balance, Drop
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import MateConfig

@@ -21,9 +21,7 @@ from shard_samples import write
 from motionloom.datasets.audio.sound import MAX_RATE, read_sound
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.files import check_file
-from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.captions.read import read_captions
-from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.schema import Manifest, ShardInfo, UserError
@@ -133,10 +131,3 @@ def test_a_check_looks_at_every_number(tmp_path: Path) -> None:
     assert examine(tmp_path / "set").errors
     with pytest.raises(UserError, match="frames a second"):
         ShardDataset.open(tmp_path / "set", "train")
-
-
-def test_the_plan_sees_cut_files(tmp_path: Path) -> None:
-    text = HEAD.format(name="r") + "}\n" + "MOTION\nFrames: 3\nFrame Time: 0.5\n" + "0 0 0\n" * 2
-    (tmp_path / "a.bvh").write_text(text)
-    plan = prepare(BvhConfig(source=tmp_path, licence="CC0")).plan
-    assert [drop.reason for drop in plan.broken] == ["the header says 3 frames, 2 found"]

@@ -18,7 +18,6 @@ from motionloom.datasets.base.lock import LOCK_FILE
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.scan import Batch
-from motionloom.datasets.convert.common.splits import hash_split
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
@@ -308,21 +307,6 @@ def test_expected_frames_are_the_written_ones(clips: Path, tmp_path: Path) -> No
         assert {s.split: s.frames for s in manifest.shards} == prepare(given).plan.frames
 
 
-def test_splits_come_from_files_then_captions_then_hash(copy: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "splits"
-    folder.mkdir()
-    ids = [f"dataset-1_{name}_001" for name in NAMES]
-    (folder / "train.txt").write_bytes(("\r\n".join(ids[:3]) + "\r\n\r\n").encode())
-    (folder / "test.txt").write_text("\n".join([*ids[3:5], ids[3], "nobody"]))
-    plan = prepare(config(copy, splits=folder)).plan
-    assert plan.counts() == {"train": 3, "val": 0, "test": 2}
-    assert [d.source for d in plan.missing] == ["nobody"]
-    assert any("listed twice" in note for note in plan.notes)
-    assert sum(d.reason == "in no split file" for d in plan.dropped) == 2
-    hashed = prepare(config(copy, captions=None)).plan
-    assert all(split == hash_split(clip.id) for split, clip in hashed.items)
-
-
 def test_archive_members_are_labels_never_paths(clips: Path, tmp_path: Path) -> None:
     source = tmp_path / "source"
     source.mkdir()
@@ -373,7 +357,7 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
         prepare(config(copy, source=tmp_path / "nothing"))
     with pytest.raises(UserError, match="no such file or folder"):
         prepare(config(copy, source=tmp_path / "none"))
-    with pytest.raises(UserError, match="cannot be made from joints"):
+    with pytest.raises(UserError, match="layout smpl75 cannot be made"):
         convert(config(copy, layout="smpl75"), tmp_path / "raw")
 
 

@@ -1,9 +1,10 @@
-"""BVH conversion without a joint map (a guess for each skeleton) and without fingers (at rest or masked)."""
+"""BVH conversion without a joint map (a guess for each skeleton), without fingers, and of ASF/AMC trials."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import tarfile
 from pathlib import Path
 from typing import Any
 
@@ -228,3 +229,36 @@ def test_a_plan_needs_no_licence_and_a_conversion_does(clips: Path, tmp_path: Pa
     assert prepared.plan.items
     with pytest.raises(UserError, match="--licence"):
         run_conversion(prepared, tmp_path / "out", progress=False)
+
+
+TRIALS = ("HDM_bd_squat1Reps_012_120.amc", "HDM_bd_depositFloorR_001_120.amc")
+
+
+@pytest.fixture(scope="module")
+def trials(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two trials of one actor, and a third whose skeleton is not there."""
+    folder = tmp_path_factory.mktemp("trials")
+    with tarfile.open(shared / "data/real/hdm05/hdm05.tar.xz", "r|*") as archive:
+        for member in archive:
+            name = Path(member.name).name
+            file = archive.extractfile(member) if name in (*TRIALS, "HDM_bd.asf") else None
+            if file is not None:
+                (folder / name).write_bytes(file.read())
+    (folder / "HDM_xx_walk.amc").write_bytes((folder / TRIALS[0]).read_bytes())
+    return folder
+
+
+def test_trials_are_converted_by_the_skeleton_of_their_subject(trials: Path, tmp_path: Path) -> None:
+    manifest = convert(trials, tmp_path / "loose")
+    assert sum(shard.samples for shard in manifest.shards) == 2
+    left_out = (tmp_path / "loose" / "left-out.txt").read_text("utf-8")
+    assert "HDM_xx_walk.amc" in left_out and "HDM_xx.asf" in left_out
+
+    with tarfile.open(tmp_path / "trials.tar.xz", "w:xz") as archive:
+        for path in sorted(trials.iterdir(), reverse=True):  # skeletons behind the motions
+            archive.add(path, path.name)
+    convert(tmp_path / "trials.tar.xz", tmp_path / "packed")
+    loose, packed = joints_by_id(tmp_path / "loose"), joints_by_id(tmp_path / "packed")
+    assert loose.keys() == packed.keys() and len(loose) == 2
+    for clip, motion in loose.items():
+        np.testing.assert_array_equal(motion, packed[clip])

@@ -16,8 +16,7 @@ from torch.utils.data import DataLoader
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches, EvalBatches
 from motionloom.datasets.loading.crops import frame_span
-from motionloom.datasets.loading.feature_stats import FeatureStats
-from motionloom.datasets.loading.statistics import compute
+from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.reader import ShardDataset

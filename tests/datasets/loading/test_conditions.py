@@ -12,11 +12,10 @@ from pydantic import Field
 from rank_shares import require_shares
 from text_samples import WordLengths
 
-from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches, EvalBatches
-from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches
 from motionloom.datasets.loading.kinds import Balance, Drop, all_kinds, key_of
 from motionloom.datasets.loading.mix import MixedDataset
-from motionloom.datasets.loading.statistics import compute, frame_statistics
+from motionloom.datasets.loading.statistics import FeatureStats, compute, frame_statistics
 from motionloom.datasets.modalities.audio import RECORD as AUDIO
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.motion.layout import MotionLayout
@@ -218,29 +217,6 @@ def test_a_mix_keeps_its_weights_within_a_kind(
     assert first == 10
 
 
-def test_evaluation_sees_the_clips_of_a_kind_once(
-    data: ShardDataset, stats: FeatureStats, readers: dict[str, object]
-) -> None:
-    seen: list[int] = []
-    for rank in range(2):
-        batches = EvalBatches(
-            data,
-            stats,
-            readers,
-            batch_size=8,
-            max_frames=30,
-            kinds=("audio", "text+audio"),
-            rank=rank,
-            world=2,
-        )
-        for k in range(len(batches)):
-            batch = batches[k]
-            seen += batch["index"][batch["valid"]].tolist()
-            assert set(kinds_in(batch)) <= {"audio", "text+audio"}
-    wanted = [i for i in range(len(data)) if kind_of(data, i) in ("audio", "text+audio")]
-    assert sorted(seen) == wanted
-
-
 def test_audio_statistics_are_those_of_all_rows_at_once(
     data: ShardDataset, heard: FrameStats, tmp_path: Path
 ) -> None:
@@ -286,5 +262,3 @@ def test_mistakes_are_named(
     batches = ConditionBatches(double, stats, readers, batch_size=4, max_frames=16)
     with pytest.raises(UserError, match="one row a motion frame"):
         batches[0]
-    with pytest.raises(UserError, match="of kind audio"):
-        EvalBatches(words, stats, readers, batch_size=4, max_frames=16, kinds=["audio"])

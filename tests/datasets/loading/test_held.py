@@ -15,9 +15,8 @@ from text_samples import OneToken, caption_batches
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
-from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.loading.mix import MixedDataset
-from motionloom.datasets.loading.statistics import STD_FLOOR, Moments, compute, from_moments
+from motionloom.datasets.loading.statistics import STD_FLOOR, FeatureStats, Moments, compute, from_moments
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import FACE, HANDS, UserError
 from motionloom.datasets.shards.clips import ClipDataset

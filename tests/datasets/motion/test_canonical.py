@@ -1,4 +1,4 @@
-"""Heading, canonical pose, mirroring, resampling and retargeting, on a figure that walks and turns."""
+"""Heading, canonical pose, mirroring, resampling and retargeting; SMPL parameters; hands at rest."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from motionloom.datasets.convert.common.features import canonical_smpl75
+from motionloom.datasets.motion.body.resting_hands import relaxed_fingers, with_resting_hands
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import (
     canonicalize,
     facing,
@@ -179,3 +182,101 @@ def test_retargeting_to_the_same_skeleton_changes_nothing_and_batches_agree() ->
     assert np.isfinite(retarget(np.zeros_like(joints), BODY)).all()
     with pytest.raises(UserError, match=r"needs joints \[\.\.\., 22, 3\]"):
         retarget(joints[:, :21], BODY)
+
+
+NEUTRAL = BodyModel.neutral("smpl22")
+MODEL = BodyModel(  # like a real model: the pelvis is not at the origin
+    Skeleton.named("smpl22"), np.add(NEUTRAL.template, [0.01, -0.25, 0.03]), np.zeros((22, 3, 0)), {}
+)
+
+
+def dance(frames: int = 121) -> tuple[np.ndarray, np.ndarray]:
+    """Smooth poses [T, 24, 3] of a figure that starts anywhere, and turns more than once; trans [T, 3]."""
+    rng = np.random.default_rng(3)
+    t = np.linspace(0, 2, frames)[:, None, None]
+    poses = 0.4 * np.sin(t * rng.uniform(1, 3, (24, 3)) + rng.uniform(0, 6, (24, 3)))
+    poses[:, 0] = [0.0, 1.0, 0.0]
+    poses[:, 0] *= 1.2 + 4.0 * t[:, :, 0]
+    trans = np.stack([t[:, 0, 0], 2 + 0.1 * np.sin(3 * t[:, 0, 0]), -3 + 0.5 * t[:, 0, 0]], axis=-1)
+    return poses, trans
+
+
+def joints_of_columns(columns: np.ndarray, body: BodyModel) -> np.ndarray:
+    values = columns.astype(np.float64)
+    return smpl_joints(values[:, 3:].reshape(-1, 24, 3)[:, :22], values[:, :3], body)
+
+
+@pytest.mark.parametrize("body", [NEUTRAL, MODEL], ids=["neutral", "model"])
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_stored_parameters_pose_the_canonical_joints(body: BodyModel, step: int) -> None:
+    poses, trans = dance()
+    columns = canonical_smpl75(poses, trans, body, 60.0, 60.0 / step)
+    wanted = canonicalize(smpl_joints(poses[:, :22], trans, body)[::step])
+    assert columns.dtype == np.float32
+    assert columns.shape == (len(wanted), 75)
+    assert np.abs(joints_of_columns(columns, body) - wanted).max() < 2e-6
+    assert np.linalg.norm(columns[:, 3:].reshape(-1, 24, 3), axis=-1).max() <= np.pi + 1e-6
+    hands = columns[:, 3 + 66 :].reshape(-1, 2, 3)
+    assert np.abs(hands - poses[::step, 22:]).max() < 1e-6
+
+
+def test_frames_between_source_frames_keep_the_bones() -> None:
+    poses, trans = dance()
+    columns = canonical_smpl75(poses, trans, NEUTRAL, 60.0, 25.0)
+    assert len(columns) == 51
+    joints = joints_of_columns(columns, NEUTRAL)
+    bones = np.linalg.norm(joints[:, 1:] - joints[:, list(NEUTRAL.skeleton.parents[1:])], axis=-1)
+    assert np.abs(bones - np.linalg.norm(NEUTRAL.skeleton.offsets[1:], axis=-1)).max() < 1e-6
+    # Frame 5 k lies at 0.2 k s, which is frame 12 k of the source.
+    whole = joints_of_columns(canonical_smpl75(poses, trans, NEUTRAL, 60.0, 60.0), NEUTRAL)
+    away = np.abs(joints[::5] - whole[::12])
+    assert np.ptp(joints[::5, 0, 1] - whole[::12, 0, 1]) < 1e-5  # the floor may differ by the lowest frame
+    assert away[..., [0, 2]].max() < 1e-5
+
+
+WHOLE = Skeleton.named("smplx52")
+
+
+def posed(seed: int, size: float = 1.0) -> np.ndarray:
+    """Joints [5, 22, 3] of a body of this size in random poses."""
+    turns = Rotation.from_rotvec(np.random.default_rng(seed).normal(0, 0.4, (5 * 22, 3))).as_matrix()
+    root = np.random.default_rng(seed).normal(0, 1, (5, 3))
+    return forward_kinematics(turns.reshape(5, 22, 3, 3), root, BODY.offsets * size, BODY.parents)[0]
+
+
+def test_of_the_rest_pose_only_the_fingers_bend() -> None:
+    made = with_resting_hands(BODY.rest_joints[None].repeat(2, 0))
+    local = np.tile(np.eye(3), (52, 1, 1))
+    mirror = np.diag([-1.0, 1.0, 1.0])
+    local[22:37], local[37:] = relaxed_fingers(), mirror @ relaxed_fingers() @ mirror
+    wanted, _ = forward_kinematics(local, np.zeros(3), WHOLE.offsets, WHOLE.parents)
+    np.testing.assert_allclose(made, np.stack([wanted, wanted]), atol=1e-9)
+
+
+def test_bones_keep_their_length_and_the_body_its_place() -> None:
+    body = posed(3, size=1.25)
+    made = with_resting_hands(body)
+    np.testing.assert_array_equal(made[:, :22], body)
+    parents = np.array(WHOLE.parents[22:])
+    bones = np.linalg.norm(made[:, 22:] - made[:, parents], axis=-1)
+    wanted = 1.25 * np.linalg.norm(WHOLE.offsets[22:], axis=-1)
+    np.testing.assert_allclose(bones, np.broadcast_to(wanted, bones.shape), rtol=1e-9)
+
+
+def test_a_hand_goes_with_its_forearm() -> None:
+    """A hand points on from the forearm, whatever the pose; the mirror image has the mirrored hands."""
+    body = posed(4)
+    made = with_resting_hands(body)
+    for side in ("left", "right"):
+        elbow, wrist, knuckle = (WHOLE.index(f"{side}_{name}") for name in ("elbow", "wrist", "middle1"))
+        forearm, palm = made[:, wrist] - made[:, elbow], made[:, knuckle] - made[:, wrist]
+        cosine = (forearm * palm).sum(-1) / np.linalg.norm(forearm, axis=-1) / np.linalg.norm(palm, axis=-1)
+        assert cosine.min() > 0.9
+    flip = np.array([-1.0, 1.0, 1.0])
+    other = with_resting_hands(body[:, BODY.mirror] * flip)
+    np.testing.assert_allclose(other, made[:, WHOLE.mirror] * flip, atol=1e-7)
+
+
+def test_other_skeletons_are_refused() -> None:
+    with pytest.raises(UserError, match=r"joints \[T, 22, 3\], not to \[2, 52, 3\]"):
+        with_resting_hands(np.zeros((2, 52, 3)))

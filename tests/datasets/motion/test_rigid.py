@@ -1,4 +1,4 @@
-"""Rigid skeletons against recorded motion, against stretched bones, and against scipy's slow solver."""
+"""Rigid skeletons against recorded motion and scipy's slow solver; planted feet; SMPL-X files read back."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.body.chain_solver import solve_poses
-from motionloom.datasets.motion.body.rigid import fit_rigid, measured_skeleton, share_twist
+from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
+from motionloom.datasets.motion.body.rigid import (
+    RigidMotion,
+    fit_rigid,
+    measured_skeleton,
+    share_twist,
+    with_offsets,
+)
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
+from motionloom.datasets.motion.body.smplx_file import smplx_parameters, write_smplx
 from motionloom.datasets.motion.features.joints import joints_of, rotations_of
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.layout import MotionLayout
@@ -172,3 +181,186 @@ def test_joints_without_bones_and_single_frames_are_fitted() -> None:
     fitted = fit_rigid(joints, skeleton)
     assert fitted.error.max_mm < 1e-3
     assert np.isfinite(fitted.rotations).all()
+
+
+FPS = 20.0
+SKELETON = Skeleton.named("smpl22")
+BALLS = [SKELETON.index("left_foot"), SKELETON.index("right_foot")]
+
+
+def standing_and_sliding(frames: int = 60, slide: float = 0.2) -> NDArray[np.float64]:
+    """The rest pose on the floor with bent knees, in the air from frame 20 to 40, and it drifts ahead."""
+    joints = np.repeat(SKELETON.rest_joints[None], frames, axis=0)
+    joints[..., 1] -= joints[..., 1].min()
+    for side in ("left", "right"):
+        knee = SKELETON.index(f"{side}_knee")
+        joints[:, knee, 2] += 0.08
+    time = np.arange(frames) / FPS
+    joints[..., 2] += slide * time[:, None]
+    joints[20:40, :, 1] += 0.3 * np.sin(np.linspace(0, np.pi, 20))[:, None] + 0.06
+    return joints
+
+
+def test_feet_stand_where_they_are_low_and_slow() -> None:
+    contacts = foot_contacts(standing_and_sliding(), SKELETON, FPS)
+    expected = np.ones((60, 2), bool)
+    expected[20:40] = False
+    np.testing.assert_array_equal(contacts, expected)
+    assert not foot_contacts(standing_and_sliding(slide=2.0), SKELETON, FPS).any()
+
+
+def test_contact_columns_take_the_place_of_speed_and_short_contacts_are_none() -> None:
+    layout = MotionLayout.named("h3d263")
+    features = np.zeros((60, layout.dim))
+    columns = features[:, layout.slice("foot_contacts")]
+    columns[:20, 1] = 1  # ball of the left foot
+    columns[41, 3] = 1  # one frame of the right one
+    columns[50:, 3] = 1
+    columns[54, 3] = 0  # a gap of one frame
+    features[:, layout.slice("foot_contacts")] = columns
+    contacts = foot_contacts(standing_and_sliding(slide=2.0), SKELETON, FPS, None, features, layout)
+    expected = np.zeros((60, 2), bool)
+    expected[:20, 0] = expected[50:, 1] = True
+    np.testing.assert_array_equal(contacts, expected)
+
+
+def test_planted_feet_stay_where_they_stand_and_the_report_says_so() -> None:
+    joints = standing_and_sliding()
+    fitted = fit_rigid(joints, SKELETON)
+    contacts = foot_contacts(fitted.joints, SKELETON, FPS)
+    planted, report = plant_feet(fitted, joints, contacts, FPS)
+    for run in (slice(0, 20), slice(40, 60)):
+        spread = np.ptp(planted.joints[run][:, BALLS][..., [0, 2]], axis=0)
+        assert spread.max() < 2e-3
+    assert report.slide_before == pytest.approx(20.0, abs=0.5)
+    assert report.slide_after < 0.5
+    assert report.contact == pytest.approx(2 / 3)
+    assert planted.error.mean_mm > fitted.error.mean_mm == report.unplanted.mean_mm
+    # Bones stay what they were, and the jump between the contacts has no step in it.
+    parents = list(SKELETON.parents[1:])
+    sizes = np.linalg.norm(planted.joints[:, 1:] - planted.joints[:, parents], axis=-1)
+    assert np.ptp(sizes, axis=0).max() < 1e-9
+    moved = np.abs(np.diff(planted.joints - fitted.joints, axis=0)).max()
+    # 10 cm of correction fade over 3 frames, by at most 1.5 times the even share.
+    assert moved < 1.5 * 0.1 / 3
+
+
+def walking(frames: int = 80, sliding: float = 0.3) -> NDArray[np.float64]:
+    """Legs that swing by sines while the root goes faster than they step: one foot is down at a time."""
+    time = np.arange(frames) / FPS
+    local = np.broadcast_to(np.eye(3), (frames, 22, 3, 3)).copy()
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        swing = sign * np.sin(2 * np.pi * 0.9 * time)
+        bend = 0.9 * np.clip(
+            sign * np.cos(2 * np.pi * 0.9 * time), 0, 1
+        )  # the knee bends while it swings ahead
+        local[:, SKELETON.index(f"{side}_hip")] = Rotation.from_euler(
+            "x", (-0.35 * swing - bend / 2)[:, None]
+        ).as_matrix()
+        local[:, SKELETON.index(f"{side}_knee")] = Rotation.from_euler("x", bend[:, None]).as_matrix()
+    joints, _ = forward_kinematics(local, np.zeros((frames, 3)), SKELETON.offsets, SKELETON.parents)
+    joints[..., 1] -= joints[:, BALLS, 1].min(axis=1)[:, None]
+    # The root goes on by as much as the lower foot goes back, and slides on top of that.
+    lower = joints[:, BALLS, 1].argmin(axis=1)
+    back = -np.diff(joints[:, BALLS, 2], axis=0)[np.arange(frames - 1), lower[1:]]
+    path = np.concatenate([[0], np.cumsum(back)]) + sliding * time
+    joints[..., 2] += path[:, None]
+    return joints
+
+
+def test_a_walk_keeps_its_swing() -> None:
+    joints = walking()
+    fitted = fit_rigid(joints, SKELETON)
+    contacts = foot_contacts(fitted.joints, SKELETON, FPS)
+    assert 0.2 < contacts.mean() < 0.8
+    planted, report = plant_feet(fitted, joints, contacts, FPS)
+    assert report.slide_before > 15
+    assert report.slide_after < 0.1 * report.slide_before
+    away = np.linalg.norm(planted.joints - fitted.joints, axis=-1)
+    assert away[:, SKELETON.index("head")].max() < 0.05
+    # A foot in the air, farther from its contacts than the blend, goes where it went.
+    near = np.zeros_like(contacts)
+    for shift in range(-4, 5):
+        near |= np.roll(contacts, shift, axis=0)
+    for foot, ball in enumerate(BALLS):
+        swinging = ~near[:, foot]
+        assert away[swinging, ball].max(initial=0.0) < 2e-3
+
+
+def test_without_contacts_nothing_changes() -> None:
+    fitted: RigidMotion = fit_rigid(standing_and_sliding(slide=2.0), SKELETON)
+    same, report = plant_feet(fitted, fitted.joints, np.zeros((60, 2), bool), FPS)
+    assert same is fitted
+    assert "no foot stands" in str(report)
+
+
+def posed(skeleton: Skeleton, frames: int = 12, seed: int = 0) -> tuple[Floats, RigidMotion]:
+    """Local rotations of a smooth random motion, and the motion fitted to its joints."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0, 2, frames)[:, None, None]
+    vectors = 0.4 * rng.normal(size=(1, len(skeleton), 3)) * np.sin(time + rng.uniform(size=(1, 1, 3)))
+    local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(frames, -1, 3, 3)
+    root = np.column_stack([np.sin(time[:, 0, 0]), 1 + 0 * time[:, 0, 0], time[:, 0, 0]])
+    joints, _ = forward_kinematics(local, root, skeleton.offsets, skeleton.parents)
+    return joints, fit_rigid(joints, skeleton, rotations=local)
+
+
+def to_y_up(points: Floats) -> Floats:
+    """(x, y, z) with Z up -> (x, z, -y)."""
+    return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
+
+
+def body_joints(arrays: dict[str, NDArray], body: BodyModel) -> Floats:
+    poses = arrays["poses"].astype(np.float64).reshape(len(arrays["poses"]), 55, 3)
+    chosen = [*range(22), *range(25, 55)][: len(body.skeleton)]
+    return to_y_up(smpl_joints(poses[:, chosen], arrays["trans"].astype(np.float64), body))
+
+
+@pytest.mark.parametrize("name", ["smpl22", "smplx52"])
+def test_the_neutral_body_wears_a_motion_of_its_own_bones_exactly(name: str, tmp_path: Path) -> None:
+    joints, motion = posed(Skeleton.named(name))
+    error = write_smplx(tmp_path / "x.npz", motion, 30.0)
+    assert error.max_mm < 1e-3
+    with np.load(tmp_path / "x.npz", allow_pickle=False) as file:
+        arrays = {key: file[key] for key in file.files}
+    assert arrays["poses"].shape == (12, 165)
+    assert float(arrays["mocap_frame_rate"]) == 30
+    assert float(arrays["mocap_time_length"]) == pytest.approx(0.4)
+    assert (arrays["betas"] == 0).all() and str(arrays["gender"]) == "neutral"
+    np.testing.assert_array_equal(arrays["pose_hand"], arrays["poses"][:, 75:])
+    np.testing.assert_array_equal(arrays["pose_body"], arrays["poses"][:, 3:66])
+    np.testing.assert_array_equal(arrays["root_orient"], arrays["poses"][:, :3])
+    shown = body_joints(arrays, BodyModel.neutral(name))  # type: ignore[arg-type]
+    np.testing.assert_allclose(shown, joints, atol=1e-5)
+
+
+def test_a_body_of_other_bones_stands_where_its_model_puts_it() -> None:
+    """A made-up model: other lengths, and a pelvis below the origin, as SMPL-X has it."""
+    skeleton = Skeleton.named("smplx52")
+    _, motion = posed(skeleton, seed=1)
+    rng = np.random.default_rng(2)
+    other = with_offsets(skeleton, skeleton.offsets * rng.uniform(0.9, 1.1, size=(52, 1)))
+    pelvis = np.array([0.003, -0.35, 0.012])
+    body = BodyModel(other, other.rest_joints + pelvis, np.zeros((52, 3, 0)), {})
+    arrays, error = smplx_parameters(motion, 20.0, body)
+    assert error.max_mm < 5
+    shown = body_joints(arrays, body)
+    leg = [skeleton.index("right_knee"), skeleton.index("right_ankle")]
+    sizes = [np.linalg.norm(s.offsets[leg], axis=-1).sum() for s in (other, skeleton)]
+    np.testing.assert_allclose(shown[:, 0], motion.root * sizes[0] / sizes[1], atol=5e-3)
+    # Every bone points the way it does in the motion.
+    parents = list(skeleton.parents[1:])
+    ways = [j[:, 1:] - j[:, parents] for j in (shown, motion.joints)]
+    units = [w / np.linalg.norm(w, axis=-1, keepdims=True) for w in ways]
+    assert np.einsum("tji,tji->tj", *units).min() > 0.97
+
+
+def test_strange_skeletons_and_too_small_models_are_refused() -> None:
+    odd = Skeleton("odd", ("a", "b"), (-1, 0), ((0, 0, 0), (0, 1, 0)))
+    still = np.broadcast_to(np.eye(3), (2, 2, 3, 3)).copy()
+    motion = RigidMotion.posed(odd, still, np.zeros((2, 3)), np.zeros((2, 2, 3)))
+    with pytest.raises(UserError, match="smpl22 and smplx52"):
+        smplx_parameters(motion, 20.0)
+    _, whole = posed(Skeleton.named("smplx52"))
+    with pytest.raises(UserError, match="use SMPL-X"):
+        smplx_parameters(whole, 20.0, BodyModel.neutral("smpl22"))

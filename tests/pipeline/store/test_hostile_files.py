@@ -24,7 +24,7 @@ import torch
 
 from motionloom.datasets.check.files import check_file
 from motionloom.datasets.convert.common.arrays import load_array
-from motionloom.datasets.loading.feature_stats import FeatureStats
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.npz import NpzFile

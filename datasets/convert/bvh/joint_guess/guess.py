@@ -12,20 +12,21 @@ backwards (`datasets/motion/plausibility.py`).
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from motionloom.datasets.convert.bvh.joint_guess.conventions import CONVENTIONS
-from motionloom.datasets.convert.bvh.joint_guess.figure import Figure
+from motionloom.datasets.convert.bvh.joint_guess.figure import CONVENTIONS, Figure
 from motionloom.datasets.convert.bvh.joint_guess.limbs import (
     How,
     Kind,
     Limb,
-    LimbPair,
+    Limbs,
     Rows,
     fill_fingers,
     fill_trunk,
-    named_pair,
+    named_limbs,
+    roots,
 )
 from motionloom.datasets.motion.bvh.joint_map import JointMap, map_text
 from motionloom.datasets.motion.bvh.motion import BvhMotion
@@ -110,30 +111,27 @@ _SLOTS: dict[Kind, tuple[str, str, str, str]] = {
 def guess_joint_map(motion: BvhMotion, target: Skeleton) -> JointGuess:
     """Guess which joints of a clip stand for those of `target` (`smpl22` or `smplx52`)."""
     figure, rows = Figure.of(motion), Rows()
-    legs, arms = named_pair(figure, "leg"), named_pair(figure, "arm")
+    legs, arms = named_limbs(figure, "leg"), named_limbs(figure, "arm")
     problems: list[str] = []
     if legs is None or arms is None:
         kinds = [kind for kind, pair in (("legs", legs), ("arms", arms)) if pair is None]
         problems.append(f"found no {' and no '.join(kinds)} by name")
-        for pair in (legs, arms):
-            if pair is not None:
-                _fill_limbs(figure, pair, rows)
+        _fill_limbs(legs or arms, rows)
         _fill_by_words(figure, rows)
     else:
         legs = _with_feet(figure, legs, rows)
         fill_trunk(figure, legs, arms, rows)
-        for pair in (legs, arms):
-            _fill_limbs(figure, pair, rows)
+        _fill_limbs((*legs, *arms), rows)
         _fill_collars(figure, arms, rows)
-        for side, arm in (("left", arms.left), ("right", arms.right)):
-            fill_fingers(figure, side, arm, rows)
+        for arm in arms:
+            fill_fingers(figure, arm, rows)
     return _guess(figure, motion.name, target, rows, problems)
 
 
-def _with_feet(figure: Figure, legs: LimbPair, rows: Rows) -> LimbPair:
+def _with_feet(figure: Figure, legs: Limbs, rows: Rows) -> Limbs:
     """Legs whose fourth slot, where no name filled it, is the only joint that follows on the ankle."""
     done: list[Limb] = []
-    for side, leg in (("left", legs.left), ("right", legs.right)):
+    for leg in legs:
         ankle, toe = leg.slots[2], leg.slots[3]
         assert ankle is not None
         below = figure.children[ankle]
@@ -141,17 +139,17 @@ def _with_feet(figure: Figure, legs: LimbPair, rows: Rows) -> LimbPair:
             toe = None if figure.coincide(below[0], ankle) else below[0]
             below = figure.children[below[0]]
         if toe is not None and leg.slots[3] is None:
-            rows.put(f"{side}_foot", [toe], "hierarchy")
+            rows.put(f"{leg.side}_foot", [toe], "hierarchy")
         elif toe is None:
-            rows.doubt(f"{side}_foot", below)
-        done.append(Limb((*leg.slots[:3], toe), leg.rivals))
-    return LimbPair("leg", done[0], done[1])
+            rows.doubt(f"{leg.side}_foot", below)
+        done.append(replace(leg, slots=(*leg.slots[:3], toe)))
+    return done[0], done[1]
 
 
-def _fill_limbs(figure: Figure, pair: LimbPair, rows: Rows) -> None:
-    for side, limb in (("left", pair.left), ("right", pair.right)):
-        for word, joint, rivals in zip(_SLOTS[pair.kind], limb.slots, limb.rivals, strict=True):
-            name = f"{side}_{word}"
+def _fill_limbs(limbs: Iterable[Limb] | None, rows: Rows) -> None:
+    for limb in limbs or ():
+        for word, joint, rivals in zip(_SLOTS[limb.kind], limb.slots, limb.rivals, strict=True):
+            name = f"{limb.side}_{word}"
             if rivals:
                 rows.doubt(name, rivals)
             elif joint is not None and name not in rows.sources:
@@ -175,11 +173,11 @@ def _fill_by_words(figure: Figure, rows: Rows) -> None:
                 rows.doubt(joint, found)
 
 
-def _fill_collars(figure: Figure, arms: LimbPair, rows: Rows) -> None:
+def _fill_collars(figure: Figure, arms: Limbs, rows: Rows) -> None:
     """Collars without a name: the only joint between chest and shoulder, else the mean of what is around."""
-    chest = figure.common_ancestor(arms.roots)
-    for side, arm in (("left", arms.left), ("right", arms.right)):
-        shoulder, collar = arm.essential("arm")[0], f"{side}_collar"
+    chest = figure.common_ancestor(roots(arms))
+    for arm in arms:
+        shoulder, collar = arm.essential()[0], f"{arm.side}_collar"
         if collar in rows.sources or collar in rows.candidates:
             continue
         between = figure.apart(chest, figure.path(chest, shoulder))[:-1]

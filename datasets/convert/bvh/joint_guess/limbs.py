@@ -11,8 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from motionloom.datasets.convert.bvh.joint_guess.conventions import CONVENTIONS, FINGERS
-from motionloom.datasets.convert.bvh.joint_guess.figure import Figure
+from motionloom.datasets.convert.bvh.joint_guess.figure import CONVENTIONS, FINGERS, Figure
 
 Kind = Literal["leg", "arm"]
 How = Literal["name", "hierarchy", "mean"]
@@ -25,12 +24,14 @@ _ESSENTIAL: dict[Kind, tuple[int, int, int]] = {"leg": (0, 1, 2), "arm": (1, 2, 
 class Limb:
     """One limb: the source joint of each of its four slots."""
 
-    slots: tuple[int | None, int | None, int | None, int | None]
-    rivals: tuple[tuple[int, ...], ...] = ((), (), (), ())
+    kind: Kind
+    side: str
+    slots: tuple[int | None, ...]
+    rivals: tuple[tuple[int, ...], ...]
     """Per slot the joints between which the names do not decide."""
 
-    def essential(self, kind: Kind) -> tuple[int, int, int]:
-        first, second, third = (self.slots[slot] for slot in _ESSENTIAL[kind])
+    def essential(self) -> tuple[int, int, int]:
+        first, second, third = (self.slots[slot] for slot in _ESSENTIAL[self.kind])
         assert first is not None and second is not None and third is not None
         return first, second, third
 
@@ -59,8 +60,7 @@ def named_limb(figure: Figure, kind: Kind, side: str) -> Limb | None:
         return None
     fitting = [{one for fit in best if (one := fit[slot]) is not None} for slot in range(4)]
     rivals = tuple(tuple(sorted(joints)) if len(joints) > 1 else () for joints in fitting)
-    a, b, c, d = best[0]
-    return Limb((a, b, c, d), rivals)
+    return Limb(kind, side, best[0], rivals)
 
 
 def _agreement(figure: Figure, kind: Kind, choice: tuple[int | None, ...]) -> int:
@@ -70,24 +70,19 @@ def _agreement(figure: Figure, kind: Kind, choice: tuple[int | None, ...]) -> in
     return max(sum(a == b for a, b in zip(words, row, strict=True)) for row in rows)
 
 
-@dataclass(frozen=True)
-class LimbPair:
-    """The two limbs of one kind."""
-
-    kind: Kind
-    left: Limb
-    right: Limb
-
-    @property
-    def roots(self) -> list[int]:
-        chains = [[joint for joint in limb.slots if joint is not None] for limb in (self.left, self.right)]
-        return [chain[0] for chain in chains]
+Limbs = tuple[Limb, Limb]
+"""The left one and the right one."""
 
 
-def named_pair(figure: Figure, kind: Kind) -> LimbPair | None:
+def named_limbs(figure: Figure, kind: Kind) -> Limbs | None:
     """The legs or arms, where both sides have their names."""
     left, right = (named_limb(figure, kind, side) for side in ("left", "right"))
-    return None if left is None or right is None else LimbPair(kind, left, right)
+    return None if left is None or right is None else (left, right)
+
+
+def roots(limbs: Iterable[Limb]) -> list[int]:
+    """The first joint of each."""
+    return [next(joint for joint in limb.slots if joint is not None) for limb in limbs]
 
 
 _PELVIS_WORDS = frozenset(known.trunk[0] for known in CONVENTIONS)
@@ -117,23 +112,23 @@ class Rows:
         self.candidates[joint] = tuple(candidates)
 
 
-def fill_trunk(figure: Figure, legs: LimbPair, arms: LimbPair, rows: Rows) -> None:
+def fill_trunk(figure: Figure, legs: Limbs, arms: Limbs, rows: Rows) -> None:
     """Add pelvis, spine1 to spine3, neck and head."""
     pelvis = _pelvis(figure, legs, arms, rows)
-    chest = figure.common_ancestor(arms.roots)
+    chest = figure.common_ancestor(roots(arms))
     spine = [j for j in figure.path(pelvis, chest) if not figure.names[j].spare]
     above: int | None = None
     if spine and "neck" in figure.names[chest].word:  # 3ds Max hangs the collars on the neck
         above, spine = chest, spine[:-1]
     _fill_spine(figure, pelvis, figure.apart(pelvis, tuple(spine)), rows)
-    _fill_head(figure, chest, above, set(arms.roots), rows)
+    _fill_head(figure, chest, above, set(roots(arms)), rows)
 
 
-def _pelvis(figure: Figure, legs: LimbPair, arms: LimbPair, rows: Rows) -> int:
+def _pelvis(figure: Figure, legs: Limbs, arms: Limbs, rows: Rows) -> int:
     """Where legs and spine branch, if it lies between the hips; else the joint of that name that does."""
-    branch = figure.common_ancestor([*legs.roots, *arms.roots])
-    hips = figure.poses[:, [legs.left.essential("leg")[0], legs.right.essential("leg")[0]]].mean(axis=1)
-    hip, knee, ankle = legs.left.essential("leg")
+    branch = figure.common_ancestor(roots([*legs, *arms]))
+    hips = figure.poses[:, [leg.essential()[0] for leg in legs]].mean(axis=1)
+    hip, knee, ankle = legs[0].essential()
     reach = _NEAR_HIPS * (figure.length(hip, knee) + figure.length(knee, ankle))
     named = [j for j, name in enumerate(figure.names) if name.word in _PELVIS_WORDS and not name.side]
     fits = [
@@ -211,9 +206,9 @@ def _single_file(figure: Figure, branches: list[int]) -> tuple[int, ...]:
     return tuple(out)
 
 
-def fill_fingers(figure: Figure, side: str, arm: Limb, rows: Rows) -> None:
+def fill_fingers(figure: Figure, arm: Limb, rows: Rows) -> None:
     """Add the three joints of each finger, by name alone: too many hands have four joints a finger."""
-    wrist = arm.essential("arm")[2]
+    side, wrist = arm.side, arm.essential()[2]
     below: dict[str, list[int]] = {}
     for joint, name in enumerate(figure.names):
         if name.side == side and not name.spare and wrist in figure.ancestors(joint):

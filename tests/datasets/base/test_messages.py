@@ -1,18 +1,22 @@
-"""What the system refuses becomes a sentence, however a library has wrapped it; a bug does not."""
+"""What is said: a sentence for what the system refuses, lines of progress, text of strangers made safe."""
 
 from __future__ import annotations
 
 import errno
+import io
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 from safetensors.numpy import save_file
 
 from motionloom.datasets.base.files import atomic_path, write_text
 from motionloom.datasets.base.os_errors import of_the_machine, sentence_of
+from motionloom.datasets.base.printable import printable
+from motionloom.datasets.base.progress import Meter, Pace, duration
 
 FULL = Path("/dev/full")
 
@@ -86,3 +90,82 @@ def test_an_error_of_another_file_keeps_its_name(tmp_path: Path) -> None:
 def test_a_machine_at_its_limits_is_no_bad_clip() -> None:
     assert of_the_machine(OSError(errno.ENOSPC, "")) and of_the_machine(OSError(errno.EMFILE, ""))
     assert not of_the_machine(OSError(errno.EACCES, "")) and not of_the_machine(ValueError())
+
+
+class Clock:
+    """A clock that stands until it is set."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_time_left_goes_by_what_was_done_here() -> None:
+    """A resumed training had its first 400 steps from before: 100 steps in 50 s leave 1,000 s for 2,000."""
+    clock = Clock()
+    pace = Pace(2500, 400, clock)
+    assert pace.left(400) == "", "nothing is known yet"
+    clock.now += 50
+    assert pace.speed(500) == 2.0
+    assert pace.left(500) == "16 min 40 s left"
+    assert pace.left(2500) == ""
+
+
+def test_lines_come_every_15_seconds_and_at_the_end_of_what_took_as_long() -> None:
+    clock = Clock()
+    pace = Pace(10, clock=clock)
+    due = []
+    for done in range(1, 11):
+        clock.now += 5
+        due.append(pace.due(done))
+    assert [number for number, said in enumerate(due, start=1) if said] == [3, 6, 9, 10]
+    assert not Pace(10, clock=clock).due(10), "what is quick says nothing"
+
+
+def test_a_meter_prints_lines_where_there_is_no_terminal() -> None:
+    clock, log = Clock(), io.StringIO()
+    with Meter("generating", 40, done=8, console=Console(file=log, width=100), clock=clock) as meter:
+        for _ in range(4):
+            clock.now += 10
+            meter.advance(8)
+    assert log.getvalue().splitlines() == ["    generating: 24/40  20 s left", "    generating: 40/40"]
+
+
+@pytest.mark.parametrize("hidden", [{"shown": False}, {"console": Console(quiet=True)}])
+def test_a_meter_that_is_not_shown(hidden: dict[str, object], capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    with Meter("generating", 2, clock=clock, **hidden) as meter:  # type: ignore[arg-type]
+        clock.now += 100
+        meter.advance()
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (0.04, "0.0 s"),
+        (9.96, "10 s"),
+        (59.4, "59 s"),
+        (200, "3 min 20 s"),
+        (7500, "2 h 05 min"),
+        (9e5, "10 d 10 h"),
+    ],
+)
+def test_durations(seconds: float, said: str) -> None:
+    assert duration(seconds) == said
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("walks\r\nfast\t", r"walks\r\nfast\t"),
+        ("\x1b]0;owned\x07\x9b31m", r"\x1b]0;owned\x07\x9b31m"),
+        ("left\u202egpj.exe", r"left\u202egpj.exe"),
+        ("\ud800", r"\ud800"),
+        ("跳舞\u3000Tänzer می\u200cرقصد 👩\u200d🚀\xa0é", "跳舞\u3000Tänzer می\u200cرقصد 👩\u200d🚀\xa0é"),
+    ],
+)
+def test_no_character_commands_a_terminal_and_every_script_stays(text: str, shown: str) -> None:
+    assert printable(text) == shown
