@@ -233,7 +233,7 @@ def protocol_of(record: Record) -> str:
 
 def said(facts: Mapping[str, Any]) -> str:
     return ", ".join(
-        f"{name.removeprefix('sampling.')} {value}" for name, value in facts.items() if value != {}
+        f"{name.removeprefix('sampling.')} {value}" for name, value in facts.items() if str(value) != "{}"
     )
 
 

@@ -25,7 +25,9 @@ def evaluate(
     device: Device = "auto",
     table: Annotated[
         str | None,
-        typer.Option(help="Measure nothing; show a table of a paper with the finished runs' rows: ude/2."),
+        typer.Option(
+            help="Measure nothing; show a table of a paper, or all, with finished runs' rows: ude/2, ude."
+        ),
     ] = None,
     tables: Annotated[bool, typer.Option("--tables", help="List the tables of the papers.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Markdown file for a table.")] = None,

@@ -198,7 +198,7 @@ class Bundle:
             if isinstance(generator, DenoisingGenerator) and "sampler" in generator.settings:
                 sampler, steps = generator.denoising(sampling)
                 out |= {f"{prefix}sampler": sampler, f"{prefix}denoising_steps": steps}
-        return {name: value for name, value in out.items() if value is not None}
+        return {name: value for name, value in out.items() if value not in (None, {})}
 
     def generate(
         self,

@@ -138,6 +138,7 @@ seed: 3
 hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
 stages:
   data: {clips: 38, max_seconds: 5.0, dances: {songs: 8, song_seconds: 10.0}}
+  tma: null
   tokenizer:
     net: {width: 16, code_dim: 16, num_codes: 32}
     train: {steps: 12, batch_size: 8, checkpoint_every: 4, validate_every: 6}

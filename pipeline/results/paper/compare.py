@@ -22,13 +22,14 @@ from motionloom.pipeline.store.yaml import read_yaml
 
 def compare_with_paper(
     table: str, runs: Sequence[Path] = (), *, out: Path | None = None, console: Console | None = None
-) -> FilledTable:
-    """Print a table of a paper with the rows of finished runs, or write it to the file `out` as Markdown.
+) -> list[FilledTable]:
+    """Print tables of a paper with the rows of finished runs, or write them to the file `out` as Markdown.
 
     Nothing is measured and no model is loaded: the figures are those of the runs' finished evaluations.
 
     Args:
-        table: Its name, such as `humantomato/7`, or a YAML file of the same form.
+        table: Its name, such as `humantomato/7`; a paper's, such as `ude`, for all of its tables; or a YAML
+            file of the same form.
         runs: Run folders; without any, the paper's numbers stand alone.
         out: File (.md) to write in place of printing.
         console: Where to print; standard output by default.
@@ -38,13 +39,15 @@ def compare_with_paper(
         if out.suffix.lower() != ".md":
             raise UserError(f"{out}: a table is written as Markdown; name a file that ends in .md")
         require_file_place(out)
-    filled = fill(table, paper_table(table), runs)
+    names = [name for name in shipped_tables() if name.startswith(f"{table}/")] or [table]
+    found = [fill(name, paper_table(name), runs) for name in names]
     if out is None:
-        filled.print(console)
+        for filled in found:
+            filled.print(console)
     else:
-        write_text(out, filled.markdown())
+        write_text(out, "\n".join(filled.markdown() for filled in found))
         console.print(str(out), soft_wrap=True)
-    return filled
+    return found
 
 
 def list_tables(console: Console | None = None) -> None:

@@ -39,14 +39,17 @@ class _Filling:
         self.folders = {label: run for run, label in self.labels.items()}
         self.decimals = [self._decimals(at) for at in range(len(table.columns))]
         self.used: dict[tuple[Path, str], Evaluation] = {}
+        self.compared: set[tuple[Path, str]] = set()
+        """Evaluations whose models stand in the table."""
         self.shown: dict[tuple[Path, str], list[tuple[Column, Figure]]] = {}
         self.settings: dict[str, None] = {}
-        self.doubts: dict[str, None] = {}
+        self.doubts: dict[str, dict[str, None]] = defaultdict(dict)
         self.seen: set[tuple[object, ...]] = set()
 
     def filled(self) -> FilledTable:
         """The paper's rows, ours below each, and the answers that need no model."""
         models = [self._models(row) for row in self.table.rows]
+        self.compared = set(self.used)
         rows: list[FilledRow] = []
         for row, ours in zip(self.table.rows, models, strict=True):
             rows += [self._paper(row), *ours]
@@ -64,7 +67,7 @@ class _Filling:
             )
         ]
         marked = mark_best(rows, self.table.columns)
-        doubts = [*self._unlike(), *self.doubts]
+        doubts = [*self._unlike(), *(f"{', '.join(of)}: {note}" for note, of in self.doubts.items())]
         notes = notes_of(self.table, marked, list(self.settings), doubts, with_runs=bool(self.evaluations))
         return FilledTable(self.name, self.table, marked, tuple(found), notes)
 
@@ -184,21 +187,24 @@ class _Filling:
         column, digits = self.table.columns[at], self.decimals[at]
         self.shown.setdefault((evaluation.run, evaluation.name), []).append((column, figure))
         if figure.note:
-            self.doubts[f"{column.title} of {self.labels[evaluation.run]}, {figure.note}"] = None
+            self.doubts[figure.note][f"{column.title} of {self.labels[evaluation.run]}"] = None
         mean = figure.value * column.scale
         spread = None if figure.interval is None else figure.interval * column.scale
         text = f"{mean:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
         return Cell(text, mean, spread, figure.protocol_key)
 
     def _references(self, values: Mapping[str, str], titles: Iterable[str]) -> list[FilledRow]:
-        """Answers that need no model, of the evaluations that the table uses; equal ones of a run once."""
+        """Answers that need no model, of the evaluations whose models stand in the table, or of all where no
+        model does; equal ones once.
+        """
         out = []
         for title in titles:
             for run, all_of_run in self.evaluations.items():
-                used = [one for one in all_of_run if (run, one.name) in self.used] or all_of_run
-                for evaluation in used:
+                for evaluation in all_of_run:
+                    if self.compared and (run, evaluation.name) not in self.compared:
+                        continue
                     row = self._reference(run, evaluation, title, values)
-                    key = (run, title, tuple(cell and cell.text for cell in row.cells), *values.items())
+                    key = (title, tuple(cell and cell.text for cell in row.cells), *values.items())
                     if any(row.cells) and key not in self.seen:
                         self.seen.add(key)
                         self.used.setdefault((run, evaluation.name), evaluation)

@@ -132,6 +132,7 @@ def differences(
         facts = figure.protocol
         add("split", facts.get("split"), paper.split)
         add("clips", facts.get("clips"), paper.clips)
+        add("songs", facts.get("songs"), None)
         if "judge" in facts and evaluation.measure == "evaluate":
             stage = _judge(evaluation, figure)
             add("judged by", stage and f"stage {stage} of its own run", paper.evaluator)

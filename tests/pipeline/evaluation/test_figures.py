@@ -134,6 +134,6 @@ def test_a_new_metric_is_one_function_and_one_line(tmp_path: Path, monkeypatch: 
         "columns: [{name: reach, better: higher, figure: reach.root}]\n"
         "rows: [{method: theirs, paper: '1.5', ours: {generator: {kind: gpt}}}]\n"
     )
-    filled = compare_with_paper(str(mine), runs, console=Console(quiet=True))
+    (filled,) = compare_with_paper(str(mine), runs, console=Console(quiet=True))
     assert [row.label for row in filled.rows if row.source == "ours"] == ["near gpt", "far gpt"]
     assert all(row.cells[0] for row in filled.rows)

@@ -40,6 +40,7 @@ from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.requests import require_used
 from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.stages.results.evaluate_units import EvaluateConfig
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer
 
@@ -241,18 +242,24 @@ def test_the_commands_settings_reach_the_sampling(
         assert made.code == 2 and wrong.partition("=")[0] in made.err
 
 
-def test_the_stage_s_sampler_runs_unless_another_is_set(tmp_path: Path) -> None:
-    """Through a recipe with some sampling settings, and through what a run writes down of it."""
-    again = tmp_path / "recipe.yaml"
-    for recipe in ("ude-learning", again):
-        resolved = load_recipe(recipe, strict=False)
+@pytest.mark.parametrize("name", list(shipped_recipes()))
+def test_what_a_run_writes_down_draws_as_its_recipe_does(name: str, tmp_path: Path) -> None:
+    """With some sampling settings or none; of UDE the stage's sampler runs unless another is set."""
+    again, drawn = tmp_path / "recipe.yaml", list[dict[str, object]]()
+    for recipe in (name, again):
+        sets = ["ude.denoising_steps=7"] if recipe == name and name.startswith("ude") else []
+        resolved = load_recipe(recipe, sets, strict=False)
         stages = {one.name: one.config for one in resolved.stages}
-        halves: list[Any] = [SimpleNamespace(modalities={"audio"}, given={}), SimpleNamespace()]
-        engine = UdeGenerator(*halves, stages["ude"])
-        for name in ("generate", "evaluate", "evaluate_dances"):
-            assert engine.denoising(stages[name].sampling) == ("dpm++", 20), name
+        sampled = {name: one.sampling for name, one in stages.items() if hasattr(one, "sampling")}
+        assert {"generate", "evaluate", "report"} <= set(sampled)
+        drawn.append({name: sampling.dump() for name, sampling in sampled.items()})
+        if "ude" in stages:
+            halves: list[Any] = [SimpleNamespace(modalities={"audio"}, given={}), SimpleNamespace()]
+            engine = UdeGenerator(*halves, stages["ude"])
+            assert {engine.denoising(sampling) for sampling in sampled.values()} == {("dpm++", 7)}
+            assert engine.denoising(SamplingConfig(temperature=0.5, sampler="ddim")) == ("ddim", 7)
         again.write_text(resolved.to_yaml())
-    assert engine.denoising(SamplingConfig(temperature=0.5, sampler="ddim")) == ("ddim", 20)
+    assert drawn[0] == drawn[1]
 
 
 def test_a_protocol_names_the_settings_that_were_in_effect() -> None:

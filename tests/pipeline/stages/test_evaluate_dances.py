@@ -216,6 +216,7 @@ stages:
     max_seconds: 5.0
     test_fraction: 0.34
     dances: {songs: 9, song_seconds: 8, share: 0.5, conditions: {audio: 1.0, both: 0.0}}
+  tma: null
   tokenizer:
     net: {width: 16, code_dim: 8, num_codes: 16, root_gain: 1.0, finger_gain: 0.0}
     train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}
@@ -262,6 +263,8 @@ def test_dances_of_a_run_are_evaluated(run: tuple[Path, str]) -> None:
 
     facts = file.figures[0].protocol
     assert (facts["clips"], facts["repeats"], facts["decodings"], facts["feature_fps"]) == (4, 2, 2, 60.0)
+    drawn = [facts[f"sampling.{name}"] for name in ("sampler", "denoising_steps", "temperature")]
+    assert drawn == ["dpm++", 2, 0.8], "the stage's sampler and steps, beside a temperature of the recipe"
     answers = {OTHER_MUSIC, NEAREST_MUSIC, RANDOM_DANCE, STILL}
     assert answers | {MODEL, RECORDED} <= {one.row for one in file.figures}
     assert value("position.ape_joints", RECORDED) == 0 < value("position.ape_joints")

@@ -107,14 +107,14 @@ def test_motion_stands_beside_what_was_recorded(judged: Path) -> None:
     ("table", "filled"), [("humantomato/2", 4), ("humantomato/4", 7), ("humantomato/6", 3)]
 )
 def test_tables_of_faces_are_filled(judged: Path, table: str, filled: int) -> None:
-    found = compare_with_paper(table, [judged / "run"])
+    (found,) = compare_with_paper(table, [judged / "run"])
     ours = [row for row in found.rows if row.source == "ours"]
     assert ours and max(sum(cell is not None for cell in row.cells) for row in ours) >= filled
 
 
 @pytest.mark.slow
 def test_each_facial_generator_has_a_row(judged: Path) -> None:
-    found = compare_with_paper("humantomato/4", [judged / "run"])
+    (found,) = compare_with_paper("humantomato/4", [judged / "run"])
     ours = {row.method: row for row in found.rows if row.source == "ours"}
     assert set(ours) == {"cVAE", "Diffusion", "Ours"}
     for row in ours.values():

@@ -35,15 +35,21 @@ def run(start: Callable[..., Any], *arguments: object) -> str:
 
 
 @pytest.mark.parametrize(
-    ("given", "recipe", "stages"),
+    ("given", "recipe", "makers", "stages"),
     [
-        ("small_run", CAPTIONS, {"tokens": "tokens-train.safetensors", "evaluate": "metrics.json"}),
-        ("ude_run", DANCES, {"evaluate": "metrics.json", "evaluate_dances": "metrics.json"}),
+        (
+            "small_run",
+            CAPTIONS,
+            ["gpt", "face_gpt"],
+            {"tokens": "tokens-train.safetensors", "evaluate": "metrics.json"},
+        ),
+        ("ude_run", DANCES, ["ude"], {"evaluate": "metrics.json", "evaluate_dances": "metrics.json"}),
     ],
 )
 def test_two_processes_make_what_one_makes(
     given: str,
     recipe: str,
+    makers: list[str],
     stages: dict[str, str],
     start: Callable[..., Any],
     tmp_path: Path,
@@ -65,8 +71,7 @@ def test_two_processes_make_what_one_makes(
         made.append({name: (folder / "stages" / name / file).read_bytes() for name, file in stages.items()})
     assert made[0] == made[1]
     for folder in (tmp_path / "run1", tmp_path / "run2"):
-        # Again, by one process and by two, and after an export: figures of the run's own recipe.
-        run(start, "export", folder, "-o", folder.with_suffix(".model"))
+        # Again, by one process and by two, with the settings of the run's own recipe.
         again = run(start, "evaluate", folder)
         assert (folder / "evaluate/metrics.json").read_bytes() == made[0]["evaluate"]
         if "evaluate_dances" in stages:
@@ -76,3 +81,18 @@ def test_two_processes_make_what_one_makes(
             assert "R@1" in again
             figures = json.loads(made[0]["evaluate"])["figures"]
             assert {"tma.t2m_r1", "tma.matching_score"} <= {one["name"] for one in figures}
+    # And what the export makes in the place of the run.
+    run(start, "export", folder, "-o", tmp_path / "model")
+    generators = [str(tmp_path / "model" / name) for name in makers]
+    for stage in (name for name in stages if name.startswith("evaluate")):
+        where = f"{stage}.inputs.generators={json.dumps(generators)}"
+        run(
+            start, "run", tmp_path / "shared.yaml", "--out", folder, "--only", stage, "--force",
+            "--set", where,
+        )  # fmt: skip
+        found = json.loads((folder / "stages" / stage / stages[stage]).read_text())
+        before = json.loads(made[0][stage])
+        assert before["about"]["made_by"] != found["about"]["made_by"]
+        assert [before[key] for key in ("figures", "protocol")] == [
+            found[key] for key in ("figures", "protocol")
+        ]

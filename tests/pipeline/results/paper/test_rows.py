@@ -75,6 +75,26 @@ def test_answers_without_a_model_stand_there_once_and_are_never_ranked(baselines
     assert best(table) == {"bl tokenizer": [0, 1, 2]}
 
 
+def test_answers_are_of_runs_that_have_a_row_and_equal_ones_stand_once(
+    baselines: Make, records: ModuleType, tmp_path: Path
+) -> None:
+    stages: dict[str, Any] = {
+        "data": {"kind": "synth", "config": {"clips": 8}},
+        "fsq": {"kind": "fsq", "config": {"net": {"part": "bodyhand"}}},
+        "evaluate": {
+            "kind": "evaluate",
+            "inputs": {"tokenizer": "fsq", "data": "data"},
+            "figures": records.reconstruction(80.0, clips=30),
+        },
+    }
+    without = records.write_run(tmp_path / "without", stages)
+    table = filled("humantomato/7", without, baselines("a"), baselines("b"))
+    references = [row.label for row in table.rows if row.source == "reference"]
+    assert references == ["nearest training clip (a evaluate)", "mean pose, still (a evaluate)"]
+    assert {one.run for one in table.differences} == {"a", "b"}
+    assert not any("without" in note for note in table.notes)
+
+
 def test_generated_motion_beside_recorded_and_chance(baselines: Make) -> None:
     table = filled("humantomato/13", baselines())
     labels = [row.label for row in table.rows]

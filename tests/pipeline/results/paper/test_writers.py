@@ -84,6 +84,13 @@ def test_the_command_prints_and_writes(baselines: Callable[..., Path], call: Cal
     assert (tmp_path / "new/a.md").read_text(encoding="utf-8").startswith("**Human")
 
 
+def test_a_papers_name_is_all_of_its_tables(call: Call, tmp_path: Path) -> None:
+    done = call("evaluate", "--table", "ude", "-o", tmp_path / "all.md")
+    assert done.code == 0, done.err
+    found = re.findall(r"^\*\*UDE Table (\d)", (tmp_path / "all.md").read_text(encoding="utf-8"), re.M)
+    assert found == ["1", "2", "3", "4", "5"]
+
+
 def test_the_list_of_tables(call: Call) -> None:
     shown = call("evaluate", "--tables")
     assert shown.code == 0
@@ -97,7 +104,7 @@ def test_a_table_of_ones_own(baselines: Callable[..., Path], tmp_path: Path) -> 
         "columns: [{name: pose, unit: mm, better: lower, figure: reconstruction.mpjpe}]\n"
         "rows: [{method: any VQ, paper: '1.5', ours: {tokenizer: {kind: [vq, rvq]}}}]\n"
     )
-    filled = compare_with_paper(str(path), [baselines()])
+    (filled,) = compare_with_paper(str(path), [baselines()])
     assert [(row.label, row.cells[0] and row.cells[0].text) for row in filled.rows[:3]] == [
         ("any VQ", "1.5"),
         ("bl vq", "140.0"),
