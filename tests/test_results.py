@@ -30,3 +30,15 @@ def test_several_seeds_are_a_mean_with_its_interval(monkeypatch: pytest.MonkeyPa
     # Student's t of three values: 4.303 deviations / sqrt(3).
     assert "| a | 2.0 ± 2.5 |" in page and "| b (1 seed) | 2.0 |" in page and page.endswith("2.0 ± 2.5")
     assert "a: clips 4; b: clips 5" in page, "rows that were measured otherwise say so"
+
+
+def test_the_first_page_says_what_one_draw_gets(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = loaded(FOLDER / "results.py", monkeypatch)
+    record = results.read_records()["synthetic_model"]
+    row = next(row["cells"] for row in record["rows"] if row["title"] == "held out: whole caption")
+    figures = {key.partition(": ")[2]: str(value).strip("*") for key, value in row.items()}
+    words = " ".join((FOLDER.parent / "README.md").read_text(encoding="utf-8").split())
+    assert (
+        f"are then right in {figures['best of four']} % of clips, with one draw in {figures['one draw']} %"
+        in words
+    )

@@ -51,7 +51,8 @@ def test_groups_select_their_stages_and_trainings_take_all_gpus(name: str) -> No
 
 def test_the_paper_waits_in_three_queues() -> None:
     plan = plan_of("humantomato-paper", nodes=2, gpus=8)
-    trained = ("tokenizer", "face_tokenizer", "tma", "tokens", "face_tokens", "gpt", "face_gpt", "evaluate")
+    judges = ("tma", "evaluator")
+    trained = ("tokenizer", "face_tokenizer", *judges, "tokens", "face_tokens", "gpt", "face_gpt", "evaluate")
     assert stages(plan) == [("data", "stats", "text"), trained, ("generate", "report")]
     first, second, third = plan.groups
     assert (first.name, second.name, third.name) == ("1-data", "2-train", "3-generate")
