@@ -85,6 +85,8 @@ class ShardIndex(Config):
     shard: ShardInfo | None
     clips: list[ClipEntry]
     dropped: list[Dropped]
+    made_on: str = ""
+    """The kind of processor, by which the last digits of a clip may differ."""
 
 
 def shard_stem(name: str, split: Split, number: int) -> str:
