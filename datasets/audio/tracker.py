@@ -154,7 +154,7 @@ def _between_rows(values: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArr
     weight = values[near].astype(np.float64)
     weight -= weight.min(axis=1, keepdims=True)
     shift = (weight * places).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
-    return np.maximum(rows + np.clip(shift, -1.0, 1.0), 0.0)
+    return np.asarray(np.maximum(rows + np.clip(shift, -1.0, 1.0), 0.0))
 
 
 def _confidence(activation: NDArray[np.float32], rows: NDArray[np.int64]) -> float:

@@ -48,7 +48,7 @@ from motionloom.pipeline.inference.requests import (
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model, say_model
-from motionloom.pipeline.inference.standing import Standing
+from motionloom.pipeline.inference.standing import stood
 from motionloom.pipeline.render.score import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.known_captions import Unknown
@@ -268,7 +268,7 @@ class Bundle:
         ]
         stands = [segment.prompt.stands for segment in segments]
         body = [
-            self._standing(motion, stands, frames)
+            stood(motion, stands, frames, self.layout, generator.part)
             for motion in generator.drive(stretches, seeds[:samples], sampling)
         ]
         faces = self._faces(segments, frames, seeds[samples:], sampling)
@@ -294,16 +294,6 @@ class Bundle:
             replace(self._motion(whole, motion, face, bands), seed=seed, beats=beats)
             for motion, face in zip(body, faces, strict=True)
         ]
-
-    def _standing(
-        self, motion: NDArray[np.float32], stands: Sequence[bool], frames: Sequence[int]
-    ) -> NDArray[np.float32]:
-        """A motion [T, C] that stands where its stretches, so many frames each, say so."""
-        if not any(stands):
-            return motion
-        standing = Standing(self.layout, self.generator.part)
-        pieces = np.split(motion, np.cumsum(frames)[:-1])
-        return np.concatenate([standing(piece, calm) for piece, calm in zip(pieces, stands, strict=True)])
 
     def _repeated(self, stage: Finished, prompt: Prompt, words: str, count: int) -> Conditions:
         """The conditions of one prompt, encoded once, for `count` rows."""
@@ -363,18 +353,14 @@ class Bundle:
             # The face takes the body's length, so that both share one time line.
             face = maker.generate(GenerationRequest(words, [len(m) for m in body], seeds[1], sampling))
         body = [
-            self._standing(motion, [prompt.stands], [len(motion)])
+            stood(motion, [prompt.stands], [len(motion)], layout, generator.part)
             for motion, prompt in zip(body, prompts, strict=True)
         ]
         made = [self._motion(*row) for row in zip(prompts, body, face, strict=True)]
+        ticks = [ticks_of(prompt, conditions, row, layout.fps) for row, prompt in enumerate(prompts)]
         return [
-            replace(
-                one,
-                beats=()
-                if one.prompt.stands
-                else tuple(t for t in ticks_of(one.prompt, conditions, row, layout.fps) if t < one.seconds),
-            )
-            for row, one in enumerate(made)
+            replace(one, beats=() if one.prompt.stands else tuple(t for t in own if t < one.seconds))
+            for one, own in zip(made, ticks, strict=True)
         ]
 
 
@@ -392,22 +378,6 @@ def _alike(frames: Sequence[int | None], batch: int) -> list[list[int]]:
     free = [row for row, count in enumerate(frames) if count is None]
     given = [row for row, count in enumerate(frames) if count is not None]
     return [rows[i : i + batch] for rows in (free, given) for i in range(0, len(rows), batch)]
-
-
-def bundle_driven_by(modality: str, stages: Sequence[Finished], stage_cache: StageCache) -> Bundle | None:
-    """The first generator of body motion that is conditioned on `modality`, with the face generators.
-
-    None where there is none.
-    """
-    bundle = Bundle(stages, stage_cache)
-    faces = [stage for stage in stages if bundle.of(stage).part == "face"]
-    for stage in stages:
-        maker = bundle.of(stage)
-        if maker.part != "face" and modality in maker.modalities:
-            # A face generator that is not conditioned on it would have nothing to go by.
-            fitting = [face for face in faces if modality in bundle.of(face).modalities]
-            return Bundle([stage, *fitting], stage_cache)
-    return None
 
 
 def unknown_captions(

@@ -6,6 +6,8 @@ lowered arms and breathes, in the layout's own columns; what is before and after
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,6 +64,21 @@ class Standing:
         goal[:, self._stays] = self._place
         self._number += len(motion)
         return np.asarray(motion + weight * (goal - motion), dtype=np.float32)
+
+
+def stood(
+    motion: NDArray[np.float32],
+    stands: Sequence[bool],
+    frames: Sequence[int],
+    layout: MotionLayout,
+    part: Part,
+) -> NDArray[np.float32]:
+    """A motion [T, C] of a part that stands where its stretches, so many frames each, say so."""
+    if not any(stands):
+        return motion
+    standing = Standing(layout, part)
+    pieces = np.split(motion, np.cumsum(frames)[:-1])
+    return np.concatenate([standing(piece, calm) for piece, calm in zip(pieces, stands, strict=True)])
 
 
 def _breath(layout: MotionLayout) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:

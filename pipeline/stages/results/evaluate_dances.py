@@ -51,8 +51,8 @@ from motionloom.pipeline.evaluation.figures import (
     group_figures,
 )
 from motionloom.pipeline.evaluation.movement import all_features, movement_figures
-from motionloom.pipeline.inference.bundle import Bundle, bundle_driven_by
-from motionloom.pipeline.stages.results.evaluation import Evaluation, EvaluationStage
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.stages.results.evaluation import Evaluation, EvaluationStage, bundle_driven_by
 
 _AT_ONCE = 16
 """Dances generated together, at most."""

@@ -29,8 +29,8 @@ from motionloom.pipeline.evaluation.truth import (
     spread_any,
     truth_of,
 )
-from motionloom.pipeline.inference.bundle import Bundle, bundle_driven_by
-from motionloom.pipeline.stages.results.evaluation import Evaluation
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.stages.results.evaluation import Evaluation, bundle_driven_by
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
 from motionloom.pipeline.store.networks import TrainedTokenizer, embed_motions
 

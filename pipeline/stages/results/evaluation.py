@@ -13,7 +13,7 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.showing import FigureTable, Showing
-from motionloom.pipeline.contract.stage import SHOWING, Finished, Inputs, StageContext, StageKind
+from motionloom.pipeline.contract.stage import SHOWING, Finished, Inputs, StageCache, StageContext, StageKind
 from motionloom.pipeline.contract.units import Arrays, even_slices
 from motionloom.pipeline.evaluation.cases import shown_cases
 from motionloom.pipeline.evaluation.figures import (
@@ -153,3 +153,19 @@ class Evaluation:
 def _joints(dataset: ClipDataset, index: int) -> Any:
     layout = dataset.layout
     return joints_of(np.asarray(dataset.motion(index))[:, layout.part("bodyhand")], layout)
+
+
+def bundle_driven_by(modality: str, stages: Sequence[Finished], stage_cache: StageCache) -> Bundle | None:
+    """The first generator of body motion that is conditioned on `modality`, with the face generators.
+
+    None where there is none.
+    """
+    bundle = Bundle(stages, stage_cache)
+    faces = [stage for stage in stages if bundle.of(stage).part == "face"]
+    for stage in stages:
+        maker = bundle.of(stage)
+        if maker.part != "face" and modality in maker.modalities:
+            # A face generator that is not conditioned on it would have nothing to go by.
+            fitting = [face for face in faces if modality in bundle.of(face).modalities]
+            return Bundle([stage, *fitting], stage_cache)
+    return None

@@ -19,11 +19,11 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_of, with_music
 from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
-from motionloom.pipeline.inference.bundle import bundle_driven_by
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions
 from motionloom.pipeline.inference.writers import Format, default_formats
 from motionloom.pipeline.render.score import Score
+from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
 
 
 class GenerateConfig(StageConfig):

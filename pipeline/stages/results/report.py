@@ -40,13 +40,14 @@ from motionloom.pipeline.evaluation.truth import (
     truth_at,
     truth_of,
 )
-from motionloom.pipeline.inference.bundle import Bundle, bundle_driven_by
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import shown
 from motionloom.pipeline.render.body.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.viewer import ViewerMotion
+from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
 from motionloom.pipeline.stages.results.report_parts import (
     add_run_facts,
     draw_curves,
