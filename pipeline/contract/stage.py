@@ -62,7 +62,7 @@ class StageConfig(Config):
     @model_validator(mode="before")
     @classmethod
     def _keep_defaults(cls, data: object) -> object:
-        """A group of settings of which some are given keeps the stage's own defaults of the others."""
+        """A group of settings of which some are given keeps what the stage sets of the others."""
         if not isinstance(data, dict):
             return data
         out = dict(data)

@@ -29,7 +29,7 @@ from motionloom.pipeline.runs.dry_run import (
     say_estimate,
     started_trainings,
 )
-from motionloom.pipeline.runs.execute import context_of, execute, perform, stage_inputs
+from motionloom.pipeline.runs.execute import context_of, execute, perform
 from motionloom.pipeline.runs.plan import Selection, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import require_consistent
@@ -152,37 +152,32 @@ def _stages_again(
 
 
 def _inputs_again(folder: Path, recipe: Recipe, stage: Stage, state: RunState | None) -> dict[str, Finished]:
-    inputs = stage_inputs(recipe, folder, stage)
-    for (name, _), said in recipe.gone.items():
-        if name == stage.name and state is None:
-            raise UserError(said)
-    if state is not None:
-        inputs = _finished_inputs(folder, inputs, state)
-    for role, source in inputs.items():
-        if not source.outside and not (source.folder / "artifact.json").is_file():
-            raise UserError(
-                f"{folder}: stage '{source.name}' (role {role}) is not finished; run the recipe first"
-            )
+    """The inputs of a stage; with `state` those that are finished, with all that they were made from."""
+    made = recipe.outside | finished_stages(folder)
+    inputs = {role: made[name] for role, name in stage.inputs.items() if name in made}
+    if state is None:
+        gone = [said for (name, _), said in recipe.gone.items() if name == stage.name]
+        unfinished = [
+            f"{folder}: stage '{name}' (role {role}) is not finished; run the recipe first"
+            for role, name in stage.inputs.items()
+            if role not in inputs
+        ]
+        if missing := gone + unfinished:
+            raise UserError(missing[0])
+    else:
+        lacking = {
+            one.folder
+            for one in state.stages
+            if not one.usable or (one.artifact is not None and one.artifact.missing(one.folder) is not None)
+        }
+        inputs = {
+            role: source
+            for role, source in inputs.items()
+            if lacking.isdisjoint(above.folder for above in (source, *source.upstream()))
+        }
     for source in inputs.values():
         require_consistent(owner_of(source.folder), [source.folder.name])
     return inputs
-
-
-def _finished_inputs(folder: Path, inputs: dict[str, Finished], state: RunState) -> dict[str, Finished]:
-    """Those of a stage's inputs that are finished, with all that they were made from."""
-    whole = {
-        stage.name
-        for stage in state.stages
-        if stage.usable and (stage.artifact is None or stage.artifact.missing(stage.folder) is None)
-    }
-    finished = finished_stages(folder) if whole else {}
-
-    def there(stage: Finished) -> bool:
-        own = [one.name for one in (stage, *stage.upstream()) if not one.outside]
-        return whole.issuperset(own)
-
-    now = {role: source if source.outside else finished.get(source.name) for role, source in inputs.items()}
-    return {role: source for role, source in now.items() if source is not None and there(source)}
 
 
 def evaluate_run(

@@ -23,7 +23,6 @@ from motionloom.datasets.base.progress import duration
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import preview_of, previews
 from motionloom.pipeline.contract.showing import ModelCard
-from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.runs.plan import PlannedStage, Selection, make_plan, require_fit
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact
@@ -85,26 +84,19 @@ def training_times(
     """Of the trainings in `rows`, by the run's own telemetry; else those of `cards` are tried out."""
     stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
     out = {}
-    for stage in (row.stage for row in rows if row.stage.kind.trains):
-        folder, resumed = stage_folder(run, stage.name), row_of(rows, stage).action == "resume"
-        flights = read_flight(folder).get(0, ())
-        found = [row["step_seconds"] for row in flights if "step_seconds" in row]
-        done = max((int(row["step"]) for row in flights), default=0) if resumed else 0
+    for row in (row for row in rows if row.stage.kind.trains):
+        stage, card = row.stage, cards.get(row.stage.name)
+        flights = read_flight(stage_folder(run, stage.name)).get(0, ())
+        found = [one["step_seconds"] for one in flights if "step_seconds" in one]
+        done = max((int(one["step"]) for one in flights), default=0) if row.action == "resume" else 0
         seconds = median(found) if found else None
-        card = cards.get(stage.name)
         small = card and card.memory_bytes < _TRIED_BYTES and card.parameters < _TRIED_PARAMETERS
         if seconds is None and small:
-            given = previews(stage, stages)
-            seconds = stage.kind.step_seconds(stage.config, given, recipe.hardware)
+            seconds = stage.kind.step_seconds(stage.config, previews(stage, stages), recipe.hardware)
         if seconds is not None:
             left = max(0, stage.config.train.steps - done)
             out[stage.name] = TrainingTime(seconds * left, bool(found))
     return out
-
-
-def row_of(rows: Sequence[PlannedStage], stage: Stage) -> PlannedStage:
-    """The row of a plan that is about a stage."""
-    return next(row for row in rows if row.stage.name == stage.name)
 
 
 def estimate_table(cards: Mapping[str, ModelCard], times: Mapping[str, TrainingTime]) -> Table:
@@ -181,27 +173,23 @@ def plan_record(
         "recipe": loaded.name,
         "folder": run,
         "hardware": loaded.hardware,
-        "stages": [_row(row, cards, times) for row in plan],
+        "stages": [
+            {
+                "stage": row.stage.name,
+                "kind": row.stage.kind.name,
+                "action": row.action,
+                "reason": row.reason,
+                "inputs": row.stage.inputs,
+                "fingerprint": row.fingerprint,
+                "training": cards.get(row.stage.name),
+                "time": times.get(row.stage.name),
+            }
+            for row in plan
+        ],
         "replaces": {
             "finished": [one.stage for one in replaced_stages(run, plan)],
             "started": started_trainings(run, plan),
         },
-    }
-
-
-def _row(
-    row: PlannedStage, cards: Mapping[str, ModelCard], times: Mapping[str, TrainingTime]
-) -> dict[str, object]:
-    stage = row.stage
-    return {
-        "stage": stage.name,
-        "kind": stage.kind.name,
-        "action": row.action,
-        "reason": row.reason,
-        "inputs": stage.inputs,
-        "fingerprint": row.fingerprint,
-        "training": cards.get(stage.name),
-        "time": times.get(stage.name),
     }
 
 
@@ -232,7 +220,7 @@ def replaced_stages(run: Path, plan: Sequence[PlannedStage]) -> list[Replaced]:
     out = []
     for row in plan:
         folder = stage_folder(run, row.stage.name)
-        if row.action != "run" or row.asked or Artifact.find(folder) is None:
+        if row.action != "run" or row.request is not None or Artifact.find(folder) is None:
             continue
         trained, seconds = row.stage.kind.trains, _seconds(folder)
         if trained or (seconds or 0.0) >= LONG_SECONDS:
@@ -247,7 +235,7 @@ def started_trainings(run: Path, plan: Sequence[PlannedStage]) -> list[str]:
         for row in plan
         if row.action == "run"
         and row.stage.kind.trains
-        and not row.asked
+        and row.request is None
         and Artifact.find(stage_folder(run, row.stage.name)) is None
         and (stage_folder(run, row.stage.name) / "checkpoints").is_dir()
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
@@ -16,7 +16,7 @@ from motionloom.models.training.distributed import alone
 from motionloom.pipeline.contract.stage import Finished, Stage, StageCache, StageContext, StageKind
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
-from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, Started, require_fit
+from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, require_fit
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.runs.verify_shards import verify_shards
 from motionloom.pipeline.store.artifact import Artifact, InputStage
@@ -38,7 +38,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     leads = process_rank() == 0
     if not leads:
         todo = joint
-    with _lock(run, needed=leads):
+    with _lock(run) if leads else nullcontext():
         team = Team.start(recipe.hardware) if joint else Team()
         if leads:
             write_text(run / "recipe.yaml", recipe.to_yaml(run))
@@ -128,14 +128,10 @@ def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]
 
 
 def _prepare(folder: Path, row: PlannedStage) -> None:
-    request = None if row.request is None else row.request.id
-    started = Started(
-        fingerprint=row.fingerprint, extendable=row.extendable, request=request, lengthened=row.lengthened
-    )
     if row.action == "run":
         remove_tree(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "started.json", started.dump())
+    write_json(folder / "started.json", row.started.dump())
     # A training that is made longer is not finished any more.
     (folder / "artifact.json").unlink(missing_ok=True)
 
@@ -149,7 +145,7 @@ def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[Plann
         fingerprint=row.fingerprint,
         seed=recipe.seed_of(stage),
         config=stage.config.dump(),
-        lengthened=row.lengthened,
+        lengthened=row.started.lengthened,
         inputs={role: _input(recipe, run, row, rows, name) for role, name in stage.inputs.items()},
     )
 
@@ -170,11 +166,8 @@ def _input(
 
 
 @contextmanager
-def _lock(run: Path, needed: bool) -> Iterator[None]:
+def _lock(run: Path) -> Iterator[None]:
     """One writer per run folder. The lock ends with its process, even a killed one."""
-    if not needed:
-        yield
-        return
     run.mkdir(parents=True, exist_ok=True)
     require_own(run)
     with file_lock(run / ".lock", wait=False) as mine:

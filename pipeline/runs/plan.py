@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -33,6 +33,7 @@ from motionloom.pipeline.runs.resolve import Tree
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.files import fingerprint_of
 from motionloom.pipeline.store.run_folder import identity_of, stage_folder
+from motionloom.pipeline.store.yaml import flatten
 from motionloom.pipeline.training.config import TrainedStageConfig
 
 REQUEST_FILE = ".again.json"
@@ -85,19 +86,18 @@ class PlannedStage:
     """One row of the plan."""
 
     stage: Stage
-    fingerprint: str
     action: Action
     reason: str
-    asked: bool = False
-    """The selection names it to run again (`--from`, `--force`)."""
-    extendable: dict[str, int | str] | None = None
-    """What a longer training would be compared with."""
-    request: Request | None = None
-    """The request for which the stage is run again."""
-    identities: Mapping[str, str] = field(default_factory=dict)
+    started: Started
+    """What the stage's folder says of it from its beginning on."""
+    request: Request | None
+    """The request for which the stage is run again: the selection names it (`--from`, `--force`)."""
+    identities: Mapping[str, str]
     """What its inputs from outside were when the plan was made."""
-    lengthened: tuple[int, ...] = ()
-    """Where schedules ended that this training, which goes on, has lengthened."""
+
+    @property
+    def fingerprint(self) -> str:
+        return self.started.fingerprint
 
 
 def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
@@ -108,37 +108,39 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
     if select.force:
         forced |= wanted
     request, done = _request(run, select, forced) if forced else (None, set())
-    plan: list[PlannedStage] = []
     rows: dict[str, PlannedStage] = {}
     for stage in recipe.stages:
         require_elsewhere(run, stage, recipe.outside)
-        facts = _facts(recipe, stage, rows)
-        fingerprint, others = fingerprint_of(facts), extendable(stage, facts)
-        again = request if stage.name in forced else None
+        facts, folder = _facts(recipe, stage, rows), stage_folder(run, stage.name)
+        before, again = Started.find(folder), request if stage.name in forced else None
+        started = Started(
+            fingerprint=fingerprint_of(facts),
+            extendable=_extendable(stage, facts),
+            request=None if again is None else again.id,
+        )
+        lengthened: tuple[int, ...] = ()
         if again is not None and stage.name not in done:
-            action, reason = _decide_again(stage, fingerprint, run, again, select)
+            action, reason = _decide_again(started, before, select)
         else:
-            action, reason = _decide(recipe, stage, fingerprint, run, rows, forced)
-        started = Started.find(stage_folder(run, stage.name))
-        lengthened = () if started is None or action != "resume" else started.lengthened
-        if action == "run" and again is None and started is not None:
-            longer = extension(stage, others, started, stage_folder(run, stage.name))
+            action, reason = _decide(recipe, stage, started, before, folder, rows, forced)
+        if before is not None and action == "resume":
+            lengthened = before.lengthened
+        elif before is not None and action == "run" and again is None:
+            longer = _extension(stage, started, before, folder)
             if longer is not None:
                 action, (reason, lengthened) = "resume", longer
         if stage.name not in wanted and action != "skip":
             action, reason = "leave", "not selected"
+        started = started.model_copy(update={"lengthened": lengthened})
         identities = {n: _fingerprint(recipe, n, rows) for n in stage.inputs.values() if n in recipe.outside}
-        rows[stage.name] = PlannedStage(
-            stage, fingerprint, action, reason, again is not None, others, again, identities, lengthened
-        )
-        plan.append(rows[stage.name])
+        rows[stage.name] = PlannedStage(stage, action, reason, started, again, identities)
     if select.only:
         for role, name in recipe.stage(select.only).inputs.items():
             if name in rows and rows[name].action != "skip":
                 raise UserError(
                     f"--only {select.only}: its input '{role}' ({name}) is not finished; run it first"
                 )
-    return plan
+    return list(rows.values())
 
 
 def require_fit(rows: Sequence[PlannedStage], hardware: Hardware) -> None:
@@ -216,29 +218,29 @@ def _done(folder: Path, request: Request) -> bool:
     return started is not None and started.request == request.id and Artifact.find(folder) is not None
 
 
-def _decide_again(
-    stage: Stage, fingerprint: str, run: Path, request: Request, select: Selection
-) -> tuple[Action, str]:
+def _decide_again(started: Started, before: Started | None, select: Selection) -> tuple[Action, str]:
     """The action of a stage that must run again and has not yet."""
     reason = "forced" if select.force else f"from {select.first}"
-    started = Started.find(stage_folder(run, stage.name))
-    if started is not None and started.request == request.id and started.fingerprint == fingerprint:
-        return "resume", f"{reason}; started earlier, not finished"
-    return "run", reason
+    same = before and (before.request, before.fingerprint) == (started.request, started.fingerprint)
+    return ("resume", f"{reason}; started earlier, not finished") if same else ("run", reason)
 
 
 def _decide(
-    recipe: Recipe, stage: Stage, fingerprint: str, run: Path, rows: dict[str, PlannedStage], forced: set[str]
+    recipe: Recipe,
+    stage: Stage,
+    started: Started,
+    before: Started | None,
+    folder: Path,
+    rows: Mapping[str, PlannedStage],
+    forced: set[str],
 ) -> tuple[Action, str]:
-    folder = stage_folder(run, stage.name)
-    artifact, started = Artifact.find(folder), Started.find(folder)
-    resumes = started is not None and started.fingerprint == fingerprint
-    if artifact is None or artifact.fingerprint != fingerprint:
-        if resumes:
+    artifact = Artifact.find(folder)
+    if artifact is None or artifact.fingerprint != started.fingerprint:
+        if before is not None and before.fingerprint == started.fingerprint:
             return "resume", "started earlier, not finished"
         if artifact is not None:
             return "run", _difference(recipe, artifact, stage, rows)
-        return "run", "never run" if started is None else "settings changed before it finished"
+        return "run", "never run" if before is None else "settings changed before it finished"
     gone = artifact.missing(folder)
     if gone:
         return "run", f"output {gone} is gone or has another size"
@@ -251,7 +253,12 @@ def _decide(
 def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[str, PlannedStage]) -> str:
     if artifact.kind != stage.kind.name or artifact.version != stage.kind.version:
         return f"{artifact.kind} v{artifact.version} is now {stage.kind.name} v{stage.kind.version}"
-    changes = list(_changed_fields(artifact.config, stage.config.dump()))
+    old_fields, fields = flatten(artifact.config), flatten(stage.config.dump())
+    changes = [
+        f"{key} {old_fields.get(key)} -> {fields.get(key)}"
+        for key in sorted(old_fields.keys() | fields.keys())
+        if old_fields.get(key) != fields.get(key)
+    ]
     if changes:
         more = f" (+{len(changes) - 1} more)" if len(changes) > 1 else ""
         return f"changed: {changes[0]}{more}"
@@ -264,14 +271,6 @@ def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[
         keep = f"; data_seed: {artifact.seed} keeps what comes before the trainings" if own else ""
         return f"seed {artifact.seed} -> {recipe.seed_of(stage)}{keep}"
     return "source files or the order of inputs changed"
-
-
-def _changed_fields(old: object, new: object, prefix: str = "") -> Iterator[str]:
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in sorted({*old, *new}):
-            yield from _changed_fields(old.get(key), new.get(key), f"{prefix}.{key}" if prefix else key)
-    elif old != new:
-        yield f"{prefix} {old} -> {new}"
 
 
 def _ancestors(recipe: Recipe, *names: str) -> set[str]:
@@ -293,7 +292,7 @@ def _descendants(recipe: Recipe, name: str) -> set[str]:
     return out
 
 
-def extendable(stage: Stage, facts: Tree) -> dict[str, int | str] | None:
+def _extendable(stage: Stage, facts: Tree) -> dict[str, int | str] | None:
     """What `started.json` keeps of a stage that trains: its steps, and a digest of the other facts."""
     if not isinstance(stage.config, TrainedStageConfig):
         return None
@@ -302,23 +301,23 @@ def extendable(stage: Stage, facts: Tree) -> dict[str, int | str] | None:
     return {"steps": stage.config.train.steps, "others": fingerprint_of({**facts, "config": fields})}
 
 
-def extension(
-    stage: Stage, wanted: Mapping[str, int | str] | None, started: Started, folder: Path
+def _extension(
+    stage: Stage, started: Started, before: Started, folder: Path
 ) -> tuple[str, tuple[int, ...]] | None:
     """Why a stage whose fingerprint has changed goes on from its checkpoints, and its lengthened schedules.
 
     None where more than its steps has changed, or they became fewer, or nothing is there to go on from.
     """
-    before = started.extendable
-    if wanted is None or before is None or before["others"] != wanted["others"]:
+    wanted, there = started.extendable, before.extendable
+    if wanted is None or there is None or there["others"] != wanted["others"]:
         return None
-    old, new = int(before["steps"]), int(wanted["steps"])
+    old, new = int(there["steps"]), int(wanted["steps"])
     if old >= new or not any((folder / "checkpoints").glob("*.ckpt")):
         return None
     said = f"train.steps {old} -> {new}: goes on from its last checkpoint"
     assert isinstance(stage.config, TrainedStageConfig)
     schedule = stage.config.schedule_of_length()
     if schedule is None:
-        return said, started.lengthened
+        return said, before.lengthened
     said += f"; {schedule} is lengthened, which is not the same as {new} steps at once"
-    return said, (*started.lengthened, old)
+    return said, (*before.lengthened, old)

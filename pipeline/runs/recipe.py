@@ -37,7 +37,7 @@ from motionloom.pipeline.contract.stage import (
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.inputs import Sources, as_stages
 from motionloom.pipeline.runs.resolve import TRAINED, Tree, find_recipe, nearest, resolve
-from motionloom.pipeline.store.run_folder import place_from
+from motionloom.pipeline.store.run_folder import STAGE_NAME, place_from
 from motionloom.pipeline.store.yaml import dump_yaml
 from motionloom.pipeline.training.config import TrainedStageConfig
 
@@ -62,7 +62,7 @@ class RecipeFile(Config):
     def _plain_names(cls, stages: dict[str, Tree]) -> dict[str, Tree]:
         """A stage's name is its folder in the run."""
         for name in stages:
-            if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
+            if not re.fullmatch(STAGE_NAME, name):
                 raise ValueError(f"stage name '{name}': use letters, digits, - and _ only")
         return stages
 

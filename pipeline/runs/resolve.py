@@ -37,7 +37,7 @@ from motionloom.datasets.schema import UserError, explain
 from motionloom.pipeline.contract.stage import Every, Finished, StageConfig, stage_kinds
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, is_place
 from motionloom.pipeline.store.weights import load_facts
-from motionloom.pipeline.store.yaml import load_yaml, read_yaml
+from motionloom.pipeline.store.yaml import load_yaml, merge, read_yaml
 from motionloom.pipeline.training.config import TrainedStageConfig
 
 Tree = dict[str, Any]
@@ -131,15 +131,6 @@ def resolve(path: Path, overrides: Sequence[str] = ()) -> Resolved:
             shared = merge(shared, defaults.get(concerning, {}))
         stages[key] = merge(shared, entry)
     _require_used(defaults.keys() - known, stages, where)
-    return out
-
-
-def merge(base: Tree, change: Tree) -> Tree:
-    """`change` over `base`, mappings key by key; neither is altered."""
-    out = dict(base)
-    for key, value in change.items():
-        old = out.get(key)
-        out[key] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
     return out
 
 

@@ -16,7 +16,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.store.files import write_json
-from motionloom.pipeline.store.run_folder import identity_of, in_export, owner_of, stage_folder
+from motionloom.pipeline.store.run_folder import STAGE_NAME, identity_of, in_export, owner_of, stage_folder
 
 FILE_NAME = "artifact.json"
 
@@ -37,7 +37,7 @@ class OutputFile(Config):
 class InputStage(Config):
     """The stage that fed a role, and its fingerprint then; of one outside the run its identity."""
 
-    stage: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
+    stage: str = Field(pattern=STAGE_NAME)
     fingerprint: str
     folder: str | None = None
     """Of a stage outside the run: its folder, seen from that of the run. None: a stage of the run."""

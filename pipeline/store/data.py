@@ -18,6 +18,7 @@ from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset, read_manifest
 from motionloom.datasets.shards.store import LocalStore, Store, open_store
+from motionloom.pipeline.store.run_folder import STAGE_NAME
 
 SHARDS = "shards"
 REFERENCE = "reference.json"
@@ -44,7 +45,7 @@ class Reader(Config):
 class MixedStage(Config):
     """One data stage of a mix."""
 
-    stage: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
+    stage: str = Field(pattern=STAGE_NAME)
     """Its name, which is its folder beside that of the mix."""
     folder: str | None = None
     """Of a stage outside the run: its folder, seen from that of the mix."""

@@ -10,11 +10,9 @@ weights.
 from __future__ import annotations
 
 import os
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.places import no_such_folder
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.files import fingerprint_of, read_record
@@ -22,6 +20,9 @@ from motionloom.pipeline.store.yaml import read_yaml
 
 BUNDLE_FILE = "bundle.json"
 """At the top of an export."""
+
+STAGE_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+"""A stage's name is that of its folder."""
 
 UNFINISHED = "unfinished"
 """The identity of a stage that has been begun and is not finished."""
@@ -66,37 +67,12 @@ def identity_of(stage: Path) -> str | None:
     return fingerprint_of({"fingerprint": record.get("fingerprint"), "files": files})
 
 
-def _exported_identity(stage: Path, above: tuple[str, ...] = ()) -> str | None:
-    """An export has no list of checksums, so its files are read; only those inside it."""
-    bundle = stage.parent / BUNDLE_FILE
-    entries = read_record(bundle).get("stages")
-    entry = entries.get(stage.name) if isinstance(entries, dict) else None
-    if not isinstance(entry, dict) or not stage.is_dir():
+def _exported_identity(stage: Path) -> str | None:
+    """By what the export says of its stages: their files are compared with that as they are opened."""
+    stages = read_record(stage.parent / BUNDLE_FILE).get("stages")
+    if not isinstance(stages, dict) or stage.name not in stages or not stage.is_dir():
         return None
-    if stage.name in above:
-        raise UserError(f"{bundle}: stage '{stage.name}' needs itself; export the run again")
-    inputs = entry.get("inputs")
-    names = {role: Path(str(name)).name for role, name in inputs.items()} if isinstance(inputs, dict) else {}
-    over = (*above, stage.name)
-    facts = {
-        "stage": {key: value for key, value in entry.items() if key != "inputs"},
-        "inputs": {role: _exported_identity(stage.parent / name, over) for role, name in names.items()},
-        "files": {path.relative_to(stage).as_posix(): _digest(path) for path in sorted(stage.rglob("*"))},
-    }
-    return fingerprint_of(facts)
-
-
-def _digest(path: Path) -> str | None:
-    if not path.is_file():
-        return None
-    state = path.stat()
-    return _digest_of(path, state.st_size, state.st_mtime_ns)
-
-
-@lru_cache(maxsize=256)
-def _digest_of(path: Path, size: int, changed: int) -> str:
-    """sha256 of a file, read again only when its size or time changes."""
-    return sha256_of(path)
+    return fingerprint_of({"stage": stage.name, "stages": stages})
 
 
 def stage_folder(run: Path, name: str) -> Path:

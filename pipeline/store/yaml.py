@@ -124,6 +124,15 @@ def dump_yaml(data: object) -> str:
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
 
 
+def merge(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    """`change` over `base`, mappings key by key; neither is altered."""
+    out = dict(base)
+    for key, value in change.items():
+        old = out.get(key)
+        out[key] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return out
+
+
 def flatten(settings: Mapping[str, object], prefix: str = "") -> dict[str, object]:
     """`{"train": {"steps": 5}}` as `{"train.steps": 5}`; lists stay whole."""
     out: dict[str, object] = {}
