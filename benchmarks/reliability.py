@@ -155,11 +155,7 @@ def preemption_table(work: Path) -> list[str]:
     if not (work / "preemption.json").exists():
         return ["not run"]
     seen = json.loads((work / "preemption.json").read_text())
-    rows = [
-        "| preemption | last step before | first step after | until SLURM's new start, s "
-        "| from there to the first step, s |",
-        "|---|---|---|---|---|",
-    ]
+    rows = ["| preemption | last step before | first step after |", "|---|---|---|"]
     for number, one in enumerate(seen["restarts"], 1):
         rows.append(f"| {number} | {' | '.join(str(value) for value in one.values())} |")
     equal = "equal" if not seen["unequal"] else f"differ: {seen['unequal']}"

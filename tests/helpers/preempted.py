@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -102,11 +101,6 @@ class Launched:
             found.setdefault(job, set()).add(state)
         return ["+".join(sorted(found.get(job, {""}))) for job in self.ids]
 
-    def started_at(self) -> datetime:
-        """When SLURM started the job that trains, this time."""
-        words = self.cluster.ask("scontrol", "show", "job", self.training).split()
-        return datetime.fromisoformat(dict(word.partition("=")[::2] for word in words)["StartTime"])
-
     def logs(self) -> str:
         """Output of all jobs."""
         return "\n".join(path.read_text() for path in sorted(self.run.glob(".slurm/*/*.log")))
@@ -168,10 +162,6 @@ class Restart:
     """The last step that rank 0 trained before it stopped."""
     first_step: int
     """The first one after it came back."""
-    queued_seconds: float
-    """From its last step to its new start: saving, the urgent job, SLURM's own waiting."""
-    start_seconds: float
-    """From SLURM's start of the job, which is in whole seconds, to the end of its first step."""
 
 
 @dataclass
@@ -194,10 +184,8 @@ def preempt(
     for name in TRAINED:
         shutil.rmtree(run / "stages" / name)
     launched = launch(calm.cluster, recipe, run, pause=0.1)
-    starts = []
     for number, step in enumerate(after):
         launched.wait_for_step(step, number)
-        starts.append(launched.started_at())
         if step in ended:
             launched.cluster.ask("scancel", "--signal=TERM", launched.training)
             continue
@@ -206,22 +194,19 @@ def preempt(
             "--output=/dev/null", "--wrap=sleep 1",
         )  # fmt: skip
     launched.wait_for_step(0, len(after))
-    starts.append(launched.started_at())
     launched.wait_for_end()
     if set(launched.states()) != {"COMPLETED"}:
         raise AssertionError(f"{launched.states()}\n{launched.logs()}")
-    return _compared(calm, launched, starts)
+    return _compared(calm, launched, len(after))
 
 
-def _compared(calm: Launched, launched: Launched, starts: Sequence[datetime]) -> Preempted:
+def _compared(calm: Launched, launched: Launched, restarts: int) -> Preempted:
     undisturbed = {(rank, row["step"]): row for rank, row in calm.rows()}
     seen = Preempted("preempted", TRAINED[0], 2, 0, steps=1 + max(step for _, step in undisturbed))
     compare(seen, [launched.records], undisturbed, calm.files(), launched.files())
     mine = [row for rank, row in launched.rows() if rank == 0]
-    for number in range(1, len(starts)):
-        last = [row for row in mine if row["start"] == number - 1][-1]
-        first = next(row for row in mine if row["start"] == number)
-        begun = starts[number].timestamp()
-        queued, start = round(begun - last["time"], 1), round(first["time"] - begun, 1)
-        seen.restarts.append(Restart(last["step"], first["step"], queued, start))
+    for number in range(restarts):
+        last = [row for row in mine if row["start"] == number][-1]
+        first = next(row for row in mine if row["start"] == number + 1)
+        seen.restarts.append(Restart(last["step"], first["step"]))
     return seen

@@ -42,7 +42,7 @@ def watch_steps() -> None:
             out = step(self, batches, *rest)
             time.sleep(float(os.environ.get(PAUSE, 0)))
             start = int(os.environ.get("SLURM_RESTART_COUNT", 0))
-            row = {"step": taken, "start": start, "time": time.time(), "batch": digest}
+            row = {"step": taken, "start": start, "batch": digest}
             _leave(rank(), row | {"figures": dict(figures)})
             return out
 

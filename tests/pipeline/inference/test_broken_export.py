@@ -13,7 +13,6 @@ from typing import Any
 import huggingface_hub.hub_mixin
 import numpy as np
 import pytest
-from safetensors.torch import load_file, save_file
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
@@ -57,14 +56,10 @@ def change(path: Path, edit: Callable[[Any], Any]) -> None:
     edit(data)
     path.write_text(json.dumps(data))
     if path.name != "bundle.json":
-        seal(path)
-
-
-def seal(path: Path) -> None:
-    def digest(facts: Any) -> None:
-        facts["stages"][path.parent.name]["sha256"][path.name] = sha256_of(path)
-
-    change(path.parent.parent / "bundle.json", digest)
+        own, digest = path.parent.name, {path.name: sha256_of(path)}
+        change(
+            path.parent.parent / "bundle.json", lambda facts: facts["stages"][own]["sha256"].update(digest)
+        )
 
 
 def test_the_folder_lists_its_stages(whole: Path) -> None:
@@ -269,16 +264,6 @@ def test_files_that_were_changed_are_refused(name: str, shipped: Path) -> None:
 def test_a_network_is_no_larger_than_its_weights(stage: str, key: str, value: int, shipped: Path) -> None:
     change(shipped / stage / "model.json", lambda facts: facts["config"].update({key: value}))
     with pytest.raises(UserError, match=f"{stage}/model.json"):  # built, it would take hours
-        Bundle.open(shipped)
-
-
-def test_weights_that_are_no_numbers_are_refused(shipped: Path) -> None:
-    path = shipped / "gpt/model.safetensors"
-    state = load_file(path)
-    next(iter(state.values())).view(-1)[0] = float("nan")
-    save_file(state, path)
-    seal(path)
-    with pytest.raises(UserError, match=r"gpt/model\.safetensors: '.*' holds numbers that are not finite"):
         Bundle.open(shipped)
 
 

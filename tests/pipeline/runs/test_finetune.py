@@ -148,6 +148,29 @@ def test_shards_are_to_have_the_layout_of_the_model(mine: Mine) -> None:
         require_start_layout(MotionLayout.named("wholebody363"), layout)
 
 
+def test_a_run_is_gone_on_from_and_exported_with_the_stages_of_the_other(
+    mine: Mine, small_run: Any, tmp_path: Path
+) -> None:
+    other = Path(shutil.copytree(small_run.folder, tmp_path / "other"))
+    sets = [f"start={other}", "tokenizer=null", "tma=null", "gpt.lora=null", "gpt.optim.lr=1e-9"]
+    sets += ["gpt.optim.warmup_steps=0", "gpt.train.steps=1"]
+    run = run_recipe(
+        mine.recipe, tmp_path / "run", overrides=sets, select=Selection(until="gpt"), console=QUIET
+    )
+    before, after = (load_file(r / "stages/gpt/model.safetensors") for r in (other, run))
+    assert before.keys() == after.keys()
+    for name, weights in before.items():  # one step of 1e-9
+        torch.testing.assert_close(after[name], weights, rtol=0, atol=1e-7)
+    made = Bundle.open(run).generate(["a person waves"], seconds=2.0, seed=1)[0]
+    export_run(run, tmp_path / "exported", console=QUIET)
+    assert {"tokenizer", "text", "tma"} <= set(BundleFile.load_json(tmp_path / "exported/bundle.json").stages)
+    other.rename(tmp_path / "away")
+    again = Bundle.open(tmp_path / "exported").generate(["a person waves"], seconds=2.0, seed=1)[0]
+    np.testing.assert_array_equal(again.features, made.features)
+    with pytest.raises(UserError, match=f"stage 'gpt' was made from {other}/stages/tokenizer, where no"):
+        Bundle.open(run)
+
+
 def test_a_ude_is_refused(ude_run: Any, mine: Mine) -> None:
     with pytest.raises(UserError, match="whose body is made by a stage of kind gpt; this one has ude"):
         mine.load(f"start={ude_run.folder}")

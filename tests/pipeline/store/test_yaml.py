@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.store.yaml import dump_yaml, load_yaml, read_yaml
 
 CORE: list[tuple[str, Any]] = [
@@ -34,9 +31,6 @@ CORE: list[tuple[str, Any]] = [
 def test_scalars_are_those_of_the_core_schema(text: str, want: Any) -> None:
     found = load_yaml(f"- {text}", "here")[0]
     assert (type(found), found) == (type(want), want)
-
-
-def test_not_a_number() -> None:
     assert math.isnan(load_yaml(".NaN", "here"))
 
 
@@ -71,25 +65,3 @@ def test_what_is_written_reads_the_same(data: dict[str, Any]) -> None:
 @given(st.dictionaries(st.sampled_from("abc"), LIKE_OTHERS))
 def test_readers_of_version_1_1_find_the_same_texts(data: dict[str, str]) -> None:
     assert yaml.safe_load(dump_yaml(data)) == data
-
-
-@pytest.mark.parametrize("name", sorted(shipped_recipes()))
-def test_shipped_recipes_mean_the_same_in_both_versions_but_for_numbers(name: str) -> None:
-    def numbers(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: numbers(item) for key, item in value.items()}
-        if isinstance(value, list):
-            return [numbers(item) for item in value]
-        exponent = isinstance(value, str) and re.fullmatch(r"[\d.]+e[-+]?\d+", value)
-        return float(value) if exponent else value
-
-    path = shipped_recipes()[name]
-    assert read_yaml(path) == numbers(yaml.safe_load(path.read_text()))
-
-
-def test_a_recipe_takes_numbers_without_a_dot(tmp_path: Path) -> None:
-    path = tmp_path / "recipe.yaml"
-    path.write_text("extends: humantomato-tiny\nname: small\nstages: {tma: {optim: {lr: 3e-4}}}\n")
-    assert load_recipe(path).stage("tma").config.optim.lr == 3e-4  # type: ignore[attr-defined]
-    path.write_text("extends: humantomato-tiny\nname: '7e2'\n")
-    assert load_recipe(path).name == "7e2"

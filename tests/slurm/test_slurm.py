@@ -1,4 +1,4 @@
-"""A launch plan on a real SLURM of two nodes: the order of its jobs, a job queued again, a failure."""
+"""A real SLURM of two nodes: a recipe from one command, its training preempted, cancelled and failed jobs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from preempted import GROUPS, Launched, launch, preempt, write_recipe
 from rich.console import Console
 from slurm_cluster import Cluster, why_not
 
@@ -19,7 +20,11 @@ from motionloom.pipeline.runs.launch_plan import LaunchPlan, SlurmOptions, make_
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.slurm import submit_run
 
-pytestmark = [pytest.mark.slurm, pytest.mark.skipif(bool(why_not()), reason=why_not())]
+pytestmark = [
+    pytest.mark.slurm,
+    pytest.mark.timeout(600),
+    pytest.mark.skipif(bool(why_not()), reason=why_not()),
+]
 WORDS = ["light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=0.5", "memory_gb_per_gpu=0.5"]
 OPTIONS = SlurmOptions.from_words([*WORDS, "extra.comment=two words"])
 
@@ -74,24 +79,6 @@ def states(cluster: Any, ids: list[str]) -> list[str]:
     return [found.get(job, "") for job in ids]
 
 
-def test_a_warned_job_starts_again_and_the_next_waits_for_it(
-    cluster: Any, program: Callable[[str], None]
-) -> None:
-    once = 'case $SLURM_JOB_NAME in *1-data) [ -n "$SLURM_RESTART_COUNT" ] || sleep 60;; esac'
-    program(f'echo "$SLURM_JOB_NAME ${{SLURM_RESTART_COUNT:-0}}" >> order; {once}')
-    ids = submitted(plan(nodes=1))
-    until(lambda: Path("order").is_file())
-    # What SLURM sends before a time limit.
-    subprocess.run(["scancel", "--batch", "--signal=USR1", ids[0]], check=True, env=os.environ)
-    until(lambda: states(cluster, ids) == ["COMPLETED"] * 3, 180)
-    names = [f"humantomato-tiny-{name}" for name in ("1-data", "1-data", "2-train", "3-generate")]
-    assert Path("order").read_text().splitlines() == [
-        f"{name} {count}" for name, count in zip(names, (0, 1, 0, 0), strict=True)
-    ]
-    (log,) = Path("run").glob(f".slurm/*/1-data-{ids[0]}.log")
-    assert "queued again" in log.read_text()
-
-
 def test_a_saved_job_starts_again_unless_it_was_cancelled(
     cluster: Any, program: Callable[[str], None]
 ) -> None:
@@ -113,3 +100,40 @@ def test_what_follows_a_failure_is_cancelled(cluster: Any, program: Callable[[st
     ids = submitted(plan(nodes=1))
     until(lambda: states(cluster, ids)[2] == "CANCELLED")
     assert states(cluster, ids) == ["COMPLETED", "FAILED", "CANCELLED"]
+
+
+STEPS = 100
+TRIGGERS = (5, 45)
+"""Steps behind which it is disturbed: by an urgent job and the warning before it, by a plain SIGTERM."""
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_recipe(tmp_path_factory.mktemp("recipe"), STEPS)
+
+
+@pytest.fixture(scope="module")
+def calm(cluster: Cluster, recipe: Path) -> Launched:
+    """The recipe, undisturbed."""
+    launched = launch(cluster, recipe, recipe.parent / "calm")
+    launched.wait_for_end()
+    return launched
+
+
+def test_one_command_converts_trains_and_evaluates_on_two_nodes(calm: Launched) -> None:
+    assert calm.states() == ["COMPLETED"] * len(GROUPS), calm.logs()
+    stages = calm.run / "stages"
+    finished = {path.parent.name for path in stages.glob("*/artifact.json")}
+    assert finished == {"data", "stats", "tokenizer", "evaluate"}
+    assert (stages / "evaluate/metrics.json").is_file()
+    trained = [(rank, row["step"]) for rank, row in calm.rows()]
+    assert sorted(trained) == [(rank, step) for rank in (0, 1) for step in range(STEPS)]
+
+
+def test_a_training_preempted_twice_equals_the_undisturbed_one(calm: Launched, recipe: Path) -> None:
+    """No step is trained twice: the signal before the end has the training save the one it is at."""
+    seen = preempt(calm, recipe, calm.run.with_name("preempted"), TRIGGERS, ended=TRIGGERS[1:])
+    assert seen.exact, seen
+    assert seen.steps == STEPS and seen.repeated == 0, seen
+    assert [one.first_step - one.last_step for one in seen.restarts] == [1, 1]
+    assert 0 < seen.restarts[0].last_step < seen.restarts[1].last_step < STEPS - 1
