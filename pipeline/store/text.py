@@ -183,8 +183,6 @@ def copy_encoder(spec: str, stage: Path, target: Path) -> None:
 
     The copy is loaded once: it must have the weights that encoded the run's captions.
     """
-    from motionloom.datasets.text.encoder import load_text_encoder
-
     digest = CacheInfo.load_json(stage / "cache" / "cache.json").encoder.rpartition(":")[2]
     problem = ""
     for find in _sources(spec):

@@ -238,7 +238,6 @@ def test_captions_from_standard_input(small_run: Any, capsys: pytest.CaptureFixt
         (("a", "b"), "give --seconds, the length of each"),
         (("a", "--samples", "2"), "leave --samples and --format out"),
         (("a", "--format", "npz"), "leave --samples and --format out"),
-        (("a", "--script", "x.yaml"), "--script says everything"),
     ],
 )
 def test_what_a_stream_is_not(words: tuple[str, ...], sentence: str, call: Callable[..., Any]) -> None:

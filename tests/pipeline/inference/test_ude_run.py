@@ -213,7 +213,6 @@ def test_models_of_one_modality_refuse_the_other(
         (("--audio", "nothing.wav"), "nothing.wav: no such sound file"),
         (("--audio", "slow.wav", "--seconds", "9"), "9 s were asked for and the music lasts 5.0 s"),
         (("a", "b", "--audio", "slow.wav"), "2 captions but 1 sounds"),
-        (("a", "--script", "show.yaml"), "--script says everything"),
         (("--script", "nothing.yaml"), "nothing.yaml"),
     ],
 )
