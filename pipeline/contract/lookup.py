@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from pydantic import Field
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, Role, Stage, StageKind, stage_kind
@@ -20,12 +18,11 @@ from motionloom.pipeline.store.run_folder import (
     STAGE_NAME,
     in_export,
     is_place,
-    label_of,
     owner_of,
     stage_folder,
     stages_of,
 )
-from motionloom.pipeline.store.run_state import RunReader, StageRecord, finished_records
+from motionloom.pipeline.store.run_state import RunReader, StageRecord, finished_records, not_here
 from motionloom.pipeline.store.weights import LayoutFacts
 
 
@@ -74,16 +71,8 @@ def finished_stages(run: Path) -> dict[str, Finished]:
 
 def outside_stage(folder: Path) -> Finished | None:
     """A finished stage of a run or of an export, by its folder, for another run; None where there is none."""
-    place = folder.resolve()
-    if in_export(place):
-        return _as_outside(exported_stage(place)) if place.is_dir() else None
-    record = RunReader(None).find(place)
+    record = RunReader(None).find(folder.resolve())
     return None if record is None else _finished(record, {})
-
-
-def _as_outside(stage: Finished) -> Finished:
-    inputs = {role: _as_outside(source) for role, source in stage.inputs.items()}
-    return replace(stage, name=label_of(stage.folder), inputs=inputs, outside=True)
 
 
 def _finished(record: StageRecord, made: dict[Path, Finished]) -> Finished:
@@ -94,25 +83,39 @@ def _finished(record: StageRecord, made: dict[Path, Finished]) -> Finished:
 
 
 def _loadable(record: StageRecord, made: dict[Path, Finished]) -> Finished:
-    if in_export(record.folder):
-        return _as_outside(exported_stage(record.folder.resolve()))
-    where = str(record.folder / "artifact.json")
+    folder = record.folder
+    where, run, exported = str(folder / "artifact.json"), owner_of(folder), in_export(folder)
     kind = stage_kind(record.kind, where)
-    if record.version != kind.version and GENERATOR in _gives(kind, record):
+    if record.version != kind.version and (exported or GENERATOR in _gives(kind, record)):
         raise UserError(
             f"{where}: made by version {record.version} of stage kind {kind.name}, which is now "
-            f"version {kind.version}; run the recipe again"
+            f"version {kind.version}; run the recipe again{' and export it' * exported}"
         )
-    run = owner_of(record.folder)
+    inputs = {role: _finished(source, made) for role, source in record.inputs.items()}
+    if exported:
+        read_bundle(run)
+        _require_roles(kind, inputs, where)
     return Finished(
         record.name,
         kind,
         kind.config.parse(dict(record.config), f"{where}: config"),
-        record.folder,
-        {role: _finished(source, made) for role, source in record.inputs.items()},
+        folder,
+        inputs,
+        exported=exported,
         outside=record.outside,
-        gone={role: say_gone(run, record.folder.name, place) for role, place in record.gone.items()},
+        gone={role: say_gone(run, folder.name, place) for role, place in record.gone.items()},
     )
+
+
+def _require_roles(kind: StageKind, inputs: Mapping[str, Finished], where: str) -> None:
+    """Refuse stages of an export in roles that they cannot fill."""
+    roles = {role.name: role for role in kind.roles() if isinstance(role, Role)}
+    for role, source in inputs.items():
+        if role not in roles or not roles[role].fits(source.kind, source.config):
+            raise UserError(
+                f"{where}: inputs: '{source.name}' of kind {source.kind.name} is no {role}; "
+                f"export the run again"
+            )
 
 
 def say_gone(run: Path, stage: str, place: Path) -> str:
@@ -169,21 +172,9 @@ def _listed(run: Path) -> list[Path]:
     return [(run / name if is_place(name) else stage_folder(run, name)).resolve() for name in names]
 
 
-# Exports. One may come from anywhere, so nothing outside its folder is ever followed.
+# Exports: folders of stages like a run's, which hold nothing else.
 
-FORMAT = 2
-
-
-class ExportedStage(Config):
-    """One stage of an export."""
-
-    kind: str
-    version: int
-    config: dict[str, object]
-    inputs: dict[str, str]
-    """Role -> name of another stage of the export."""
-    sha256: dict[str, str]
-    """File of the stage's folder -> its sha256, which is compared when the stage is opened."""
+FORMAT = 3
 
 
 class BundleFile(Config):
@@ -193,87 +184,38 @@ class BundleFile(Config):
     layout: LayoutFacts
     generators: tuple[str, ...]
     """Stages that generate, the default first."""
-    stages: dict[str, ExportedStage] = Field(default_factory=dict)
     sampling: dict[str, object] = Field(default_factory=dict)
     """Fields of `SamplingConfig` that its motions are best drawn with, where nobody says otherwise."""
 
 
 def open_exported(folder: Path) -> list[Finished]:
     """The stages of an export that generate, the default first."""
-    path, facts, made = folder / BUNDLE_FILE, _read(folder), dict[str, Finished]()
-    makers = [_build(folder, facts, name, (), made) for name in facts.generators]
-    for stage in makers:
+    path, reader, made = folder / BUNDLE_FILE, RunReader(folder), dict[Path, Finished]()
+    makers = []
+    for name in read_bundle(folder).generators:
+        record = reader.find(folder / name) if re.fullmatch(STAGE_NAME, name) else None
+        if record is None:
+            raise UserError(not_here(folder, name))
+        stage = _finished(record, made)
         if not stage.gives(GENERATOR):
             raise UserError(
                 f"{path}: its stage '{stage.name}' of kind {stage.kind.name} generates nothing; export the "
                 f"run again"
             )
+        makers.append(stage)
     return makers
 
 
 def exported_sampling(folder: Path) -> SamplingConfig:
     """How an export's motions are best drawn; fields of which it says nothing are not set."""
-    return SamplingConfig.parse(_read(folder).sampling, f"{folder / BUNDLE_FILE}: sampling")
+    return SamplingConfig.parse(read_bundle(folder).sampling, f"{folder / BUNDLE_FILE}: sampling")
 
 
-def exported_stage(folder: Path) -> Finished:
-    """One stage of an export, by its folder, which must be there."""
-    return _build(folder.parent, _read(folder.parent), folder.name, (), {})
-
-
-def _read(folder: Path) -> BundleFile:
+def read_bundle(folder: Path) -> BundleFile:
+    """What an export says of itself."""
     path = folder / BUNDLE_FILE
     if read_record(path).get("format") != FORMAT:
         raise UserError(
             f"{path}: exported by another version of motionloom; export the run again: motionloom export RUN"
         )
     return BundleFile.load_json(path)
-
-
-def _build(
-    folder: Path, facts: BundleFile, name: str, above: tuple[str, ...], made: dict[str, Finished]
-) -> Finished:
-    """A stage and those it needs, each once."""
-    path = folder / BUNDLE_FILE
-    if name in above:
-        raise UserError(f"{path}: stage '{name}' needs itself; export the run again")
-    if name in made:
-        return made[name]
-    entry = facts.stages.get(name)
-    if entry is None or not re.fullmatch(STAGE_NAME, name) or not (folder / name).is_dir():
-        raise UserError(
-            f"{path}: its stage '{name}' is not here; copy the whole folder, or export the run again"
-        )
-    kind = stage_kind(entry.kind, f"{path}: stages.{name}")
-    if entry.version != kind.version:
-        raise UserError(
-            f"{path}: stages.{name} was made by version {entry.version} of kind {kind.name}, which "
-            f"is now version {kind.version}; run and export the recipe again"
-        )
-    _require_whole(folder / name, entry.sha256, path)
-    inputs = {
-        role: _build(folder, facts, source, (*above, name), made) for role, source in entry.inputs.items()
-    }
-    config = kind.config.parse(entry.config, f"{path}: stages.{name}.config")
-    roles = {role.name: role for role in kind.roles() if isinstance(role, Role)}
-    for role, source in inputs.items():
-        if role not in roles or not roles[role].fits(source.kind, source.config):
-            raise UserError(
-                f"{path}: stages.{name}.inputs: '{source.name}' of kind {source.kind.name} is no "
-                f"{role}; export the run again"
-            )
-    made[name] = Finished(name, kind, config, folder / name, inputs, exported=True)
-    return made[name]
-
-
-def _require_whole(stage: Path, digests: Mapping[str, str], path: Path) -> None:
-    """Refuse files that are not those that were exported; files that are missing say so when they load."""
-    for name, digest in digests.items():
-        if Path(name).is_absolute() or ".." in Path(name).parts or not Path(name).name:
-            raise UserError(
-                f"{path}: stages.{stage.name}.sha256 names {name!r}, which is no file of its folder"
-            )
-        if (stage / name).is_file() and sha256_of(stage / name) != digest:
-            raise UserError(
-                f"{stage / name}: is not the file that was exported (another sha256); copy the folder again"
-            )

@@ -8,13 +8,13 @@ from collections.abc import Iterable
 from itertools import chain, count
 from pathlib import Path
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.pipeline.contract.lookup import FORMAT, BundleFile, ExportedStage
+from motionloom.pipeline.contract.lookup import FORMAT, BundleFile
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.requests import require_used
+from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.checksums import require_unchanged
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
@@ -48,37 +48,33 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
     for stage in makers:
         _collect(stage, needed)
     names = _names(needed.values())
-    entries: dict[str, ExportedStage] = {}
     (out / BUNDLE_FILE).unlink(missing_ok=True)
+    made: dict[str, Artifact] = {}
     for folder, stage in needed.items():
-        name = names[folder]
+        name, artifact = names[folder], Artifact.find(folder)
+        assert artifact is not None
         require_unchanged(folder)
         try:
             stage.kind.export(stage, out / name)
             if half and (weights := out / name / "model.safetensors").is_file():
                 halve_weights(weights)
         except BaseException:
-            for made in (*entries, name):  # nothing that looks like a model is left
-                shutil.rmtree(out / made, ignore_errors=True)
+            for copied in (*made, name):  # nothing that looks like a model is left
+                shutil.rmtree(out / copied, ignore_errors=True)
             raise
-        roles = set(stage.kind.exported(stage.config))
-        entries[name] = ExportedStage(
-            kind=stage.kind.name,
-            version=stage.kind.version,
-            config=stage.kind.exported_config(stage.config).dump(),
-            inputs={role: names[source.folder] for role, source in stage.inputs.items() if role in roles},
-            sha256={
-                path.relative_to(out / name).as_posix(): sha256_of(path)
-                for path in sorted((out / name).rglob("*"))
-                if path.is_file()
-            },
-        )
+        inputs = {
+            role: InputStage(stage=names[source.folder], fingerprint=made[names[source.folder]].fingerprint)
+            for role, source in stage.inputs.items()
+            if role in stage.kind.exported(stage.config)
+        }
+        config = stage.kind.exported_config(stage.config).dump()
+        changes = {"stage": name, "config": config, "inputs": inputs}
+        made[name] = artifact.model_copy(update=changes).finish(out / name)
     write_json(out / "skeleton.json", _plain(skeleton))
     facts = BundleFile(
         format=FORMAT,
         layout=LayoutFacts.of(bundle.layout),
         generators=tuple(names[stage.folder] for stage in makers),
-        stages=entries,
         sampling=sampling,
     )
     write_json(out / BUNDLE_FILE, facts.dump())

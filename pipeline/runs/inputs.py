@@ -160,8 +160,8 @@ def _require_usable(found: Finished, name: str, where: str) -> None:
     run = owner_of(found.folder)
     again = f"make it again: motionloom run {run / 'recipe.yaml'} -o {run}"
     for stage in _needed(found):
-        artifact = Artifact.find(stage.folder)
-        if artifact is None:  # in an export, which is checked as it is opened
+        artifact = None if in_export(stage.folder) else Artifact.find(stage.folder)
+        if artifact is None:  # an export is checked as it is opened
             continue
         if artifact.version != stage.kind.version:
             raise UserError(

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import Config, UserError
@@ -47,18 +47,21 @@ class InputStage(Config):
         """Stages of the run itself are written without the folder that they do not have."""
         return {name: value for name, value in handler(self).items() if value is not None}
 
-    def place(self, run: Path) -> Path:
-        return stage_folder(run, self.stage) if self.folder is None else (run / self.folder).resolve()
-
-    def now(self, run: Path) -> str | None:
-        """What `fingerprint` would be of what is there now; None if nothing is."""
+    def place(self, stage: Path) -> Path:
+        """Its folder; `stage` is that of the stage which it fed."""
         if self.folder is None:
-            return fingerprint_now(self.place(run))
-        return identity_of(self.place(run))
+            return stage.parent / self.stage
+        return (owner_of(stage) / self.folder).resolve()
 
-    def say(self, run: Path) -> str:
+    def now(self, stage: Path) -> str | None:
+        """What `fingerprint` would be of what is there now; None if nothing is."""
+        place = self.place(stage)
+        return fingerprint_now(place) if self.folder is None else identity_of(place)
+
+    def say(self, stage: Path) -> str:
         """Its name, for people; with the place of one outside the run."""
-        return f"'{self.stage}'" if self.folder is None else f"'{self.stage}' of {owner_of(self.place(run))}"
+        owner = "" if self.folder is None else f" of {owner_of(self.place(stage))}"
+        return f"'{self.stage}'{owner}"
 
 
 class Artifact(Config):
@@ -74,6 +77,14 @@ class Artifact(Config):
     """Steps at which learning-rate schedules ended that were lengthened when more steps were asked for."""
     inputs: dict[str, InputStage]
     outputs: dict[str, OutputFile] = Field(default_factory=dict)
+
+    @field_validator("outputs")
+    @classmethod
+    def _in_its_folder(cls, outputs: dict[str, OutputFile]) -> dict[str, OutputFile]:
+        for name in outputs:
+            if Path(name).is_absolute() or ".." in Path(name).parts or not Path(name).name:
+                raise ValueError(f"names {name!r}, which is no file of its folder")
+        return outputs
 
     @staticmethod
     def find(folder: Path) -> Artifact | None:
@@ -109,13 +120,13 @@ def changed_above(folder: Path, found: dict[Path, Changed | None]) -> Changed | 
     Goes up to the first stage of all, into other runs too; an export is whole in itself. What is gone without
     a trace cannot be compared and is let through.
     """
-    key, own = folder.resolve(), folder.parent.parent
+    key = folder.resolve()
     if key not in found:
         found[key] = None  # a damaged folder may name itself
         artifact = None if in_export(folder) else Artifact.find(folder)
         sources = [] if artifact is None else list(artifact.inputs.values())
-        own_ones = ((folder, one) for one in sources if one.now(own) not in (None, one.fingerprint))
-        above = (changed_above(source.place(own), found) for source in sources)
+        own_ones = ((folder, one) for one in sources if one.now(folder) not in (None, one.fingerprint))
+        above = (changed_above(source.place(folder), found) for source in sources)
         found[key] = next(own_ones, None) or next(filter(None, above), None)
     return found[key]
 
@@ -127,8 +138,8 @@ def require_consistent(run: Path, stages: Iterable[str]) -> None:
             folder, source = changed
             own = folder.parent.parent
             raise UserError(
-                f"{own}: stage '{folder.name}' was made from another {source.say(own)}, which has been made "
-                f"anew since; finish the run: motionloom run {own / 'recipe.yaml'} -o {own}"
+                f"{own}: stage '{folder.name}' was made from another {source.say(folder)}, which has been "
+                f"made anew since; finish the run: motionloom run {own / 'recipe.yaml'} -o {own}"
             )
 
 

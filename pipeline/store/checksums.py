@@ -15,7 +15,7 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.shards.checksums import state_of
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.files import write_json
-from motionloom.pipeline.store.run_folder import owner_of
+from motionloom.pipeline.store.run_folder import in_export, owner_of
 
 NOTE = ".compared.json"
 
@@ -55,12 +55,14 @@ class Compared(Config):
 def require_unchanged(folder: Path, *, again: bool = False) -> int:
     """Refuse a finished stage one of whose files is not the one that it made; how many were read.
 
+    Those of an export are compared each time.
+
     Shards are left to whoever reads them (`verify_shards.py`), unless `again` has all compared once more.
     """
-    artifact, run = Artifact.find(folder), owner_of(folder)
+    artifact, run, exported = Artifact.find(folder), owner_of(folder), in_export(folder)
     if artifact is None:
         return 0
-    known = Compared(files={}) if again else Compared.read(run / NOTE)
+    known = Compared(files={}) if again or exported else Compared.read(run / NOTE)
     compared: dict[str, ComparedFile] = {}
     for name, info in artifact.outputs.items():
         path = folder / name
@@ -70,13 +72,13 @@ def require_unchanged(folder: Path, *, again: bool = False) -> int:
         if known.knows(key, info.sha256, state):
             continue
         if not state or state[0] != info.bytes or sha256_of(path) != info.sha256:
-            what = "is not the file that its stage made (another sha256)" if state else "is gone"
-            raise UserError(
-                f"{path}: {what}; copy it back, or make it again: motionloom run {run / 'recipe.yaml'} -o "
-                f"{run} --from {folder.name}"
-            )
+            maker = "was exported" if exported else "its stage made"
+            what = f"is not the file that {maker} (another sha256)" if state else "is gone"
+            again_by = f"motionloom run {run / 'recipe.yaml'} -o {run} --from {folder.name}"
+            fix = "copy the folder again" if exported else f"copy it back, or make it again: {again_by}"
+            raise UserError(f"{path}: {what}; {fix}")
         compared[key] = ComparedFile(sha256=info.sha256, states=[state])
-    if compared:
+    if compared and not exported:
         with suppress(OSError):  # a run that may only be read
             Compared.read(run / NOTE).write(run / NOTE, compared)
     return len(compared)

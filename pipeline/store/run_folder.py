@@ -56,8 +56,6 @@ def place_from(run: Path, stage: Path) -> str:
 
 def identity_of(stage: Path) -> str | None:
     """Tells what a stage's folder holds from all else it might hold; None where nothing is there."""
-    if in_export(stage):
-        return _exported_identity(stage)
     artifact = stage / "artifact.json"
     if not artifact.is_file():
         return UNFINISHED if (stage / "started.json").is_file() else None
@@ -65,14 +63,6 @@ def identity_of(stage: Path) -> str | None:
     outputs = record.get("outputs")
     files = {name: file.get("sha256") for name, file in outputs.items()} if isinstance(outputs, dict) else {}
     return fingerprint_of({"fingerprint": record.get("fingerprint"), "files": files})
-
-
-def _exported_identity(stage: Path) -> str | None:
-    """By what the export says of its stages: their files are compared with that as they are opened."""
-    stages = read_record(stage.parent / BUNDLE_FILE).get("stages")
-    if not isinstance(stages, dict) or stage.name not in stages or not stage.is_dir():
-        return None
-    return fingerprint_of({"stage": stage.name, "stages": stages})
 
 
 def stage_folder(run: Path, name: str) -> Path:

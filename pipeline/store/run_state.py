@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.artifact import Artifact, Changed, changed_above
 from motionloom.pipeline.store.files import read_record
 from motionloom.pipeline.store.run_folder import (
     BUNDLE_FILE,
-    identity_of,
     in_export,
     label_of,
     owner_of,
@@ -55,11 +55,17 @@ class StageRecord:
             yield from stage.upstream()
 
 
+def not_here(export: Path, name: str) -> str:
+    """What to say of a stage that an export names and does not hold."""
+    fix = "copy the whole folder, or export the run again"
+    return f"{export / BUNDLE_FILE}: its stage '{name}' is not here; {fix}"
+
+
 class RunReader:
-    """Reads finished stages and those that fed them, each once, into other runs too."""
+    """Reads finished stages and those that fed them, each once, into other runs and exports too."""
 
     def __init__(self, home: Path | None) -> None:
-        """`home` is the run whose stages have no run in their names; None where all of them do."""
+        """`home` is the run or export whose stages have no run in their names; None where all of them do."""
         self._home = None if home is None else home.resolve()
         self._found: dict[Path, StageRecord | None] = {}
         self._places: dict[Path, dict[Path, int]] = {}
@@ -73,18 +79,19 @@ class RunReader:
         return self._found[key]
 
     def _read(self, folder: Path) -> StageRecord | None:
-        exported = in_export(folder)
-        artifact = _exported_artifact(folder) if exported else Artifact.find(folder)
+        artifact, exported, run = Artifact.find(folder), in_export(folder), owner_of(folder)
         if artifact is None:
             return None
-        run = owner_of(folder)
         inputs, gone = dict[str, StageRecord](), dict[str, Path]()
         for role, source in artifact.inputs.items():
-            stage = self.find(source.place(run))
+            # An export may come from anywhere: nothing outside its folder is ever followed.
+            stage = None if exported and source.folder is not None else self.find(source.place(folder))
             if stage is not None:
                 inputs[role] = stage
+            elif exported:
+                raise UserError(not_here(run, source.stage))
             elif source.folder is not None:
-                gone[role] = source.place(run)
+                gone[role] = source.place(folder)
         outside = run.resolve() != self._home
         return StageRecord(
             name=label_of(folder) if outside else folder.name,
@@ -112,23 +119,6 @@ def finished_records(run: Path) -> dict[str, StageRecord]:
     reader = RunReader(run)
     found = {name: reader.find(stage_folder(run, name)) for name in stages_of(run)}
     return {name: stage for name, stage in found.items() if stage is not None}
-
-
-def _exported_artifact(folder: Path) -> Artifact | None:
-    """What made a stage of an export, as far as the export says it."""
-    where = folder.parent / BUNDLE_FILE
-    entries = read_record(where).get("stages")
-    entry = entries.get(folder.name) if isinstance(entries, dict) else None
-    if not isinstance(entry, dict):
-        return None
-    inputs = {
-        role: {"stage": name, "fingerprint": "", "folder": str(folder.parent.resolve() / str(name))}
-        for role, name in dict(entry.get("inputs", {})).items()
-    }
-    identity = str(identity_of(folder))
-    data = {"stage": folder.name, "fingerprint": identity, "seed": 0, "inputs": inputs}
-    data |= {key: entry[key] for key in ("kind", "version", "config") if key in entry}
-    return Artifact.parse(data, f"{where}: stages.{folder.name}")
 
 
 @dataclass(frozen=True)
@@ -245,7 +235,7 @@ def _why_outdated(run: Path, name: str, found: dict[Path, Changed | None]) -> st
     folder, source = changed
     own = folder.parent.parent
     there = f" of {own}" if source.folder is None and own.resolve() != run.resolve() else ""
-    return f"{source.say(own)}{there} has been made anew since"
+    return f"{source.say(folder)}{there} has been made anew since"
 
 
 def _mapping(value: object) -> Mapping[str, object]:

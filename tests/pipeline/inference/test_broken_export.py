@@ -21,6 +21,7 @@ from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.exported import write_bundle
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import model_folder
+from motionloom.pipeline.store.artifact import Artifact
 
 STAGES = [
     "stats", "text", "tokenizer", "tma", "gpt", "face_tokenizer", "face_gpt", "face_vae", "face_diffusion",
@@ -55,19 +56,19 @@ def change(path: Path, edit: Callable[[Any], Any]) -> None:
     data = json.loads(path.read_text())
     edit(data)
     path.write_text(json.dumps(data))
-    if path.name != "bundle.json":
-        own, digest = path.parent.name, {path.name: sha256_of(path)}
-        change(
-            path.parent.parent / "bundle.json", lambda facts: facts["stages"][own]["sha256"].update(digest)
-        )
+    if path.name not in ("bundle.json", "artifact.json"):
+        sealed = {path.name: {"bytes": path.stat().st_size, "sha256": sha256_of(path)}}
+        change(path.parent / "artifact.json", lambda facts: facts["outputs"].update(sealed))
 
 
 def test_the_folder_lists_its_stages(whole: Path) -> None:
     facts = json.loads((whole / "bundle.json").read_text())
     assert facts["generators"] == ["gpt", "face_gpt", "face_vae", "face_diffusion"]
-    assert set(facts["stages"]) == {path.name for path in whole.iterdir() if path.is_dir()} == set(STAGES)
-    assert facts["stages"]["gpt"]["inputs"] == {"tokenizer": "tokenizer", "text": "text", "tma": "tma"}
-    assert facts["stages"]["face_gpt"]["inputs"] == {"tokenizer": "face_tokenizer", "text": "text"}
+    found = {path.parent.name: Artifact.load_json(path) for path in whole.glob("*/artifact.json")}
+    assert set(found) == {path.name for path in whole.iterdir() if path.is_dir()} == set(STAGES)
+    inputs = {name: {role: one.stage for role, one in made.inputs.items()} for name, made in found.items()}
+    assert inputs["gpt"] == {"tokenizer": "tokenizer", "text": "text", "tma": "tma"}
+    assert inputs["face_gpt"] == {"tokenizer": "face_tokenizer", "text": "text"}
 
 
 def test_the_hubs_helper_misses_nothing(whole: Path, small_run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,10 +106,10 @@ def test_the_text_encoder_is_never_outside(name: str, model: Path) -> None:
 
 def test_the_encoder_of_the_config_is_not_followed(model: Path) -> None:
     """What a text stage was configured with is a place on another machine."""
-    change(model / "bundle.json", lambda f: f["stages"]["text"]["config"].update(encoder="/etc"))
+    change(model / "text/artifact.json", lambda facts: facts["config"].update(encoder="/etc"))
     assert Bundle.open(model).generate(["a person waves"], seconds=1.0)
     (model / "text/text.json").unlink()
-    with pytest.raises(UserError, match=r"text.json: no such file"):
+    with pytest.raises(UserError, match=r"text.json: is gone"):
         Bundle.open(model).generate(["a person waves"], seconds=1.0)
 
 
@@ -118,62 +119,53 @@ def test_a_stage_is_one_that_is_listed_and_beside(name: str, model: Path) -> Non
     shutil.copytree(model / "gpt", model.parent / "gpt")
     (model / "a/b").mkdir(parents=True)
     whole = (model / "bundle.json").read_text()
-
-    def alias(facts: Any) -> None:
-        facts["generators"].append(name)
-        facts["stages"][name] = facts["stages"]["gpt"]
-
-    def feed(facts: Any) -> None:
-        facts["stages"][name] = facts["stages"]["tokenizer"]
-        facts["stages"]["gpt"]["inputs"]["tokenizer"] = name
-
-    for edit in (alias, feed, lambda facts: facts["generators"].append(name)):
-        (model / "bundle.json").write_text(whole)
-        change(model / "bundle.json", edit)
-        with pytest.raises(UserError, match=f"its stage '{name}' is not here"):
-            Bundle.open(model)
+    change(model / "bundle.json", lambda facts: facts["generators"].append(name))
+    with pytest.raises(UserError, match=f"its stage '{name}' is not here"):
+        Bundle.open(model)
+    (model / "bundle.json").write_text(whole)
+    change(model / "gpt/artifact.json", lambda facts: facts["inputs"]["tokenizer"].update(stage=name))
+    with pytest.raises(UserError, match=f"its stage '{name}' is not here|inputs.tokenizer.stage' = '{name}"):
+        Bundle.open(model)
 
 
-WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
+WRONG: dict[str, tuple[str, Callable[[Any], Any], str]] = {
     "a circle": (
-        lambda f: f["stages"]["tokenizer"]["inputs"].update(stats="gpt"), "stage 'gpt' needs itself"
+        "tokenizer", lambda f: f["inputs"]["stats"].update(stage="gpt"), "its stage 'gpt' is not here"
     ),
-    "itself": (lambda f: f["stages"]["stats"]["inputs"].update(data="stats"), "'stats' needs itself"),
-    "an unknown kind": (
-        lambda f: f["stages"]["gpt"].update(kind="os"), "stages.gpt: stage kind 'os' is not known here"
+    "itself": (
+        "tokenizer", lambda f: f["inputs"]["stats"].update(stage="tokenizer"), "'tokenizer' is not here"
     ),
-    "another version": (
-        lambda f: f["stages"]["gpt"].update(version=99), "stages.gpt was made by version 99 of kind gpt"
+    "one elsewhere": (
+        "gpt", lambda f: f["inputs"]["tokenizer"].update(folder="../tokenizer"), "'tokenizer' is not here"
     ),
-    "a wrong config": (
-        lambda f: f["stages"]["gpt"]["config"].update(priorr=1), "stages.gpt.config: unknown key 'priorr'"
-    ),
-    "no generator": (lambda f: f.update(generators=[]), "no finished stage here generates body motion"),
-    "faces alone": (lambda f: f.update(generators=["face_vae"]), "here generates body motion"),
+    "an unknown kind": ("gpt", lambda f: f.update(kind="os"), "stage kind 'os' is not known here"),
+    "another version": ("gpt", lambda f: f.update(version=99), "made by version 99 of stage kind gpt"),
+    "a wrong config": ("gpt", lambda f: f["config"].update(priorr=1), "config: unknown key 'priorr'"),
+    "no generator": ("", lambda f: f.update(generators=[]), "no finished stage here generates body motion"),
+    "faces alone": ("", lambda f: f.update(generators=["face_vae"]), "here generates body motion"),
     "what does not generate": (
-        lambda f: f["generators"].append("stats"), "stage 'stats' .*generates nothing.*export the run again"
+        "", lambda f: f["generators"].append("stats"), "'stats' .*generates nothing.*export the run again"
     ),
     "an input that is missing": (
-        lambda f: f["stages"]["gpt"]["inputs"].pop("tokenizer"), "no finished 'tokenizer' stage here"
+        "gpt", lambda f: f["inputs"].pop("tokenizer"), "no finished 'tokenizer' stage here"
     ),
     "an input of another kind": (
-        lambda f: f["stages"]["gpt"]["inputs"].update(tokenizer="tma"),
-        "stages.gpt.inputs: 'tma' of kind tma is no tokenizer",
+        "gpt", lambda f: f["inputs"]["tokenizer"].update(stage="tma"), "'tma' of kind tma is no tokenizer"
     ),
-    "an unknown key": (lambda f: f.update(code="os"), "unknown key 'code'"),
+    "an unknown key": ("", lambda f: f.update(code="os"), "unknown key 'code'"),
     "sampling of an unknown key": (
-        lambda f: f.update(sampling={"cfg_scael": 1}), "sampling: unknown key 'cfg_scael'; did you mean"
+        "", lambda f: f.update(sampling={"cfg_scael": 1}), "sampling: unknown key 'cfg_scael'; did you mean"
     ),
-    "a sum of a file elsewhere": (
-        lambda f: f["stages"]["gpt"].update(sha256={"../stats.safetensors": ""}), "no file of its folder"
+    "a file elsewhere": (
+        "gpt", lambda f: f["outputs"].update({"../x": {"bytes": 1, "sha256": ""}}), "no file of its folder"
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", WRONG)
 def test_what_cannot_be_is_refused_in_a_sentence(name: str, model: Path) -> None:
-    edit, says = WRONG[name]
-    change(model / "bundle.json", edit)
+    stage, edit, says = WRONG[name]
+    change(model / stage / "artifact.json" if stage else model / "bundle.json", edit)
     with pytest.raises(UserError, match=says):
         MotionModel.from_pretrained(model)
 
