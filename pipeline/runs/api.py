@@ -153,7 +153,7 @@ def _stages_again(
 
 def _inputs_again(folder: Path, recipe: Recipe, stage: Stage, state: RunState | None) -> dict[str, Finished]:
     """The inputs of a stage; with `state` those that are finished, with all that they were made from."""
-    made = recipe.outside | finished_stages(folder)
+    made = {**recipe.outside, **finished_stages(folder)}
     inputs = {role: made[name] for role, name in stage.inputs.items() if name in made}
     if state is None:
         gone = [said for (name, _), said in recipe.gone.items() if name == stage.name]
