@@ -88,7 +88,7 @@ def test_a_lost_stage_is_named(model: Path) -> None:
         (model.parent / stage).rename(model / stage)
 
 
-@pytest.mark.parametrize("text", ['{"parts": ["gpt"]}', '{"format": 3}', "[]", "{", "\x00"])
+@pytest.mark.parametrize("text", ['{"parts": ["gpt"]}', '{"format": 2}', "[]", "{", "\x00"])
 def test_a_folder_of_another_version_is_refused(text: str, model: Path) -> None:
     (model / "bundle.json").write_text(text)
     with pytest.raises(UserError, match=r"bundle.json: .*again"):
