@@ -90,27 +90,21 @@ class Dmd(nn.Module):
         step: Tensor,
         codes: Mapping[str, Tensor],
         length: Tensor,
-        absent: Mapping[str, Tensor] | None = None,
         hidden: Tensor | None = None,
     ) -> Tensor:
         """`denoise` of noisy [B, T, D] at step [B], given the tokens of clips of `length` [B] frames."""
         groups = (length + GROUP_FRAMES - 1) // GROUP_FRAMES
-        condition = self.encode_tokens(codes, groups, absent, hidden)
+        condition = self.encode_tokens(codes, groups, hidden)
         return self.denoise(noisy, step, condition, length_mask(length, noisy.shape[1]))
 
     def encode_tokens(
-        self,
-        codes: Mapping[str, Tensor],
-        groups: Tensor,
-        absent: Mapping[str, Tensor] | None = None,
-        hidden: Tensor | None = None,
+        self, codes: Mapping[str, Tensor], groups: Tensor, hidden: Tensor | None = None
     ) -> Tensor:
         """Condition of each frame from the tokens, [B, 4 G, C]; computed once a motion, not at each step.
 
         Args:
             codes: Per stream int64 [B, G * per_group].
             groups: int64 [B], groups that count; the others are padding.
-            absent: Bool [B] per stream that a clip may lack: its tokens are read as zero.
             hidden: Bool [B, G], groups whose tokens are read as zero.
         """
         slots = []
@@ -118,8 +112,6 @@ class Dmd(nn.Module):
             per = self.pattern.count(name)
             here = codes[name].reshape(len(groups), codes[name].shape[1] // per, per)
             vectors = self.embeddings[name](here[:, :, self.pattern[:index].count(name)])
-            if absent is not None and name in absent:
-                vectors = vectors.masked_fill(absent[name][:, None, None], 0.0)
             if hidden is not None:
                 vectors = vectors.masked_fill(hidden[..., None], 0.0)
             slots.append(vectors)
@@ -182,7 +174,7 @@ def dmd_loss(
         noise: [B, T, D], standard normal.
         present: bool [B, D], columns that count (None = all).
     """
-    found = net(noiser.add_noise(motion, noise, step), step, codes, length, None, hidden)
+    found = net(noiser.add_noise(motion, noise, step), step, codes, length, hidden)
     target = motion if net.config.schedule.predicts == "sample" else noise
     error = found - target.to(found.dtype)
     loss = masked_mean(error.square(), length_mask(length, motion.shape[1]), present)

@@ -6,15 +6,11 @@ averaged with weights that rise and fall linearly across the overlap, and one st
 motion [ours]. Averaging noise is averaging x0, which is linear in it at a given x_t. Since all windows are
 denoised together from one noise, no seam is left; a motion that fits into one window is denoised as it is.
 
-Every motion draws from its own seed, and motions of one length are denoised together, so a motion does not
-depend on what it is generated with.
-
 Legend: n motions, T frames, D features, K windows, W frames of a window.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -22,7 +18,7 @@ from torch import Tensor
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd
-from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.diffusion.schedule import Sampler, by_length
 from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.layers.transformer import length_mask
@@ -35,12 +31,10 @@ def decode_motions(
     codes: Codes,
     *,
     seeds: Sequence[int],
-    frames: Sequence[int] | None = None,
     sampler: Sampler = "ddpm",
     steps: int = 50,
     window: int = 160,
     overlap: int = 32,
-    absent: Mapping[str, Tensor] | None = None,
     hidden: Tensor | None = None,
 ) -> list[Tensor]:
     """Motions [T, D] of n token sequences, in the coordinates of training, one seed each (UDE section 3.4).
@@ -49,16 +43,15 @@ def decode_motions(
         net: The denoiser; runs in evaluation mode and is left as it was.
         codes: Tokens, n rows.
         seeds: One per row; repeat a row with other seeds for more motions of one token sequence.
-        frames: Frames of each motion (default: all of its tokens').
         steps: Denoising steps, at most those of the training.
         window: Frames denoised at once, a multiple of 4: what the network was trained on.
         overlap: Frames that neighbouring windows share, a multiple of 4 below `window`.
-        absent: Bool [n] per stream whose tokens say nothing.
         hidden: Bool [n, G], groups that are filled in without their tokens, if the training had `hide`.
     """
-    count = len(codes.groups)
-    if len(seeds) != count or (frames is not None and len(frames) != count):
-        raise UserError(f"{len(seeds)} seeds and {count} token sequences; each motion needs its own")
+    if len(seeds) != len(codes.groups):
+        raise UserError(
+            f"{len(seeds)} seeds and {len(codes.groups)} token sequences; each motion needs its own"
+        )
     if hidden is not None and not net.config.hide:
         raise UserError(
             "this DMD was trained with every token in sight and cannot fill in for hidden ones; train it "
@@ -68,32 +61,21 @@ def decode_motions(
         raise UserError(
             f"window {window} and overlap {overlap} must be multiples of {GROUP_FRAMES}, the overlap smaller"
         )
-    available = [int(g) * GROUP_FRAMES for g in codes.groups]
-    wanted = available if frames is None else list(frames)
-    for row, (size, most) in enumerate(zip(wanted, available, strict=True)):
-        if not 1 <= size <= most:
-            raise UserError(f"motion {row} was asked for {size} frames; its tokens are {most} frames")
-    rows_of: dict[int, list[int]] = defaultdict(list)
-    for row, size in enumerate(wanted):
-        rows_of[size].append(row)
-    out: dict[int, Tensor] = {}
+
+    def denoised(rows: list[int], x: Tensor, noise: list[torch.Generator]) -> Tensor:
+        mine = {name: values[rows] for name, values in codes.codes.items()}
+        unread = None if hidden is None else hidden[rows]
+        windows = _Windows(net, mine, unread, x.shape[1], window, overlap)
+        return net.config.schedule.denoise(windows.denoise, x, noise, sampler, steps)
+
+    frames = [groups * GROUP_FRAMES for groups in codes.groups.tolist()]
     with evaluating(net):
-        for size, rows in rows_of.items():
-            index = torch.tensor(rows, device=codes.groups.device)
-            mine = {name: values[index] for name, values in codes.codes.items()}
-            gone = None if absent is None else {name: values[index] for name, values in absent.items()}
-            unread = None if hidden is None else hidden[index]
-            windows = _Windows(net, mine, gone, unread, size, window, overlap)
-            noise = [torch.Generator().manual_seed(seeds[row]) for row in rows]
-            x = torch.stack([torch.randn(size, net.motion_dim, generator=g) for g in noise]).to(index.device)
-            made = net.config.schedule.denoise(windows.denoise, x, noise, sampler, steps)
-            out.update(zip(rows, made, strict=True))
-    return [out[row] for row in range(count)]
+        return by_length(frames, seeds, net.motion_dim, codes.groups.device, denoised)
 
 
 def window_starts(frames: int, window: int, overlap: int) -> list[int]:
-    """First frames of the windows that cover `frames`; the last one ends with the last group."""
-    last = -(-frames // GROUP_FRAMES) * GROUP_FRAMES - window
+    """First frames of the windows that cover `frames`; the last one ends with the motion."""
+    last = frames - window
     if last <= 0:
         return [0]
     return [*range(0, last, window - overlap), last]
@@ -106,7 +88,7 @@ def blend_weights(starts: Sequence[int], window: int, overlap: int, frames: int)
     ends of the motion.
     """
     place = torch.arange(window, dtype=torch.float64)
-    weights = torch.zeros(len(starts), max(frames, starts[-1] + window), dtype=torch.float64)
+    weights = torch.zeros(len(starts), frames, dtype=torch.float64)
     for row, start in enumerate(starts):
         weight = torch.ones(window, dtype=torch.float64)
         if row > 0:
@@ -114,38 +96,30 @@ def blend_weights(starts: Sequence[int], window: int, overlap: int, frames: int)
         if row < len(starts) - 1:
             weight = torch.minimum(weight, (window - place) / (overlap + 1))
         weights[row, start : start + window] = weight
-    weights = weights[:, :frames]
     return weights / weights.sum(0)
 
 
 class _Windows:
-    """The windows of n motions of one length, their tokens encoded once."""
+    """The windows of n motions of one length, whole groups, their tokens encoded once."""
 
     def __init__(
         self,
         net: Dmd,
         codes: Mapping[str, Tensor],
-        absent: Mapping[str, Tensor] | None,
         hidden: Tensor | None,
         frames: int,
         window: int,
         overlap: int,
     ) -> None:
         self.net = net
-        self.frames = frames
+        self.frames, self.size = frames, min(window, frames)
         self.starts = window_starts(frames, window, overlap)
-        self.size = min(window, -(-frames // GROUP_FRAMES) * GROUP_FRAMES)
-        count, number = len(next(iter(codes.values()))), len(self.starts)
         cut = {name: self._cut(values, net.pattern.count(name)) for name, values in codes.items()}
-        device = next(iter(codes.values())).device
-        self.length = torch.tensor([min(self.size, frames - s) for s in self.starts], device=device).repeat(
-            count
-        )
-        gone = None if absent is None else {k: v.repeat_interleave(number) for k, v in absent.items()}
-        groups = (self.length + GROUP_FRAMES - 1) // GROUP_FRAMES
+        rows = next(iter(cut.values()))
+        self.length = torch.full((len(rows),), self.size, device=rows.device)
         unread = None if hidden is None else self._cut(hidden, 1)
-        self.condition = net.encode_tokens(cut, groups, gone, unread)
-        self.weights = blend_weights(self.starts, self.size, overlap, frames).float().to(device)
+        self.condition = net.encode_tokens(cut, self.length // GROUP_FRAMES, unread)
+        self.weights = blend_weights(self.starts, self.size, overlap, frames).float().to(rows.device)
 
     def _cut(self, values: Tensor, per: int) -> Tensor:
         """[n, G * per] of whole motions -> [n * K, W / 4 * per] of their windows."""
@@ -158,18 +132,17 @@ class _Windows:
     def denoise(self, x: Tensor, step: Tensor) -> Tensor:
         """The network's prediction for motions x [n, T, D] at one time step."""
         count, number = len(x), len(self.starts)
-        padded = torch.nn.functional.pad(x, (0, 0, 0, max(0, self.starts[-1] + self.size - self.frames)))
-        cut = torch.stack([padded[:, s : s + self.size] for s in self.starts], dim=1).flatten(0, 1)
+        cut = torch.stack([x[:, s : s + self.size] for s in self.starts], dim=1).flatten(0, 1)
         mask = length_mask(self.length, self.size)
         found = self.net.denoise(cut, step.to(x.device).expand(len(cut)), self.condition, mask)
         if number == 1:
-            return found[:, : self.frames]
+            return found
         found = found.view(count, number, *found.shape[1:])
-        out = torch.zeros_like(padded, dtype=found.dtype)
+        out = torch.zeros_like(x, dtype=found.dtype)
         for k, start in enumerate(self.starts):
-            stop = min(start + self.size, self.frames)
-            out[:, start:stop] += self.weights[k, start:stop, None] * found[:, k, : stop - start]
-        return out[:, : self.frames]
+            inside = slice(start, start + self.size)
+            out[:, inside] += self.weights[k, inside, None] * found[:, k]
+        return out
 
 
 @torch.no_grad()
@@ -177,6 +150,6 @@ def decode_window(
     net: Dmd, codes: Mapping[str, Tensor], x: Tensor, *, seed: int, sampler: Sampler, steps: int
 ) -> Tensor:
     """One window [T, D] of tokens [1, G * per], denoised from x [T, D] as it is; `net` in evaluation mode."""
-    windows = _Windows(net, codes, None, None, len(x), len(x), 0)
+    windows = _Windows(net, codes, None, len(x), len(x), 0)
     noise, x = [torch.Generator().manual_seed(seed)], x[None].to(windows.condition.device)
     return net.config.schedule.denoise(windows.denoise, x, noise, sampler, steps)[0]

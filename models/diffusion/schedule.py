@@ -6,7 +6,8 @@ starts without it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, Protocol
 
 import torch
@@ -109,3 +110,26 @@ class ScheduleConfig(Config):
             stepped: Tensor = scheduler.step(found.to(x.dtype), step, x, **extra).prev_sample
             x = stepped
         return x
+
+
+def by_length(
+    frames: Sequence[int],
+    seeds: Sequence[int],
+    dim: int,
+    device: torch.device,
+    denoised: Callable[[list[int], Tensor, list[torch.Generator]], Tensor],
+) -> list[Tensor]:
+    """Motions [T, dim] of so many `frames`, one seed each: those of one length are denoised together.
+
+    `denoised(rows, x, noise)` makes the motions [n, T, dim] of some rows from standard normal x [n, T, dim].
+    Each row draws from its own seed, so a motion does not depend on what it is generated with.
+    """
+    groups: dict[int, list[int]] = defaultdict(list)
+    for row, count in enumerate(frames):
+        groups[count].append(row)
+    out: dict[int, Tensor] = {}
+    for count, rows in groups.items():
+        noise = [torch.Generator().manual_seed(seeds[row]) for row in rows]
+        x = torch.stack([torch.randn(count, dim, generator=g) for g in noise]).to(device)
+        out.update(zip(rows, denoised(rows, x, noise), strict=True))
+    return [out[row] for row in range(len(frames))]

@@ -112,6 +112,14 @@ class InterleavedGPT(TokenNetwork):
         x = torch.cat([self.embed_text(text, drop_text), embedded], dim=1)
         return self.logits(self.hidden(x), kinds, self.legal(tokens, kinds))
 
+    def require_guidance(self, scale: float) -> None:
+        """Refuse guidance, a `scale` other than 1, of a network that was always trained with its text."""
+        if scale != 1 and self.config.condition_dropout == 0:
+            raise UserError(
+                "guidance needs a GPT trained with condition_dropout > 0; set cfg_scale to 1, for the face's "
+                "GPT face_cfg_scale"
+            )
+
     def embed_text(self, text: Tensor, drop: Tensor | None = None) -> Tensor:
         """The first input [B, 1, D] of text [B, E]; null where `drop` [B]."""
         if text.shape[-1] != self.text_dim:

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import Drawing, decode, requested_groups, seeds_of, uniform_numbers
 from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.network import InterleavedGPT
@@ -59,11 +58,7 @@ def generate(
     allowed = min(most_groups, gpt.max_groups)
     limit = requested_groups(groups, batch, most=most_groups, limit=allowed, device=device)
     how = Drawing(temperature, top_k, top_p)
-    if cfg_scale != 1 and gpt.config.condition_dropout == 0:
-        raise UserError(
-            "guidance needs a GPT trained with condition_dropout > 0; set cfg_scale to 1, for the face's GPT "
-            "face_cfg_scale"
-        )
+    gpt.require_guidance(cfg_scale)
     size, most = len(gpt.pattern), int(limit.max()) if batch else 0
     uniform = uniform_numbers(seeds_of(seed, batch, "texts"), most * size, device)
     scale = torch.full((batch,), cfg_scale, device=device) if cfg_scale != 1 else None

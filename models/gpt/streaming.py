@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import Drawing, next_token
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.layers.transformer import KVCache
@@ -36,11 +35,7 @@ class TokenStream:
     def __init__(
         self, gpt: InterleavedGPT, *, how: Drawing, context: int, cfg_scale: float = 1.0, seed: int = 0
     ) -> None:
-        if cfg_scale != 1 and gpt.config.condition_dropout == 0:
-            raise UserError(
-                "guidance needs a GPT trained with condition_dropout > 0; set cfg_scale to 1, for the face's "
-                "GPT face_cfg_scale"
-            )
+        gpt.require_guidance(cfg_scale)
         self.gpt, self.how = gpt.eval(), how
         self.context = min(context, gpt.max_groups - 1)
         self._scale = cfg_scale

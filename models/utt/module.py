@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from motionloom.models.condition.mate import Encoded, drop_conditions
-from motionloom.models.discriminator.losses import discriminator_loss, generator_loss, gradient_penalty
+from motionloom.models.discriminator.losses import discriminator_loss, generator_loss
 from motionloom.models.discriminator.patch import PatchDiscriminator
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy, soft_motion
@@ -129,9 +129,4 @@ class UttModule(PlayersModule):
         glob, length = shared["glob"].detach(), shared["length"]
         real = batch["motion"][:, : shared["motion"].shape[1]]
         fake = critic(shared["motion"].detach(), glob, length)
-        values = discriminator_loss(critic(real, glob, length), fake)
-        weight = self.loss_config.adversarial.gradient_penalty
-        if weight and self.training:
-            values["penalty"] = gradient_penalty(critic, real, glob, length)
-            values["loss"] = values["loss"] + weight * values["penalty"]
-        return values
+        return discriminator_loss(critic(real, glob, length), fake)

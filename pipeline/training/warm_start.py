@@ -69,8 +69,7 @@ def same_encoder(one: str, other: str, stages: Mapping[str, Stage]) -> bool:
     if one == other or one not in stages or other not in stages:
         return True
     first, second = stages[one], stages[other]
-    tma = first.inputs.get("tma") == second.inputs.get("tma")
-    return first.kind.name == second.kind.name and tma and _encoder(first) == _encoder(second)
+    return first.kind.name == second.kind.name and _encoder(first) == _encoder(second)
 
 
 def _encoder(stage: Stage) -> object:

@@ -22,7 +22,7 @@ from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
-from motionloom.models.diffusion.dmd_module import DmdModule
+from motionloom.models.diffusion.module import DmdModule
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import MqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
@@ -145,7 +145,7 @@ def module_of(name: str, steps: int, *, dropout: float = 0.0) -> StageModule:
         ),
         {"text": 4, "audio": 3}, frozen.streams, frozen.pattern, timed=["audio"])  # fmt: skip
     loss = {
-        "adversarial": {"weight": 0.1, "sample": bool(dropout), "gradient_penalty": 0.01},
+        "adversarial": {"weight": 0.1, "sample": bool(dropout)},
         "adversarial_start": 4,
         "adversarial_ramp": 4,
         "discriminator": {"dim": 8, "ff": 8, "heads": 2, "dropout": dropout, "spectral_norm": True},

@@ -20,7 +20,7 @@ from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 if TYPE_CHECKING:
-    from motionloom.models.diffusion.dmd_module import DmdModule
+    from motionloom.models.diffusion.module import DmdModule
 
 
 class DmdStageConfig(TrainedStageConfig):
@@ -72,7 +72,7 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
         return Dmd(config, tokenizer.streams, tokenizer.pattern, tokenizer.dim)
 
     def module(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs, seed: int) -> DmdModule:
-        from motionloom.models.diffusion.dmd_module import DmdModule
+        from motionloom.models.diffusion.module import DmdModule
 
         return DmdModule(
             net, config.optim, seed=seed, max_steps=config.train.steps, tokenizer=inputs.tokenizer.net

@@ -9,7 +9,7 @@ import torch
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig, dmd_loss
-from motionloom.models.diffusion.dmd_module import DmdModule
+from motionloom.models.diffusion.module import DmdModule
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import MqConfig

@@ -141,13 +141,12 @@ def test_the_generators_loss_moves_mate_and_utt_and_not_the_critic(kind: str) ->
 
 
 def test_the_critics_loss_moves_the_critic_alone() -> None:
-    module = toy_module(loss={"adversarial": {"weight": 0.5, "gradient_penalty": 0.1}})
+    module = toy_module(loss={"adversarial": {"weight": 0.5}})
     assert module.discriminator is not None
     batch, shared = toy_batch(module), {}
     module.play("tokens", batch, shared)
     values = module.play("critic", batch, shared)  # also with what still has its gradient
-    assert set(values) == {"loss", "real", "fake", "accuracy", "penalty"}
-    torch.testing.assert_close(values["loss"], values["real"] + values["fake"] + 0.1 * values["penalty"])
+    assert set(values) == {"loss", "real", "fake", "accuracy"}
     values["loss"].backward()
     assert set(grads(module.net).values()) == {0.0}
     moved = grads(module.discriminator)

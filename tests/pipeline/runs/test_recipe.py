@@ -75,7 +75,6 @@ stages:
   face_vae: {kind: tma, part: face, net: {frame_stride: 1}, loss: {contrastive: 0}}
   diffusion: {kind: diffusion}
   tma: {kind: tma}
-  latents: {kind: aligned_text}
   generate: {kind: generate, inputs: {generators: [face_vae, diffusion]}}
 """
 
@@ -147,8 +146,8 @@ def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> N
             r"stages.face_vae: null in .*recipe.yaml leaves it out; valid names: diffusion",
         ),
         (
-            "extends: base\nname: child\nstages: {tma: null}",
-            r"stage 'latents' needs a stage 'tma' \(role 'tma'\), which stages.tma: null in .* leaves",
+            "extends: base\nname: child\nstages: {text: null}",
+            r"stage 'face_vae' needs a stage 'text' \(role 'text'\), which stages.text: null in .* leaves",
         ),
         (
             "extends: base\nname: child\nstages: {face_vea: null}",
@@ -166,7 +165,7 @@ def test_a_stage_of_the_base_can_be_left_out(load: Any) -> None:
     child = (
         "extends: base\nname: child\nstages: {face_vae: null, generate: {inputs: {generators: [diffusion]}}}"
     )
-    left = ["data", "stats", "text", "diffusion", "tma", "latents", "generate"]
+    left = ["data", "stats", "text", "diffusion", "tma", "generate"]
     assert names(load(child, base=LISTED)) == left
     assert names(load(LISTED, "face_vae=null", "generate.inputs.generators=[diffusion]")) == left
     with pytest.raises(UserError, match="no stage 'diffusion'; --set diffusion=null"):

@@ -97,5 +97,3 @@ def test_text_stages_of_one_encoder(tmp_path: Path) -> None:
     assert same_encoder("near", other, stages) and same_encoder("near", "unknown", stages)
     assert same_encoder("far", place, stages)
     assert not same_encoder("near", place, stages) and not same_encoder("near", "far", stages)
-    stages["latents"] = Stage("latents", stage_kind("aligned_text", "here"), TextConfig(), {})
-    assert not same_encoder("near", "latents", stages)
