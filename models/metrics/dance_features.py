@@ -3,7 +3,7 @@
 They are those of fairmotion as AI Choreographer and Bailando use them. Choices that their numbers hang on:
 
 - Energy expenditure divides only the *previous* position by the frame time (a misplaced bracket), so that it
-  depends on where the motion is. `published` keeps it; without it the second difference is meant.
+  depends on where the motion is; it is kept.
 - Frame times are constants: 1/60 s for kinetic features and 1/120 s for the speeds of geometric ones,
   whatever the data. Resample motions of other rates to 60 fps to compare with published values.
 - Bailando moves the first root to the origin, AI Choreographer does not: `zero_start` does it.
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 KINETIC_SECONDS = 1 / 60
 MANUAL_SECONDS = 1 / 120
+WINDOW = 2
+"""Frames to either side that kinetic features are averaged over."""
 
 # Lengths of the body the thresholds are given in: upper arm, shoulders, hips of the mean SMPL body, metres.
 _ARM = float(np.linalg.norm(np.subtract((0.199113488, 0.236807942, -0.0180702247),
@@ -43,53 +45,46 @@ def zero_start(joints: NDArray[np.floating]) -> Array:
     return x - x[:1, :1]
 
 
-def kinetic_features(
-    joints: NDArray[np.floating],
-    *,
-    frame_seconds: float = KINETIC_SECONDS,
-    window: int = 2,
-    published: bool = True,
-) -> Array:
+def kinetic_features(joints: NDArray[np.floating]) -> Array:
     """Joints [T >= 3, N, 3], Y up -> [3 N]: horizontal and vertical energy, energy spent, joint by joint."""
     x = np.asarray(joints, dtype=np.float64)
     if x.ndim != 3 or len(x) < 3:
         raise UserError(f"kinetic features need joints [T >= 3, N, 3], not {list(x.shape)}")
     steps = np.diff(x, axis=0)
-    velocity = _windowed(steps, 1, len(x), window) / frame_seconds
+    velocity = _windowed(steps, 1, len(x)) / KINETIC_SECONDS
     horizontal = (velocity[..., [0, 2]] ** 2).sum(-1).mean(0)
     vertical = (velocity[..., 1] ** 2).mean(0)
-    after = steps[1:] / frame_seconds
-    before = x[1:-1] - x[:-2] / frame_seconds if published else steps[:-1] / frame_seconds
-    change = _windowed((after - before) / frame_seconds, 1, len(x), window)
+    after, before = steps[1:] / KINETIC_SECONDS, x[1:-1] - x[:-2] / KINETIC_SECONDS
+    change = _windowed((after - before) / KINETIC_SECONDS, 1, len(x))
     spent = np.linalg.norm(change, axis=-1).mean(0)
     return np.stack([horizontal, vertical, spent], axis=-1).reshape(-1)
 
 
-def _windowed(values: Array, first: int, frames: int, window: int) -> Array:
-    """Means over frames t - window .. t + window for t = 1 .. frames - 1; `values[0]` is frame `first`'s.
+def _windowed(values: Array, first: int, frames: int) -> Array:
+    """Means over frames t - 2 .. t + 2 for t = 1 .. frames - 1; `values[0]` is frame `first`'s.
 
     Frames outside of the values are left out of the mean.
     """
     sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
     centre = np.arange(1, frames)
-    begin = np.clip(centre - window - first, 0, len(values))
-    end = np.clip(centre + window + 1 - first, 0, len(values))
+    begin = np.clip(centre - WINDOW - first, 0, len(values))
+    end = np.clip(centre + WINDOW + 1 - first, 0, len(values))
     count = np.maximum(end - begin, 1).reshape(-1, *(1,) * (values.ndim - 1))
     return np.asarray((sums[end] - sums[begin]) / count)
 
 
-def manual_features(joints: NDArray[np.floating], *, frame_seconds: float = MANUAL_SECONDS) -> Array:
+def manual_features(joints: NDArray[np.floating]) -> Array:
     """Joints [T >= 2, N >= 22, 3], Y up -> [32]: how often each of 32 geometric statements is true."""
     if joints.ndim != 3 or len(joints) < 2 or joints.shape[1] < len(_NAMES):
         raise UserError(f"geometric features need joints [T >= 2, N >= 22, 3], not {list(joints.shape)}")
-    poses = _Poses(np.asarray(joints, dtype=np.float64), frame_seconds)
+    poses = _Poses(np.asarray(joints, dtype=np.float64))
     return np.asarray(poses.statements().mean(1))
 
 
 class _Poses:
     """Frames 1 .. T - 1 of a motion, with the frame before each."""
 
-    def __init__(self, joints: Array, frame_seconds: float) -> None:
+    def __init__(self, joints: Array) -> None:
         self.dt = frame_seconds
         self.now = dict(zip(_NAMES, np.moveaxis(joints[1:, : len(_NAMES)], 1, 0), strict=True))
         self.before = dict(zip(_NAMES, np.moveaxis(joints[:-1, : len(_NAMES)], 1, 0), strict=True))
@@ -162,16 +157,16 @@ class _Poses:
 
     def moves_along(self, a: str, b: str, p: str, limit: float) -> NDArray[np.bool_]:
         """p moves, as seen from a, faster than `limit` a second towards b."""
-        return np.asarray(_along(self._seen(a, p), self.bone(a, b)) / self.dt > limit)
+        return np.asarray(_along(self._seen(a, p), self.bone(a, b)) / MANUAL_SECONDS > limit)
 
     def moves_off(self, a: str, b: str, c: str, p: str, limit: float) -> NDArray[np.bool_]:
         """p moves, as seen from a, faster than `limit` a second away from the plane through a, b and c."""
         normal = np.cross(self.bone(a, c), self.bone(a, b))
-        return np.asarray(_along(self._seen(a, p), normal) / self.dt > limit)
+        return np.asarray(_along(self._seen(a, p), normal) / MANUAL_SECONDS > limit)
 
     def fast(self, p: str, limit: float) -> NDArray[np.bool_]:
         """p moves faster than `limit` a second."""
-        return np.asarray(np.linalg.norm(self.now[p] - self.before[p], axis=-1) / self.dt > limit)
+        return np.asarray(np.linalg.norm(self.now[p] - self.before[p], axis=-1) / MANUAL_SECONDS > limit)
 
     def _seen(self, a: str, p: str) -> Array:
         """How far p moved since the frame before, as seen from a."""

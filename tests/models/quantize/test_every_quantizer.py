@@ -66,10 +66,3 @@ def test_never_updates(make: Callable[[], nn.Module], how: str) -> None:
     for _ in range(3):
         quantizer(torch.randn(2, 20, 4), update=how != "update=False")
     assert all(torch.equal(v, before[k]) for k, v in quantizer.state_dict().items())
-
-
-@pytest.mark.slow
-def test_compiles_to_one_graph(make: Callable[[], nn.Module]) -> None:
-    quantizer, z = make(), torch.randn(2, 20, 4)
-    quantizer(z)
-    assert torch._dynamo.explain(quantizer)(z).graph_break_count == 0

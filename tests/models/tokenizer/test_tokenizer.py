@@ -12,7 +12,6 @@ from torch.nn import functional
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.layers.strided import StridedDecoder, StridedEncoder
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.models.tokenizer.body_hand import H2VQ
 from motionloom.models.tokenizer.build import build_tokenizer
@@ -111,11 +110,6 @@ def test_sizes_of_udes_quantization() -> None:
     assert isinstance(config, MqConfig)
     assert config.commitment() == 1
     assert (config.codebook_weight, config.commitment_weight) == (1, 1)
-
-
-def test_depth_0_is_three_layers() -> None:
-    for net in (StridedEncoder(5, 6, width=8, depth=0), StridedDecoder(6, 5, width=8, depth=0)):
-        assert sum(isinstance(m, torch.nn.Conv1d) for m in net.modules()) == 3
 
 
 def test_padded_batch_equals_each_clip_alone(tokenizer: Tokenizer) -> None:

@@ -84,13 +84,6 @@ def test_only_adapters_and_what_is_whole_learn() -> None:
     assert not torch.equal(net.text_in.weight, before["text_in.weight"])
 
 
-def test_dropout_of_adapters_draws_as_the_training_does() -> None:
-    net = network()
-    add_lora(net, LoraConfig(dropout=0.5))
-    found = net.stack.blocks[0].attention.qkv.lora_dropout["default"]
-    assert isinstance(found, torch.nn.Dropout) and found.p == 0.5
-
-
 def test_names_that_no_layer_has_are_refused() -> None:
     with pytest.raises(UserError, match=r"no linear layer of this network is called 'key'"):
         add_lora(network(), LoraConfig(layers=("key",)))

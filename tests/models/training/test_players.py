@@ -85,24 +85,11 @@ def test_drops_multiply_from_their_steps_on() -> None:
     assert config.factor(10, 100) == config.factor(10, 10_000), "a longer training begins the same"
 
 
-def test_drops_and_cosine_multiply() -> None:
-    plain, dropped = OptimConfig(schedule="cosine"), OptimConfig(schedule="cosine", drop_at=(50,))
-    assert dropped.factor(49, 100) == plain.factor(49, 100)
-    assert dropped.factor(50, 100) == pytest.approx(0.1 * plain.factor(50, 100))
-
-
 def test_a_parameter_of_two_players_is_refused() -> None:
     duel = Duel(seed=0, max_steps=1)
     duel.critic = duel.net
     with pytest.raises(ValueError, match="two players"):
         duel.configure_optimizers()
-
-
-def test_requires_grad_is_as_before(tmp_path: Path) -> None:
-    duel = Duel(seed=0, max_steps=1)
-    before = {name: p.requires_grad for name, p in duel.named_parameters()}
-    trained = train(tmp_path, steps=6, module={"start": 0})
-    assert {name: p.requires_grad for name, p in trained.named_parameters()} == before
 
 
 def test_bfloat16_trains_near_float32(tmp_path: Path) -> None:
@@ -114,20 +101,6 @@ def test_bfloat16_trains_near_float32(tmp_path: Path) -> None:
         # Steps of 24 x lr at most; the two differ by a small share of that.
         torch.testing.assert_close(half.state_dict()[name], value, atol=0.1 * STEPS * CRITIC.lr, rtol=0)
     assert any(not torch.equal(v, full.state_dict()[k]) for k, v in half.state_dict().items())
-
-
-def test_play_is_one_graph() -> None:
-    duel = Duel(seed=0, max_steps=1, dropout=0.0)
-    batch = Vectors(4)[0]
-    plain, shared = {}, {}
-    torch.compiler.reset()
-    play = torch.compile(duel.play, fullgraph=True, backend="eager")
-    again: dict[str, Tensor] = {}
-    for name in ("generator", "critic"):
-        plain[name] = duel.play(name, batch, shared)
-        for key, value in play(name, batch, again).items():
-            torch.testing.assert_close(value, plain[name][key])
-    assert again.keys() == shared.keys() == {"made"}
 
 
 class Scaler(torch.amp.GradScaler):

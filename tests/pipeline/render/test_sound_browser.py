@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -239,27 +238,3 @@ def test_time_line_shows_beats_bands_and_the_band_that_plays(visit: Make, until:
     play = page.locator(".mlv-play").bounding_box()
     sound = page.get_by_role("button", name="Sound on").bounding_box()
     assert abs(play["y"] + play["height"] / 2 - sound["y"] - sound["height"] / 2) < 3  # one row
-
-
-def test_the_browser_hears_each_click_in_its_place(visit: Make, dance: Path, data_of: Make) -> None:
-    data = data_of(dance)
-    page = visit(dance)
-    rate, encoded = page.evaluate(
-        """async (text) => {
-            const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-            const sound = await new OfflineAudioContext(1, 1, 44100).decodeAudioData(bytes.buffer);
-            const values = new Uint8Array(sound.getChannelData(0).buffer), step = 8192;
-            let out = "";
-            for (let k = 0; k < values.length; k += step) {
-                out += String.fromCharCode(...values.subarray(k, k + step));
-            }
-            return [sound.sampleRate, btoa(out)];
-        }""",
-        data["sounds"][0]["data"],
-    )
-    heard = np.abs(np.frombuffer(base64.b64decode(encoded), "<f4"))
-    assert rate == 44100 and abs(len(heard) / rate - 8.0) < 0.03
-    for beat in np.arange(0.5, 7.6, 0.5):
-        window = heard[round((beat - 0.1) * rate) : round((beat + 0.1) * rate)]
-        first = int(np.argmax(window > 0.3)) / rate - 0.1
-        assert abs(first) < 0.002, beat

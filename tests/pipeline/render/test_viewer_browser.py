@@ -69,37 +69,6 @@ def test_plays_by_itself_and_pauses(visit: Any, until: Any, single: Path) -> Non
     until(page, f"__viewer.frame !== {stopped[0]}")
 
 
-def test_clock_keeps_time_and_speed(visit: Any, single: Path) -> None:
-    page = visit(single)
-
-    def pace() -> float:
-        page.evaluate("() => { __viewer.setFrame(0); __viewer.play(true); }")
-        return float(
-            page.evaluate(
-                """() => new Promise(done => {
-                const from = __viewer.time, start = performance.now();
-                const pace = () => done((__viewer.time - from) / ((performance.now() - start) / 1000));
-                setTimeout(() => requestAnimationFrame(pace), 900);
-            })"""
-            )
-        )
-
-    assert 0.6 < pace() < 1.15
-    page.get_by_label("Speed").select_option("0.25")
-    assert 0.1 < pace() < 0.32
-
-
-def test_whole_figure_fits_at_first_sight_in_any_frame(visit: Any, single: Path, pixels: Any) -> None:
-    page = visit(single)
-    for frame in (0, 20, 40, 59):
-        still(page, frame)
-        image = pixels(page)
-        height, width = image.shape[:2]
-        left, top, right, bottom = figure_box(image)
-        assert left > 2 and top > 2 and right < width - 3 and bottom < height - 3
-        assert bottom - top > 0.5 * height
-
-
 def test_frames_differ_and_keys_step(visit: Any, single: Path, pixels: Any) -> None:
     page = visit(single)
     still(page, 10)

@@ -244,22 +244,6 @@ def test_what_is_no_music(served: Any, data: bytes, status: int, words: str) -> 
     assert got.status == status and words in got.json["error"] and "/tmp" not in got.json["error"]
 
 
-def test_two_hundred_at_once(run_server: Callable[..., Any], quick: Any) -> None:
-    """Every answer is that of its own request, by name, caption, seed and content."""
-
-    def ask(number: int) -> None:
-        asked = {"caption": f"a person waves {number}", "seconds": 0.2, "seed": number}
-        got = served.post("/api/generate", {**asked, "request": f"r{number}"})
-        said = got.json
-        assert got.status == 200 and got.headers["x-request"] == said["request"] == f"r{number}"
-        assert (said["caption"], said["seed"]) == (f"a person waves {number}", number)
-        assert said["joints"][0][0][0] == pytest.approx(number / 1000)
-
-    with run_server(quick, waiting=200) as served, ThreadPoolExecutor(200) as clients:
-        list(clients.map(ask, range(200)))
-    assert len(quick.asked) == len(set(quick.asked)) == 200
-
-
 def test_more_than_may_wait_are_refused(run_server: Callable[..., Any], quick: Any) -> None:
     """Of 200 at once one runs and eight wait; the others hear so at once, and none is without an answer."""
     quick.open.clear()

@@ -21,16 +21,11 @@ from motionloom.pipeline.runs.plan import Selection
 
 pytestmark = pytest.mark.slow
 
-# Without what draws per process (dropout, latent noise), so that one and two processes can be compared.
+# Without what draws per process (dropout), so that one and two processes can be compared.
 RECIPE = """
 extends: small
 name: small
 stages:
-  tokenizer: {train: {steps: 4, checkpoint_every: 2, validate_every: 2}}
-  tma:
-    net: {dropout: 0.0}
-    loss: {reconstruction: 0.0, latent: 0.0}
-    train: {steps: 4, checkpoint_every: 2, validate_every: 2}
   gpt:
     net: {dropout: 0.0, condition_dropout: 0.0}
     loss: {align_weight: 0.0}
@@ -94,37 +89,12 @@ def assert_same_training(one: Path, two: Path, stage: str) -> None:
     weights = [load_file(run / "stages" / stage / "model.safetensors") for run in (one, two)]
     assert weights[0].keys() == weights[1].keys()
     for name, value in weights[0].items():
-        error = np.abs(value.astype(np.float64) - weights[1][name])
-        if "quantizer" in name:
-            # A vector between two codes may fall to the other one by a rounding error.
-            assert np.quantile(error, 0.5) < 1e-4 and error.mean() < 1e-2, (stage, name)
-        else:
-            assert error.max() < 1e-4, (stage, name)
+        np.testing.assert_allclose(weights[1][name], value, rtol=0, atol=1e-4, err_msg=name)
     logged = [rows(run, stage) for run in (one, two)]
     assert [row["step"] for row in logged[0]] == [row["step"] for row in logged[1]]
     for first, second in zip(*logged, strict=True):
-        compared = [name for name in first if name.endswith(("loss", "recon", "ce", "contrastive", "kl"))]
-        for name in compared:
-            assert second[name] == pytest.approx(first[name], rel=1e-3, abs=1e-4), (stage, name)
-
-
-def test_two_processes_equal_one(
-    small_run: Any,
-    single: Path,
-    recipe: Path,
-    running: Callable[..., Any],
-    call: Callable[..., Any],
-    tmp_path: Path,
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(small_run.folder, run)
-    output = finish(running("run", recipe, "--out", run, "--until", "gpt", "--replace", *PAIR))
-    assert output.count("[4/15] tokenizer") == output.count("[7/15] tokens") == 1, "only one process speaks"
-    assert files(run) == files(single)
-    for stage in ("tokenizer", "tma"):
-        assert_same_training(single, run, stage)
-    again = call("run", recipe, "--out", run, "--until", "gpt", *PAIR)
-    assert again.code == 0 and "nothing to do" in again.out
+        for name in (name for name in first if name.endswith(("loss", "ce"))):
+            assert second[name] == pytest.approx(first[name], rel=1e-3, abs=1e-4), name
 
 
 def test_torchrun_equals_one_process(

@@ -119,20 +119,6 @@ def test_a_validation_is_cut_short_and_made_up_for(training: Train, tmp_path: Pa
     assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
 
 
-def test_a_validation_that_is_made_up_for_is_cut_short_again(tmp_path: Path) -> None:
-    whole = train(tmp_path / "whole")
-    for _ in range(3):
-        with pytest.raises(Interrupted, match="saved at step 12 of 24"):
-            train(tmp_path / "hit", validation_signalled={1: TERM})
-    with pytest.raises(Interrupted, match="saved at step 12 of 24"):
-        train(tmp_path / "hit", validation_signalled={2: TERM})  # the last batch: it is whole
-    rows = read_training_log(tmp_path / "hit")
-    assert rows == [row for row in read_training_log(tmp_path / "whole") if row["step"] <= 12]
-    assert "val/loss" in rows[-1] and rows[-1]["step"] == 12
-    again = train(tmp_path / "hit")
-    assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
-
-
 def test_signals_are_noted_and_the_first_counts() -> None:
     before = {number: signal.getsignal(number) for number in SIGNALS}
     with Signals() as signals:
