@@ -85,7 +85,6 @@ class _Poses:
     """Frames 1 .. T - 1 of a motion, with the frame before each."""
 
     def __init__(self, joints: Array) -> None:
-        self.dt = frame_seconds
         self.now = dict(zip(_NAMES, np.moveaxis(joints[1:, : len(_NAMES)], 1, 0), strict=True))
         self.before = dict(zip(_NAMES, np.moveaxis(joints[:-1, : len(_NAMES)], 1, 0), strict=True))
         floor = np.zeros((len(joints) - 1, 3))
