@@ -40,8 +40,8 @@ from motionloom.datasets.synth.actions.truth import FACES, HANDS, takes_part
 from motionloom.datasets.synth.captions import body_captions
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of, truth_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.evaluation.answers import most_alike, nearest_texts
 from motionloom.pipeline.evaluation.figures import NEAREST_LABELS, NEAREST_WORDS
-from motionloom.pipeline.evaluation.lookup import most_alike, nearest_texts
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder

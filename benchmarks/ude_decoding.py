@@ -32,7 +32,7 @@ from rich.table import Table
 
 from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.dmd_sampling import decode_motions
+from motionloom.models.diffusion.sampling import decode_motions
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.models.metrics.dance import foot_skating

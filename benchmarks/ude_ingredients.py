@@ -24,7 +24,7 @@ import numpy as np
 import yaml
 
 from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
-from motionloom.models.diffusion.dmd_sampling import decode_motions
+from motionloom.models.diffusion.sampling import decode_motions
 from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache

@@ -27,7 +27,7 @@ from rich.table import Table
 
 from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
 from motionloom.datasets.synth.measure import agrees
-from motionloom.models.diffusion.dmd_sampling import decode_motions
+from motionloom.models.diffusion.sampling import decode_motions
 from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES

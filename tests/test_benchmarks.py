@@ -16,8 +16,8 @@ import pytest
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import synthesize
+from motionloom.pipeline.evaluation.answers import by_labels
 from motionloom.pipeline.evaluation.figures import NEAREST_LABELS, NEAREST_WORDS
-from motionloom.pipeline.evaluation.lookup import by_labels
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.recipe import load_recipe
 

@@ -7,7 +7,7 @@ Notable choices:
 - Encoded tokens join the frames by place, not by cross-attention [ours]: each group of tokens belongs to
   four known frames, so a linear layer writes each group out as its four frames and is added there. Nothing
   about that alignment has to be learnt, it costs nothing, and a stretch of frames carries its own tokens,
-  which is what long motions in windows need (`dmd_sampling.py`).
+  which is what long motions in windows need (`sampling.py`).
 - Any streams and pattern of `gpt/tokens.py`: every token of a group is one position of the encoder.
 - Trained with `hide`, the network also fills in frames whose tokens it is not shown [ours], so a change of
   conditions can be bridged instead of decoded from tokens that no clip ever had side by side.

@@ -1,6 +1,6 @@
 """`DmdStream`: a `Dmd`'s motion of tokens that arrive group by group, in bounded memory [ours].
 
-A whole motion is denoised at once, its windows agreeing at every step (`dmd_sampling.py`): the last token
+A whole motion is denoised at once, its windows agreeing at every step (`sampling.py`): the last token
 can change the first frame. Here each window is denoised alone as soon as its tokens are known, and the frames
 that it shares with the one before fade from one to the other. The noise of a frame is the same in every
 window, and so are its tokens, so both say nearly the same. The last window ends with the motion.
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from motionloom.models.diffusion.dmd import Dmd
-from motionloom.models.diffusion.dmd_sampling import decode_window
+from motionloom.models.diffusion.sampling import decode_window
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 

@@ -1,15 +1,30 @@
-"""Motions from a trained denoiser, by diffusers' samplers."""
+"""Motions from trained denoisers, by diffusers' samplers: of a text, and of tokens in overlapping windows.
+
+A window of frames carries its own tokens, so the motion of tokens of any length is cut into windows of the
+size that the DMD was trained on. At every denoising step each window's noise is predicted, overlapping
+predictions are averaged with weights that rise and fall linearly across the overlap, and one step is taken on
+the whole motion [ours]. Averaging noise is averaging x0, which is linear in it at a given x_t. Since all
+windows are denoised together from one noise, no seam is left; a motion that fits into one window is denoised
+as it is.
+
+Legend: n motions, T frames, D features, K windows, W frames of a window.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.diffusion.schedule import Sampler, by_length
+from motionloom.models.gpt.frozen import evaluating
+from motionloom.models.gpt.tokens import Codes
+from motionloom.models.layers.transformer import length_mask
+from motionloom.models.tokenizer.base import GROUP_FRAMES
 
 
 @torch.no_grad()
@@ -49,3 +64,133 @@ def sample_motions(
         return net.config.schedule.denoise(predict, x, noise, sampler, steps)
 
     return by_length(frames, seeds, net.motion_dim, text.device, denoised)
+
+
+@torch.no_grad()
+def decode_motions(
+    net: Dmd,
+    codes: Codes,
+    *,
+    seeds: Sequence[int],
+    sampler: Sampler = "ddpm",
+    steps: int = 50,
+    window: int = 160,
+    overlap: int = 32,
+    hidden: Tensor | None = None,
+) -> list[Tensor]:
+    """Motions [T, D] of n token sequences, in the coordinates of training, one seed each (UDE section 3.4).
+
+    Args:
+        net: The denoiser; runs in evaluation mode and is left as it was.
+        codes: Tokens, n rows.
+        seeds: One per row; repeat a row with other seeds for more motions of one token sequence.
+        steps: Denoising steps, at most those of the training.
+        window: Frames denoised at once, a multiple of 4: what the network was trained on.
+        overlap: Frames that neighbouring windows share, a multiple of 4 below `window`.
+        hidden: Bool [n, G], groups that are filled in without their tokens, if the training had `hide`.
+    """
+    if len(seeds) != len(codes.groups):
+        raise UserError(
+            f"{len(seeds)} seeds and {len(codes.groups)} token sequences; each motion needs its own"
+        )
+    if hidden is not None and not net.config.hide:
+        raise UserError(
+            "this DMD was trained with every token in sight and cannot fill in for hidden ones; train it "
+            "with net.hide above 0"
+        )
+    if window % GROUP_FRAMES or overlap % GROUP_FRAMES or not 0 <= overlap < window:
+        raise UserError(
+            f"window {window} and overlap {overlap} must be multiples of {GROUP_FRAMES}, the overlap smaller"
+        )
+
+    def denoised(rows: list[int], x: Tensor, noise: list[torch.Generator]) -> Tensor:
+        mine = {name: values[rows] for name, values in codes.codes.items()}
+        unread = None if hidden is None else hidden[rows]
+        windows = _Windows(net, mine, unread, x.shape[1], window, overlap)
+        return net.config.schedule.denoise(windows.denoise, x, noise, sampler, steps)
+
+    frames = [groups * GROUP_FRAMES for groups in codes.groups.tolist()]
+    with evaluating(net):
+        return by_length(frames, seeds, net.motion_dim, codes.groups.device, denoised)
+
+
+def window_starts(frames: int, window: int, overlap: int) -> list[int]:
+    """First frames of the windows that cover `frames`; the last one ends with the motion."""
+    last = frames - window
+    if last <= 0:
+        return [0]
+    return [*range(0, last, window - overlap), last]
+
+
+def blend_weights(starts: Sequence[int], window: int, overlap: int, frames: int) -> Tensor:
+    """Share of each window in each frame, float64 [K, frames], summing to 1 over K.
+
+    A window's weight rises linearly over its first `overlap` frames and falls over its last, but not at the
+    ends of the motion.
+    """
+    place = torch.arange(window, dtype=torch.float64)
+    weights = torch.zeros(len(starts), frames, dtype=torch.float64)
+    for row, start in enumerate(starts):
+        weight = torch.ones(window, dtype=torch.float64)
+        if row > 0:
+            weight = torch.minimum(weight, (place + 1) / (overlap + 1))
+        if row < len(starts) - 1:
+            weight = torch.minimum(weight, (window - place) / (overlap + 1))
+        weights[row, start : start + window] = weight
+    return weights / weights.sum(0)
+
+
+class _Windows:
+    """The windows of n motions of one length, whole groups, their tokens encoded once."""
+
+    def __init__(
+        self,
+        net: Dmd,
+        codes: Mapping[str, Tensor],
+        hidden: Tensor | None,
+        frames: int,
+        window: int,
+        overlap: int,
+    ) -> None:
+        self.net = net
+        self.frames, self.size = frames, min(window, frames)
+        self.starts = window_starts(frames, window, overlap)
+        cut = {name: self._cut(values, net.pattern.count(name)) for name, values in codes.items()}
+        rows = next(iter(cut.values()))
+        self.length = torch.full((len(rows),), self.size, device=rows.device)
+        unread = None if hidden is None else self._cut(hidden, 1)
+        self.condition = net.encode_tokens(cut, self.length // GROUP_FRAMES, unread)
+        self.weights = blend_weights(self.starts, self.size, overlap, frames).float().to(rows.device)
+
+    def _cut(self, values: Tensor, per: int) -> Tensor:
+        """[n, G * per] of whole motions -> [n * K, W / 4 * per] of their windows."""
+        pieces = [
+            values[:, start // GROUP_FRAMES * per : (start + self.size) // GROUP_FRAMES * per]
+            for start in self.starts
+        ]
+        return torch.stack(pieces, dim=1).flatten(0, 1)
+
+    def denoise(self, x: Tensor, step: Tensor) -> Tensor:
+        """The network's prediction for motions x [n, T, D] at one time step."""
+        count, number = len(x), len(self.starts)
+        cut = torch.stack([x[:, s : s + self.size] for s in self.starts], dim=1).flatten(0, 1)
+        mask = length_mask(self.length, self.size)
+        found = self.net.denoise(cut, step.to(x.device).expand(len(cut)), self.condition, mask)
+        if number == 1:
+            return found
+        found = found.view(count, number, *found.shape[1:])
+        out = torch.zeros_like(x, dtype=found.dtype)
+        for k, start in enumerate(self.starts):
+            inside = slice(start, start + self.size)
+            out[:, inside] += self.weights[k, inside, None] * found[:, k]
+        return out
+
+
+@torch.no_grad()
+def decode_window(
+    net: Dmd, codes: Mapping[str, Tensor], x: Tensor, *, seed: int, sampler: Sampler, steps: int
+) -> Tensor:
+    """One window [T, D] of tokens [1, G * per], denoised from x [T, D] as it is; `net` in evaluation mode."""
+    windows = _Windows(net, codes, None, len(x), len(x), 0)
+    noise, x = [torch.Generator().manual_seed(seed)], x[None].to(windows.condition.device)
+    return net.config.schedule.denoise(windows.denoise, x, noise, sampler, steps)[0]

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.dmd_sampling import decode_motions
 from motionloom.models.diffusion.dmd_streaming import DmdStream
+from motionloom.models.diffusion.sampling import decode_motions
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES

@@ -15,7 +15,7 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import FACE_ALIGNMENT, GENERATOR, Every, StageContext, register
 from motionloom.pipeline.contract.units import Arrays, Row, as_rows
-from motionloom.pipeline.evaluation.answers import mean_poses
+from motionloom.pipeline.evaluation.answers import LOOKUPS, mean_poses
 from motionloom.pipeline.evaluation.cases import Case, extreme_cases, write_cases
 from motionloom.pipeline.evaluation.clip_metrics import (
     CAPTION_METRICS,
@@ -31,7 +31,6 @@ from motionloom.pipeline.evaluation.latent_metrics import (
     judged_figures,
     reconstructed_figures,
 )
-from motionloom.pipeline.evaluation.lookup import LOOKUPS
 from motionloom.pipeline.evaluation.movement import Features, all_features, movement_figures
 from motionloom.pipeline.evaluation.reconstruction import clip_error_figures, face_figures
 from motionloom.pipeline.evaluation.truth import Truth, digest_of, reconstruct_truth, spread_any, truth_of

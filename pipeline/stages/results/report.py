@@ -47,8 +47,13 @@ from motionloom.pipeline.render.body.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.score import Score
 from motionloom.pipeline.render.viewer import ViewerMotion
-from motionloom.pipeline.stages.results.report_drawings import draw_curves, draw_flights, draw_showings
-from motionloom.pipeline.stages.results.report_facts import add_run_facts, say_missing
+from motionloom.pipeline.stages.results.report_parts import (
+    add_run_facts,
+    draw_curves,
+    draw_flights,
+    draw_showings,
+    say_missing,
+)
 from motionloom.pipeline.store.run_state import RunState, run_state
 
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig, dmd_loss
-from motionloom.models.diffusion.dmd_sampling import blend_weights, decode_motions, window_starts
 from motionloom.models.diffusion.module import hidden_stretch
+from motionloom.models.diffusion.sampling import blend_weights, decode_motions, window_starts
 from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import Stream

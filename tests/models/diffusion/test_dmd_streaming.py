@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
-from motionloom.models.diffusion.dmd_sampling import decode_window
 from motionloom.models.diffusion.dmd_streaming import DmdStream
+from motionloom.models.diffusion.sampling import decode_window
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.tokenizer.base import Stream
 

@@ -8,8 +8,8 @@ import pytest
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.evaluation.answers import by_labels, by_words
 from motionloom.pipeline.evaluation.clip_metrics import CAPTION_METRICS, Performance, measure_clip
-from motionloom.pipeline.evaluation.lookup import by_labels, by_words
 from motionloom.pipeline.evaluation.truth import has_caption, truth_of
 
 

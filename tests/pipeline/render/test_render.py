@@ -22,8 +22,7 @@ from motionloom.pipeline.render.camera import FIELD_OF_VIEW, Camera, fit_distanc
 from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.film import write_mp4
 from motionloom.pipeline.render.page import Page
-from motionloom.pipeline.render.raster import cover
-from motionloom.pipeline.render.scene import LAMP, SKY, SOLE, Actor, Ground, draw_figure
+from motionloom.pipeline.render.scene import LAMP, SKY, SOLE, Actor, Ground, cover, draw_figure
 from motionloom.pipeline.render.viewer import ViewerMotion, quantise, safe_json, viewer_script, write_viewer
 
 SMPLX = Skeleton.named("smplx52")

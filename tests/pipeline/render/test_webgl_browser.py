@@ -14,8 +14,7 @@ from motionloom.datasets.motion.body.rigid import fit_rigid
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.render.body.posing import posing_of
 from motionloom.pipeline.render.camera import VIEWS, Camera
-from motionloom.pipeline.render.raster import cover
-from motionloom.pipeline.render.scene import Actor
+from motionloom.pipeline.render.scene import Actor, cover
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
 SMPLX = Skeleton.named("smplx52")

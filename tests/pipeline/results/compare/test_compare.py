@@ -19,8 +19,7 @@ from run_records import write_compared as write_run
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.evaluation.figures import STILL
-from motionloom.pipeline.results.compare.command import compare_runs
-from motionloom.pipeline.results.compare.page import missing_lines
+from motionloom.pipeline.results.compare.command import compare_runs, missing_lines
 from motionloom.pipeline.results.compare.runs import ABSENT, open_runs, setting_differences
 from motionloom.pipeline.results.compare.tables import ComparedTable, compared_tables
 

@@ -15,9 +15,9 @@ import pytest
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.evaluation.figures import CHANCE, STILL, FigureFile
 from motionloom.pipeline.results.paper.compare import paper_table
-from motionloom.pipeline.results.paper.conditions import StageMatch
 from motionloom.pipeline.results.paper.fill import fill
 from motionloom.pipeline.results.paper.filled import FilledRow, FilledTable
+from motionloom.pipeline.results.paper.schema import StageMatch
 from motionloom.pipeline.store.run_state import StageRecord, finished_records
 
 Make = Callable[..., Path]
