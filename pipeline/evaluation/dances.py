@@ -16,6 +16,8 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.synth.dances import beats_of
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.render.score import Score, Segment
 
 SOUND = "audio.flac"
@@ -126,6 +128,16 @@ def song_of(dataset: ClipDataset, index: int) -> str:
     meta = dataset.meta(index)
     song = meta.song if meta.song is not None else (meta.truth or {}).get("song")
     return dataset.ids[index] if song is None else str(song)
+
+
+def dance_to(bundle: Bundle, clips: Sequence[DanceClip], **drawn: Any) -> list[GeneratedMotion]:
+    """Dances to the music of clips, each as long as its clip; `drawn` is for `Bundle.generate`."""
+    return bundle.generate(
+        sounds=[clip.sound for clip in clips],
+        conditions={"audio": [clip.music for clip in clips]},
+        seconds=[clip.seconds for clip in clips],
+        **drawn,
+    )
 
 
 def require_dances(dataset: ClipDataset) -> None:

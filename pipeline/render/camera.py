@@ -50,11 +50,10 @@ def fit_distance(height: float, radius: float, width: int, tall: int) -> float:
 
 def smooth_path(root: NDArray[np.floating], fps: float, seconds: float = 0.8) -> NDArray[np.float64]:
     """Root positions [T, 3] averaged over about `seconds`, ends repeated: what a camera follows."""
-    reach = max(1, round(fps * seconds / 2))
-    padded = np.pad(np.asarray(root, np.float64), ((reach, reach), (0, 0)), mode="edge")
-    total = np.cumsum(np.pad(padded, ((1, 0), (0, 0))), axis=0)
-    window = 2 * reach + 1
-    return (total[window:] - total[:-window]) / window
+    from scipy.ndimage import uniform_filter1d
+
+    window = 2 * max(1, round(fps * seconds / 2)) + 1
+    return np.asarray(uniform_filter1d(np.asarray(root, np.float64), window, axis=0, mode="nearest"))
 
 
 def floor_of(joints: NDArray[np.floating]) -> float:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import wave
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
@@ -112,18 +111,16 @@ def playable(sound: Soundtrack, where: str) -> NDArray[np.float32]:
 
 def wav_bytes(samples: NDArray[np.floating]) -> bytes:
     """A 16-bit mono WAV of samples [S] in -1..1 at `RATE` Hz."""
+    import soundfile  # only pages and films with sound pay for the import
+
     file = io.BytesIO()
-    with wave.open(file, "wb") as out:
-        out.setnchannels(1)
-        out.setsampwidth(2)
-        out.setframerate(RATE)
-        out.writeframes(np.round(np.asarray(samples, np.float64) * 32767).astype("<i2").tobytes())
+    soundfile.write(file, samples, RATE, format="WAV", subtype="PCM_16")
     return file.getvalue()
 
 
 def _mp3(samples: NDArray[np.float32]) -> bytes | None:
     """MP3 of samples [S] at `BIT_RATE`, or None where libsndfile cannot write MP3."""
-    import soundfile  # only pages with sound pay for the import
+    import soundfile
 
     if "MP3" not in soundfile.available_formats():
         return None

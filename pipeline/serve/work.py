@@ -6,11 +6,10 @@ before it is begun.
 
 from __future__ import annotations
 
-import queue
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
-from typing import TypeVar
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 
@@ -24,7 +23,7 @@ class Stopped(Exception):  # noqa: N818
 
 
 class Worker:
-    """Runs calls one after another in a thread of its own.
+    """Runs calls one after another in a thread of its own; asked by one thread alone.
 
     Args:
         waiting: Calls that may wait, besides the one that runs.
@@ -32,38 +31,25 @@ class Worker:
 
     def __init__(self, waiting: int) -> None:
         self.waiting = waiting
-        self._calls: queue.Queue[Callable[[], None]] = queue.Queue(waiting)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="model")
+        self._calls: list[Future[Any]] = []
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="model", daemon=True)
-        self._thread.start()
 
     def submit(self, call: Callable[[], T]) -> Future[T]:
         """The future of a call; `Busy` where too many wait, `Stopped` after `stop`."""
-        future: Future[T] = Future()
-
-        def run() -> None:
-            if self._stopped.is_set():
-                if future.set_running_or_notify_cancel():
-                    future.set_exception(Stopped())
-                return
-            if not future.set_running_or_notify_cancel():
-                return
-            try:
-                future.set_result(call())
-            except BaseException as error:
-                future.set_exception(error)
-
-        if self._stopped.is_set():
+        if self.stopped:
             raise Stopped
-        try:
-            self._calls.put_nowait(run)
-        except queue.Full:
-            raise Busy from None
+        if self.length >= self.waiting:
+            raise Busy
+        future = self._pool.submit(self._begin, call)
+        self._calls.append(future)
         return future
 
     @property
     def length(self) -> int:
-        return self._calls.qsize()
+        """Calls that wait."""
+        self._calls = [future for future in self._calls if not future.done()]
+        return sum(not future.running() for future in self._calls)
 
     @property
     def stopped(self) -> bool:
@@ -73,13 +59,9 @@ class Worker:
     def stop(self) -> None:
         """Answer all that wait with `Stopped`; what runs is let finish."""
         self._stopped.set()
+        self._pool.shutdown(wait=False)
 
-    def _work(self) -> None:
-        while True:
-            try:
-                call = self._calls.get(timeout=0.2)
-            except queue.Empty:
-                if self._stopped.is_set():
-                    return
-                continue
-            call()
+    def _begin(self, call: Callable[[], T]) -> T:
+        if self.stopped:
+            raise Stopped
+        return call()

@@ -28,6 +28,7 @@ from motionloom.pipeline.evaluation.dances import (
     SOUND,
     DanceClip,
     commonest,
+    dance_to,
     dances_of,
     digest_of_dances,
     other_songs,
@@ -138,14 +139,8 @@ class _DanceEvaluation(Evaluation):
         """Joints [T, N, 3] of dances to some clips' own music, by their numbers."""
         some = self.clips[piece]
         seed, noise_seed = self.seeds(draw, piece.start)
-        motions = self.bundle.generate(
-            sounds=[clip.sound for clip in some],
-            conditions={"audio": [clip.music for clip in some]},
-            seconds=[clip.seconds for clip in some],
-            seed=seed,
-            noise_seed=noise_seed,
-            sampling=self.config.sampling,
-        )
+        drawn = {"seed": seed, "noise_seed": noise_seed, "sampling": self.config.sampling}
+        motions = dance_to(self.bundle, some, **drawn)
         return {f"{number:06d}": motion.joints for number, motion in enumerate(motions)}
 
     @cached_property

@@ -17,7 +17,7 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
     register,
 )
-from motionloom.pipeline.evaluation.dances import DanceClip, dances_of, with_music
+from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_of, with_music
 from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
 from motionloom.pipeline.inference.bundle import bundle_driven_by
 from motionloom.pipeline.inference.motion import GeneratedMotion
@@ -114,13 +114,7 @@ def _danced(context: StageContext) -> list[tuple[GeneratedMotion, DanceClip]]:
     clips = dances_of(dataset, config.dances, unit=bundle.generator.unit_frames, seconds=longest)
     if not clips:
         return []
-    made = bundle.generate(
-        sounds=[clip.sound for clip in clips],
-        conditions={"audio": [clip.music for clip in clips]},
-        seconds=[clip.seconds for clip in clips],
-        seed=context.seed,
-        sampling=config.sampling,
-    )
+    made = dance_to(bundle, clips, seed=context.seed, sampling=config.sampling)
     return list(zip(made, clips, strict=True))
 
 

@@ -31,7 +31,7 @@ from motionloom.pipeline.contract.stage import (
     stage_kind,
 )
 from motionloom.pipeline.evaluation.cases import Clips
-from motionloom.pipeline.evaluation.dances import dances_of, with_music
+from motionloom.pipeline.evaluation.dances import dance_to, dances_of, with_music
 from motionloom.pipeline.evaluation.truth import (
     Truth,
     has_caption,
@@ -198,13 +198,7 @@ def _danced(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
     clips = dances_of(dataset, config.dances, unit=unit, seconds=longest)
     made: Sequence[GeneratedMotion | None] = [None] * len(clips)
     if bundle is not None and clips:
-        made = bundle.generate(
-            sounds=[clip.sound for clip in clips],
-            conditions={"audio": [clip.music for clip in clips]},
-            seconds=[clip.seconds for clip in clips],
-            seed=context.seed,
-            sampling=config.sampling,
-        )
+        made = dance_to(bundle, clips, seed=context.seed, sampling=config.sampling)
     out = []
     for number, (clip, motion) in enumerate(zip(clips, made, strict=True), start=1):
         truth = truth_at(dataset, clip.index, len(clip.joints))

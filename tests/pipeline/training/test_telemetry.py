@@ -12,7 +12,7 @@ from tiny_players import train
 
 from motionloom.datasets.base.files import write_text
 from motionloom.pipeline.render.page import Page
-from motionloom.pipeline.stages.results.report_drawings import draw_flights
+from motionloom.pipeline.stages.results.report_parts import draw_flights
 from motionloom.pipeline.store.run_state import RunState, StageState
 from motionloom.pipeline.store.training_log import read_flight, read_rows
 from motionloom.pipeline.training.telemetry import WaitTimes, waited_in_steps
