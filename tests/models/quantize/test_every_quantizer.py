@@ -14,7 +14,6 @@ from motionloom.models.quantize.fsq import FsqQuantizer
 from motionloom.models.quantize.gradient import GradientQuantizer, GradientQuantizerConfig
 
 SMALL = QuantizerConfig(num_codes=6, dim=4)
-LEARNT = GradientQuantizerConfig(num_codes=6, dim=4)
 KINDS: dict[str, Callable[[], nn.Module]] = {
     "ema": lambda: EmaQuantizer(SMALL),
     "residual": lambda: ResidualQuantizer(SMALL, 2),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from html import unescape
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -17,25 +16,6 @@ from motionloom.pipeline.render.labels import curve_label
 from motionloom.pipeline.render.page import Cell, Page
 
 NASTY = '<b onclick="x">&'
-
-
-class Balanced(HTMLParser):
-    """Fails on a tag that is closed and not open."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.feed(html)
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: object) -> None:
-        self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: object) -> None:
-        pass
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
 
 
 def test_figures_of_a_log_have_names_for_people() -> None:
