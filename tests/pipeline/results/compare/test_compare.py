@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
@@ -220,3 +222,14 @@ def test_the_command(tmp_path: Path, call: Callable[..., Any]) -> None:
     assert re.search(r"│ one +│ 3 of 3 +│ 40.0 +│ 0.500 ± 0.010 +│", done.out)
     assert "two: missing tokenizer: in training, step 10 of 100; evaluate: not run yet" in done.out
     assert "settings that differ: seed" in done.out
+
+
+def test_it_needs_no_torch(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name, figures=metrics()) for name in ("one", "two")]
+    code = (
+        "import sys\nfrom motionloom.pipeline.cli.main import app\n"
+        f"app(['compare', {str(runs[0])!r}, {str(runs[1])!r}, '-o', {str(tmp_path / 'page.html')!r}],"
+        " standalone_mode=False)\nprint('torch' in sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "False" and (tmp_path / "page.html").is_file()

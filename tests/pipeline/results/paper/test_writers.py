@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -131,3 +133,15 @@ def test_mistakes_are_one_sentence(
     done = call("evaluate", *words)
     assert done.code == 2 and says in done.err and len(done.err.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_no_torch_is_imported(baselines: Callable[..., Path]) -> None:
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom motionloom.pipeline import compare_with_paper\n"
+        "compare_with_paper('humantomato/7', [Path(sys.argv[1])])\n"
+        "print(sorted({'torch', 'numpy'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code, str(baselines())], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip().endswith("[]") and "140.00" in done.stdout
