@@ -13,17 +13,17 @@ from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import register
-from motionloom.pipeline.stages.networks.tokenizer import WindowInputs, WindowStageConfig, window_batches
+from motionloom.pipeline.stages.networks.tokenizer import WindowInputs, window_batches
 from motionloom.pipeline.store.networks import LoadedDmd, TrainedTokenizer, require_streams, stream_facts
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
-from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 if TYPE_CHECKING:
     from motionloom.models.diffusion.module import DmdModule
 
 
-class DmdStageConfig(WindowStageConfig):
+class DmdStageConfig(TrainedStageConfig):
     """A diffusion decoder of the tokens of one tokenizer."""
 
     net: DmdConfig = DmdConfig()
@@ -31,6 +31,8 @@ class DmdStageConfig(WindowStageConfig):
     train: TrainConfig = TrainConfig(steps=200_000, batch_size=64)
     window: int = Field(160, ge=8, multiple_of=4)
     """Frames of a training window; longer motions are decoded in overlapping windows of this size."""
+    windows_per_clip: int = Field(1, ge=1)
+    """Windows cut from one read of a clip."""
 
 
 class DmdInputs(WindowInputs):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -50,19 +50,14 @@ _FREE = frozenset(
 """Settings that are of the training and not of the network: another one may go on with others."""
 
 
-class WindowStageConfig(TrainedStageConfig):
-    """What every stage has that trains on windows of clips."""
+class TokenizerStageConfig(TrainedStageConfig):
+    """What every tokenizer stage has."""
 
+    train: TrainConfig = TrainConfig(steps=100_000, batch_size=256)
     window: int = Field(64, ge=4, multiple_of=4)
     """Frames of a training window."""
     windows_per_clip: int = Field(1, ge=1)
     """Windows cut from one read of a clip."""
-
-
-class TokenizerStageConfig(WindowStageConfig):
-    """What every tokenizer stage has."""
-
-    train: TrainConfig = TrainConfig(steps=100_000, batch_size=256)
     net: AnyTokenizerConfig
 
     def require_fit(self, hardware: Hardware) -> None:
@@ -118,6 +113,16 @@ class MqStageConfig(TokenizerStageConfig):
     """UDE's motion quantization."""
 
     net: MqConfig = MqConfig()
+
+
+class WindowConfig(Protocol):
+    """Settings of a stage that trains on windows."""
+
+    @property
+    def window(self) -> int: ...
+
+    @property
+    def windows_per_clip(self) -> int: ...
 
 
 class WindowInputs(Inputs):
@@ -202,7 +207,7 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
 
 
 def window_batches(
-    config: WindowStageConfig, inputs: WindowInputs, columns: NDArray[np.int64], seed: int, **validation: Any
+    config: WindowConfig, inputs: WindowInputs, columns: NDArray[np.int64], seed: int, **validation: Any
 ) -> Batches:
     """Windows of the training split; validation on held-out clips, as `EvalBatches` takes it."""
     data, stats = inputs.data, inputs.stats

@@ -5,17 +5,19 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 
+from motionloom.datasets.schema import SPLITS, Split
 from motionloom.datasets.shards import store as retry
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
-from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.models.training import stage_module
 from motionloom.pipeline.training import trainer
 
@@ -48,13 +50,22 @@ def loopback() -> ModuleType:
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Synthetic clips in small shards."""
-    out = tmp_path_factory.mktemp("shards")
-    config = SynthConfig(clips=60, min_seconds=2.0, max_seconds=5.0)
+    whole, out = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("shards")
+    synthesize(SynthConfig(clips=60, min_seconds=2.0, max_seconds=5.0), whole, workers=1)
+    splits = {split: ShardDataset.open(whole, split) for split in SPLITS}
+    items = [(split, (split, i)) for split, dataset in splits.items() for i in range(len(dataset))]
+
+    def copy(item: tuple[Split, int]) -> Sample:
+        dataset, i = splits[item[0]], item[1]
+        return Sample(dataset.meta(i), dataset.motion(i), dataset.texts(i), dataset.face_texts(i))
+
     write_dataset(
         out,
-        [(split_of(number, config), number) for number in range(config.clips)],
-        partial(make_sample, config=config),
-        DatasetFacts("made", config.motion_layout, "CC0", converter="test", converter_version=1, options={}),
+        items,
+        copy,
+        DatasetFacts(
+            "made", splits["train"].layout, "CC0", converter="copy", converter_version=1, options={}
+        ),
         WriteOptions(clips_per_shard=8, progress=False),
     )
     return out
@@ -134,3 +145,18 @@ def test_reader_and_cache_may_change_without_training_again(
         third = recipe(tmp_path, "three", {"path": url, "order": "global", "cache": new})
         plan = call("run", third, "--out", tmp_path / "run", "--dry-run", "--replace")
         assert "5 of 5 stages would run" in plan.out and "changed: " in plan.out, plan.out
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ({}, "key 'path' is required"),
+        ({"path": "x", "mode": "streamed"}, "needs order: streamed"),
+        ({"path": "x", "cache": {"gigabyte": 3}}, "did you mean 'gigabytes'"),
+    ],
+)
+def test_contradictions_are_named(
+    data: dict[str, Any], said: str, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    done = call("run", recipe(tmp_path, "wrong", data), "--out", tmp_path / "run")
+    assert done.code != 0 and said in " ".join((done.out + done.err).split())
