@@ -96,14 +96,19 @@ def rendered(count: int) -> None:
         truth = np.array(song.beats_within(0, song.seconds))
         ours, theirs = track(sound), librosa_beats(sound.samples, sound.rate)
         rows.append(
-            [max(f_measure(one, found) for one in which(truth)) for found in (ours.times, theirs)
-             for which in (lambda beats: [beats], tempi)]
-        )  # fmt: skip
+            [
+                max(f_measure(one, found) for one in which(truth))
+                for found in (ours.times, theirs)
+                for which in (lambda beats: [beats], tempi)
+            ]
+        )
         bars = truth[(song.beat_number(0.0) + np.arange(len(truth))) % song.meter == 0]
         downbeats.append(f_measure(bars, ours.times[ours.bar_places == 0]))
     mean = np.mean(rows, axis=0)
-    print(f"{count} rendered songs, F: ours {mean[0]:.3f} (any {mean[1]:.3f}), librosa {mean[2]:.3f} "
-          f"(any {mean[3]:.3f}); our downbeats {np.mean(downbeats):.3f}")  # fmt: skip
+    print(
+        f"{count} rendered songs, F: ours {mean[0]:.3f} (any {mean[1]:.3f}), librosa {mean[2]:.3f} "
+        f"(any {mean[3]:.3f}); our downbeats {np.mean(downbeats):.3f}"
+    )
 
 
 def real(paths: list[Path], references: list[str]) -> None:
@@ -125,12 +130,16 @@ def real(paths: list[Path], references: list[str]) -> None:
         beats = sum(map(len, runs))
         if beats:
             rows.append(row)
-        tempi = f"{_bpm(ours.times):.0f} | {_bpm(theirs):.0f}"
-        print(f"| {path.stem} | {ours.confidence:.2f} | {tempi} | {beats} "
-              f"| {row[0]:.2f} ({row[1]:.2f}) | {row[2]:.2f} ({row[3]:.2f}) |", flush=True)  # fmt: skip
+        print(
+            f"| {path.stem} | {ours.confidence:.2f} | {_bpm(ours.times):.0f} | {_bpm(theirs):.0f} "
+            f"| {beats} | {row[0]:.2f} ({row[1]:.2f}) | {row[2]:.2f} ({row[3]:.2f}) |",
+            flush=True,
+        )
     mean = np.mean(rows, axis=0)
-    print(f"{len(rows)} real songs, F: ours {mean[0]:.3f} (any {mean[1]:.3f}), librosa {mean[2]:.3f} "
-          f"(any {mean[3]:.3f})")  # fmt: skip
+    print(
+        f"{len(rows)} real songs, F: ours {mean[0]:.3f} (any {mean[1]:.3f}), librosa {mean[2]:.3f} "
+        f"(any {mean[3]:.3f})"
+    )
 
 
 def no_music(speech: list[Path]) -> None:

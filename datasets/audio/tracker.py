@@ -29,6 +29,10 @@ _OFTEN = (0.02, 0.98)
 """Activations are kept between these: one row alone never decides."""
 _UNEVEN = 40.0
 """What it costs to change the tempo, for each e-fold."""
+_EAGER = 1.0
+"""What each beat gains beside what is heard, in nats: beats that are faint count too."""
+_MODERATE = 2.0
+"""What it costs, each beat, to be an octave away from 120 beats a minute; more by the square."""
 _ROUNDING = 0.4
 """What it costs to go to the next period, as beats do whose distance lies between two."""
 _SLIP = 8.0
@@ -77,7 +81,7 @@ def beat_rows(activation: NDArray[np.float32]) -> NDArray[np.int64]:
     kept = np.clip(activation, *_OFTEN).astype(np.float64)
     # The score of no beat at all is taken off. Beside the piece beats cost nothing, so that the first and the
     # last are within their period from its ends.
-    gain = np.pad(np.log(kept) - np.log1p(-kept), periods[-1])
+    gain = np.pad(np.log(kept) - np.log1p(-kept) + _EAGER, periods[-1])
     change = _change_cost(periods)
     # score[t, i]: of the best beats up to one at row t after which the next follows in periods[i] rows.
     score = np.zeros((len(gain), len(periods)), dtype=np.float32)
@@ -135,10 +139,11 @@ def _count_bars(
 
 
 def _change_cost(periods: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[from, to] between periods: nothing for the same, little for a neighbour, much for another tempo."""
+    """[from, to] between periods: little to a neighbour, much to another tempo, more to an unusual one."""
     apart = np.abs(np.log(periods[:, None] / periods[None]))
     steps = np.abs(periods[:, None] - periods[None])
-    return np.where(steps == 0, 0.0, np.where(steps == 1, _ROUNDING, _ROUNDING + _UNEVEN * apart))
+    change = np.where(steps == 0, 0.0, np.where(steps == 1, _ROUNDING, _ROUNDING + _UNEVEN * apart))
+    return np.asarray(change + _MODERATE * np.log2(periods / (ROWS / 2)) ** 2)
 
 
 def _peak(values: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:

@@ -1,0 +1,120 @@
+"""Beats are found in music and not in noise; decoding is the best path, by an obvious and slow version."""
+
+from __future__ import annotations
+
+from itertools import pairwise, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.audio import tracker
+from motionloom.datasets.audio.bands import ROWS, band_from, band_power
+from motionloom.datasets.audio.beat_net import (
+    BeatNet,
+    BeatNetConfig,
+    activations,
+    levels,
+    read_beat_net,
+    write_beat_net,
+)
+from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.synth.music.performance import render_song
+from motionloom.datasets.synth.music.song import draw_song
+
+RATE = 16_000
+
+
+def even_song(genre: str, bpm: int) -> Sound:
+    song = draw_song(0, 1, genres=(genre,), tempo=(bpm, bpm), seconds=20.0)
+    return Sound(render_song(song, RATE), RATE)
+
+
+@pytest.mark.parametrize(("genre", "bpm"), [("house", 124), ("rock", 97)])
+def test_beats_of_a_metronome_are_found_and_counted(genre: str, bpm: int) -> None:
+    found = tracker.track(even_song(genre, bpm))
+    truth = np.arange(0, 20, 60 / bpm)
+    inside = (found.times > 1) & (found.times < 19)  # the ends have music on one side alone
+    away = np.abs(found.times[inside, None] - truth).min(axis=1)
+    assert away.max() < 0.03
+    assert abs(inside.sum() - ((truth > 1) & (truth < 19)).sum()) <= 1
+    assert found.meter == 4
+    bars = found.times[(found.bar_places == 0) & inside]
+    assert np.abs(bars[:, None] - truth[::4]).min(axis=1).max() < 0.03
+
+
+def test_noise_and_silence_are_no_music() -> None:
+    noise = np.random.default_rng(0).standard_normal(10 * RATE).astype(np.float32)
+    music = tracker.track(even_song("house", 124)).confidence
+    assert tracker.track(Sound(np.clip(0.2 * noise, -1, 1), RATE)).confidence < 0.3 < 0.5 < music
+    assert tracker.track(Sound(np.zeros_like(noise), RATE)).confidence < 0.1
+    assert not len(tracker.track(Sound(np.zeros(RATE, dtype=np.float32), RATE)).times)
+
+
+def test_gain_moves_no_beat() -> None:
+    sound = even_song("house", 124)
+    quiet = Sound(0.01 * sound.samples, RATE)
+    assert np.allclose(tracker.track(sound).times, tracker.track(quiet).times, atol=0.01)
+
+
+def test_the_path_of_beats_is_the_best_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    periods = np.array([3, 4, 5])
+    monkeypatch.setattr(tracker, "PERIODS", periods)
+    monkeypatch.setattr(tracker, "_MODERATE", 0.02)  # all three are unusual tempi
+    heard = np.random.default_rng(3).random(17).astype(np.float32)
+    kept = np.clip(heard, 0.02, 0.98).astype(np.float64)
+    gain = np.log(kept / (1 - kept)) + tracker._EAGER
+    change = tracker._change_cost(periods)
+
+    def walk(first: int, steps: tuple[int, ...]) -> tuple[float, list[int]]:
+        rows = first + np.cumsum(periods[list(steps)])[:-1]
+        turns = sum(change[pair] for pair in pairwise(steps)) + change[steps[-1]].min()
+        return float(gain[rows].sum() - turns), rows.tolist()
+
+    # All ways from before the first row to beyond the last.
+    walks = [
+        walk(first, steps)
+        for first in range(-5, 0)
+        for count in range(4, 9)
+        for steps in product(range(3), repeat=count)
+        if first + periods[list(steps)].sum() >= len(heard) > first + periods[list(steps[:-1])].sum()
+        and first + periods[steps[0]] >= 0
+    ]
+    assert tracker.beat_rows(heard).tolist() == max(walks)[1]
+
+
+def test_bars_are_counted_by_three_and_go_on_after_a_cut() -> None:
+    heard = np.tile([0.9, 0.05, 0.05], 12).astype(np.float32)
+    places, meter = tracker.bar_places(np.concatenate([heard, heard[1:]]))
+    assert meter == 3
+    assert places.tolist() == [*[0, 1, 2] * 12, *([0, 1, 2] * 12)[1:]]
+
+
+def test_blocks_of_a_long_piece_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    net = BeatNet(BeatNetConfig(width=8, layers=3)).eval()
+    heard = np.random.default_rng(0).standard_normal((500, 64)).astype(np.float32)
+    whole = activations(net, heard)
+    monkeypatch.setattr("motionloom.datasets.audio.beat_net._BLOCK", 64)
+    assert np.allclose(activations(net, heard), whole, atol=1e-6)
+
+
+def test_a_network_is_read_again_and_other_files_are_refused(tmp_path: Path) -> None:
+    net = BeatNet(BeatNetConfig(width=8, layers=2)).eval()
+    write_beat_net(net, tmp_path / "net.safetensors")
+    again = read_beat_net(tmp_path / "net.safetensors")
+    heard = np.ones((10, 64), dtype=np.float32)
+    assert np.allclose(activations(again, heard), activations(net, heard), atol=1e-2)  # half precision
+    (tmp_path / "torn.safetensors").write_bytes((tmp_path / "net.safetensors").read_bytes()[:300])
+    with pytest.raises(UserError, match=r"torn\.safetensors"):
+        read_beat_net(tmp_path / "torn.safetensors")
+
+
+def test_bands_hear_a_tone_where_it_is() -> None:
+    t = np.arange(2 * RATE) / RATE
+    power = band_power(Sound((0.5 * np.sin(2 * np.pi * 1000 * t)).astype(np.float32), RATE))
+    assert power.shape == (2 * ROWS + 1, 64)
+    assert abs(int(power[ROWS].argmax()) - band_from(1000.0)) <= 1
+    assert np.abs(levels(power).mean(axis=0)).max() < 1e-4
