@@ -37,8 +37,8 @@ _SHORTEST = 3.0
 
 QUIET_DB = -70.0
 BEAT = 0.3
-"""Speech reaches 0.28 and noise 0.2; music with drums has 0.5 and more. The confidence of `tracker.track` can
-take its place when it tells them apart as well."""
+"""Speech reaches 0.28 and noise 0.2; music with drums has 0.5 and more.
+"""
 STEADY = 0.3
 NOISE_STEADY = 0.1
 SYLLABLES = 0.33
