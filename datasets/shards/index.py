@@ -80,6 +80,8 @@ class ShardIndex(Config):
     shard: ShardInfo | None
     clips: list[ClipEntry]
     dropped: list[Dropped]
+    made_on: str = ""
+    """The kind of processor, by which the last digits of a clip may differ."""
 
 
 def index_path(tar: Path) -> Path:

@@ -7,6 +7,7 @@ finished.
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -124,9 +125,18 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
         )
     else:
         task.path.unlink()  # webdataset treats a shard without samples as an error
-    index = ShardIndex(fingerprint=task.fingerprint, shard=info, clips=entries, dropped=dropped)
+    index = ShardIndex(
+        fingerprint=task.fingerprint, shard=info, clips=entries, dropped=dropped, made_on=_processor()
+    )
     write_json(index_path(task.path), index.dump())
     return info, dropped
+
+
+def _processor() -> str:
+    """Kind and widest instructions of the processor, such as `x86_64 AVX2`: what sums are rounded by."""
+    import torch
+
+    return f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
 
 
 Encoded = list[tuple[str, int, dict[str, bytes]]]

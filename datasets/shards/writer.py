@@ -213,7 +213,11 @@ class DatasetWriter(Generic[T]):
                 some = "; ".join(map(str, groups[:3])) or "there was none"
                 where = f"; all of them: {self.out / LEFT_OUT_FILE}" if len(manifest.dropped) > 1 else ""
                 raise UserError(f"{self.out}: no clip survived the conversion ({some}){where}")
-            _finish_index(self.out, shards)
+            made_on = _finish_index(self.out, shards)
+            if len(made_on) > 1:
+                kinds = f"{len(made_on)} kinds of processor ({', '.join(sorted(made_on))})"
+                note = f"made on {kinds}: the last digits of clips may differ from those of a set made on one"
+                manifest = manifest.model_copy(update={"notes": [*manifest.notes, note]})
             write_json(self.out / MANIFEST_FILE, manifest.dump())
             shutil.rmtree(self.work_folder, ignore_errors=True)
         return manifest
@@ -294,19 +298,23 @@ def _shards_in(folder: Path, name: str, *suffixes: str) -> list[Path]:
     return [path for path in folder.iterdir() if shard.fullmatch(path.name)] if folder.is_dir() else []
 
 
-def _finish_index(out: Path, shards: list[ShardInfo]) -> None:
+def _finish_index(out: Path, shards: list[ShardInfo]) -> set[str]:
+    """Write `index.npz`; the kinds of processor that the shards were made on."""
     splits: dict[Split, SplitIndex] = {}
     owners: dict[str, str] = {}
+    made_on: set[str] = set()
     for split in SPLITS:
         splits[split] = SplitIndex.build(
-            _unique(ShardIndex.load_json(index_path(out / shard.name)), shard.name, owners)
+            _unique(ShardIndex.load_json(index_path(out / shard.name)), shard.name, owners, made_on)
             for shard in shards
             if shard.split == split
         )
     save_index(out, splits)
+    return made_on - {""}  # unknown of shards that were made before this was kept
 
 
-def _unique(index: ShardIndex, shard: str, owners: dict[str, str]) -> ShardIndex:
+def _unique(index: ShardIndex, shard: str, owners: dict[str, str], made_on: set[str]) -> ShardIndex:
+    made_on.add(index.made_on)
     for clip in index.clips:
         if clip.id in owners:
             raise UserError(

@@ -232,6 +232,9 @@ def convert_command(
         say=lambda line: say(console, line),
     )
     say_manifest(manifest, out, console)
+    for note in manifest.notes:
+        if note not in conversion.plan.notes:  # said before
+            say(console, f"note: {note}")
     if conversion.plan.captions:
         say(console, conversion.plan.captions)
 
@@ -259,10 +262,10 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
             )
     console.print(table)
     _say_left_out(manifest, out, console)
-    console.print(
+    say(
+        console,
         f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), "
         f"{manifest.fps:g} fps, {', '.join(manifest.licences) or manifest.licence}",
-        markup=False,
     )
 
 

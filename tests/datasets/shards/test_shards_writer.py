@@ -22,6 +22,7 @@ from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import decode, encode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Dropped, UserError
+from motionloom.datasets.shards import tasks
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, kind_of_reason, tally, write_left_out
 from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
@@ -215,6 +216,17 @@ def test_parts_in_any_order_and_one_last_run_give_the_same_bytes(
     assert made.write(out, convert=convert) == whole
     assert digests(out) == digests(tmp_path / "whole")
     assert {name: (out / name).stat().st_mtime_ns for name in kept} == kept
+
+
+def test_parts_of_several_kinds_of_processor_are_noted(
+    made: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number, kind in enumerate(("x86_64 AVX2", "x86_64 AVX512")):
+        monkeypatch.setattr(tasks, "_processor", lambda kind=kind: kind)
+        made.write(tmp_path, part=Part(number, 2))
+    (note,) = made.write(tmp_path).notes
+    assert "2 kinds of processor (x86_64 AVX2, x86_64 AVX512)" in note
+    assert not made.write(tmp_path / "of one").notes
 
 
 def test_parts_work_at_once_and_leave_each_others_files(made: ModuleType, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +19,9 @@ from foreign_figures import build, write_figure
 from foreign_tools import FOREIGN
 from safetensors.numpy import load_file
 
+from motionloom.datasets.base.files import write_json
 from motionloom.datasets.motion.bvh.joint_map import JointMap
+from motionloom.datasets.schema import Manifest
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.cli.options import plain
@@ -176,6 +179,18 @@ def test_stats_describes_and_writes(shards: Path, tmp_path: Path, call: Call) ->
     assert stored["mean"].shape == (363,) and (stored["std"] > 0).all()
     call("data", "stats", shards, "--out", out)
     assert out.read_bytes() == first, "equal statistics must be equal files"
+
+
+def test_text_of_a_manifest_adds_no_line_and_commands_no_terminal(
+    shards: Path, tmp_path: Path, call: Call
+) -> None:
+    shutil.copytree(shards, tmp_path / "set")
+    manifest = Manifest.load_json(tmp_path / "set/manifest.json").model_copy(
+        update={"licence": "CC0\nerror: \x1b[31m", "licences": {}}
+    )
+    write_json(tmp_path / "set/manifest.json", manifest.dump())
+    done = call("data", "stats", tmp_path / "set")
+    assert done.code == 0 and r"CC0\nerror: \x1b[31m" in done.out and "\x1b" not in done.out
 
 
 def test_convert_plans_and_converts(tmp_path: Path, call: Call) -> None:
