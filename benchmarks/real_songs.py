@@ -213,7 +213,7 @@ def main() -> None:
     parser.add_argument("--record", type=Path, help="a JSON file for docs/results.md")
     args = parser.parse_args()
     model = MotionModel.from_pretrained(args.model)
-    training = Training(ShardDataset(args.train, "train"))
+    training = Training(ShardDataset.open(args.train, "train"))
     parts = [part for song in args.songs for part in stretches(song, args.stretches, args.seconds)]
     sounds = [part.sound for part in parts]
 

@@ -21,7 +21,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from motionloom.pipeline.evaluation.estimate import estimate
-from motionloom.pipeline.evaluation.figures import FILE_NAME, MODEL, NEAREST_WORDS, RECORDED, FigureFile
+from motionloom.pipeline.evaluation.figures import (
+    FILE_NAME,
+    MODEL,
+    NEAREST_LABELS,
+    NEAREST_MUSIC,
+    NEAREST_WORDS,
+    OTHER_MUSIC,
+    RANDOM_DANCE,
+    RECORDED,
+    FigureFile,
+)
 
 HERE = Path(__file__).resolve().parent
 RECORDS, WORDS, PAGE = HERE / "records", HERE / "results_page.md", HERE.parent / "docs" / "results.md"
@@ -78,7 +88,41 @@ def _of(prefix: str, stages: Mapping[str, str], answers: Mapping[str, str]) -> d
     return rows | {title: (first, row) for title, row in answers.items()}
 
 
+DANCES = {
+    "recorded dances": RECORDED,
+    "**generated from its music**": MODEL,
+    "the same under other music": OTHER_MUSIC,
+    "dance to the nearest training music": NEAREST_MUSIC,
+    "random training dance": RANDOM_DANCE,
+}
+LOOKUPS = {"nearest training labels": NEAREST_LABELS, "nearest training caption": NEAREST_WORDS}
+
 TABLES = {
+    "dances": Table(
+        "Dances to unheard played songs",
+        {title: ("evaluate_dances", row) for title, row in DANCES.items()},
+        (
+            Column("Beat Align (UDE)", "beat_align.bailando", 3),
+            Column("Beat Align (MINT)", "beat_align.mint", 3),
+            Column("tempo within five percent", "recognition.tempo", 2),
+            Column("genre", "recognition.genre", 2),
+            Column("skating", "feet.skating", 3),
+            *TEXT[1:5],
+        ),
+    ),
+    "dance_texts": Table(
+        "Captions",
+        {
+            "generated": ("evaluate", MODEL),
+            **{title: ("evaluate", row) for title, row in LOOKUPS.items()},
+            "recorded": ("evaluate", RECORDED),
+        },
+        (
+            Column("action right, %", "agreement.action", 0, 100),
+            Column("everything right, %", "agreement.everything", 0, 100),
+            TEXT[0],
+        ),
+    ),
     "ude_codebook": Table(
         "Codebooks of 512 codes, 1,000 steps of 32 windows",
         {
@@ -115,6 +159,7 @@ TABLES = {
     ),
 }  # fmt: skip
 SEEDS = (7, 8, 9)
+COMMANDS = dict.fromkeys(("dances", "dance_texts"), "motionloom run ude-dance")
 
 
 def collect(run: Path) -> None:
@@ -133,7 +178,8 @@ def write(name: str, title: str, columns: list[dict[str, Any]], rows: list[Recor
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=HERE)
     record = {
         "title": title, "measured": f"{datetime.now(UTC):%Y-%m-%d}", "commit": commit.stdout.strip(),
-        "command": "python benchmarks/ude_ingredients.py CLIPS WORK", "columns": columns, "rows": rows,
+        "command": COMMANDS.get(name, "python benchmarks/ude_ingredients.py CLIPS WORK"),
+        "columns": columns, "rows": rows,
     }  # fmt: skip
     (RECORDS / f"{name}.json").write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
 
@@ -145,6 +191,8 @@ def row_of(run: Path, table: Table, title: str) -> Record:
     seeds, protocol = [], {}
     for seed in SEEDS if row == MODEL else SEEDS[:1]:
         folder = run / "stages" / f"{stage}_{seed}"
+        if seed == SEEDS[0] and (run / "stages" / stage).is_dir():  # of a recipe that has one
+            folder = run / "stages" / stage
         if not (folder / "artifact.json").is_file():
             continue
         found = FigureFile.read(folder / FILE_NAME) if (folder / FILE_NAME).is_file() else None

@@ -2,7 +2,7 @@
 
 The weights in the package are those of the recipe `beats`:
 
-    motionloom run beats -o runs/beats
+    motionloom run ude-beats -o runs/beats
     python -c "from motionloom.pipeline.stages.networks import beats; from pathlib import Path; \\
         beats.put_into_package(Path('runs/beats/stages/beats'))"
 """
@@ -10,24 +10,24 @@ The weights in the package are those of the recipe `beats`:
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from pydantic import Field
-from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits
 
 from motionloom.datasets.audio.bands import BANDS, ROWS
 from motionloom.datasets.audio.beat_net import WEIGHTS, BeatNet, BeatNetConfig, write_beat_net
 from motionloom.datasets.synth.music.tapped import TappedBatches
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Inputs, register
 from motionloom.pipeline.stages.data.songs import SongPool
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts, load_weights
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+
+if TYPE_CHECKING:
+    from motionloom.models.training.beats import BeatsModule
 
 _NO_MOTION = LayoutFacts(name="none", fps=ROWS, family="none")
 
@@ -53,18 +53,6 @@ class BeatsInputs(Inputs):
     songs: SongPool
 
 
-class BeatsModule(StageModule):
-    """Binary cross-entropies of beats and of downbeats."""
-
-    net: BeatNet
-
-    def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Each beat counts two rows beside it by half, as hands and rows are not exact."""
-        both = binary_cross_entropy_with_logits(self.net(batch["levels"]), batch["targets"], reduction="none")
-        beat, downbeat = both.mean(dim=(0, 1)).unbind()
-        return {"loss": beat + downbeat, "beat": beat, "downbeat": downbeat}
-
-
 class BeatsStage(TrainedStage[BeatsConfig, BeatsInputs, BeatNet]):
     """Music to beats."""
 
@@ -81,6 +69,8 @@ class BeatsStage(TrainedStage[BeatsConfig, BeatsInputs, BeatNet]):
         return BeatNet(BeatNetConfig.parse(facts.config, facts.where))
 
     def module(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int) -> BeatsModule:
+        from motionloom.models.training.beats import BeatsModule
+
         return BeatsModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
     def batches(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int, log: Log) -> Batches:
