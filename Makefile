@@ -17,7 +17,7 @@ help:
 	@echo "make test   the tests, without the long ones; a few minutes"
 	@echo "make test-all   all tests: trainings, kills, clusters and browsers too"
 	@echo "make lint   ruff and mypy"
-	@echo "make test-older   the same tests as an older processor computes, without AVX-512"
+	@echo "make test-older   all tests as an older processor computes, without AVX-512"
 	@echo "make dist   sdist and wheel, in dist/"
 	@echo "make test-dist   the wheel in an environment of its own, away from the tree"
 
@@ -49,7 +49,7 @@ OLDER := NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" OPENBLAS_CORETY
   GLIBC_TUNABLES=glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX512DQ,-AVX512CD
 
 test-older: $(STAMP)
-	$(OLDER) $(BIN)/python -P -m pytest -q -n auto --maxprocesses 4 --dist loadfile -m "$(FAST)" $(PYTEST_ARGS)
+	$(OLDER) $(BIN)/python -P -m pytest -n auto --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)
 
 # mypy reads the folders as the namespace package `motionloom`, so it gets a folder of that name that links to them.
 lint: $(STAMP)

@@ -318,7 +318,11 @@ def card_of(
     head = ["right, %", *(f"{title}: {kind}" for title in shares for kind in KINDS)]
     lines = [head, ["---"] * len(head), *rows_of(shares)]
     size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
-    options = "".join(f" --{name.replace('_', '-')} {value}" for name, value in sampling.items())
+    options = "".join(
+        f" --sampling {name}" + (f".{key}={part}" if key else f"={part}")
+        for name, value in sampling.items()
+        for key, part in (value.items() if isinstance(value, dict) else [("", value)])
+    )
     recommended = bundle.recommended.model_dump(mode="json", exclude_unset=True)
     recipe_file = figures["recipe"]
     settings = "".join(f" --set '{one}'" for one in figures["settings"])
@@ -326,15 +330,15 @@ def card_of(
     words = '"a person waves with the left hand"'
     uses = [f'{words} --face "a person looks happy"' if bundle.faces else words]
     uses = ["--audio song.mp3", f"{words} --audio song.mp3@0:30-1:00", *uses] if heard else uses
+    asked = "" if sampling == recommended else options
     return CARD.read_text(encoding="utf-8").format(
         licence=licence,
-        examples_of_use="\n".join(f"motionloom generate {figures['name']} {use}{options}" for use in uses),
+        examples_of_use="\n".join(f"motionloom generate {figures['name']} {use}{asked}" for use in uses),
         songs=" and dances to songs that FluidSynth played" if heard else "",
         or_music=" and no recorded music" if heard else "",
         music=music_section() if heard else "",
         name=figures["name"],
         description=recipe.description,
-        options="" if sampling == recommended else options,
         sampling=", ".join(f"{name} {value}" for name, value in sampling.items())
         or "the defaults of sampling",
         fps=bundle.layout.fps,
