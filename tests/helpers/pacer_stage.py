@@ -173,9 +173,13 @@ class PacerGenerator:
     method = "pacer"
     modalities = frozenset({"audio"})
     settings: frozenset[str] = frozenset()
-    text = None
     unit_frames = 1
     max_frames = None
+
+    @property
+    def prepared(self) -> dict[str, object]:
+        """What the stage of its modality gives."""
+        return {"audio": self.audio}
 
     @torch.no_grad()
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
