@@ -8,6 +8,7 @@ recipe's stage and the Python API can never differ. A converter is imported when
 from __future__ import annotations
 
 import inspect
+import shlex
 import time
 import types
 import typing
@@ -30,6 +31,7 @@ from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.store.files import require_folder
 
 if typing.TYPE_CHECKING:
+    from motionloom.datasets.convert.common.config import ConvertConfig
     from motionloom.datasets.convert.common.plan import ConversionPlan
 
 _REASONS = 12
@@ -213,10 +215,13 @@ def convert_command(
     if plan:
         conversion = prepare(config, maps=out, workers=workers, progress=shown).looked()
         planned = conversion.estimated(workers, started)
+        licensed = bool(conversion.converter.licence(planned))
+        line = proposed(kind, config, out, planned, licensed=licensed) if planned.items else ""
         if as_json:
-            print_json(planned.dump())
+            print_json(planned.dump() | {"command": line})
         else:
             _say_plan(planned, console)
+            say(console, f"convert it: {line}" if line else "nothing of it can be converted")
         return
     require_folder(out)
     conversion = prepare(config, out=out, workers=workers, progress=shown)
@@ -237,6 +242,37 @@ def convert_command(
             say(console, f"note: {note}")
     if conversion.plan.captions:
         say(console, conversion.plan.captions)
+
+
+def proposed(
+    kind: str, config: ConvertConfig, out: Path, plan: ConversionPlan[Any], *, licensed: bool
+) -> str:
+    """The command that converts what was planned: the settings given, and what else the plan found needed."""
+    changes: dict[str, object] = {} if licensed else {"licence": "unknown"}
+    if plan.stop:
+        changes["uncaptioned"] = "drop"
+    lost = len(plan.rejected) + len(plan.broken)
+    if lost > config.most_rejected * (lost + len(plan.items)):
+        changes["most_rejected"] = 1
+    if plan.look is not None and plan.look.problems:
+        tried = plan.look.suggestions
+        helps = tried and all(one.option in ("unit", "up") for one in tried)
+        changes.update({one.option: one.value for one in tried} if helps else {"look": 0})
+    words = ["motionloom", "data", "convert", kind, str(config.source), str(out)]
+    for key, field in type(config).model_fields.items():
+        value = changes.get(key, getattr(config, key))
+        if key == "source" or value is None or value == field.get_default(call_default_factory=True):
+            continue
+        option = f"--{key.replace('_', '-')}"
+        if key not in _EVERYDAY and not field.is_required():
+            listed = f"[{','.join(map(str, value))}]" if isinstance(value, tuple) else value
+            words += ["--set", f"{key}={str(listed).lower() if isinstance(value, bool) else listed}"]
+        elif isinstance(value, bool):
+            words.append(option if value else f"--no-{option[2:]}")
+        else:
+            for one in value if isinstance(value, tuple) else (value,):
+                words += [option, str(one)]
+    return shlex.join(words)
 
 
 def _say_plan(plan: ConversionPlan[Any], console: Console) -> None:

@@ -232,4 +232,46 @@ OTHERS = (
         sides=("l", "r"),
         means={"spine1": ("hip", "abdomen")},
     ),
+    Foreign(
+        "Axis Neuron",
+        (),
+        _chain("Hips@pelvis, Spine@spine1, Spine1@spine2, Spine2@a1, Spine3@spine3"),
+        _chain("Neck@neck, Head@head"),
+        _chain("{}UpLeg@hip, {}Leg@knee, {}Foot@ankle, {}Toe@foot"),
+        _chain("{}Shoulder@collar, {}Arm@shoulder, {}ForeArm@elbow, {}Hand@wrist"),
+        means={"spine2": ("Spine1", "Spine2")},
+    ),
+    Foreign(
+        "DAZ Genesis 8",
+        (),
+        _chain("hip@pelvis, abdomenLower@spine1, abdomenUpper@spine2, chestLower@a1, chestUpper@spine3"),
+        _chain("neckLower@neck, neckUpper@a2, head@head"),
+        _chain("{}ThighBend@hip, {}ThighTwist@a4, {}Shin@knee, {}Foot@ankle")
+        + _chain("{}Metatarsals@ankle, {}Toe@foot"),
+        _chain("{}Collar@collar, {}ShldrBend@shoulder, {}ShldrTwist@a6, {}ForearmBend@elbow, {}Hand@wrist"),
+        sides=("l", "r"),
+        means={"spine2": ("abdomenUpper", "chestLower")},
+    ),
+    Foreign(
+        "MakeHuman (CMU rig)",
+        ("Root",),
+        _chain("Hips@pelvis, Spine1@spine1, Spine2@spine2, Spine3@spine3"),
+        _chain("Neck@neck, Head@head, __Jaw@jaw, Jaw@jaw"),
+        _chain("__UpLeg_{}@a3, UpLeg_{}@hip, LoLeg_{}@knee, Foot_{}@ankle, Toe_{}@foot"),
+        _chain("Clavicle_{}@collar, UpArm_{}@shoulder, LoArm_{}@elbow, Hand_{}@wrist"),
+        sides=("L", "R"),
+        fingers=lambda side, name, n: f"{name}{n}_{side}",
+    ),
+    Foreign(
+        "MakeHuman (default rig)",
+        (),
+        _chain("root@pelvis, spine05@spine1, spine04@b1, spine03@spine2, spine02@a1, spine01@spine3"),
+        _chain("neck01@neck, neck02@a2, head@head"),
+        _chain("pelvis.{}@a3, upperleg01.{}@hip, upperleg02.{}@a4, lowerleg01.{}@knee, lowerleg02.{}@a5")
+        + _chain("foot.{}@ankle, toe1-1.{}@foot"),
+        _chain("clavicle.{}@collar, upperarm01.{}@shoulder, upperarm02.{}@a6, lowerarm01.{}@elbow")
+        + _chain("lowerarm02.{}@a7, wrist.{}@wrist"),
+        sides=("L", "R"),
+        fingers=lambda side, name, n: f"finger{FINGERS.index(name) + 1}-{n}.{side}",
+    ),
 )

@@ -22,6 +22,7 @@ from motionloom.datasets.convert.bvh.plan import (
     plan_bvh,
     read_motion,
 )
+from motionloom.datasets.convert.bvh.settle import is_added_pose, named_unit
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.feature_step import FeatureBatch, FeatureStep
 from motionloom.datasets.convert.common.features import features_of
@@ -29,9 +30,10 @@ from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
-from motionloom.datasets.motion.bvh.joint_map import JointMap, skeleton_key
+from motionloom.datasets.motion.bvh.joint_map import JointMap, metres, skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.sample import Sample
 
@@ -94,7 +96,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         """The joints as the map reads them, and the joints that no row of it names."""
         motion = read_motion(self._read(clip), clip.label())
         joint_map = self._map_of(motion)
-        joints = joint_map.apply(motion, unit=self.config.unit, up=self.config.up)
+        joints = self._world(motion, joint_map)
         used = {name for names in joint_map.sources for name in names}
         free = [name for name in motion.joints if name not in used and name not in joint_map.unmapped]
         twice = sorted({name for name in free if motion.joints.count(name) > 1})
@@ -105,14 +107,15 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         if twice:
             remarks.append(f"joints that appear more than once, which no row can name: {', '.join(twice)}")
         names = tuple(names[0] if len(names) == 1 else names for names in joint_map.sources)
-        return SourceJoints(joints, self.config.source_fps or motion.fps, names, tuple(remarks))
+        up = joint_map.up or self.config.up
+        return SourceJoints(joints, self.config.source_fps or motion.fps, names, tuple(remarks), up)
 
     def encode(self, label: str, data: bytes) -> NDArray[np.float32]:
         """Features [T', D] of one file; `label` names it in errors."""
         config = self.config
         motion = read_motion(data, label)
         joint_map = self._map_of(motion)
-        joints = joint_map.apply(motion, unit=config.unit, up=config.up)
+        joints = self._world(motion, joint_map)
         try:
             if len(self.layout.skeleton) > joints.shape[1]:
                 joints = with_resting_hands(joints)
@@ -122,6 +125,23 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         except UserError as error:
             unit, up = joint_map.unit or config.unit, joint_map.up or config.up
             raise UserError(f"{label}: {error} (read with unit '{unit}', up '{up}')") from None
+
+    def _world(self, motion: BvhMotion, joint_map: JointMap) -> NDArray[np.float64]:
+        """Joints [T, N, 3] in metres, Y up, without an added first frame.
+
+        Where the unit is settled by the skeleton's first clips and makes no person of this one's figure, but
+        another known unit does, that one counts: writers of one skeleton may use several.
+        """
+        config = self.config
+        unit = joint_map.unit or ("cm" if config.unit == "auto" else config.unit)
+        up = "y" if config.up == "auto" else config.up
+        joints = joint_map.apply(motion, unit=unit, up=up)
+        if config.unit == "auto" and not any(one.unit and one.where == joint_map.where for one in self.given):
+            height = measure(joints, motion.fps).height
+            own = named_unit(height / metres(unit))
+            if own is not None and not PERSON_METRES[0] <= height <= PERSON_METRES[1]:
+                joints *= metres(own) / metres(unit)
+        return joints[int(is_added_pose(joints)) :]
 
     def _map_of(self, motion: BvhMotion) -> JointMap:
         try:

@@ -7,9 +7,10 @@ order of their work change nothing.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
@@ -17,6 +18,7 @@ from pydantic import BeforeValidator, Field
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
+from motionloom.datasets.convert.bvh.settle import is_added_pose, settled
 from motionloom.datasets.convert.captions.options import CaptionConfig, CaptionedPlan, settle_captions
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
@@ -24,7 +26,14 @@ from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.scan import Batch, BatchScan, FoundFile, list_batches, scan_batches
 from motionloom.datasets.motion.bvh.asf import FPS, JOINED, count_frames, read_amc, skeleton_of
-from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, skeleton_key
+from motionloom.datasets.motion.bvh.joint_map import (
+    JointMap,
+    UnfinishedMapError,
+    Unit,
+    Up,
+    metres,
+    skeleton_key,
+)
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy, require_all_frames
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -41,6 +50,9 @@ MAPS_FOLDER = "joint_maps"
 
 JointMaps = Mapping[str, JointMap]
 """The joint maps of a conversion, by `skeleton_key`."""
+
+_MEASURED = 5
+"""Clips of a skeleton by which its unit and its upward axis are settled: one may lie on the floor."""
 
 
 def load_maps(choice: Path | str, target: Skeleton) -> list[JointMap]:
@@ -83,8 +95,12 @@ def choose_maps(
                     maps[key] = one
                 except UserError as error:
                     misfits.setdefault(one.where, str(error))
-    for key, motion in _first_clips(plan, skeletons.keys() - maps.keys()).items():
-        guess = guess_joint_map(motion, target)
+    settles = skeletons.keys() if "auto" in (config.unit, config.up) else set[str]()
+    first_clips = _first_clips(plan, settles | (skeletons.keys() - maps.keys()))
+    for key, motions in first_clips.items():
+        if key in maps:
+            continue
+        guess = guess_joint_map(motions[0], target)
         written = _written(guess, key, folder)
         if guess.certain:
             maps[key] = guess.joint_map(f"the guess from {guess.source}")
@@ -100,27 +116,52 @@ def choose_maps(
         raise UserError(f"{config.source}: {next(iter(doubts.values()))}")
     plan.items = [item for item in plan.items if item[1].found.skeleton not in doubts]
     plan.notes += doubts.values()
+    for key in maps.keys() & settles & first_clips.keys():
+        maps[key] = _settle(config, maps[key], first_clips[key], plan)
     for clip in left:
         plan.reject(clip.label(), f"no certain joint map for its skeleton ({doubts[clip.found.skeleton]})")
     return maps
 
 
-def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str, BvhMotion]:
-    """The first readable clip of each of the skeletons."""
+def _settle(
+    config: BvhConfig, joint_map: JointMap, motions: Sequence[BvhMotion], plan: ConversionPlan[BvhClip]
+) -> JointMap:
+    """The map with unit and upward axis as some of its clips settle them, which the plan tells."""
+    given = replace(
+        joint_map,
+        unit=joint_map.unit or (None if config.unit == "auto" else config.unit),
+        up=joint_map.up or (None if config.up == "auto" else config.up),
+    )
+    unit, up, height = settled(given, motions)
+    name, made = motions[0].name, replace(given, unit=unit, up=up)
+    if given.unit is None:
+        named = f"{metres(unit):.4g} m ({unit if isinstance(unit, str) else 'no known unit fits'})"
+        tall = f"the figures are then {height:.2f} m tall"
+        plan.notes.append(f"unit by body size, from {name}: {named}; {tall}")
+    if up != "y" and given.up is None:
+        plan.notes.append(f"upward axis by where heads are, from {name}: {up}")
+    if any(is_added_pose(made.apply(motion)) for motion in motions):
+        plan.notes.append(f"first frames that are an added T-pose are left out, as in {name}")
+    return made
+
+
+def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str, list[BvhMotion]]:
+    """The first readable clips of each of the skeletons, of one batch each."""
     wanted: dict[Batch, dict[str, str]] = {}
     for _, clip in plan.items:
         if clip.found.skeleton in skeletons:
             wanted.setdefault(clip.batch, {})[clip.label()] = clip.found.skeleton
-    found: dict[str, BvhMotion] = {}
+    found: dict[str, list[BvhMotion]] = {}
     for batch, labels in wanted.items():
-        missing = set(labels.values()) - set(found)
+        left = Counter({key: n for key, n in Counter(labels.values()).items() if key not in found})
         with suppress(UserError):  # a damaged archive; its clips are reported when they are converted
-            for file in batch.read() if missing else ():
-                if labels.get(file.label) in missing:
+            for file in batch.read() if left else ():
+                key = labels.get(file.label, "")
+                if left[key] and len(found.get(key, ())) < _MEASURED:
+                    left[key] -= 1
                     with suppress(UserError):  # likewise; the next clip of this skeleton may be whole
-                        found[labels[file.label]] = read_motion(file.data, file.label)
-                        missing.remove(labels[file.label])
-                if not missing:
+                        found.setdefault(key, []).append(read_motion(file.data, file.label))
+                if all(not n or len(found.get(key, ())) == _MEASURED for key, n in left.items()):
                     break
     return found
 
@@ -170,10 +211,10 @@ class BvhConfig(CaptionConfig):
     """Frame rate of the shards; clips are resampled by time."""
     source_fps: float | None = Field(default=None, ge=1, le=10_000)
     """True frame rate of the files, for collections that state a wrong one."""
-    unit: Unit = "cm"
-    """Length unit of the files."""
-    up: Up = "y"
-    """Upward axis of the files."""
+    unit: Unit | Literal["auto"] = "auto"
+    """Length unit of the files: by the size of the bodies (`auto`), a name, or metres (`0.0564`)."""
+    up: Up | Literal["auto"] = "auto"
+    """Upward axis of the files; `auto`: where the heads are."""
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton."""
     fingers: Literal["recorded", "resting", "missing"] = "recorded"

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,8 @@ from rich.table import Table
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.motion.bvh.joint_map import METRES
+from motionloom.datasets.motion.bvh.joint_map import METRES, metres
+from motionloom.datasets.motion.frame_rate import wrong_rate
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import MOST, PERSON_METRES, PlausibilityStats, measure
 from motionloom.datasets.schema import Dropped, UserError
@@ -55,6 +56,8 @@ class SeenClip:
     joints: NDArray[np.float64]
     fps: float
     file_fps: float
+    up: str = "y"
+    """The upward axis of its file."""
 
 
 def stats_of(clips: Iterable[SeenClip]) -> PlausibilityStats:
@@ -65,13 +68,13 @@ def stats_of(clips: Iterable[SeenClip]) -> PlausibilityStats:
     return stats
 
 
-def suggest(clips: list[SeenClip], config: ConvertConfig, names: Names, up: str) -> list[Suggestion]:
+def suggest(clips: list[SeenClip], config: ConvertConfig, names: Names) -> list[Suggestion]:
     """Changes that together make people of the clips, one after the other: axis, unit, sides."""
     out: list[Suggestion] = []
     now = stats_of(clips)
     if now.upright <= MOST:
-        axis = head_axis(clips, up)
-        clips = [replace(clip, joints=_turned(clip.joints, up, axis)) for clip in clips]
+        axis = head_axis(clips)
+        clips = [replace(clip, joints=_turned(clip.joints, clip.up, axis)) for clip in clips]
         why = f"the head is above the pelvis along the {axis} axis of the files"
         turn = Suggestion("source", "turn the files so that y or z points up", why)
         is_option = hasattr(config, "up") and axis in ("+y", "+z")
@@ -89,12 +92,16 @@ def suggest(clips: list[SeenClip], config: ConvertConfig, names: Names, up: str)
 
 
 def _unit_suggestion(height: float, config: ConvertConfig) -> tuple[float, Suggestion]:
-    given = METRES.get(getattr(config, "unit", "m"), 1.0)
+    own: Any = getattr(config, "unit", "m")
+    given = 1.0 if own == "auto" else metres(own)
     factors = {unit: metres / given for unit, metres in METRES.items()}
     fits = {u: f for u, f in factors.items() if PERSON_METRES[0] <= height * f <= PERSON_METRES[1]}
     if not fits:
         why = f"the figures are {height:.3g} m tall, and no unit makes 1.2 to 2.2 m of it"
-        return 1.7 / max(height, 1e-9), Suggestion("source", "scale the files", why)
+        factor = 1.7 / max(height, 1e-9)
+        if hasattr(config, "unit"):
+            return factor, Suggestion("unit", f"{factor * given:.4g}", why)
+        return factor, Suggestion("source", "scale the files", why)
     unit, factor = min(fits.items(), key=lambda item: abs(np.log(height * item[1] / 1.7)))
     why = f"then the figures are {height * factor:.2f} m tall"
     if hasattr(config, "unit"):
@@ -109,11 +116,11 @@ def _file_axes(vectors: NDArray[np.floating], up: str) -> NDArray[np.floating]:
     return vectors
 
 
-def head_axis(clips: Iterable[SeenClip], up: str) -> str:
+def head_axis(clips: Iterable[SeenClip]) -> str:
     """The axis of the files along which the head lies from the pelvis in most clips."""
     found: Counter[str] = Counter()
     for clip in clips:
-        way = _file_axes(np.array(measure(clip.joints, clip.fps).up), up)
+        way = _file_axes(np.array(measure(clip.joints, clip.fps).up), clip.up)
         axis = int(np.abs(way).argmax())
         found[("+" if way[axis] > 0 else "-") + "xyz"[axis]] += 1
     return found.most_common(1)[0][0]
@@ -151,6 +158,8 @@ class SourceJoints:
     """What stands for each joint in the file (several: their mean), where a joint map says it."""
     remarks: tuple[str, ...] = ()
     """What a user should know about the file, the same words for the same thing."""
+    up: str = "y"
+    """The upward axis of the file."""
 
 
 @dataclass(frozen=True)
@@ -254,6 +263,7 @@ def look_at(
     clips: list[SeenClip] = []
     failed: list[tuple[str, Dropped]] = []
     remarks: Counter[str] = Counter()
+    rates: list[str] = []
     names: Names = ()
     for name, item in chosen:
         try:
@@ -266,16 +276,18 @@ def look_at(
             continue
         step = max(1, round(seen.fps / _FRAMES_A_SECOND))
         body = np.asarray(seen.joints[::step, :BODY_JOINTS], dtype=np.float64)
-        clips.append(SeenClip(name, body, seen.fps / step, seen.fps))
+        clips.append(SeenClip(name, body, seen.fps / step, seen.fps, seen.up))
+        if wrong := wrong_rate(np.asarray(seen.joints, dtype=np.float64), seen.fps):
+            rates.append(f"{label(item)}: {wrong}")
         remarks.update(seen.remarks)
         names = names or seen.names
     unreadable = Counter(name for name, _ in failed)
-    up = str(getattr(config, "up", "y"))
     found = [
-        _subset(name, [clip for clip in clips if clip.subset == name], unreadable[name], up)
+        _subset(name, [clip for clip in clips if clip.subset == name], unreadable[name])
         for name in dict.fromkeys(name for name, _ in chosen)
     ]
-    problems, warnings, suggestions = _judge(clips, config, names, up)
+    problems, warnings, suggestions = _judge(clips, config, names)
+    warnings += rates
     groups = grouped([drop for _, drop in failed])
     if failed and not clips and len(groups) == 1:
         problems = [f"none could be read: {groups[0]}"]
@@ -315,7 +327,7 @@ def _choose(
     return chosen, len(by_subset)
 
 
-def _subset(name: str, clips: list[SeenClip], unreadable: int, up: str) -> SubsetLook:
+def _subset(name: str, clips: list[SeenClip], unreadable: int) -> SubsetLook:
     stats = stats_of(clips)
     return SubsetLook(
         name=name,
@@ -323,7 +335,7 @@ def _subset(name: str, clips: list[SeenClip], unreadable: int, up: str) -> Subse
         unreadable=unreadable,
         height=round(stats.height, 4) if clips else None,
         upright=round(stats.upright * len(clips)) if clips else 0,
-        head=head_axis(clips, up) if clips else "",
+        head=head_axis(clips) if clips else "",
         above_floor=round(stats.above_floor, 4) if clips else None,
         walking=stats.walking,
         backwards=stats.backwards,
@@ -332,7 +344,7 @@ def _subset(name: str, clips: list[SeenClip], unreadable: int, up: str) -> Subse
 
 
 def _judge(
-    clips: list[SeenClip], config: ConvertConfig, names: Names, up: str
+    clips: list[SeenClip], config: ConvertConfig, names: Names
 ) -> tuple[list[str], list[str], list[Suggestion]]:
     oddities = stats_of(clips).oddities()
     problems = [oddity.text for oddity in oddities if oddity.is_error]
@@ -348,4 +360,4 @@ def _judge(
                 for oddity in stats_of(members).oddities()
                 if oddity.is_error and oddity.kind not in known
             ]
-    return problems, warnings, suggest(clips, config, names, up) if problems else []
+    return problems, warnings, suggest(clips, config, names) if problems else []

@@ -4,7 +4,9 @@ A map file is JSON: one key named after the target skeleton holds rows `[index, 
 `source` is a joint name or a list of names whose mean position is taken (a pair is the midpoint, a repeated
 name weighs more); `null` is a row still to be filled in. Optional are `note`, `unmapped` (joints left out on
 purpose), `unit` and `up` of the files it is for, and `skeleton`: a map with this key is for files of that
-skeleton alone. Only positions cross the map: rest poses and bone axes of the two skeletons differ.
+skeleton alone. The End Site of joint `Foot` is named `End Site of Foot`; `ends` places it for figures that
+have none, in multiples of the distance from the joint's parent. Only positions cross the map: rest poses and
+bone axes of the two skeletons differ.
 Guessed ones come from `convert/bvh/joint_guess`.
 """
 
@@ -13,24 +15,35 @@ from __future__ import annotations
 import difflib
 import json
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from motionloom.datasets.base.files import sha256_of_json
-from motionloom.datasets.motion.bvh.motion import BvhMotion
+from motionloom.datasets.motion.bvh.motion import END, BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config, UserError, read_plain
 
-Unit = Literal["m", "cm", "mm", "inch"]
+NamedUnit = Literal["m", "cm", "mm", "inch", "dm", "foot", "inch/0.45"]
+Unit = NamedUnit | Annotated[float, Field(gt=0, lt=1e6)]
+"""A name, or the metres in a length of the files."""
 Up = Literal["y", "z"]
 
-METRES: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+METRES: dict[NamedUnit, float] = {
+    "m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "dm": 0.1, "foot": 0.3048, "inch/0.45": 0.0254 / 0.45,
+}  # fmt: skip
+"""The last is that of CMU's recordings."""
+
+
+def metres(unit: Unit) -> float:
+    """Metres in a length of files in this unit."""
+    return METRES[unit] if isinstance(unit, str) else unit
+
 
 _ROWS = TypeAdapter(list[tuple[int, str, str | list[str] | None]])
 
@@ -44,6 +57,7 @@ class _About(Config):
     skeleton: str = ""
     unit: Unit | None = None
     up: Up | None = None
+    ends: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
 
 
 def skeleton_key(joints: Sequence[str], parents: Sequence[int]) -> str:
@@ -65,6 +79,8 @@ class JointMap:
     unit: Unit | None = None
     up: Up | None = None
     """What its files are measured in, where it says so."""
+    ends: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """End Sites that the files do not have, by their joints."""
 
     @staticmethod
     def load(path: Path, *, target: str = "smpl22") -> JointMap:
@@ -110,13 +126,14 @@ class JointMap:
             raise UserError(f"{path}: {target} has no row for {', '.join(missing)}")
         about = _About.parse({key: data[key] for key in _About.model_fields if key in data}, str(path))
         rows_in_order = tuple(sources[i] for i in range(len(skeleton)))
-        return JointMap(
-            str(path), skeleton, rows_in_order, about.unmapped, about.skeleton, about.unit, about.up
-        )
+        return JointMap(str(path), skeleton, rows_in_order, **dict(about))
 
     def require_fit(self, joints: Sequence[str], clip: str) -> None:
-        """`UserError` naming `clip` and the first joint of the map that is not among `joints`, or twice."""
-        counts = Counter(joints)
+        """`UserError` naming `clip` and the first joint of the map that is not among `joints`, or twice.
+
+        Whether a joint has an End Site shows when a clip is read.
+        """
+        counts = Counter([*joints, *map(END.format, dict.fromkeys(joints))])
         for name in dict.fromkeys(name for names in self.sources for name in names):
             if counts[name] == 0:
                 near = difflib.get_close_matches(name, joints, n=1, cutoff=0.5)
@@ -130,17 +147,25 @@ class JointMap:
 
         `unit` and `up` describe the file, which does not say them itself; the map's own count before them.
         """
+        joints = self.places(motion) * metres(self.unit or unit)
+        if (self.up or up) == "z":
+            joints = np.stack([joints[..., 0], joints[..., 2], -joints[..., 1]], axis=-1)
+        return joints
+
+    def places(self, motion: BvhMotion) -> NDArray[np.float64]:
+        """Positions of the target's joints [T, N, 3] in the lengths and axes of the file."""
         self.require_fit(motion.joints, motion.name)
-        unit, up = self.unit or unit, self.up or up
+        used = {name for names in self.sources for name in names}
+        if not used <= set(motion.joints):
+            motion = motion.with_ends(self.ends)
         world = motion.positions()
         index = {name: i for i, name in enumerate(motion.joints)}
+        if missing := sorted(used - set(index)):
+            raise UserError(f"{motion.name}: no '{missing[0]}', which {self.where} names")
         joints = world[:, [index[names[0]] for names in self.sources]]
         for joint, names in enumerate(self.sources):
             if len(names) > 1:
                 joints[:, joint] = world[:, [index[name] for name in names]].mean(axis=1)
-        joints *= METRES[unit]
-        if up == "z":
-            joints = np.stack([joints[..., 0], joints[..., 2], -joints[..., 1]], axis=-1)
         return joints
 
 

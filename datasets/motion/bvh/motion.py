@@ -11,8 +11,8 @@ because importers of Blender, Houdini and FBX tools take bone directions and len
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -38,6 +38,9 @@ WRITTEN_ORDER = "ZXY"
 
 CENTIMETRES = 100.0
 
+END = "End Site of {}"
+"""What the End Site of a joint is called where it counts as a joint."""
+
 
 @dataclass(frozen=True)
 class BvhMotion:
@@ -55,10 +58,34 @@ class BvhMotion:
     """The motion block [T, total channels]: lengths and degrees."""
     fps: float
     """1 / frame time, snapped to a whole number where the printed digits allow one (0.0333333 is 30)."""
+    ends: Mapping[int, Sequence[float]] = field(default_factory=dict)
+    """OFFSET [3] of the End Site of the joints that have one."""
 
     @property
     def frames(self) -> int:
         return len(self.values)
+
+    def with_ends(self, made: Mapping[str, Sequence[float]] | None = None) -> BvhMotion:
+        """The same with its End Sites as joints without channels behind the others, named as `END` says.
+
+        `made` are other End Sites of joints, in multiples of the distance from their parents.
+        """
+        bones = np.linalg.norm(self.local_offsets()[0], axis=-1)
+        ends = dict(self.ends)
+        for name, offset in (made or {}).items():
+            if name in self.joints:
+                joint = self.joints.index(name)
+                ends[joint] = (np.asarray(offset) * bones[joint]).tolist()
+        if not ends:
+            return self
+        return replace(
+            self,
+            joints=(*self.joints, *(END.format(self.joints[joint]) for joint in ends)),
+            parents=(*self.parents, *ends),
+            offsets=np.concatenate([self.offsets, np.array(list(ends.values()), dtype=np.float64)]),
+            channels=(*self.channels, *[()] * len(ends)),
+            ends={},
+        )
 
     def local_offsets(self) -> Floats:
         """Translation of every joint against its parent [T, N, 3]: OFFSET, replaced by position channels."""
@@ -153,6 +180,7 @@ def read_bvh(source: Path | str | bytes, *, name: str | None = None) -> BvhMotio
         channels=tuple(joints.channels),
         values=read_values(data, section.body, section.frames, width, where),
         fps=section.fps,
+        ends=joints.ends,
     )
 
 

@@ -50,6 +50,8 @@ class Hierarchy:
     parents: list[int] = field(default_factory=list)
     offsets: list[list[float]] = field(default_factory=list)
     channels: list[tuple[str, ...]] = field(default_factory=list)
+    ends: dict[int, list[float]] = field(default_factory=dict)
+    """OFFSET of the End Site of the joints that have one; of several the first."""
 
 
 def load_text(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
@@ -251,7 +253,11 @@ class _HierarchyParser:
         elif key == "END" and block is not None and in_joint:
             self.pending = -1
         elif key == "OFFSET" and block is not None:
-            self.offsets[block] = self._offset(words)  # of an End Site, -1, only checked
+            offset = self._offset(words)
+            if in_joint:
+                self.offsets[block] = offset
+            else:
+                self.out.ends.setdefault(self.open[-2], offset)
         elif key == "CHANNELS" and block is not None and in_joint:
             self.channels[block] = self._channel_names(words)
         else:

@@ -20,6 +20,7 @@ from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.bvh.joint_map import JointMap, map_text
+from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.canonical import canonicalize, resample
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
@@ -190,6 +191,67 @@ def test_a_guess_needs_no_whole_first_file_and_no_folder(tmp_path: Path) -> None
     toeless(tmp_path / "other")
     with pytest.raises(UserError, match=r"`motionloom data joints a.bvh -o joint_map.json` writes a map"):
         prepare(BvhConfig(source=tmp_path / "other", licence="CC0"))
+
+
+@pytest.mark.parametrize(
+    ("metres", "up", "tells"),
+    [
+        (1.0, "y", "1 m (m)"),
+        (0.1, "z", "0.1 m (dm)"),
+        (0.3048, "y", "0.3048 m (foot)"),
+        (0.0254 / 0.45, "z", "0.05644 m (inch/0.45)"),
+        (0.0254, "y", "0.0254 m (inch)"),
+        (0.018, "z", "no known unit fits"),
+        (0.55, "y", "no known unit fits"),
+    ],
+)
+def test_unit_and_axis_are_settled_by_the_figures(metres: float, up: Any, tells: str, tmp_path: Path) -> None:
+    built = build(LAFAN1)
+    built.points = [point / metres for point in built.points]
+    world = write_figure(tmp_path / "mocap/a.bvh", built, unit="m", up=up, frames=66) * metres
+    # The path through the room is not scaled, so that the root's height is another one: the bones count.
+    prepared = prepare(BvhConfig(source=tmp_path / "mocap", licence="CC0"), out=tmp_path / "out")
+    (note,) = (note for note in prepared.plan.notes if note.startswith("unit by body size, from a.bvh"))
+    assert tells in note
+    assert any("upward axis" in note for note in prepared.plan.notes) is (up == "z")
+    read = prepared.converter.joints(prepared.plan.items[0][1]).joints
+    own = [built.names.index(built.ours[joint][0]) for joint in ("left_hip", "left_knee", "head")]
+    ours = [Skeleton.named("smpl22").index(joint) for joint in ("left_hip", "left_knee", "head")]
+    scale = np.linalg.norm(np.diff(read[:, ours], axis=1), axis=-1) / np.linalg.norm(
+        np.diff(world[:, own], axis=1), axis=-1
+    )
+    # A known unit is exact; a scale by size makes 1.7 m of our 1.55 m figure, within its sway.
+    np.testing.assert_allclose(scale, 1.0, atol=0.15 if "no known" in tells else 1e-4)
+
+
+def test_one_skeleton_in_two_units(tmp_path: Path) -> None:
+    for unit in ("cm", "m"):
+        write_figure(tmp_path / f"mocap/{unit}.bvh", build(LAFAN1), unit=unit, frames=66)
+    assert not convert(tmp_path / "mocap", tmp_path / "out").dropped
+    joints = joints_by_id(tmp_path / "out")
+    np.testing.assert_allclose(joints["cm"], joints["m"], atol=1e-4)
+
+
+@pytest.mark.parametrize("pose", ["T", "A", "the same", "bent"])
+def test_an_added_first_pose_is_left_out(pose: str, tmp_path: Path) -> None:
+    """A rest pose in front of a motion that begins elsewhere; not a first frame that belongs to it."""
+    path = tmp_path / "mocap/a.bvh"
+    write_figure(path, build(LAFAN1, a_pose=pose == "A"), frames=66)
+    plain = read_bvh(path)
+    head, _, body = path.read_text().partition("Frames: 66")
+    lines = body.splitlines()
+    rest = [0.0] * plain.values.shape[1]
+    rest[:3] = plain.values[0, :3] + [0.0, 0.0, 40.0]
+    start = 6 if pose == "the same" else 0  # a step among steps
+    first = lines[2].split() if start else list(map(str, rest))
+    if pose == "bent":
+        first[3 + 3 * plain.joints.index("LeftLeg") + 2] = "70"
+    path.write_text("\n".join([f"{head}Frames: 67", lines[1], " ".join(first), *lines[2:]]) + "\n")
+    manifest = convert(tmp_path / "mocap", tmp_path / "out", look=0)
+    told = any("added T-pose" in note for note in manifest.notes)
+    assert told is (pose in "TA")
+    (frames,) = (shard.frames for shard in manifest.shards if shard.samples)
+    assert frames == len(np.arange(0, (66 if told else 67) / 60 - 1e-9, 1 / 20))
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from foreign_figures import UNITS, Built, build, write_figure
 from foreign_tools import FOREIGN, OTHERS, Foreign
 
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
+from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.skeleton import Skeleton
 
@@ -87,9 +88,6 @@ def test_missing_joints_are_means_or_open(tmp_path: Path) -> None:
         "Head",
         "Head",
     )
-    toeless = Foreign("x", (), spec.trunk, spec.neck, spec.leg[:3], spec.arm)
-    guess = guess_joint_map(clip(tmp_path, build(toeless)), BODY)
-    assert [row.joint for row in guess.open_rows] == ["left_foot", "right_foot"]
     headless = Foreign("x", (), spec.trunk, ("bone1@neck", "bone2@a2", "bone3@head"), spec.leg, spec.arm)
     guess = guess_joint_map(clip(tmp_path, build(headless)), BODY)
     assert "neck (bone1 or bone2 or bone3?), head (bone1 or bone2 or bone3?)" in guess.doubts()
@@ -97,6 +95,56 @@ def test_missing_joints_are_means_or_open(tmp_path: Path) -> None:
     guess = guess_joint_map(clip(tmp_path, build(handless)), BODY)
     assert "found no arms" in guess.doubts()
     assert sources(guess)["left_knee"] == ("LeftLeg",), "what is certain is filled in"
+
+
+@pytest.mark.parametrize("end", [None, "on the ankle", "the heel", "the ball"])
+@pytest.mark.parametrize("style", STYLES[:3], ids=str)
+def test_feet_without_a_toe_are_end_sites_or_estimated(
+    end: str | None, style: dict[str, Any], tmp_path: Path
+) -> None:
+    spec = BY_TOOL["LAFAN1"]
+    built = build(Foreign("x", (), spec.trunk, spec.neck, spec.leg[:3], spec.arm))
+    truth = build(spec)
+    style = {key: value for key, value in style.items() if key != "a_pose"}
+    world = write_figure(tmp_path / "whole.bvh", truth, frames=40, **style)
+    whole = read_bvh(tmp_path / "whole.bvh")
+    joints = [whole.joints.index(name) for name in built.names]
+    ends = {}
+    for side in ("Left", "Right"):
+        ankle, toe = whole.joints.index(f"{side}Foot"), whole.joints.index(f"{side}Toe")
+        places = {"on the ankle": 0.0, "the heel": -0.5, "the ball": 1.0}
+        if end is not None:
+            ends[joints.index(ankle)] = places[end] * whole.offsets[toe]
+    columns = [c for j in joints for c in range(*(np.cumsum([0, *map(len, whole.channels)])[[j, j + 1]]))]
+    motion = BvhMotion(
+        "a.bvh", tuple(built.names), tuple(built.parents), whole.offsets[joints],
+        tuple(whole.channels[j] for j in joints), whole.values[:, columns], whole.fps, ends,
+    )  # fmt: skip
+    guess = guess_joint_map(motion, BODY)
+    row = {row.joint: row for row in guess.rows}["left_foot"]
+    assert guess.certain and row.sources == ("End Site of LeftFoot",)
+    assert (row.how, bool(guess.ends)) == (("end", False) if end == "the ball" else ("estimate", True))
+    written = tmp_path / "map.json"
+    written.write_text(guess.text(), encoding="utf-8")
+    found = JointMap.load(written).apply(motion, unit=style["unit"], up=style.get("up", "y"))
+    wanted = world[:, [truth.names.index(f"{side}Toe") for side in ("Left", "Right")]]
+    # The reader's own rounding; or our neutral foot under swinging hips and knees.
+    bound = 1e-4 if end == "the ball" else 0.08
+    assert np.linalg.norm(found[:, [10, 11]] - wanted, axis=-1).max() < bound
+
+
+@pytest.mark.parametrize("spec", [*FOREIGN, *OTHERS], ids=lambda spec: spec.tool)
+def test_lower_case_and_prefixed_names(spec: Foreign) -> None:
+    built = build(spec)
+    above = [built.points[max(parent, 0)] for parent in built.parents]
+    offsets = np.array(built.points) - np.array(above)
+    channels = (("Xposition",), *[()] * (len(offsets) - 1))
+    for change in (str.lower, "Actor1_{}".format, "ns|x:{}".format):
+        names, rest = tuple(map(change, built.names)), np.zeros((1, 1))
+        motion = BvhMotion("a.bvh", names, tuple(built.parents), offsets, channels, rest, 30.0)
+        guess = guess_joint_map(motion, BODY)
+        assert guess.certain, guess.doubts()
+        assert sources(guess) == {joint: tuple(map(change, built.ours[joint])) for joint in BODY.joints}
 
 
 def test_unknown_toes_and_collars_follow_from_the_tree(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -205,16 +206,17 @@ def test_convert_plans_and_converts(tmp_path: Path, call: Call) -> None:
     assert strict.code == 2 and "frame_time_zero.bvh" in strict.err and "Frame Time" in strict.err
 
 
-def test_a_forgotten_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, call: Call) -> None:
+def test_a_wrong_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, call: Call) -> None:
     source, out = tmp_path / "mocap", tmp_path / "out"
     for seed in range(3):
         write_clip(source / f"{seed}.bvh", seed, z_up=True)
     joint_map = write_map(tmp_path / "joint_map.json")
-    more = ("--joint-map", joint_map, "--licence", "CC0", "--workers", 1)
+    more = ("--joint-map", joint_map, "--licence", "CC0", "--workers", 1, "--up", "y")
     words = ("data", "convert", "bvh", source, out, *more)
     plan = call(*words, "--plan")
     assert plan.code == 0 and not out.exists()
     assert "0 of 3, along +z of the files" in plan.out and "try: --up z" in plan.out
+    assert plan.out.rstrip().endswith(f"--joint-map {joint_map} --up z")
     refused = call(*words)
     assert refused.code == 2 and "no people standing on a floor" in refused.err and "--up z" in refused.err
     assert call(*words, "--up", "z").code == 0
@@ -223,6 +225,33 @@ def test_a_forgotten_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, c
     lying = tmp_path / "lying"
     assert call(*words[:4], lying, *more, "--set", "look=0").code == 0
     assert call("data", "check", lying).code == 1
+
+
+ODD = {
+    "freebvh": 1, "momask_template": 1, "sfu_affective_vicon": 1, "virvig_dancedb_metres": 1,
+    "makehuman_blender": 0, "": 4,
+}  # fmt: skip
+"""Files of other makers, each in a unit, with an axis and names of its own, and their folder: clips of each;
+one has a single frame."""
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_the_line_that_a_plan_proposes_converts_files_of_other_makers(
+    name: str, shared: Path, tmp_path: Path, call: Call
+) -> None:
+    source = shared / "data/real/odd_bvh" / (f"{name}.bvh" if name else "")
+    plan = call("data", "convert", "bvh", source, tmp_path / "out", "--plan", "--set", "look=9")
+    assert plan.code == 0, plan.err
+    (line,) = (line for line in plan.out.splitlines() if "convert" in line.split("│")[0])
+    if not ODD[name]:
+        assert line == "nothing of it can be converted"
+        return
+    assert "problem:" not in plan.out
+    words = shlex.split(line.removeprefix("convert it: "))
+    assert words[:2] == ["motionloom", "data"] and "--licence" in words
+    assert call(*words[1:]).code == 0
+    manifest = Manifest.load_json(tmp_path / "out" / "manifest.json")
+    assert sum(shard.samples for shard in manifest.shards) == ODD[name]
 
 
 def test_joints_of_a_skeleton_and_of_a_file(tmp_path: Path, call: Call) -> None:

@@ -72,6 +72,9 @@ Unreal mannequin | pelvis spine1 spine2 spine3 spine4 spine5 | neck1 head | thig
 Bandai-Namco, Unity, VRM | hips spine chest upperchest | neck head | upperleg lowerleg foot toes | shoulder upperarm lowerarm hand
 3ds Max Biped | pelvis spine spine1 spine2 | neck head | thigh calf foot toe0 | clavicle upperarm forearm hand
 DAZ, Poser | hip abdomen chest | neck head | thigh shin foot toe | collar shldr forearm hand
+DAZ Genesis 3, 8 | hip abdomenlower abdomenupper chestlower chestupper | necklower head | thighbend shin foot toe | collar shldrbend forearmbend hand
+MakeHuman (CMU rig) | root spine1 spine2 spine3 | neck head | upleg loleg foot toe | clavicle uparm loarm hand
+MakeHuman (default rig) | root spine5 spine4 spine3 spine2 spine1 | neck1 head | upperleg1 lowerleg1 foot toe11 | clavicle upperarm1 lowerarm1 wrist
 Kinect | spinebase spinemid spineshoulder | neck head | hip knee ankle foot | - shoulder elbow wrist
 """  # noqa: E501 (a table)
 """Tool | pelvis, spine upwards | neck, head | leg | arm; `-` is a joint that the tool does not have."""
@@ -90,6 +93,10 @@ _FINGERS = {
     ),
     "Xsens MVN (segments)": FingerWords(
         ("second", "third", "fifth", "fourth", "first"), ("pp", "mp", "dp"), ("mc", "pp", "dp")
+    ),
+    "MakeHuman (CMU rig)": _PLAIN,
+    "MakeHuman (default rig)": FingerWords(
+        ("finger2", "finger3", "finger5", "finger4", "finger1"), ("1", "2", "3"), ("1", "2", "3")
     ),
     "Blender Rigify": FingerWords(("findex", "fmiddle", "fpinky", "fring", "thumb"), _FOUR, _FOUR),
     "SMPL, SMPL-H, SMPL-X": _PLAIN,
@@ -112,6 +119,8 @@ _ENDS = ("end", "leaf", "nub", "site", "tip", "top")
 _HANDLES = ("ctrl", "eff", "effector", "helper", "ik", "pole", "prop", "target", "weapon")
 SPARE_WORDS = frozenset([*_ENDS, *_HANDLES, "eye", "jaw", "roll", "twist"])
 """A name with one of these words is no joint of the body: ends of chains, twist bones, handles."""
+_HELPER = re.compile(r"(?:^|.*[:|/_])__(?=[^_])")
+"""MakeHuman's `__UpLeg_L` is a helper above `UpLeg_L`."""
 
 SIDE_WORDS = {"left": "left", "lft": "left", "l": "left", "right": "right", "rgt": "right", "r": "right"}
 
@@ -142,7 +151,11 @@ def read_names(joints: Sequence[str]) -> tuple[JointName, ...]:
         while common := _common(pieces, end):
             trimmed = slice(1, None) if end == 0 else slice(None, -1)
             pieces = [p[trimmed] if len(p) > 1 and p[end] == common else p for p in pieces]
-    return tuple(_read(p) for p in pieces)
+    read = map(_read, pieces)
+    return tuple(
+        replace(one, spare=one.spare or bool(_HELPER.match(name)))
+        for one, name in zip(read, joints, strict=True)
+    )
 
 
 @cache
@@ -171,9 +184,12 @@ def _common(pieces: list[list[str]], end: int) -> str:
 def _read(pieces: list[str]) -> JointName:
     sides = {SIDE_WORDS[piece] for piece in pieces if piece in SIDE_WORDS}
     word = "".join(piece for piece in pieces if piece not in SIDE_WORDS)
-    # `lfemur`: the letter of the side stands before a word without anything between.
-    if not sides and word not in vocabulary() and word[:1] in ("l", "r") and word[1:] in vocabulary():
-        sides, word = {SIDE_WORDS[word[0]]}, word[1:]
+    if not sides and word not in vocabulary():  # `lfemur`, `leftupleg`, `hipleft`: nothing stands between
+        for side_word in sorted(SIDE_WORDS, key=len, reverse=True):
+            cut = {word.removeprefix(side_word), word.removesuffix(side_word)} & vocabulary()
+            if cut:
+                sides, word = {SIDE_WORDS[side_word]}, cut.pop()
+                break
     side: Side = ""
     if len(sides) == 1:
         side = "left" if "left" in sides else "right"
@@ -189,22 +205,31 @@ SAME_PLACE = 2e-3
 
 @dataclass(frozen=True)
 class Figure:
-    """Joints of one clip; parents come before children."""
+    """Joints of one clip, its End Sites behind the others; parents come before children."""
 
     joints: tuple[str, ...]
     parents: tuple[int, ...]
     poses: NDArray[np.float64]
     """Positions [K, N, 3] in some frames of the clip."""
+    motion: BvhMotion
+    """These frames."""
 
     @staticmethod
     def of(motion: BvhMotion) -> Figure:
         chosen = np.unique(np.linspace(0, motion.frames - 1, POSES).round().astype(int))
         few = replace(motion, values=motion.values[chosen])
-        return Figure(motion.joints, motion.parents, few.positions())
+        ended = few.with_ends()
+        return Figure(ended.joints, ended.parents, ended.positions(), few)
 
     @cached_property
     def names(self) -> tuple[JointName, ...]:
-        return read_names(self.joints)
+        own = self.motion.joints
+        return (*read_names(own), *[JointName("", "", True)] * (len(self.joints) - len(own)))
+
+    def end_of(self, joint: int) -> int | None:
+        """The End Site of a joint."""
+        ends = range(len(self.motion.joints), len(self.joints))
+        return next((end for end in ends if self.parents[end] == joint), None)
 
     @cached_property
     def children(self) -> tuple[tuple[int, ...], ...]:

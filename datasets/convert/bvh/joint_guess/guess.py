@@ -1,6 +1,7 @@
 """Guess the joint map of any figure: names first, checked and completed by its tree.
 
-1. Legs and arms by the words of their names along a chain (`limbs.py`).
+1. Legs and arms by the words of their names along a chain (`limbs.py`), their feet also at End Sites
+   (`feet.py`).
 2. Pelvis, spine, neck and head between and above them, fingers below the wrists.
 3. A joint that is missing between two others is a mean of its neighbours.
 
@@ -12,10 +13,11 @@ backwards (`datasets/motion/plausibility.py`).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
+from motionloom.datasets.convert.bvh.joint_guess.feet import with_feet
 from motionloom.datasets.convert.bvh.joint_guess.figure import CONVENTIONS, Figure
 from motionloom.datasets.convert.bvh.joint_guess.limbs import (
     How,
@@ -29,7 +31,7 @@ from motionloom.datasets.convert.bvh.joint_guess.limbs import (
     roots,
 )
 from motionloom.datasets.motion.bvh.joint_map import JointMap, map_text
-from motionloom.datasets.motion.bvh.motion import BvhMotion
+from motionloom.datasets.motion.bvh.motion import END, BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 
 
@@ -58,6 +60,8 @@ class JointGuess:
     """Source joints that stand for nothing."""
     problems: tuple[str, ...]
     """What contradicts the rows, each a clause."""
+    ends: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Estimated End Sites, as in a joint map."""
 
     @property
     def open_rows(self) -> tuple[GuessedJoint, ...]:
@@ -72,12 +76,16 @@ class JointGuess:
         """The map, if it is certain; errors name it `where`."""
         if not self.certain:
             raise ValueError(f"{self.source}: the guess is not certain: {self.doubts()}")
-        return JointMap(where, self.target, tuple(row.sources for row in self.rows), self.unmapped)
+        rows = tuple(row.sources for row in self.rows)
+        return JointMap(where, self.target, rows, self.unmapped, ends=self.ends)
 
     def summary(self) -> str:
         """How the joints were found, in one line."""
         counts: Counter[str] = Counter(row.how for row in self.rows)
-        kinds = {"name": "by name", "hierarchy": "by hierarchy", "mean": "as means", "missing": "open"}
+        kinds = {
+            "name": "by name", "hierarchy": "by hierarchy", "mean": "as means", "end": "at End Sites",
+            "estimate": "estimated (the feet)", "missing": "open",
+        }  # fmt: skip
         found = ", ".join(f"{counts[how]} {text}" for how, text in kinds.items() if counts[how])
         return f"{found}; {len(self.unmapped)} of the source's joints stand for nothing"
 
@@ -98,7 +106,8 @@ class JointGuess:
             note += f". NOT CERTAIN: {self.doubts()}. {todo}"
         sources: list[tuple[str, ...] | None] = [row.sources or None for row in self.rows]
         candidates = {row.joint: list(row.candidates) for row in self.open_rows if row.candidates}
-        more = {key: value for key, value in (("skeleton", skeleton), ("candidates", candidates)) if value}
+        about = (("skeleton", skeleton), ("candidates", candidates), ("ends", dict(self.ends)))
+        more = {key: value for key, value in about if value}
         return map_text(self.target, sources, note=note, unmapped=self.unmapped, **more)
 
 
@@ -119,31 +128,13 @@ def guess_joint_map(motion: BvhMotion, target: Skeleton) -> JointGuess:
         _fill_limbs(legs or arms, rows)
         _fill_by_words(figure, rows)
     else:
-        legs = _with_feet(figure, legs, rows)
+        legs = with_feet(figure, legs, rows)
         fill_trunk(figure, legs, arms, rows)
         _fill_limbs((*legs, *arms), rows)
         _fill_collars(figure, arms, rows)
         for arm in arms:
             fill_fingers(figure, arm, rows)
     return _guess(figure, motion.name, target, rows, problems)
-
-
-def _with_feet(figure: Figure, legs: Limbs, rows: Rows) -> Limbs:
-    """Legs whose fourth slot, where no name filled it, is the only joint that follows on the ankle."""
-    done: list[Limb] = []
-    for leg in legs:
-        ankle, toe = leg.slots[2], leg.slots[3]
-        assert ankle is not None
-        below = figure.children[ankle]
-        while toe is None and len(below) == 1:
-            toe = None if figure.coincide(below[0], ankle) else below[0]
-            below = figure.children[below[0]]
-        if toe is not None and leg.slots[3] is None:
-            rows.put(f"{leg.side}_foot", [toe], "hierarchy")
-        elif toe is None:
-            rows.doubt(f"{leg.side}_foot", below)
-        done.append(replace(leg, slots=(*leg.slots[:3], toe)))
-    return done[0], done[1]
 
 
 def _fill_limbs(limbs: Iterable[Limb] | None, rows: Rows) -> None:
@@ -197,11 +188,14 @@ def _guess(figure: Figure, source: str, target: Skeleton, rows: Rows, problems: 
     for joint in target.joints:
         how = rows.how[joint] if joint in rows.sources else "missing"
         candidates = named(rows.candidates.get(joint, ()))
-        made.append(GuessedJoint(joint, named(rows.sources.get(joint, ())), how, candidates))
+        sources = named(rows.sources.get(joint, ()))
+        sources = tuple(map(END.format, sources)) if how == "estimate" else sources
+        made.append(GuessedJoint(joint, sources, how, candidates))
     used = {name for row in made for name in row.sources}
     counts = Counter(figure.joints)
     twice = sorted(name for name in used if counts[name] > 1)
     if twice:
         problems.append(f"{', '.join(twice)}: two joints of one name")
-    unmapped = tuple(name for name in dict.fromkeys(figure.joints) if name not in used)
-    return JointGuess(source, target, tuple(made), unmapped, tuple(problems))
+    unmapped = tuple(name for name in dict.fromkeys(figure.motion.joints) if name not in used)
+    ends = {figure.joints[joint]: offset for joint, offset in rows.ends.items()}
+    return JointGuess(source, target, tuple(made), unmapped, tuple(problems), ends)

@@ -14,7 +14,7 @@ import numpy as np
 from motionloom.datasets.convert.bvh.joint_guess.figure import CONVENTIONS, FINGERS, Figure
 
 Kind = Literal["leg", "arm"]
-How = Literal["name", "hierarchy", "mean"]
+How = Literal["name", "hierarchy", "mean", "end", "estimate"]
 
 _ESSENTIAL: dict[Kind, tuple[int, int, int]] = {"leg": (0, 1, 2), "arm": (1, 2, 3)}
 """Slots of the two long bones: hip, knee, ankle; shoulder, elbow, wrist. The fourth can be completed."""
@@ -102,9 +102,13 @@ class Rows:
     sources: dict[str, tuple[int, ...]] = field(default_factory=dict)
     how: dict[str, How] = field(default_factory=dict)
     candidates: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    ends: dict[int, tuple[float, float, float]] = field(default_factory=dict)
+    """Estimated End Sites of joints, in multiples of the distance from their parents."""
 
     def put(self, joint: str, sources: Iterable[int], how: How) -> None:
-        """`joint` is the mean of these; a source that appears twice weighs twice."""
+        """`joint` is the mean of these; a source that appears twice weighs twice. `estimate` means the
+        estimated End Site of its source.
+        """
         self.sources[joint], self.how[joint] = tuple(sources), how
 
     def doubt(self, joint: str, candidates: Iterable[int]) -> None:

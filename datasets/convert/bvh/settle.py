@@ -1,0 +1,80 @@
+"""What a motion file does not say, by the figures in it: unit, upward axis, and an added first frame.
+
+A unit is the known one that makes the most ordinary adult of the figure; where none makes a person at all,
+the scale that makes it 1.7 m tall. The upward axis is that along which heads are above pelvises in most
+frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.bvh.joint_map import METRES, JointMap, NamedUnit, Unit, Up, metres
+from motionloom.datasets.motion.bvh.motion import BvhMotion
+from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
+from motionloom.datasets.motion.skeleton import Skeleton
+
+ADULT_METRES = 1.7
+_ABOVE = 0.8
+"""Cosine between an axis and the way from pelvis to head from which a figure stands along it."""
+_JUMP_METRES, _JUMP_TIMES = 0.05, 5.0
+"""An added frame is so far from the second one, and so much further than the next ones from each other."""
+_NEXT = 10
+_STRAIGHT = 0.98
+"""Share of their bones' length that stretched limbs reach."""
+_SPREAD = 0.3
+"""Cosine between both arms, at most: 90 degrees in an A-pose, 180 in a T-pose."""
+
+_NAMED = Skeleton.named("smpl22")
+_ARMS, _LEGS = (
+    [[_NAMED.index(f"{side}_{joint}") for joint in joints] for side in ("left", "right")]
+    for joints in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
+)
+_PELVIS, _HEAD = _NAMED.index("pelvis"), _NAMED.index("head")
+
+
+def named_unit(height: float) -> NamedUnit | None:
+    """The known unit in which a figure of this height in lengths of the file is a person, if any is."""
+    fits = [unit for unit, size in METRES.items() if PERSON_METRES[0] <= height * size <= PERSON_METRES[1]]
+    return min(fits, key=lambda unit: abs(np.log(height * METRES[unit] / ADULT_METRES)), default=None)
+
+
+def up_of(clips: Sequence[NDArray[np.floating]]) -> Up:
+    """The upward axis of some clips of joints [T, N, 3] in the axes of their files."""
+    trunks = np.concatenate([clip[:, _HEAD] - clip[:, _PELVIS] for clip in clips])
+    trunks /= np.maximum(np.linalg.norm(trunks, axis=-1, keepdims=True), 1e-9)
+    along = (trunks > _ABOVE).sum(axis=0)
+    return "z" if along[2] > along[1] else "y"
+
+
+def settled(joint_map: JointMap, motions: Sequence[BvhMotion]) -> tuple[Unit, Up, float]:
+    """Unit and upward axis of a skeleton's files, by some of its clips, and the median height in metres."""
+    clips = [joint_map.places(motion) for motion in motions]
+    heights = [measure(clip, motion.fps).height for clip, motion in zip(clips, motions, strict=True)]
+    height = float(np.median(heights))
+    unit = joint_map.unit or named_unit(height) or float(f"{ADULT_METRES / max(height, 1e-6):.4g}")
+    return unit, joint_map.up or up_of(clips), height * metres(unit)
+
+
+def is_added_pose(joints: NDArray[np.floating]) -> bool:
+    """Whether the first frame of joints [T, N, 3] in metres is a T- or A-pose that some writers put in front.
+
+    The motion itself then begins with a jump.
+    """
+    if len(joints) < 4:
+        return False
+    steps = np.linalg.norm(np.diff(joints[: _NEXT + 2], axis=0), axis=-1).max(axis=-1)
+    if steps[0] < max(_JUMP_METRES, _JUMP_TIMES * float(steps[1:].max())):
+        return False
+    arms, legs = joints[0][_ARMS], joints[0][_LEGS]
+    ways = arms[:, 2] - arms[:, 0]
+    cosine = float(ways[0] @ ways[1] / max(float(np.prod(np.linalg.norm(ways, axis=-1))), 1e-9))
+    return cosine < _SPREAD and all(_is_straight(limb) for limb in (*arms, *legs))
+
+
+def _is_straight(limb: NDArray[np.floating]) -> bool:
+    bones = np.linalg.norm(np.diff(limb, axis=0), axis=-1).sum()
+    return float(np.linalg.norm(limb[2] - limb[0])) > _STRAIGHT * float(bones)
