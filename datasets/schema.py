@@ -185,6 +185,19 @@ class Dropped(Config):
     motion or of texts, that is damaged. `missing`: listed somewhere, but not in the source."""
 
 
+class AuditRow(Config):
+    """One number that the makers of a set state, and what was found and converted of it."""
+
+    what: str
+    stated: float
+    by: str
+    """Where it is stated."""
+    found: float
+    taken: float
+    why: str = ""
+    """Why the others were left out."""
+
+
 class Manifest(Config):
     """`manifest.json` beside the shards; written last, so a folder without one is unfinished."""
 
@@ -205,3 +218,5 @@ class Manifest(Config):
     audio: dict[str, Any] | None = None
     """Settings the audio features were made with; a model trained on them keeps these."""
     notes: list[str] = []
+    audit: list[AuditRow] = []
+    """What the makers of the source say there is, for sources with published numbers."""

@@ -205,6 +205,7 @@ class DatasetWriter(Generic[T]):
             licences=facts.licences,
             audio=facts.audio,
             notes=list(facts.notes),
+            audit=list(facts.audit),
         )
         if self._how.part is None:
             write_left_out(self.out, manifest.dropped)

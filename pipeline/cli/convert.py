@@ -39,7 +39,8 @@ _REASONS = 12
 
 _EVERYDAY = (
     "layout", "fps", "licence", "limit", "use", "subsets", "captions", "splits", "uncaptioned", "joint_map",
-    "unit", "up", "music", "body_model", "humanml_index", "humanml_texts",
+    "unit", "up", "music", "body_model", "humanml_index", "humanml_texts", "where", "sound", "tasks",
+    "variant",
 )  # fmt: skip
 """Fields with an option of their own, where a converter has them."""
 
@@ -278,6 +279,8 @@ def proposed(
 def _say_plan(plan: ConversionPlan[Any], console: Console) -> None:
     """Print the plan, and what a few clips showed."""
     console.print(plan.table())
+    if (audit := plan.audit_table()) is not None:
+        console.print(audit)
     if plan.look is None:
         return
     console.print(plan.look.table())

@@ -16,10 +16,10 @@ from rich.progress import track
 
 from motionloom.datasets.audio.sound import sound_seconds
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.music import SOUND_SUFFIXES, SoundConfig
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.splits import hash_split, join_splits, read_ids
 from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
@@ -81,13 +81,12 @@ MUSIC_LICENCE = "CC-BY-4.0 AND LicenseRef-AIST-Dance-DB"
 grant; shards that hold sound, or features made from it, stand under both.
 """
 MOTIONS = "motions"
-SOUND_SUFFIXES = (".wav", ".flac", ".mp3", ".ogg")
 
 SEQUENCE = re.compile(r"g([A-Z]{2})_s([A-Z]{2})_c(?:All|\d\d)_d(\d+)_m([A-Z]{2}\d+)_ch(\d+)")
 """Genre, situation (BM basic, FM advanced), dancer, music, choreography."""
 
 
-class AistppConfig(ConvertConfig):
+class AistppConfig(SoundConfig):
     """Options of the AIST++ converter; `source` is the folder of the annotations, with motions/ in it."""
 
     layouts = ("body133", "h3d263", "smpl75")
@@ -110,14 +109,6 @@ class AistppConfig(ConvertConfig):
     """Folder of `<sequence>.wav` or `<music>.wav` (also flac, mp3, ogg); default: wavs/ in the source."""
     music_offset: float = Field(default=0.0, ge=0)
     """Second of the music at which the motion begins."""
-    max_music_gap: float = Field(default=1.0, ge=0)
-    """Seconds of motion that may be cut where the music ends first; beyond that the sequence is left out."""
-    audio_features: bool = True
-    """Store the 438 audio features."""
-    audio_fps: float | None = Field(default=None, gt=0)
-    """Rows of audio features a second; default: one for every motion frame. The published ones have 60."""
-    sound_rate: int = Field(default=16_000, ge=0, le=192_000)
-    """Sample rate at which the sound itself is stored; 0 leaves it out."""
     caption_genre: bool = False
     """Give every clip the caption "a dancer performs ...", by the genre in its name."""
     body_model: Path | None = None
@@ -145,6 +136,12 @@ class AistClip:
     sound: str | None
     """Name of the music file in its folder."""
     licence: str
+
+    @property
+    def facts(self) -> dict[str, str | float]:
+        genre, situation, dancer, music, choreography = _fields(self.id)
+        named = {"genre": genre, "situation": situation, "dancer": dancer, "music": f"m{music}"}
+        return {**named, "choreography": choreography, "seconds": self.used / FPS}
 
     def label(self) -> str:
         return f"{MOTIONS}/{self.id}.pkl"

@@ -172,6 +172,11 @@ class AmassClip:
     def seconds(self) -> float:
         return (self.last - self.first) / self.fps
 
+    @property
+    def facts(self) -> dict[str, str | float]:
+        about = {"subset": self.file.subset, "gender": self.header.gender, "model": self.header.kind}
+        return {**about, "seconds": self.seconds, "fps": self.fps}
+
     def label(self) -> str:
         return self.file.label if self.id == self.file.id else f"{self.file.label} ({self.id})"
 

@@ -76,7 +76,8 @@ def read_motion_header(path: Path, label: str) -> MotionHeader:
             frames = _matrix(file, "root_orient", 3)[0]
             for part in ("pose_body", "pose_hand")[: 1 + hands]:
                 _same(label, part, _matrix(file, part, _PARTS[part])[0], frames)
-        _same(label, "trans", _matrix(file, "trans", 3)[0], frames)
+        trans = _trans(file)
+        _same(label, trans, _matrix(file, trans, 3)[0], frames)
         if frames < 1:
             raise UserError(f"{label}: no frames")
         if "betas" in file.names and len(file.header("betas").shape) not in (1, 2):
@@ -107,13 +108,18 @@ def read_motion(
                 check_values(parts[-1], MAX_ANGLE, f"{label}: {name}", first_frame=first)
             parts = [np.concatenate(parts[:2], axis=1), *parts[2:]]
             extra = np.zeros((len(parts[0]), 6))
-        trans = file.numbers("trans")[frames]
+        trans = file.numbers(_trans(file))[frames]
         check_values(trans, MAX_METRES, f"{label}: trans", first_frame=first)
         betas = _betas(file) if "betas" in file.names else None
     rotations = np.concatenate(parts, axis=1) if hands else parts[0]
     if palms:
         rotations = np.concatenate([rotations, extra], axis=1)
     return SmplMotion(rotations.reshape(len(rotations), -1, 3), trans, betas)
+
+
+def _trans(file: NpzFile) -> str:
+    """AMASS's name of the translation, or the other one (`transl`) where only that is there."""
+    return "transl" if "transl" in file.names and "trans" not in file.names else "trans"
 
 
 def _matrix(file: NpzFile, name: str, width: int | None) -> tuple[int, int]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -23,6 +24,7 @@ from motionloom.datasets.convert.bvh.plan import (
     read_motion,
 )
 from motionloom.datasets.convert.bvh.settle import is_added_pose, named_unit
+from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.feature_step import FeatureBatch, FeatureStep
 from motionloom.datasets.convert.common.features import features_of
@@ -56,7 +58,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         self.maps: JointMaps = {}
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[BvhClip]:
-        plan, self.maps = plan_bvh(self.config, self.given, settings)
+        plan, self.maps = plan_bvh(self.config, self.given, settings, Audit(self.published))
         return plan
 
     def depends_on(self, clip: BvhClip) -> list[object]:
@@ -65,7 +67,9 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     def _content(self, clip: BvhClip) -> str:
         """Digest of a clip's file and of how its joints are read."""
         used = self.maps.get(clip.found.skeleton)
-        return sha256_of_json([clip.found.sha256, [used.sources, used.unit, used.up] if used else None])
+        made_from = [clip.found.sha256, [used.sources, used.unit, used.up] if used else None]
+        cut = self.config.cut(clip.label())
+        return sha256_of_json(made_from if cut == slice(None) else [*made_from, cut.start, cut.stop])
 
     def licence(self, plan: ConversionPlan[BvhClip]) -> str:
         return self.config.licence or ""
@@ -94,7 +98,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     def joints(self, clip: BvhClip) -> SourceJoints:
         """The joints as the map reads them, and the joints that no row of it names."""
-        motion = read_motion(self._read(clip), clip.label())
+        motion = self._motion(self._read(clip), clip.label())
         joint_map = self._map_of(motion)
         joints = self._world(motion, joint_map)
         used = {name for names in joint_map.sources for name in names}
@@ -113,7 +117,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     def encode(self, label: str, data: bytes) -> NDArray[np.float32]:
         """Features [T', D] of one file; `label` names it in errors."""
         config = self.config
-        motion = read_motion(data, label)
+        motion = self._motion(data, label)
         joint_map = self._map_of(motion)
         joints = self._world(motion, joint_map)
         try:
@@ -142,6 +146,10 @@ class Bvh(Converter[BvhConfig, BvhClip]):
             if own is not None and not PERSON_METRES[0] <= height <= PERSON_METRES[1]:
                 joints *= metres(own) / metres(unit)
         return joints[int(is_added_pose(joints)) :]
+
+    def _motion(self, data: bytes, label: str) -> BvhMotion:
+        motion = read_motion(data, label)
+        return replace(motion, values=motion.values[self.config.cut(label)])
 
     def _map_of(self, motion: BvhMotion) -> JointMap:
         try:

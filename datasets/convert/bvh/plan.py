@@ -20,11 +20,13 @@ from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
 from motionloom.datasets.convert.bvh.settle import is_added_pose, settled
 from motionloom.datasets.convert.captions.options import CaptionConfig, CaptionedPlan, settle_captions
+from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.scan import Batch, BatchScan, FoundFile, list_batches, scan_batches
+from motionloom.datasets.convert.common.where import Fact, Facts
 from motionloom.datasets.motion.bvh.asf import FPS, JOINED, count_frames, read_amc, skeleton_of
 from motionloom.datasets.motion.bvh.joint_map import (
     JointMap,
@@ -222,6 +224,18 @@ class BvhConfig(CaptionConfig):
     have none, and each clip gets hands at rest, which count as motion (`resting`) or do not (`missing`).
     """
 
+    def batches(self) -> list[Batch]:
+        """Where the motion files are."""
+        return list_batches(self.source)
+
+    def about(self, path: str) -> Facts:
+        """What metadata of the set say of a file; nothing for plain folders."""
+        return {}
+
+    def cut(self, label: str) -> slice:
+        """The frames of a file that are its clip."""
+        return slice(None)
+
     def mapped_skeleton(self) -> Skeleton:
         """The skeleton that the joint map reads: without fingers where the files have none."""
         own = self.motion_layout().skeleton
@@ -239,6 +253,10 @@ class BvhClip:
     id: str
     split: Split
     texts: tuple[Caption, ...]
+    frames: int
+    """Of the file that are used."""
+    fps: float
+    about: Facts
 
     @property
     def subset(self) -> str:
@@ -246,26 +264,31 @@ class BvhClip:
         folders = PurePosixPath(self.found.path).parts[:-1]
         return self.batch.archive or (folders[0] if folders else "")
 
+    @property
+    def facts(self) -> dict[str, Fact]:
+        seconds = self.frames / self.fps
+        return {"subset": self.subset, "seconds": seconds, "fps": self.fps, **self.about}
+
     def label(self) -> str:
         return self.found.label
 
 
 def plan_bvh(
-    config: BvhConfig, given: Sequence[JointMap], settings: PlanSettings
+    config: BvhConfig, given: Sequence[JointMap], settings: PlanSettings, audit: Audit
 ) -> tuple[ConversionPlan[BvhClip], JointMaps]:
     """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
-    batches = list_batches(config.source)
+    batches = config.batches()
     scans = scan_batches(
         batches, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
     )
-    draft = _decide(config, batches, scans)
+    draft = _decide(config, batches, scans, audit)
     joints = {key: names for scan in scans for key, names in scan.joints.items()}
     maps = choose_maps(config, given, draft, joints, settings.maps)
     draft.limit(lambda clip: clip.id)
     layout = config.motion_layout()
     draft.finish(
         found=sum(len(scan.files) for scan in scans),
-        frames=lambda clip: frames_after(clip.found.frames, config.source_fps or clip.found.fps, layout),
+        frames=lambda clip: frames_after(clip.frames, clip.fps, layout),
         licence=lambda clip: config.licence or "not stated yet",
     )
     return draft, maps
@@ -292,12 +315,14 @@ def _header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
     return section.frames, section.fps, key, names
 
 
-def _decide(config: BvhConfig, batches: list[Batch], scans: list[BatchScan]) -> ConversionPlan[BvhClip]:
+def _decide(
+    config: BvhConfig, batches: list[Batch], scans: list[BatchScan], audit: Audit
+) -> ConversionPlan[BvhClip]:
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
     refused = config.licence_problem(config.licence) if config.licence else ""
     listing = config.listing([file.path for _, file in found])
     broken = [scan.problem for scan in scans if scan.problem is not None]
-    draft = CaptionedPlan[BvhClip](config, broken=broken, notes=listing.notes)
+    draft = CaptionedPlan[BvhClip](config, broken=broken, notes=listing.notes, audit=audit)
     ids: dict[str, str] = {}
     contents: dict[str, str] = {}
     other_rate = 0
@@ -313,17 +338,19 @@ def _decide(config: BvhConfig, batches: list[Batch], scans: list[BatchScan]) -> 
             continue
         stated = listing.rows[clip.path].fps if clip.path in listing.rows else None
         other_rate += stated is not None and abs(stated - clip.fps) > 0.01 * clip.fps
+        frames = len(range(clip.frames)[config.cut(clip.label)])
+        fps = config.source_fps or clip.fps
         if clip_id in ids:
             reason = f"second file for clip id '{clip_id}'; the first is {ids[clip_id]}"
         elif clip.sha256 in contents:
             reason = f"same bytes as {contents[clip.sha256]}"
         else:
-            seconds = clip.frames / (config.source_fps or clip.fps)
-            reason = listing.problem(clip.path) or refused or config.length_problem(seconds)
+            reason = listing.problem(clip.path) or refused or config.length_problem(frames / fps)
         ids.setdefault(clip_id, clip.label)
         contents.setdefault(clip.sha256, clip.label)
         texts = listing.texts_of(clip.path)
-        made = BvhClip(batches[number], number, clip, clip_id, listing.split_of(clip.path), texts)
+        split, about = listing.split_of(clip.path), config.about(clip.path)
+        made = BvhClip(batches[number], number, clip, clip_id, split, texts, frames, fps, about)
         draft.decide(made, texts, reason)
     if other_rate:
         draft.notes.append(

@@ -211,10 +211,7 @@ class CaptionedPlan(ConversionPlan[C]):
                 reason = "" if keep else "no captions"
         elif texts and not reason:
             self.captioned += 1
-        if reason:
-            self.leave_out(clip.label(), reason)
-        else:
-            self.take(clip)
+        self.settle(clip, reason)
 
 
 def settle_captions(config: CaptionConfig, draft: CaptionedPlan[C], found: Listing) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar, get_args
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, field_validator
 from pydantic.fields import FieldInfo
 
+from motionloom.datasets.convert.common.where import parse_where
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import Config, MotionType, UserError
 
@@ -37,6 +38,9 @@ class ConvertConfig(Config):
     """Longer clips are left out."""
     limit: int | None = Field(default=None, ge=1)
     """Convert only this many clips, chosen by a hash of the id so that they stay spread over the source."""
+    where: str = Field(default="", json_schema_extra={"runtime": True})
+    """Convert only clips of which this holds: `category=dance and seconds<30` (=, !=, <, <=, >, >=; `and`).
+    A wrong name is answered with the names that are known of the source's clips."""
     motion_type: MotionType = "float32"
     """`float16` halves the shards; positions then keep about a millimetre."""
     look: int = Field(default=5, ge=0, json_schema_extra={"runtime": True})
@@ -46,6 +50,12 @@ class ConvertConfig(Config):
     most_rejected: float = Field(default=0.5, ge=0, le=1, json_schema_extra={"runtime": True})
     """Share of the clips that may turn out unreadable or unfit; a conversion that loses more fails, although
     what is left of it is written."""
+
+    @field_validator("where")
+    @classmethod
+    def _conditions(cls, text: str) -> str:
+        parse_where(text)
+        return text
 
     def motion_layout(self) -> MotionLayout:
         if self.layout not in self.layouts:

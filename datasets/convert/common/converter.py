@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.convert.common.audit import Published
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.feature_step import FeatureStep
 from motionloom.datasets.convert.common.look import SourceJoints
@@ -54,6 +55,8 @@ class Converter(ABC, Generic[Cfg, C]):
     example: ClassVar[str]
     """What follows `motionloom data convert NAME` in the example of the help."""
     config_class: ClassVar[type[ConvertConfig]]
+    published: ClassVar[Published | None] = None
+    """What the makers of a set say there is in it."""
     version: ClassVar[int] = 1
     """Raised when the same source gives other samples: finished shards are then made again."""
 

@@ -17,9 +17,11 @@ from rich.table import Table
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.base.progress import duration
+from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import Look
-from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
+from motionloom.datasets.convert.common.where import Facts, parse_where, require_known
+from motionloom.datasets.schema import SPLITS, AuditRow, Dropped, Split, UserError
 from motionloom.datasets.shards.left_out import grouped, grouped_notes
 
 
@@ -80,13 +82,30 @@ class ConversionPlan(Generic[C]):
     """Why it must not be carried out before the user decides something; empty when nothing is open."""
     look: Look | None = None
     """What a few clips showed; None when none was looked at."""
+    audit: Audit = field(default_factory=Audit)
+    """Clips found and taken, beside what the makers of the source state."""
+    known: set[str] = field(default_factory=set)
+    """Names of the facts that `config.where` may ask for."""
 
     @property
     def name(self) -> str:
         return f"{self.config.source.name} -> {self.config.name}"
 
     def take(self, clip: C) -> None:
-        self.items.append((clip.split, clip))
+        """This one becomes a sample, unless `config.where` asks for others."""
+        self.settle(clip, "")
+
+    def settle(self, clip: C, reason: str) -> None:
+        """Take a clip or leave it out for `reason`, and count it."""
+        facts = facts_of(clip)
+        self.known.update(facts)
+        if not reason and not all(one.holds(facts) for one in parse_where(self.config.where)):
+            reason = f"not where {self.config.where.strip()}"
+        self.audit.add(facts, taken=not reason)
+        if reason:
+            self.leave_out(clip.label(), reason)
+        else:
+            self.items.append((clip.split, clip))
 
     def leave_out(self, source: str, reason: str) -> None:
         """This one could become a sample, but does not."""
@@ -115,6 +134,8 @@ class ConversionPlan(Generic[C]):
         self, *, found: int, frames: Callable[[C], int], licence: Callable[[C], str]
     ) -> ConversionPlan[C]:
         """Itself, with its totals; `frames` (at the target rate) and `licence` are asked about every clip."""
+        if self.known:
+            require_known(self.config.where, self.known)
         self.found, self.notes = found, grouped_notes(self.notes)
         self.frames = dict.fromkeys(SPLITS, 0)
         for split, clip in self.items:
@@ -153,6 +174,27 @@ class ConversionPlan(Generic[C]):
             table.add_row("stops here", "", "", escape(self.stop))
         return table
 
+    def audit_table(self) -> Table | None:
+        """What is stated, found and taken; numbers of which nothing was found share a row."""
+        rows = self.audit_rows()
+        if not rows:
+            return None
+        table = Table(
+            "count", "stated", "found", "converted", "left out", title=escape(f"by the {rows[0].by}")
+        )
+        here = [row for row in rows if row.found or row.what in ("clips", "hours")]
+        for row in here:
+            numbers = (f"{value:,.10g}" for value in (row.stated, row.found, row.taken))
+            table.add_row(escape(row.what), *numbers, escape(printable(row.why)))
+        if absent := [row.what for row in rows if row not in here]:
+            table.add_row(escape(_some(absent)), "", "0", "0", "not in this copy")
+        return table
+
+    def audit_rows(self) -> list[AuditRow]:
+        """What is stated, found and taken, and why clips were left out."""
+        why = "; ".join(str(group) for group in grouped(self.left_out())[:5])
+        return self.audit.rows(len(self.items), why)
+
     def dump(self) -> dict[str, object]:
         left: dict[str, list[dict[str, str]]] = {
             name: [{"source": drop.source, "reason": drop.reason} for drop in drops]
@@ -172,6 +214,7 @@ class ConversionPlan(Generic[C]):
             "licences": dict(self.licences),
             "bytes_needed": self.bytes_needed,
             "seconds_needed": self.seconds_needed,
+            "audit": [row.dump() for row in self.audit_rows()],
             "look": None if self.look is None else self.look.dump(),
         }
 
@@ -192,6 +235,12 @@ class ConversionPlan(Generic[C]):
         bad = [*self.broken, *self.missing]
         if bad:
             raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")
+
+
+def facts_of(clip: PlannedClip) -> Facts:
+    """What is known of a clip by name, for `where`; converters whose clips have more add `facts` to them."""
+    facts: Facts = getattr(clip, "facts", {})
+    return {"id": clip.id, "split": clip.split, **facts}
 
 
 def limited(

@@ -89,10 +89,15 @@ class SplitNames:
 
 def hash_split(clip_id: str) -> Split:
     """80/5/15 by the id alone, so a clip keeps its split when others come or go."""
-    share = int.from_bytes(hashlib.sha256(clip_id.encode()).digest()[:8], "big") / 2**64
+    share = hash_share(clip_id)
     if share < TRAIN_SHARE:
         return "train"
     return "val" if share < TRAIN_SHARE + VAL_SHARE else "test"
+
+
+def hash_share(clip_id: str) -> float:
+    """A number in [0, 1) by the id alone."""
+    return int.from_bytes(hashlib.sha256(clip_id.encode()).digest()[:8], "big") / 2**64
 
 
 def hash_splits(ids: Iterable[str]) -> tuple[dict[str, Split], list[str]]:

@@ -103,6 +103,11 @@ class HumanMl3dClip:
     texts: tuple[Caption, ...]
     licence: str
 
+    @property
+    def facts(self) -> dict[str, float]:
+        mirrored = original_of(self.id) is not None
+        return {"seconds": self.frames / FPS, "captions": len(self.texts), "mirrored": float(mirrored)}
+
     def label(self) -> str:
         return self.files[0]
 

@@ -112,6 +112,11 @@ class MotionXClip:
     """(source of the captions, file) of sentences about frames."""
 
     @property
+    def facts(self) -> dict[str, str | float]:
+        captions = len(self.texts) + len(self.face_texts)
+        return {"subset": self.subset, "seconds": self.frames / FPS, "captions": float(captions)}
+
+    @property
     def subset(self) -> str:
         return subset_of(self.id)
 

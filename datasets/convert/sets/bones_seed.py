@@ -1,0 +1,167 @@
+"""BONES-SEED: BVH of the 77-joint SOMA skeleton at 120 fps, with metadata and temporal labels.
+
+`soma_uniform/bvh/DATE/NAME.bvh` (one skeleton for all) or `soma_proportional/` (each actor's own), loose or
+in the archives of the release; `metadata/seed_metadata_v00N.csv` and `..._temporal_labels.jsonl`. Lengths are
+in centimetres, Y up. The zero pose has every bone along an axis of its own joint: only positions are read, so
+it needs no correction to a T-pose. The same motion for the robot G1 (`g1/csv`) is left out: it is no
+person's.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from motionloom.datasets.convert.bvh.convert import Bvh
+from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.captions.options import Listing, list_clips
+from motionloom.datasets.convert.captions.read import CaptionRow
+from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.scan import ARCHIVES, Batch, list_batches
+from motionloom.datasets.convert.common.splits import hash_split, read_split_files
+from motionloom.datasets.convert.common.where import Facts
+from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv, read_json_lines
+from motionloom.datasets.schema import Caption, UserError
+
+FPS = 120.0
+_FACTS = (
+    "package", "category", "is_neutral", "is_mirror", "move_name", "take_org_name", "take_date",
+    "content_name", "content_uniform_style", "content_type_of_movement", "content_body_position",
+    "content_horizontal_move", "content_vertical_move", "content_props", "content_complex_action",
+    "content_repeated_action", "actor_uid", "actor_gender", "actor_age_yr", "actor_height_cm",
+    "actor_weight_kg",
+)  # fmt: skip
+_CAPTIONS = {
+    "natural": [f"content_natural_desc_{number}" for number in range(1, 5)],
+    "short": ["content_short_description", "content_short_description_2"],
+    "technical": ["content_technical_description"],
+}
+
+Kind = Literal["natural", "short", "technical", "timeline"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """What the metadata say of a file."""
+
+    facts: dict[str, str]
+    texts: tuple[Caption, ...]
+
+
+class BonesSeedConfig(BvhConfig):
+    """Options of the BONES-SEED converter; `source` is the folder that holds metadata/."""
+
+    name: str = "bones-seed"
+    """Name of the data set; part of the shards' file names."""
+    licence: str | None = "bones-seed-license"
+    """Licence of the clips."""
+    variant: Literal["uniform", "proportional"] = "uniform"
+    """Motion on one skeleton for all, or on each actor's own."""
+    kinds: tuple[Kind, ...] = ("natural", "short", "timeline")
+    """Captions to keep: natural, short and technical descriptions, and the sentences of the timeline."""
+    split_by: Literal["actor_uid", "take_org_name", "move_name"] = "actor_uid"
+    """The column that a split never tears apart: by default nobody who is tested was trained on."""
+
+    @property
+    def has_captions(self) -> bool:
+        return True
+
+    def batches(self) -> list[Batch]:
+        name = f"soma_{self.variant}"
+        places = [self.source / name, *(self.source / f"{name}{end}" for end in ARCHIVES)]
+        place = next((place for place in places if place.exists()), None)
+        if place is None:
+            raise UserError(f"{self.source}: no {name}/ and no archive {name}.tar.gz in it")
+        return list_batches(place)
+
+    def about(self, path: str) -> Facts:
+        row = _rows(self.source, self.kinds).get(_stem(path))
+        return row.facts if row else {}
+
+    def listing(self, paths: Sequence[str]) -> Listing:
+        if self.captions is not None:
+            return super().listing(paths)
+        known = _rows(self.source, self.kinds)
+        here = {_stem(path): path for path in paths}
+        rows = [
+            CaptionRow(
+                name,
+                row.texts,
+                here[name],
+                hash_split(row.facts.get(self.split_by) or name),
+                False,
+                None,
+                name,
+            )
+            for name, row in known.items()
+            if name in here
+        ]
+        found = list_clips(paths, rows, read_split_files(self.splits)[0] if self.splits else None, [])
+        found.missing.update({name: name for name in known.keys() - here.keys()})
+        return found
+
+
+def _stem(path: str) -> str:
+    return PurePosixPath(path).stem
+
+
+@lru_cache(maxsize=2)
+def _rows(source: Path, kinds: tuple[Kind, ...]) -> dict[str, Row]:
+    """The metadata by file name."""
+    folder = source / "metadata"
+    tables = sorted(folder.glob("seed_metadata_v*.csv"))
+    if not tables:
+        parquet = sorted(folder.glob("*.parquet"))
+        hint = f"; save {parquet[-1].name} as CSV" if parquet else "; give the folder of the release"
+        raise UserError(f"{folder}: no seed_metadata_v00N.csv in it{hint}")
+    labels = sorted(folder.glob("*temporal_labels.jsonl")) if "timeline" in kinds else []
+    timeline = _timeline(labels[-1]) if labels else {}
+    found = {}
+    for row in read_csv(tables[-1], ("filename", "move_duration_frames", "is_mirror", "actor_uid")):
+        name, seconds = row["filename"], float(row["move_duration_frames"] or 0) / FPS
+        texts = [
+            text
+            for kind in kinds
+            for column in _CAPTIONS.get(kind, ())
+            for text in captions_of(row.get(column), kind)
+        ]
+        for text in timeline.get(name, ()):
+            if text.start < seconds:
+                texts.append(text.model_copy(update={"end": min(text.end or seconds, seconds)}))
+        facts = {key: sys.intern(row[key]) for key in _FACTS if row.get(key)}
+        found[name] = Row(facts, tuple(texts))
+    return found
+
+
+def _timeline(path: Path) -> dict[str, list[Caption]]:
+    """The sentences of the temporal labels by file name, with start and end in seconds."""
+    found: dict[str, list[Caption]] = {}
+    for place, record in read_json_lines(path, path.name):
+        events = record.get("events")
+        try:
+            for event in events if isinstance(events, list) else ():
+                start, end = float(event["start_time"]), float(event["end_time"])
+                texts = captions_of(event["description"], "timeline", start, end)
+                found.setdefault(str(record["filename"]), []).extend(texts if start < end else ())
+        except (KeyError, TypeError, ValueError) as error:
+            reason = f"needs filename, and events with start_time, end_time and description ({error})"
+            raise UserError(f"{place}: a record {reason}") from None
+    return found
+
+
+class BonesSeed(Bvh):
+    """The BONES-SEED converter."""
+
+    name = "bones_seed"
+    title = "BONES-SEED"
+    summary = "BONES-SEED: SOMA motion capture with descriptions and timelines to shards."
+    example = "bones-seed shards"
+    config_class = BonesSeedConfig
+    published = Published(
+        "card, 2026-03",
+        {"clips": 142220, "is_mirror=false": 71132, "is_mirror=true": 71088, "hours": 288, "actor_uid": 522},
+    )

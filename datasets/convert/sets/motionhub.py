@@ -1,0 +1,167 @@
+"""MotionHub: SMPL-H motion of twenty sets at 30 fps, with captions in three depths, music, speech and pairs.
+
+The lists are `annotations/TASK/{train,test}.json` (`data_list`: key -> row). A row names the motion
+(`smplh_52/`: poses [T, 156], `trans` or `transl`, betas), the captions (`hierarchical_caption/`: macro, meso,
+micro), music or speech, and of one of two people the other's key. A motion that several tasks list is one
+clip; one that is for testing in any is for testing in all. The two of a pair are two clips, each moved to its
+own place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.files import inside, read_text_file
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.splits import hash_share, original_of
+from motionloom.datasets.convert.common.where import Fact
+from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
+from motionloom.datasets.convert.sets.shared.release import Entry, ReleaseClip, note_broken
+from motionloom.datasets.convert.sets.shared.tables import captions_of, read_json, require_record
+from motionloom.datasets.schema import Caption, Split, UserError
+
+TASKS = ("text_motion", "music_dance", "speech_gesture", "two_person_interaction")
+_SUBSETS = {
+    "amass_sup": 7673, "CombatMotion_seperate": 25987, "EgoBody": 980, "fit3d": 944, "GRAB": 1335,
+    "human36m": 925, "HumanML3D_AMASS": 29120, "HumanML3D_HumanACT12": 2382, "humansc3d": 688,
+    "MotionGV": 833121, "nturgbd120": 106864, "permo": 6610, "trumans": 3623, "aist": 1408,
+    "finedance": 4194, "beat_v2.0.0": 21603, "ted_db": 22548, "chi3d": 912, "hi4d": 300, "interx": 34161,
+}  # fmt: skip
+_FACTS = ("genre", "speaker_id", "language", "has_hand", "interactor_key")
+"""Fields of a row that are kept as facts."""
+
+
+class MotionHubConfig(BodyConfig):
+    """Options of the MotionHub converter; `source` is the folder that holds annotations/."""
+
+    name: str = "motionhub"
+    """Name of the data set; part of the shards' file names."""
+    layout: str = "wholebody313"
+    """`wholebody313` with fingers, `body133`, an h3d layout, or `smpl75` for UDE."""
+    fps: float = 30.0
+    """Frame rate of the shards; clips are resampled by time."""
+    tasks: tuple[str, ...] = TASKS
+    """Of which lists clips are taken."""
+    levels: tuple[str, ...] = ("macro", "meso", "micro")
+    """Depths of the captions to keep."""
+    script: bool = True
+    """Keep the words that are spoken as captions, with source `speech`."""
+    val_share: float = 0.02
+    """Share of the training clips that become the validation split, by a hash: the set has none."""
+
+
+class MotionHub(BodyRelease[MotionHubConfig]):
+    """The MotionHub converter."""
+
+    name = "motionhub"
+    title = "MotionHub"
+    summary = "MotionHub: SMPL-H motion with captions, music, speech and pairs to shards."
+    example = "MotionHub shards"
+    config_class = MotionHubConfig
+    terms = "MotionHub, terms of the subset's source"
+    model = "SMPL-H"
+    published = Published(
+        "card of the release, 2026-07",
+        {"clips": 1105378, "hours": 1528}
+        | {f"subset={name}": count for name, count in _SUBSETS.items()},
+    )  # fmt: skip
+
+    def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
+        found: dict[str, Entry] = {}
+        moved = 0
+        for task, split, key, row in self._rows(draft):
+            for file in _motions(row):
+                before = found.get(file)
+                if before is None:
+                    found[file] = self._entry(file, task, split, key, row, draft)
+                    continue
+                tasks = before.facts["task"]
+                assert isinstance(tasks, tuple)
+                moved += split != before.split
+                found[file] = replace(
+                    before,
+                    split="test" if "test" in (split, before.split) else before.split,
+                    sound=before.sound or _sound(row),
+                    texts=before.texts or tuple(self._texts(row, draft)),
+                    facts={**before.facts, "task": tuple(dict.fromkeys((*tasks, task)))},
+                )
+        if moved:
+            draft.notes.append(f"{moved} clips are for training in one list and for testing in another: test")
+        for entry in found.values():
+            held = entry.split == "train" and hash_share(entry.group) < self.config.val_share
+            yield replace(entry, split="val") if held else entry
+
+    def _rows(
+        self, draft: ConversionPlan[ReleaseClip]
+    ) -> Iterator[tuple[str, Split, str, dict[str, object]]]:
+        lists: list[tuple[str, Split]] = [
+            (task, split) for task in self.config.tasks for split in ("train", "test")
+        ]  # type: ignore[misc]
+        here = 0
+        for task, split in lists:
+            name = f"annotations/{task}/{split}.json"
+            path = self.config.source / name
+            if not path.is_file():
+                draft.notes.append(f"no {name}")
+                continue
+            here += 1
+            listed = require_record(read_json(path, name), name).get("data_list")
+            rows = enumerate(listed) if isinstance(listed, list) else require_record(listed, name).items()
+            for key, row in rows:
+                yield task, split, str(key), require_record(row, f"{name}: '{key}'")
+        if not here:
+            raise UserError(
+                f"{self.config.source}: no annotations/{self.config.tasks[0]}/train.json in it; give the "
+                f"folder of the release, with annotations/"
+            )
+
+    def _entry(
+        self,
+        file: str,
+        task: str,
+        split: Split,
+        key: str,
+        row: dict[str, object],
+        draft: ConversionPlan[ReleaseClip],
+    ) -> Entry:
+        clip_id = file.removesuffix(".npz").replace("/smplh_52/", "/")
+        subset = file.split("/")[0]
+        original = original_of(clip_id)
+        facts: dict[str, Fact] = {"subset": subset, "task": (task,), "key": key}
+        facts |= {name: str(row[name]) for name in _FACTS if row.get(name) is not None}
+        return Entry(
+            clip_id, file, tuple(self._texts(row, draft)), split, original or clip_id, facts, _sound(row),
+            mirror_of=original, licence=f"MotionHub, terms of {subset}",
+        )  # fmt: skip
+
+    def _texts(self, row: dict[str, object], draft: ConversionPlan[ReleaseClip]) -> Iterator[Caption]:
+        source = self.config.source
+        for field in ("hierarchical_caption_path", "speech_script_path"):
+            name = row.get(field)
+            if not isinstance(name, str):
+                continue
+            try:
+                path = inside(source, name)
+                if field == "speech_script_path":
+                    yield from captions_of(read_text_file(path, name), "speech") if self.config.script else ()
+                    continue
+                levels = require_record(read_json(path, name), name)
+                for level in self.config.levels:
+                    yield from captions_of(levels.get(level), level)
+            except UserError as error:
+                note_broken(draft, name, error)
+
+
+def _motions(row: dict[str, object]) -> Iterator[str]:
+    """The motion files of a row: one, or one for each person."""
+    stated = next((row[name] for name in ("smplh_path", "smplx_path", "motion_path") if row.get(name)), None)
+    for file in stated if isinstance(stated, list) else [stated]:
+        if isinstance(file, str):
+            yield file.removeprefix("./")
+
+
+def _sound(row: dict[str, object]) -> str | None:
+    stated = row.get("music_path") or row.get("audio_path")
+    return stated if isinstance(stated, str) else None

@@ -1,0 +1,168 @@
+"""`BodyRelease`: sets of SMPL-H or SMPL-X parameters, with the sound that people dance or speak to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar, Literal, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.audio.features import VERSION, AudioSettings
+from motionloom.datasets.audio.sound import sound_seconds
+from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
+from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
+from motionloom.datasets.convert.common.features import (
+    SMPL_JOINTS,
+    body_of,
+    canonical_smpl75,
+    features_of,
+    require_human,
+    upright,
+)
+from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.music import SoundConfig, cut_of
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.sets.shared.release import (
+    Entry,
+    Figure,
+    Release,
+    ReleaseClip,
+    ReleaseConfig,
+    note_broken,
+)
+from motionloom.datasets.motion.body.smpl import SkeletonName, smpl_joints
+from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.sample import Sample
+
+SOURCE_FPS = 30.0
+"""Of all these sets, where a file states none."""
+
+
+class BodyConfig(ReleaseConfig, SoundConfig):
+    """Options of sets of body model parameters."""
+
+    layouts = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
+
+    body_model: Path | None = None
+    """Your body model (.npz), for bones by each clip's shape; else those of one neutral adult."""
+    up: Literal["y", "z"] = "y"
+    """The axis that points up in the files."""
+    sound: Literal["optional", "require", "none"] = "optional"
+    """Whether a clip needs its music or speech; `none` converts the motion alone."""
+
+
+Cfg = TypeVar("Cfg", bound=BodyConfig)
+
+
+class BodyRelease(Release[Cfg]):
+    """A set of SMPL-H or SMPL-X parameters."""
+
+    model: ClassVar[Literal["SMPL-H", "SMPL-X"]]
+    """Whose shapes and rest pose the parameters mean."""
+
+    def __init__(self, config: Cfg) -> None:
+        super().__init__(config)
+        self.body = body_of(config.body_model, cast("SkeletonName", self.layout.skeleton_name))
+        found = self.body.statement["kind"]
+        if config.body_model is not None and found != self.model:
+            raise UserError(
+                f"{config.body_model}: a body model of {found}; {self.title} has parameters of {self.model}"
+            )
+        self._audio = config.audio_settings() if config.sound != "none" else None
+        self._sounds: dict[str, float] = {}
+        """Seconds of every sound file that can be read."""
+
+    def length(self, path: Path, label: str) -> tuple[int, float]:
+        header = read_motion_header(path, label)
+        if header.kind != self.model:
+            raise UserError(f"{label}: parameters of {header.kind}; {self.title} has those of {self.model}")
+        return header.frames, header.fps or SOURCE_FPS
+
+    def figure(self, path: Path, label: str) -> Figure:
+        motion = read_motion(path, label, hands=True)
+        return Figure(rotations=motion.rotations, trans=motion.trans, betas=motion.betas)
+
+    def options(self) -> dict[str, object]:
+        version = VERSION if self._audio else None
+        return super().options() | {"body_model": self.body.statement, "audio_version": version}
+
+    def audio(self) -> AudioSettings | None:
+        return self._audio
+
+    def with_sound(
+        self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
+    ) -> Iterator[tuple[Entry, str]]:
+        silent, lengths = 0, self._sounds
+        for sound in dict.fromkeys(entry.sound for entry in entries if self.config.sound != "none"):
+            if sound is not None:
+                try:
+                    lengths[sound] = sound_seconds(inside(self.config.source, sound), sound)
+                except UserError as error:
+                    note_broken(draft, sound, error)
+        for entry in entries:
+            heard = entry.sound if entry.sound in lengths else None
+            silent += heard is None and self.config.sound != "none"
+            missing = f"no readable sound ({entry.sound or 'none is listed'})"
+            yield (
+                replace(entry, sound=heard, facts={**entry.facts, "sound": float(heard is not None)}),
+                missing if heard is None and self.config.sound == "require" else "",
+            )
+        if silent:
+            draft.notes.append(f"{silent} of {len(entries)} clips have no sound")
+
+    def cut_to_sound(self, entry: Entry, last: int, fps: float) -> tuple[int, str]:
+        if entry.sound is None:
+            return last, ""
+        heard = self._sounds[entry.sound]
+        cut = min(last, int(heard * fps + 1e-6))
+        if last - cut <= self.config.max_music_gap * fps:
+            return cut, ""
+        return cut, f"{last / fps:.2f} s of motion, but {heard:.2f} s of sound in {entry.sound}"
+
+    def depends_on(self, clip: ReleaseClip) -> list[object]:
+        sound = clip.entry.sound
+        size = (self.config.source / sound).stat().st_size if sound else 0
+        return [*super().depends_on(clip), sound, size]
+
+    def posed(self, figure: Figure) -> NDArray[np.float64]:
+        rotations, trans = self._parameters(figure)
+        count = len(self.body.skeleton)
+        return smpl_joints(rotations[:, :count], trans, self.body, figure.betas)
+
+    def _parameters(self, figure: Figure) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        assert figure.rotations is not None and figure.trans is not None
+        if self.config.up == "z":
+            return upright(figure.rotations, figure.trans, self.body)
+        return figure.rotations, figure.trans
+
+    def convert(self, clip: ReleaseClip) -> Sample:
+        layout, figure = self.layout, self.read(clip)
+        joints = self.posed(figure)
+        if layout.family == "raw":
+            require_human(joints, clip.fps)
+            rotations, trans = self._parameters(figure)
+            palms = np.zeros((len(trans), SMPL_JOINTS - BODY_JOINTS, 3))
+            poses = np.concatenate([rotations[:, :BODY_JOINTS], palms], axis=1)
+            motion = canonical_smpl75(poses, trans, self.body, clip.fps, layout.fps)
+        else:
+            face = figure.face if layout.has("face") else None
+            motion = features_of(joints, clip.fps, layout, face=face, same_bones=self.config.retarget)
+        assert figure.rotations is not None
+        fingers = np.ptp(figure.rotations[:, BODY_JOINTS:], axis=0)
+        meta = self.clip_meta(
+            clip,
+            motion,
+            hands=layout.num_joints > BODY_JOINTS and float(fingers.max(initial=0.0)) > FINGERS_MOVE,
+            face=layout.has("face") and figure.face is not None and bool(figure.face.any()),
+        )
+        rows, wav = None, None
+        if clip.entry.sound is not None:
+            seconds = len(motion) / layout.fps
+            source, start = self.config.source, clip.first / clip.fps
+            rows, wav = cut_of(self.config, source, clip.entry.sound, start, seconds)
+            meta = meta.model_copy(update={"song": clip.entry.sound})
+        return Sample(meta, motion, texts=list(clip.entry.texts), audio=rows, wav=wav)

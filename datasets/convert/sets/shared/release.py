@@ -1,0 +1,287 @@
+"""`Release`: the converter of a set with published lists and one motion file for one clip or several.
+
+A set says what its lists state (`entries`), how long a motion file is (`length`) and what is in it
+(`figure`). Whether a file is there, can be read and is wanted, its split and its words, and everything from
+joints to samples is decided here, alike for all sets. A plan reads lists and headers, no motion.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.convert.common.audit import Audit
+from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.converter import Converter, PlanSettings
+from motionloom.datasets.convert.common.features import features_of, frames_after
+from motionloom.datasets.convert.common.files import inside, read_in_threads
+from motionloom.datasets.convert.common.look import SourceJoints
+from motionloom.datasets.convert.common.plan import ConversionPlan, drop
+from motionloom.datasets.convert.common.splits import hash_split, read_split_files
+from motionloom.datasets.convert.common.where import Fact
+from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
+from motionloom.datasets.shards.sample import Sample
+
+_END_TOLERANCE = 0.5
+"""Seconds that a caption may reach past its clip."""
+
+
+class ReleaseConfig(ConvertConfig):
+    """Options of every published set."""
+
+    layouts: ClassVar[tuple[str, ...]] = ("body133", "h3d263")
+
+    layout: str = "body133"
+    """Feature layout of the shards."""
+    fps: float = 20.0
+    """Frame rate of the shards; clips are resampled by time."""
+    splits: Path | None = None
+    """Folder of train.txt, val.txt, test.txt with clip ids; else the set's own lists."""
+    uncaptioned: Literal["drop", "keep"] = "keep"
+    """What to do with clips that have no usable caption."""
+    retarget: bool = False
+    """Give every clip the bone lengths of the layout's skeleton (the h3d layouts always do)."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One clip, as the set's own lists state it. Paths are relative to the source."""
+
+    id: str
+    file: str
+    texts: tuple[Caption, ...] = ()
+    split: Split | None = None
+    """None: by a hash of `group`, or of the id."""
+    group: str = ""
+    """Clips that must not be torn apart by the hash."""
+    facts: dict[str, Fact] = field(default_factory=dict)
+    sound: str | None = None
+    first: int = 0
+    last: int | None = None
+    """Frames [first, last) of the file; None: to its end."""
+    mirror_of: str | None = None
+    licence: str | None = None
+    """Where it is not the set's."""
+    problem: str = ""
+    """Why it is left out."""
+
+
+@dataclass(frozen=True)
+class ReleaseClip:
+    """A clip of the plan: an entry, its split, and the frames of its file that are used."""
+
+    entry: Entry
+    split: Split
+    first: int
+    last: int
+    fps: float
+    licence: str
+    size: int
+    """Of the motion file, in bytes."""
+
+    @property
+    def id(self) -> str:
+        return self.entry.id
+
+    @property
+    def seconds(self) -> float:
+        return (self.last - self.first) / self.fps
+
+    @property
+    def facts(self) -> dict[str, Fact]:
+        return {**self.entry.facts, "seconds": self.seconds, "captions": float(len(self.entry.texts))}
+
+    def label(self) -> str:
+        whole = self.entry.last is None and not self.entry.first
+        return self.entry.file if whole else f"{self.entry.file} ({self.id})"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One person in metres, Y up: joints, or the rotations (axis-angle, radians) that pose a body."""
+
+    joints: NDArray[np.float64] | None = None
+    """[T, 22, 3]."""
+    rotations: NDArray[np.float64] | None = None
+    """[T, 52, 3]: 22 of the body, 30 of the fingers."""
+    trans: NDArray[np.float64] | None = None
+    """[T, 3], what a body model adds to every vertex."""
+    betas: NDArray[np.float64] | None = None
+    face: NDArray[np.float64] | None = None
+    """[T, 50] FLAME expression."""
+
+    def cut(self, first: int, last: int) -> Figure:
+        """Frames [first, last) of it."""
+
+        def part(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            return None if values is None else values[first:last]
+
+        moving = {name: part(getattr(self, name)) for name in ("joints", "rotations", "trans", "face")}
+        return replace(self, **moving)
+
+    def __len__(self) -> int:
+        return len(next(values for values in (self.joints, self.rotations) if values is not None))
+
+
+Cfg = TypeVar("Cfg", bound=ReleaseConfig)
+
+
+class Release(Converter[Cfg, ReleaseClip]):
+    """What a set's own file completes with its name, numbers, lists and reader."""
+
+    terms: ClassVar[str]
+    """The licence of clips that state none of their own."""
+
+    @abstractmethod
+    def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
+        """Every clip that the set's lists state, in an order that depends on them alone; what is odd about
+        the lists goes into `draft.notes`. `UserError` when they are not there or cannot be read.
+        """
+
+    @abstractmethod
+    def length(self, path: Path, label: str) -> tuple[int, float]:
+        """Frames and frame rate of a motion file, by its header."""
+
+    @abstractmethod
+    def figure(self, path: Path, label: str) -> Figure:
+        """What a motion file holds."""
+
+    def plan(self, settings: PlanSettings) -> ConversionPlan[ReleaseClip]:
+        config, layout = self.config, self.layout
+        if not config.source.is_dir():
+            raise UserError(f"{config.source}: no such folder")
+        draft = ConversionPlan[ReleaseClip](config, audit=Audit(self.published))
+        entries = list(self.entries(draft))
+        if not entries:
+            raise UserError(f"{config.source}: the lists of {self.title} name no clip in it")
+        files = list(dict.fromkeys(entry.file for entry in entries))
+        found = read_in_threads(self._scan, files, workers=settings.workers, progress=settings.progress)
+        scanned = dict(zip(files, found, strict=True))
+        for file, state in scanned.items():
+            if isinstance(state, UserError):
+                draft.fail(file, state)
+        listed = read_split_files(config.splits)[0] if config.splits else None
+        seen: dict[str, str] = {}
+        for entry, reason in self.with_sound(entries, draft):
+            state = scanned[entry.file]
+            if state is None:
+                draft.miss(entry.file, f"clip '{entry.id}' is listed, but its file is not in the source")
+            elif not isinstance(state, UserError):
+                clip, problem = self._clip(entry, state, listed, draft)
+                first = seen.setdefault(clip.id, clip.label())
+                again = (
+                    "" if first == clip.label() else f"second clip with id '{clip.id}'; the first is {first}"
+                )
+                draft.settle(clip, entry.problem or reason or again or problem)
+        draft.limit(lambda clip: clip.id)
+        return draft.finish(
+            found=sum(state is not None for state in scanned.values()),
+            frames=lambda clip: frames_after(clip.last - clip.first, clip.fps, layout),
+            licence=lambda clip: clip.licence,
+        )
+
+    def with_sound(
+        self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
+    ) -> Iterator[tuple[Entry, str]]:
+        """The entries as their sound allows, and why one must be left out; sets without sound have none."""
+        return ((entry, "") for entry in entries)
+
+    def cut_to_sound(self, entry: Entry, last: int, fps: float) -> tuple[int, str]:
+        """The last frame before the sound ends, and why the clip is left out if it ends too early."""
+        return last, ""
+
+    def _scan(self, file: str) -> tuple[int, float, int] | UserError | None:
+        """Frames, rate and bytes of a motion file; None when it is not there."""
+        try:
+            path = inside(self.config.source, file)
+            if not path.is_file():
+                return None
+            return (*self.length(path, file), path.stat().st_size)
+        except UserError as error:
+            return error
+
+    def _clip(
+        self,
+        entry: Entry,
+        state: tuple[int, float, int],
+        listed: dict[str, Split] | None,
+        draft: ConversionPlan[ReleaseClip],
+    ) -> tuple[ReleaseClip, str]:
+        """The clip of an entry whose file is there, and why it is left out."""
+        config, (frames, fps, size) = self.config, state
+        last, mute = self.cut_to_sound(entry, min(frames if entry.last is None else entry.last, frames), fps)
+        seconds = max(last - entry.first, 0) / fps
+        texts = []
+        for text in entry.texts:
+            if text.start < seconds and (text.end is None or text.end <= seconds + _END_TOLERANCE):
+                end = None if text.end is None else min(text.end, seconds)
+                texts.append(text.model_copy(update={"end": end}))
+            else:
+                draft.notes.append(f"{entry.id}: a caption at {text.start:g} s is beyond its {seconds:.1f} s")
+        entry = replace(entry, texts=tuple(texts))
+        split = entry.split or hash_split(entry.group or entry.id)
+        if listed is not None:
+            split = listed.get(entry.id, split)
+        licence = config.licence or entry.licence or self.terms
+        clip = ReleaseClip(entry, split, min(entry.first, last), last, fps, licence, size)
+        if not texts:
+            draft.uncaptioned.append(clip.label())
+        reason = (
+            mute
+            or ("" if listed is None or entry.id in listed else "in no split file")
+            or ("" if texts or config.uncaptioned == "keep" else "no usable caption")
+            or config.licence_problem(licence)
+            or config.length_problem(clip.seconds)
+        )
+        return clip, reason
+
+    def depends_on(self, clip: ReleaseClip) -> list[object]:
+        entry = clip.entry
+        texts = [caption.dump() for caption in entry.texts]
+        return [clip.id, entry.file, clip.size, clip.first, clip.last, texts, clip.licence]
+
+    def licence(self, plan: ConversionPlan[ReleaseClip]) -> str:
+        alone = next(iter(plan.licences), self.terms) if len(plan.licences) <= 1 else self.terms
+        return self.config.licence or alone
+
+    def subset(self, clip: ReleaseClip) -> str:
+        return str(clip.entry.facts.get("subset", ""))
+
+    def read(self, clip: ReleaseClip) -> Figure:
+        """The frames of a clip."""
+        file = clip.entry.file
+        figure = self.figure(inside(self.config.source, file), file)
+        if len(figure) < clip.last:
+            raise UserError(
+                f"{file}: {len(figure)} frames, {clip.last} when the plan was made; convert again"
+            )
+        return figure.cut(clip.first, clip.last)
+
+    def posed(self, figure: Figure) -> NDArray[np.float64]:
+        """World joints [T, N, 3] of as many joints as the layout has."""
+        assert figure.joints is not None
+        return figure.joints
+
+    def joints(self, clip: ReleaseClip) -> SourceJoints:
+        return SourceJoints(self.posed(self.read(clip)), clip.fps)
+
+    def convert(self, clip: ReleaseClip) -> Sample:
+        joints = self.posed(self.read(clip))
+        motion = features_of(joints, clip.fps, self.layout, same_bones=self.config.retarget)
+        return Sample(self.clip_meta(clip, motion), motion, texts=list(clip.entry.texts))
+
+    def clip_meta(self, clip: ReleaseClip, motion: NDArray[np.float32], **facts: bool) -> ClipMeta:
+        return self.meta(
+            clip, motion, source=clip.label(), licence=clip.licence, mirror_of=clip.entry.mirror_of, **facts
+        )
+
+
+def note_broken(draft: ConversionPlan[ReleaseClip], label: str, error: UserError) -> None:
+    """A list, caption or sound file that cannot be read: what needs it goes without."""
+    draft.broken.append(drop(label, error))
