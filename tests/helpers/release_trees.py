@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 def walk(bent: float = 0.0) -> tuple[Floats, Floats]:
-    """Axis-angles [T, 52, 3] and translation [T, 3] of a walk that turns left, Y up; `bent` tells them apart."""
+    """Axis-angles [T, 52, 3] and translation [T, 3] of a walk to the left, Y up; `bent` tells them apart."""
     clip = walk_z_up(FPS, SECONDS)
     poses = clip["poses"].reshape(-1, 52, 3)
     flat = Rotation.from_rotvec([-np.pi / 2, 0, 0])
