@@ -23,7 +23,7 @@ from motionloom.datasets.convert.bvh.plan import (
     plan_bvh,
     read_motion,
 )
-from motionloom.datasets.convert.bvh.settle import is_added_pose, named_unit
+from motionloom.datasets.convert.bvh.settle import added_frames, named_unit
 from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.feature_step import FeatureBatch, FeatureStep
@@ -145,7 +145,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
             own = named_unit(height / metres(unit))
             if own is not None and not PERSON_METRES[0] <= height <= PERSON_METRES[1]:
                 joints *= metres(own) / metres(unit)
-        return joints[int(is_added_pose(joints)) :]
+        return joints[added_frames(joints) :]
 
     def _motion(self, data: bytes, label: str) -> BvhMotion:
         motion = read_motion(data, label)

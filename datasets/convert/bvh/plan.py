@@ -18,7 +18,7 @@ from pydantic import BeforeValidator, Field
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
-from motionloom.datasets.convert.bvh.settle import is_added_pose, settled
+from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.captions.options import CaptionConfig, CaptionedPlan, settle_captions
 from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.converter import PlanSettings
@@ -142,7 +142,7 @@ def _settle(
         plan.notes.append(f"unit by body size, from {name}: {named}; {tall}")
     if up != "y" and given.up is None:
         plan.notes.append(f"upward axis by where heads are, from {name}: {up}")
-    if any(is_added_pose(made.apply(motion)) for motion in motions):
+    if any(added_frames(made.apply(motion)) for motion in motions):
         plan.notes.append(f"first frames that are an added T-pose are left out, as in {name}")
     return made
 

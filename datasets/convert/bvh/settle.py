@@ -21,8 +21,9 @@ ADULT_METRES = 1.7
 _ABOVE = 0.8
 """Cosine between an axis and the way from pelvis to head from which a figure stands along it."""
 _JUMP_METRES, _JUMP_TIMES = 0.05, 5.0
-"""An added frame is so far from the second one, and so much further than the next ones from each other."""
-_NEXT = 10
+"""An added frame is so far from the second one, and so much further than later frames are from each other."""
+_BLENDED, _LATER = 10, 40
+"""Frames that an added one may have been blended into, and the last of those that are looked at for it."""
 _STRAIGHT = 0.98
 """Share of their bones' length that stretched limbs reach."""
 _SPREAD = 0.3
@@ -59,20 +60,23 @@ def settled(joint_map: JointMap, motions: Sequence[BvhMotion]) -> tuple[Unit, Up
     return unit, joint_map.up or up_of(clips), height * metres(unit)
 
 
-def is_added_pose(joints: NDArray[np.floating]) -> bool:
-    """Whether the first frame of joints [T, N, 3] in metres is a T- or A-pose that some writers put in front.
-
-    The motion itself then begins with a jump.
+def added_frames(joints: NDArray[np.floating]) -> int:
+    """How many frames a writer put in front of joints [T, N, 3] in metres: a T- or A-pose, from which the
+    motion begins with a jump, and the frames into which it was blended.
     """
     if len(joints) < 4:
-        return False
-    steps = np.linalg.norm(np.diff(joints[: _NEXT + 2], axis=0), axis=-1).max(axis=-1)
-    if steps[0] < max(_JUMP_METRES, _JUMP_TIMES * float(steps[1:].max())):
-        return False
+        return 0
+    steps = np.linalg.norm(np.diff(joints[: _LATER + 1], axis=0), axis=-1).max(axis=-1)
+    usual = float(np.median(steps[_BLENDED:] if len(steps) > 2 * _BLENDED else steps[1:]))
+    if steps[0] < max(_JUMP_METRES, _JUMP_TIMES * usual):
+        return 0
     arms, legs = joints[0][_ARMS], joints[0][_LEGS]
     ways = arms[:, 2] - arms[:, 0]
     cosine = float(ways[0] @ ways[1] / max(float(np.prod(np.linalg.norm(ways, axis=-1))), 1e-9))
-    return cosine < _SPREAD and all(_is_straight(limb) for limb in (*arms, *legs))
+    if cosine > _SPREAD or not all(_is_straight(limb) for limb in (*arms, *legs)):
+        return 0
+    rough = np.flatnonzero(steps[:_BLENDED] > _JUMP_TIMES * usual + 0.1 * _JUMP_METRES)
+    return int(rough.max(initial=0)) + 1
 
 
 def _is_straight(limb: NDArray[np.floating]) -> bool:
