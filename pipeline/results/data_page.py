@@ -118,6 +118,7 @@ def write_data_report(
         page.add_viewer(to_watch(opened, clips), f"At most {WATCH_SECONDS:g} s of each clip.{raw}")
     _captions(page, records, sum(map(len, opened.values())))
     _features(page, next(iter(opened.values())), measured)
+    _stated(page, manifest)
     _rejected(page, manifest, sum(map(len, opened.values())))
     _source(page, manifest, records)
     if found is not None:
@@ -261,6 +262,16 @@ def _features(page: Page, dataset: ShardDataset, found: Measures) -> None:
         rows.append([label(name), size, *means, *ends, still])
     columns = ["feature", "columns", "mean of |mean|", "mean deviation", "largest", "lowest value"]
     page.add_table([*columns, "highest value", "still columns"], rows, digits=4)
+
+
+def _stated(page: Page, manifest: Manifest) -> None:
+    """What the makers of the source state, beside what was found and converted."""
+    if not manifest.audit:
+        return
+    page.add_heading("What the makers state")
+    rows: Rows = [[row.what, row.stated, row.found, row.taken, row.why] for row in manifest.audit]
+    header = ["", "stated", "found", "converted", "left out"]
+    page.add_table(header, rows, f"Stated by: {manifest.audit[0].by}")
 
 
 def _rejected(page: Page, manifest: Manifest, clips: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from amass_clips import walk as walk_z_up
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.motion.body.smpl import BodyModel
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.skeleton import Skeleton
 
 FPS, SECONDS = 30.0, 3.0
@@ -97,8 +98,12 @@ def finedance(root: Path) -> Path:
 _FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
 
 
-def soma() -> list[tuple[str, str]]:
-    """The 77 joints of SOMA with their parents, parents first."""
+Naming = tuple[list[tuple[str, str]], dict[str, int]]
+"""Joints with their parents, parents first, and which one of `smplx52` a joint stands for."""
+
+
+def soma() -> Naming:
+    """The 77 joints of SOMA."""
     body = "Hips: Spine1 Spine2 Chest Neck1 Neck2 Head HeadEnd"
     chains = [body, "Head: Jaw", "Head: LeftEye", "Head: RightEye"]
     for side in ("Left", "Right"):
@@ -109,6 +114,11 @@ def soma() -> list[tuple[str, str]]:
         chains.append(
             "Hips: " + " ".join(side + name for name in ("Leg", "Shin", "Foot", "ToeBase", "ToeEnd"))
         )
+    ours = {soma_of(name): number for number, name in enumerate(Skeleton.named("smplx52").joints)}
+    return _tree(chains), ours
+
+
+def _tree(chains: list[str]) -> list[tuple[str, str]]:
     joints = [("Hips", "")]
     for chain in chains:
         parent, names = chain.split(": ")
@@ -116,6 +126,20 @@ def soma() -> list[tuple[str, str]]:
             joints.append((name, parent))
             parent = name
     return joints
+
+
+def xsens() -> Naming:
+    """The 23 joints of 100STYLE."""
+    chains = ["Hips: Chest Chest2 Chest3 Chest4 Neck Head"]
+    body = {"Hips": "pelvis", "Chest": "spine1", "Chest2": "spine2", "Chest4": "spine3"}
+    names = body | {"Neck": "neck", "Head": "head"}
+    for side in ("Left", "Right"):
+        arm, leg = ("Collar", "Shoulder", "Elbow", "Wrist"), ("Hip", "Knee", "Ankle", "Toe")
+        chains.append("Chest4: " + " ".join(side + part for part in arm))
+        chains.append("Hips: " + " ".join(side + part for part in leg))
+        names |= {side + part: f"{side}_{part}".lower().replace("toe", "foot") for part in (*arm, *leg)}
+    skeleton = Skeleton.named("smplx52")
+    return _tree(chains), {name: skeleton.index(one) for name, one in names.items()}
 
 
 def soma_of(name: str) -> str:
@@ -140,38 +164,37 @@ def soma_of(name: str) -> str:
 
 
 @lru_cache
-def soma_file(fps: float = 120.0) -> str:
-    """The walk on SOMA's joints, in centimetres, in a zero pose that has nothing to do with a T-pose."""
-    skeleton = Skeleton.named("smplx52")
+def bvh_file(naming: Callable[[], Naming], fps: float, before: int = 0) -> str:
+    """The walk on another skeleton, in centimetres, in a zero pose that has nothing to do with a T-pose.
+
+    Before and after it the figure stands still for some frames.
+    """
+    joints, ours = naming()
     poses, trans = walk()
-    at = np.arange(int(SECONDS * fps)) / fps * FPS
+    at = np.minimum(np.arange(int(SECONDS * fps) + 1) / fps * FPS, len(poses) - 1.0)
     low = np.minimum(at.astype(int), len(poses) - 2)
     weight = (at - low)[:, None, None]
     poses = (1 - weight) * poses[low] + weight * poses[low + 1]
     trans = (1 - weight[:, 0]) * trans[low] + weight[:, 0] * trans[low + 1]
+    poses = np.concatenate([np.repeat(poses[:1], before, 0), poses, np.repeat(poses[-1:], before, 0)])
+    trans = np.concatenate([np.repeat(trans[:1], before, 0), trans, np.repeat(trans[-1:], before, 0)])
     local = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(len(poses), 52, 3, 3)
-    body = BodyModel.neutral("smplx52")
-    ours = {soma_of(name): number for number, name in enumerate(skeleton.joints)}
-    joints = soma()
+    template = BodyModel.neutral("smplx52").template
     names = [name for name, _ in joints]
-    rng = np.random.default_rng(7)
-    zero = Rotation.random(len(names), random_state=rng).as_matrix()
+    zero = Rotation.random(len(names), random_state=np.random.default_rng(7)).as_matrix()
     zero[0] = np.eye(3)
-    rest, offsets, turned = {}, {}, {}
-    lines: dict[str, NDArray[Any]] = {}
-    for number, (name, parent) in enumerate(joints):
-        above = names.index(parent) if parent else None
-        at_rest = body.template[ours[name]] if name in ours else rest[parent] + [0.0, 0.02, 0.03]
-        rest[name] = at_rest
-        if above is None:
-            offsets[name], turned[name] = np.zeros(3), local[:, 0]
-            lines[name] = turned[name]
-            continue
-        # A joint between two of ours takes the bone of the next: it must move with its parent.
+    rest = {names[0]: template[0]}
+    offsets = {names[0]: np.zeros(3)}
+    turned = {names[0]: local[:, 0]}
+    rotations = {names[0]: local[:, 0]}
+    for number, (name, parent) in enumerate(joints[1:], start=1):
+        above = names.index(parent)
+        rest[name] = template[ours[name]] if name in ours else rest[parent] + [0.0, 0.02, 0.03]
         turned[name] = turned[parent] @ local[:, ours[name]] if name in ours else turned[parent]
-        offsets[name] = zero[above].T @ (at_rest - rest[parent])
-        lines[name] = (turned[parent] @ zero[above]).transpose(0, 2, 1) @ (turned[name] @ zero[number])
-    return _bvh(joints, offsets, lines, trans + body.template[0], fps)
+        offsets[name] = zero[above].T @ (rest[name] - rest[parent])
+        own = (turned[parent] @ zero[above]).transpose(0, 2, 1)
+        rotations[name] = own @ (turned[name] @ zero[number])
+    return _bvh(joints, offsets, rotations, trans + template[0], fps)
 
 
 def _bvh(
@@ -214,10 +237,10 @@ def _bvh(
 def bones_seed(root: Path) -> Path:
     """Two takes of two actors and a mirrored one, of which one has a timeline."""
     header = "filename,move_name,move_duration_frames,category,is_mirror,actor_uid,content_natural_desc_1"
-    rows = ["walk_001__A1,walk_001,360,Dances,False,A1,A person walks to the left.",
-            "walk_001__A1_M,walk_001,360,Dances,True,A1,A person walks to the right.",
-            'talk_002__A2,talk_002,360,Baseline,False,A2,"A person walks, and talks."',
-            "gone_003__A2,gone_003,360,Baseline,False,A2,Nobody."]  # fmt: skip
+    rows = ["walk_001__A1,walk_001,361,Dances,False,A1,A person walks to the left.",
+            "walk_001__A1_M,walk_001,361,Dances,True,A1,A person walks to the right.",
+            'talk_002__A2,talk_002,361,Baseline,False,A2,"A person walks, and talks."',
+            "gone_003__A2,gone_003,361,Baseline,False,A2,Nobody."]  # fmt: skip
     put(root / "metadata/seed_metadata_v004.csv", "\n".join([header, *rows]) + "\n")
     events = [{"start_time": 0.0, "end_time": 1.5, "description": "starts"},
               {"start_time": 1.5, "end_time": 3.2, "description": "goes on"}]  # fmt: skip
@@ -225,5 +248,105 @@ def bones_seed(root: Path) -> Path:
     put(root / "metadata/seed_metadata_v002_temporal_labels.jsonl", record + "\n")
     for number, name in enumerate(("walk_001__A1", "walk_001__A1_M", "talk_002__A2")):
         lines = "\n" * number  # no two files have the same bytes
-        put(root / f"soma_uniform/bvh/24010{number}/{name}.bvh", soma_file() + lines)
+        put(root / f"soma_uniform/bvh/24010{number}/{name}.bvh", bvh_file(soma, 120.0) + lines)
+    return root
+
+
+def _about_y(angle: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def _posed(bent: float) -> tuple[Floats, Floats]:
+    """Joints [T, 22, 3] of the walk on the floor, first root above the origin; headings [T] to undo."""
+    poses, trans = walk(bent)
+    joints = smpl_joints(poses[:, :22], trans, BodyModel.neutral("smpl22"))
+    origin = joints[0, 0] * [1, 0, 1] + [0, joints[..., 1].min(), 0]
+    turned = Rotation.from_rotvec(poses[:, 0]).as_matrix()
+    return joints - origin, -np.arctan2(turned[:, 0, 2], turned[:, 2, 2])
+
+
+def encode_272(bent: float = 0.0) -> Floats:
+    """Columns [T, 272] of the walk, frame by frame and in float64; rotations are left at 0."""
+    joints, angles = _posed(bent)
+    out = np.zeros((len(joints), 272))
+    for t, angle in enumerate(angles):
+        own = [_about_y(angle) @ (joint - joints[t, 0] * [1, 0, 1]) for joint in joints[t]]
+        out[t, 8:74] = np.ravel(own)
+        if t:
+            out[t, :2] = (_about_y(angles[t - 1]) @ (joints[t, 0] - joints[t - 1, 0]))[[0, 2]]
+        out[t, 2:8] = _about_y(angle - angles[t - 1] if t else angle)[:2].ravel()
+    return out
+
+
+def encode_296(bent: float = 0.0) -> Floats:
+    """Columns [T - 1, 296] of the walk on SnapMoGen's joints, in units of 18 mm, frame by frame."""
+    joints, angles = _posed(bent)
+    order = (15, 16, 20, 1, 17, 21, 2, 18, 22, 3, 19, 23, 4, 7, 11, 6, 8, 12, 9, 13, 10, 14)
+    ours = {theirs: number for number, theirs in enumerate(order)} | {0: 0, 5: 12}
+    figure = np.stack([joints[:, ours[number]] for number in range(24)], axis=1) / 0.018
+    rows = []
+    for t in range(len(figure) - 1):
+        turn = _about_y(angles[t])
+        step = turn @ (figure[t + 1, 0] - figure[t, 0])
+        own = [turn @ (joint - figure[t, 0] * [1, 0, 1]) for joint in figure[t]]
+        root = [angles[t + 1] - angles[t], step[0], step[2], own[0][1]]
+        rows.append([*root, *np.zeros(144), *np.ravel(own), *np.zeros(76)])
+    return np.array(rows)
+
+
+def motion272(root: Path) -> Path:
+    """HumanML3D-272's tree: two clips, a mirrored one, and one that is listed but not there."""
+    (root / "motion_data").mkdir(parents=True)
+    for name, bent in (("000000", 0.0), ("M000000", 0.3), ("000001", 0.6)):
+        np.save(root / f"motion_data/{name}.npy", encode_272(bent))
+        put(root / f"texts/{name}.txt", "a person walks#a/DET person/NOUN walk/VERB#0.0#0.0\n")
+    put(root / "split/train.txt", "000000\nM000000\n000002\n")
+    put(root / "split/test.txt", "000001\n")
+    return root
+
+
+def snapmogen(root: Path) -> Path:
+    """A recording of which two parts have captions, and one whose file is not there."""
+    (root / "renamed_feats").mkdir(parents=True)
+    np.save(root / "renamed_feats/m_ep2_00086.npy", encode_296())
+    said = {"manual": ["A person walks."], "gpt": ["Someone walks to the left."]}
+    names = ["m_ep2_00086#0#90", "m_ep2_00086#30#80", "gone#0#90"]
+    put(root / "all_caption_clean.json", dict.fromkeys(names, said))
+    put(root / "data_split_info1/train_ids.txt", "\n".join(names) + "\n")
+    return root
+
+
+def beat2(root: Path) -> Path:
+    """A talk with speech and words, and an additional one without."""
+    folder = root / "beat_english_v2.0.0"
+    (folder / "smplxflame_30").mkdir(parents=True)
+    for name, bent in (("2_scott_0_1_1", 0.0), ("2_scott_0_2_2", 0.3)):
+        poses, trans = walk(bent)
+        flat = np.concatenate([poses[:, :22], np.full((len(poses), 3, 3), 0.1), poses[:, 22:]], axis=1)
+        face = np.linspace(-1, 1, len(poses))[:, None] * np.linspace(0.1, 1, 100)
+        np.savez(
+            folder / f"smplxflame_30/{name}.npz", poses=flat.reshape(-1, 165), trans=trans,
+            expressions=face, betas=np.zeros(300), gender="neutral", mocap_frame_rate=30,
+        )  # fmt: skip
+    put(folder / "train_test_split.csv", "id,type\n2_scott_0_1_1,test\n2_scott_0_2_2,additional\n")
+    sing(folder / "wave16k/2_scott_0_1_1.wav")
+    words = ((0.0, 0.2, ""), (0.2, 0.6, "hello"), (0.6, 1.0, "there"), (1.0, 2.0, ""), (2.0, 2.5, "friend"))
+    rows = [f'xmin = {a} \n xmax = {b} \n text = "{word}" ' for a, b, word in words]
+    tier = "\n".join([' class = "IntervalTier" ', ' name = "words" ', *rows])
+    phones = tier.replace("words", "phones").replace("hello", "HH")
+    text = f'File type = "ooTextFile"\nitem []: \n  item [1]:\n{tier}\n  item [2]:\n{phones}\n'
+    put(folder / "textgrid/2_scott_0_1_1.TextGrid", text)
+    return root
+
+
+def style100(root: Path) -> Path:
+    """Three movements of two styles, of which one has no frames in the list of cuts."""
+    for style, movement in (("ArmsAboveHead", "FW"), ("ArmsAboveHead", "ID"), ("Old", "FW")):
+        lines = "\n" * (len(style) + len(movement + style) * (movement == "ID"))  # no two are the same
+        put(root / f"{style}/{style}_{movement}.bvh", bvh_file(xsens, 60.0, 40) + lines)
+    cuts = ["STYLE_NAME,FW_START,FW_STOP,ID_START,ID_STOP", "ArmsAboveHead,40,221,N/A,N/A", "Old,40,221,,"]
+    put(root / "Frame_Cuts.csv", "\n".join(cuts) + "\n")
+    styles = ["Style Name,Description", "Arms Above Head,Both arms held up.", "Old,Slow and bent."]
+    put(root / "Dataset_List.csv", "\n".join(styles) + "\n")
     return root

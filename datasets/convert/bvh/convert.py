@@ -58,7 +58,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         self.maps: JointMaps = {}
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[BvhClip]:
-        plan, self.maps = plan_bvh(self.config, self.given, settings, Audit(self.published))
+        plan, self.maps = plan_bvh(self.config, self.given, settings, Audit(self.stated()))
         return plan
 
     def depends_on(self, clip: BvhClip) -> list[object]:

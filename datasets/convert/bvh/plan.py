@@ -232,6 +232,10 @@ class BvhConfig(CaptionConfig):
         """What metadata of the set say of a file; nothing for plain folders."""
         return {}
 
+    def unfit(self, path: str) -> str:
+        """Why the lists of the set leave a file out; empty when they do not."""
+        return ""
+
     def cut(self, label: str) -> slice:
         """The frames of a file that are its clip."""
         return slice(None)
@@ -345,7 +349,12 @@ def _decide(
         elif clip.sha256 in contents:
             reason = f"same bytes as {contents[clip.sha256]}"
         else:
-            reason = listing.problem(clip.path) or refused or config.length_problem(frames / fps)
+            reason = (
+                config.unfit(clip.path)
+                or listing.problem(clip.path)
+                or refused
+                or config.length_problem(frames / fps)
+            )
         ids.setdefault(clip_id, clip.label)
         contents.setdefault(clip.sha256, clip.label)
         texts = listing.texts_of(clip.path)

@@ -85,6 +85,10 @@ class Converter(ABC, Generic[Cfg, C]):
         captions. When it changes, the clip is made again.
         """
 
+    def stated(self) -> Published | None:
+        """The numbers that the source at hand is compared with."""
+        return self.published
+
     def licence(self, plan: ConversionPlan[C]) -> str:
         """The licence of the whole data set."""
         return self.config.licence or next(iter(plan.licences), "")

@@ -180,7 +180,7 @@ class ConversionPlan(Generic[C]):
         if not rows:
             return None
         table = Table(
-            "count", "stated", "found", "converted", "left out", title=escape(f"by the {rows[0].by}")
+            "count", "stated", "found", "converted", "left out", title=escape(f"stated by: {rows[0].by}")
         )
         here = [row for row in rows if row.found or row.what in ("clips", "hours")]
         for row in here:

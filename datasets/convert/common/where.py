@@ -27,7 +27,7 @@ _ORDER: dict[str, Callable[[float, float], bool]] = {
 }
 _CONDITION = re.compile(
     r"""\s*(?P<name>[A-Za-z_][\w.]*)\s*(?P<sign><=|>=|!=|=|<|>)\s*"""
-    r"""(?P<value>"[^"]*"|'[^']*'|(?:(?!\sand\s)[^<>=!"'])+)\s*(?P<rest>\sand\s|$)""",
+    r"""(?P<value>"[^"]*"|'[^']*'|(?:(?!\sand(?:\s|$))[^<>=!"'])+)\s*(?P<rest>\band(?:\s|$)|$)""",
     re.IGNORECASE,
 )
 

@@ -25,6 +25,7 @@ from motionloom.datasets.convert.common.scan import ARCHIVES, Batch, list_batche
 from motionloom.datasets.convert.common.splits import hash_split, read_split_files
 from motionloom.datasets.convert.common.where import Facts
 from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv, read_json_lines
+from motionloom.datasets.motion.bvh.joint_map import Unit, Up
 from motionloom.datasets.schema import Caption, UserError
 
 FPS = 120.0
@@ -59,6 +60,10 @@ class BonesSeedConfig(BvhConfig):
     """Name of the data set; part of the shards' file names."""
     licence: str | None = "bones-seed-license"
     """Licence of the clips."""
+    unit: Unit = "cm"
+    """Length unit of the files."""
+    up: Up = "y"
+    """Upward axis of the files."""
     variant: Literal["uniform", "proportional"] = "uniform"
     """Motion on one skeleton for all, or on each actor's own."""
     kinds: tuple[Kind, ...] = ("natural", "short", "timeline")

@@ -15,6 +15,9 @@ from amass_clips import expected_joints, features, meta_of, reasons
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.common.conversion import Conversion, run_conversion
 from motionloom.datasets.convert.registry import converter_named, prepare
+from motionloom.datasets.convert.sets.motion272 import joints_of_272
+from motionloom.datasets.convert.sets.snapmogen import ORDER, joints_of_296
+from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, UserError
@@ -26,6 +29,15 @@ SETS: dict[str, dict[str, Any]] = {
     "motionhub": {"clip": "HumanML3D_AMASS/000/000001", "layout": "wholebody313", "more": QUICK, "found": 3},
     "finedance": {"clip": "001", "layout": "wholebody313", "more": QUICK, "found": 3},
     "bones_seed": {"clip": "walk_001__A1", "layout": "wholebody313", "more": {}, "found": 3},
+    "motion272": {"clip": "000000", "layout": "body133", "more": {}, "found": 3},
+    "snapmogen": {"clip": "m_ep2_00086#0#90", "layout": "body133", "more": {}, "found": 2},
+    "beat2": {
+        "clip": "beat_english_v2.0.0/2_scott_0_1_1",
+        "layout": "wholebody363",
+        "more": QUICK,
+        "found": 2,
+    },
+    "style100": {"clip": "ArmsAboveHead_FW", "layout": "body133", "more": {}, "found": 3},
 }
 
 
@@ -56,19 +68,21 @@ def test_a_set_gives_the_walk_it_was_made_from(
 ) -> None:
     case = SETS[name]
     conversion = planned(name, built(name))
-    assert conversion.plan.found == case["found"]
     rows = {row.what: row for row in conversion.plan.audit_rows()}
-    assert rows["clips"].found == case["found"] and rows["clips"].stated > 200
+    if "clips" in rows:
+        assert rows["clips"].found == case["found"] and rows["clips"].stated > 200
+    assert rows or name == "motion272"  # whose numbers are those of another tree
     manifest = make(name, built(name), tmp_path / "out")
     assert manifest.audit == conversion.plan.audit_rows() and manifest.licence
     assert check(tmp_path / "out") == []
     layout = MotionLayout.named(case["layout"], fps=30.0)
     motion = features(tmp_path / "out")[case["clip"]]
-    found = decode(motion, layout)
+    found = decode(motion[:, layout.part("bodyhand")], layout.without_face())
     wanted = expected_joints(30.0, joints=layout.num_joints)[: len(found)]
     assert len(found) >= 89
-    # BVH at 120 fps is resampled, and stores nine digits; six columns are float32.
-    np.testing.assert_allclose(found, wanted, atol=5e-4)
+    # BVH is made at 60 or 120 fps by interpolating angles; the four spine joints of Xsens are not our three.
+    limbs = [number for number in range(22) if number not in (3, 6, 9)] if name == "style100" else slice(None)
+    np.testing.assert_allclose(found[:, limbs], wanted[:, limbs], atol=5e-4)
     assert meta_of(tmp_path / "out", case["clip"])[0].has_hands == (layout.num_joints > 22)
 
 
@@ -115,7 +129,7 @@ def test_seed_has_facts_timelines_and_splits_by_actor(built: Callable[[str], Pat
     assert clip.id == "walk_001__A1"
     assert [(text.text, text.start, text.end) for text in clip.texts if text.source == "timeline"] == [
         ("starts", 0.0, 1.5),
-        ("goes on", 1.5, 3.0),
+        ("goes on", 1.5, 361 / 120),
     ]
     with pytest.raises(UserError, match=r"no clip has 'categry'; known of clips: actor_uid, category, "):
         planned("bones_seed", built("bones_seed"), where="categry=Dances")
@@ -148,11 +162,83 @@ def wide(path: Path, columns: int) -> None:
     np.save(path, np.zeros((90, columns), dtype=np.float32))
 
 
+def test_vectors_are_turned_back_to_the_joints() -> None:
+    """To rounding, whatever the frame rate: the encoders in the helpers go frame by frame."""
+    wanted = expected_joints(30.0)
+    for joints in (joints_of_272(trees.encode_272()), joints_of_296(trees.encode_296())[:, ORDER] * 0.018):
+        found = canonicalize(joints)
+        np.testing.assert_allclose(found, wanted[: len(found)], atol=1e-10)
+
+
+def test_motionmillion_and_streams_have_other_trees(tmp_path: Path) -> None:
+    for place, names in (("motion_data/vector_272", ("gv/a", "gv/b")), ("train_stream", ("seq1",))):
+        for name in names:
+            path = tmp_path / place.split("/")[0] / f"{place}/{name}.npy"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.save(path, trees.encode_272())
+    million, stream = tmp_path / "motion_data", tmp_path / "train_stream"
+    trees.put(million / "texts/gv/a.txt", "a person walks\nsomeone walks\n")
+    trees.put(million / "split/version1/t2m_60_300/train.txt", "gv/a\n")
+    plan = planned("motion272", million).plan
+    ((_, clip),) = plan.items
+    assert [text.text for text in clip.entry.texts] == ["a person walks", "someone walks"]
+    assert [row.stated for row in plan.audit_rows()] == [2_000_000, 2000]
+    assert {drop.source: drop.reason for drop in plan.dropped} == {
+        "motion_data/vector_272/gv/b.npy": "in no split list"
+    }
+    trees.put(stream / "train_stream_text/seq1.txt", "stands*walks off#45")
+    ((split, clip),) = planned("motion272", stream).plan.items
+    assert split == "train"
+    assert [(text.text, text.start, text.end) for text in clip.entry.texts] == [
+        ("stands", 0.0, 1.5),
+        ("walks off", 1.5, None),
+    ]
+
+
+def test_beat2_keeps_face_and_what_is_said(built: Callable[[str], Path], tmp_path: Path) -> None:
+    make("beat2", built("beat2"), tmp_path / "out")
+    clip = "beat_english_v2.0.0/2_scott_0_1_1"
+    meta, texts = meta_of(tmp_path / "out", clip)
+    assert meta.has_face and meta.split == "test"
+    assert [(text.text, text.start, text.end) for text in texts] == [
+        ("hello there", 0.2, 1.0),
+        ("friend", 2.0, 2.5),
+    ]
+    face = features(tmp_path / "out")[clip][:, MotionLayout.named("wholebody363").slice("face")]
+    wanted = np.linspace(-1, 1, 91)[:, None] * np.linspace(0.1, 1, 100)[:50]
+    np.testing.assert_allclose(face, wanted[: len(face)], atol=1e-6)
+    plan = planned(
+        "beat2", built("beat2"), where="speaker=2_scott and type!=additional", sound="require"
+    ).plan
+    assert [one.id for _, one in plan.items] == [clip]
+
+
+def test_snapmogen_and_styles_are_cut(built: Callable[[str], Path]) -> None:
+    clips = {clip.id: clip for _, clip in planned("snapmogen", built("snapmogen")).plan.items}
+    assert {clip.last - clip.first for clip in clips.values()} == {90, 50}
+    assert {text.source for text in clips["m_ep2_00086#30#80"].entry.texts} == {"manual", "gpt"}
+    plan = planned("style100", built("style100"), where="style=Old").plan
+    ((_, clip),) = plan.items
+    assert (clip.frames, clip.fps) == (181, 60.0)
+    assert [text.text for text in clip.texts] == [
+        "a person walks forward in the style old",
+        "a person walks forward: Slow and bent",
+    ]
+    assert {drop.reason for drop in plan.dropped} == {
+        "no frames of it in Frame_Cuts.csv",
+        "not where style=Old",
+    }
+
+
 HML = "HumanML3D_AMASS/smplh_52/000/000001.npz"
 LIST = "annotations/text_motion/train.json"
 META, LABELS = "metadata/seed_metadata_v004.csv", "metadata/seed_metadata_v002_temporal_labels.jsonl"
 TAKE = "soma_uniform/bvh/240100/walk_001__A1.bvh"
 DANCE = "motion/001.npy"
+VECTORS, FEATS, SAID = "motion_data/000000.npy", "renamed_feats/m_ep2_00086.npy", "all_caption_clean.json"
+CUTS, BEAT = "Frame_Cuts.csv", "beat_english_v2.0.0"
+LIST2 = f"{BEAT}/train_test_split.csv"
+TALK, GRID = f"{BEAT}/smplxflame_30/2_scott_0_1_1.npz", f"{BEAT}/textgrid/2_scott_0_1_1.TextGrid"
 
 DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
     ("motionhub", lambda root: cut(root / HML), f"{HML}: not an .npz file, or cut off"),
@@ -170,6 +256,27 @@ DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
     ("bones_seed", lambda root: cut(root / LABELS), f"{Path(LABELS).name}:1: not valid JSON"),
     ("bones_seed", lambda root: text(root / LABELS, "end_time", "end"), "needs filename, and events with"),
     ("bones_seed", lambda root: cut(root / TAKE), "walk_001__A1.bvh"),
+    ("motion272", lambda root: cut(root / VECTORS), f"{VECTORS}: truncated array"),
+    ("motion272", lambda root: nan_at(root / VECTORS), f"{VECTORS}: nan at frame 5, column 9"),
+    ("motion272", lambda root: wide(root / VECTORS, 263), f"{VECTORS}: expected [T, 272], found [90, 263]"),
+    ("motion272", lambda root: (root / "texts/000000.txt").write_bytes(b"\xff\xfe#"), "not UTF-8 text"),
+    ("motion272", lambda root: text(root / "split/test.txt", "000001", "000000"), "in two splits leaks"),
+    ("snapmogen", lambda root: cut(root / FEATS), f"{FEATS}: truncated array"),
+    ("snapmogen", lambda root: wide(root / FEATS, 148), f"{FEATS}: expected [T, 296], found [90, 148]"),
+    ("snapmogen", lambda root: cut(root / SAID), f"{SAID}: not valid JSON"),
+    ("snapmogen", lambda root: text(root / SAID, "gone#0#90", "gone"), "a clip is named NAME#FIRST#LAST"),
+    ("snapmogen", lambda root: text(root / SAID, '"gone#0#90": {', '"gone#0#90": [{}], "x#0#9": {'),
+     "'gone#0#90': a JSON object is expected"),
+    ("beat2", lambda root: cut(root / TALK), f"{TALK}: not an .npz file, or cut off"),
+    ("beat2", lambda root: nan_at(root / TALK, "expressions"), "expressions: nan at frame 5, column 1"),
+    ("beat2", lambda root: text(root / GRID, '"words"', '"letters"'), f'{GRID}: no tier "words" in it'),
+    ("beat2", lambda root: text(root / LIST2, "id,type", "id,kind"), "no column 'type'"),
+    ("beat2", lambda root: cut(root / BEAT / "wave16k/2_scott_0_1_1.wav"), "2_scott_0_1_1.wav"),
+    ("style100", lambda root: cut(root / "Old/Old_FW.bvh"), "Old/Old_FW.bvh"),
+    ("style100", lambda root: text(root / CUTS, "STYLE_NAME", "STYLE"), "no column 'STYLE_NAME'"),
+    ("style100", lambda root: text(root / CUTS, "Old,40", "Old,now"), "frames 'now' to '221'"),
+    ("style100", lambda root: text(root / CUTS, "Old,40,221", "Old,999,1200"), "shorter than 1 s"),
+    ("style100", lambda root: (root / CUTS).unlink(), "no Frame_Cuts.csv in it"),
 ]  # fmt: skip
 
 

@@ -45,7 +45,7 @@ SOURCE_FPS = 30.0
 class BodyConfig(ReleaseConfig, SoundConfig):
     """Options of sets of body model parameters."""
 
-    layouts = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
+    layouts: ClassVar[tuple[str, ...]] = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
 
     body_model: Path | None = None
     """Your body model (.npz), for bones by each clip's shape; else those of one neutral adult."""

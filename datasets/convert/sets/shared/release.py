@@ -156,7 +156,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         config, layout = self.config, self.layout
         if not config.source.is_dir():
             raise UserError(f"{config.source}: no such folder")
-        draft = ConversionPlan[ReleaseClip](config, audit=Audit(self.published))
+        draft = ConversionPlan[ReleaseClip](config, audit=Audit(self.stated()))
         entries = list(self.entries(draft))
         if not entries:
             raise UserError(f"{config.source}: the lists of {self.title} name no clip in it")

@@ -1,0 +1,149 @@
+"""BEAT2: people who talk, with face; SMPL-X .npz and 100 FLAME expressions at 30 fps, speech and transcripts.
+
+`beat_LANGUAGE_v2.0.0/` holds `smplxflame_30/NAME.npz` (poses [T, 165], expressions [T, 100], trans, betas),
+`wave16k/NAME.wav`, `textgrid/NAME.TextGrid` and `train_test_split.csv`. The first 50 expressions are the
+face's columns, as they are: both are the first of FLAME's basis. NAME is `NUMBER_SPEAKER_KIND_FIRST_LAST`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from motionloom.datasets.convert.common.arrays import check_values
+from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.files import read_text_file
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.where import Fact
+from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
+from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
+from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv
+from motionloom.datasets.motion.layout import FACE_DIMS
+from motionloom.datasets.motion.npz import NpzFile
+from motionloom.datasets.schema import Caption, Split, UserError
+
+MOTION, SPEECH, WORDS, LISTS = "smplxflame_30", "wave16k", "textgrid", "train_test_split.csv"
+_SPLITS: dict[str, Split] = {"train": "train", "val": "val", "test": "test"}
+_TIER = re.compile(r'name\s*=\s*"words".*?(?=\n\s*item\s*\[|\Z)', re.DOTALL)
+_WORD = re.compile(r'xmin\s*=\s*([\d.]+)\s+xmax\s*=\s*([\d.]+)\s+text\s*=\s*"((?:[^"]|"")*)"')
+
+
+class Beat2Config(BodyConfig):
+    """Options of the BEAT2 converter; `source` is BEAT2/, or the folder of one language."""
+
+    layouts = ("wholebody363", *BodyConfig.layouts)
+
+    name: str = "beat2"
+    """Name of the data set; part of the shards' file names."""
+    layout: str = "wholebody363"
+    """`wholebody363` with fingers and face, or one without."""
+    fps: float = 30.0
+    """Frame rate of the shards; clips are resampled by time."""
+    additional: Literal["train", "drop"] = "train"
+    """What becomes of the takes that the list calls `additional`."""
+    pause: float = 0.5
+    """Seconds of silence that end a phrase; what is said becomes a caption a phrase, with source `speech`."""
+
+
+class Beat2(BodyRelease[Beat2Config]):
+    """The BEAT2 converter."""
+
+    name = "beat2"
+    title = "BEAT2"
+    summary = "BEAT2: talking people with face, speech and transcripts to shards."
+    example = "BEAT2 shards"
+    config_class = Beat2Config
+    terms = "BEAT2-noncommercial"
+    model = "SMPL-X"
+    published = Published("EMAGE paper, CVPR 2024", {"hours": 60, "speaker": 25})
+
+    def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
+        source = self.config.source
+        folders = sorted(
+            path.parent for path in [source / MOTION, *source.glob(f"*/{MOTION}")] if path.is_dir()
+        )
+        if not folders:
+            raise UserError(
+                f"{source}: no {MOTION}/ in it nor in its folders; give BEAT2/, or one language's"
+            )
+        for folder in folders:
+            below = "" if folder == source else f"{folder.name}/"
+            listed = {}
+            if (folder / LISTS).is_file():
+                listed = {
+                    row["id"].strip(): row["type"].strip() for row in read_csv(folder / LISTS, ("id", "type"))
+                }
+            else:
+                draft.notes.append(f"no {below}{LISTS}: split 80/5/15 by hash of the name")
+            language = folder.name.removeprefix("beat_").split("_v")[0]
+            here = {path.stem for path in (folder / MOTION).glob("*.npz")}
+            for name in sorted({*here, *listed}):
+                yield self._entry(below, name, language, listed.get(name), bool(listed), draft)
+
+    def _entry(
+        self,
+        below: str,
+        name: str,
+        language: str,
+        kind: str | None,
+        has_list: bool,
+        draft: ConversionPlan[ReleaseClip],
+    ) -> Entry:
+        facts: dict[str, Fact] = {"language": language, "type": kind or ""}
+        parts = name.split("_")
+        if len(parts) >= 2 and parts[0].isdigit():
+            facts |= {"speaker_id": float(parts[0]), "speaker": f"{parts[0]}_{parts[1]}"}
+        problem = ""
+        if has_list and kind is None:
+            problem = f"not in {LISTS}"
+        elif kind == "additional" and self.config.additional == "drop":
+            problem = "additional (--set additional=train keeps it)"
+        split: Split | None = "train" if kind == "additional" else _SPLITS.get(kind or "")
+        sound, said = f"{below}{SPEECH}/{name}.wav", tuple(self._words(below, name, draft))
+        return Entry(
+            f"{below}{name}", f"{below}{MOTION}/{name}.npz", said, split, name, facts,
+            sound if (self.config.source / sound).is_file() else None, problem=problem,
+        )  # fmt: skip
+
+    def _words(self, below: str, name: str, draft: ConversionPlan[ReleaseClip]) -> Iterator[Caption]:
+        """What is said, a caption for each phrase between two pauses."""
+        file = f"{below}{WORDS}/{name}.TextGrid"
+        path = self.config.source / file
+        if not path.is_file():
+            return
+        try:
+            tier = _TIER.search(read_text_file(path, file))
+            if tier is None:
+                raise UserError(f'{file}: no tier "words" in it')
+        except UserError as error:
+            note_broken(draft, file, error)
+            return
+        said: list[str] = []
+        start = end = 0.0
+        words = [(float(a), float(b), text.strip()) for a, b, text in _WORD.findall(tier[0]) if text.strip()]
+        for begin, stop, word in words:
+            if said and begin - end > self.config.pause:
+                yield from captions_of(" ".join(said), "speech", start, end)
+                said = []
+            start, end, said = (start if said else begin), stop, [*said, word]
+        yield from captions_of(" ".join(said), "speech", start, end)
+
+    def figure(self, path: Path, label: str) -> Figure:
+        figure = super().figure(path, label)
+        with NpzFile(path, label) as file:
+            face = (
+                file.numbers("expressions")
+                if "expressions" in file.names
+                else np.zeros((len(figure), FACE_DIMS))
+            )
+        if face.ndim != 2 or len(face) != len(figure) or face.shape[1] < FACE_DIMS:
+            raise UserError(
+                f"{label}: expressions is {list(face.shape)}, not [{len(figure)}, {FACE_DIMS} or more]"
+            )
+        check_values(face, 1e3, f"{label}: expressions")
+        return replace(figure, face=face[:, :FACE_DIMS])

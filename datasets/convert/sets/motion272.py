@@ -1,0 +1,158 @@
+"""The 272 columns of MotionStreamer and MotionMillion, at 30 fps: joints without inverse kinematics.
+
+| columns | content |
+|---|---|
+| 0:2 | step of the root since the frame before, x and z, seen from that frame's heading |
+| 2:8 | turn of the heading since the frame before, the first two rows of its matrix |
+| 8:74 | 22 joints above the origin, seen from this frame's heading, metres, Y up |
+| 74:140, 140:272 | their steps; the local rotations of SMPL in six columns |
+
+Joints are read from the positions, so bones are each person's own; the rotations are not needed. Known trees:
+`motion_data/` with `texts/` and `split/` (HumanML3D-272, BABEL-272), `motion_data/vector_272/` with
+`split/version1/t2m_60_300/` (MotionMillion), `train_stream/` with `train_stream_text/` (BABEL-272-stream).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
+from motionloom.datasets.convert.common.arrays import check_array_header, load_array
+from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.files import read_text_file
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.splits import original_of, read_split_files
+from motionloom.datasets.convert.common.where import Fact
+from motionloom.datasets.convert.sets.shared.release import (
+    Entry,
+    Figure,
+    Release,
+    ReleaseClip,
+    ReleaseConfig,
+    note_broken,
+)
+from motionloom.datasets.convert.sets.shared.tables import captions_of
+from motionloom.datasets.convert.sets.shared.vectors import walked
+from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.schema import SPLITS, Caption, Split, UserError
+
+FPS, WIDTH = 30.0, 272
+_STEP, _TURN, _POSITIONS = slice(0, 2), slice(2, 8), slice(8, 8 + 3 * BODY_JOINTS)
+_MOTION = ("motion_data/vector_272", "motion_data")
+_LISTS = ("split/version1/t2m_60_300", "split", "splits")
+_STREAMED = re.compile(r"(?P<first>[^*]+)\*(?P<second>.+)#(?P<frames>\d+)\s*")
+
+
+class Motion272Config(ReleaseConfig):
+    """Options of the converter of 272-column sets; `source` is the folder that holds motion_data/."""
+
+    name: str = "motion272"
+    """Name of the data set; part of the shards' file names."""
+    list_folder: str = ""
+    """Folder of the split lists in the source, such as split/version1/tokenizer_96; else the usual ones."""
+
+
+class Motion272(Release[Motion272Config]):
+    """The converter of 272-column sets."""
+
+    name = "motion272"
+    title = "272-column sets"
+    summary = "MotionMillion, HumanML3D-272, BABEL-272: vectors of 272 columns to shards."
+    example = "MotionMillion shards"
+    config_class = Motion272Config
+    terms = "272-column set: non-commercial, AMASS's terms where its motions are from there"
+    published = Published("MotionMillion paper", {"clips": 2_000_000, "hours": 2000})
+
+    def stated(self) -> Published | None:
+        """MotionMillion's numbers, for its layout alone."""
+        return self.published if (self.config.source / _MOTION[0]).is_dir() else None
+
+    def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
+        source = self.config.source
+        streams = [split for split in SPLITS if (source / f"{split}_stream").is_dir()]
+        if streams:
+            for split in streams:
+                names = sorted(path.stem for path in (source / f"{split}_stream").glob("*.npy"))
+                yield from (
+                    self._entry(f"{split}_stream", f"{split}_stream_text", n, split, draft) for n in names
+                )
+            return
+        motion = next((name for name in _MOTION if (source / name).is_dir()), None)
+        if motion is None:
+            raise UserError(f"{source}: no {_MOTION[-1]}/ in it; unpack motion_data.zip, or give its folder")
+        lists = [self.config.list_folder] if self.config.list_folder else _LISTS
+        folder = next((source / name for name in lists if (source / name).is_dir()), None)
+        listed: dict[str, Split] = {}
+        if folder is None:
+            draft.notes.append("no split lists: split 80/5/15 by hash of the id")
+        else:
+            listed, notes = read_split_files(folder)
+            draft.notes += notes
+        root = source / motion
+        here = (path.relative_to(root).as_posix().removesuffix(".npy") for path in root.rglob("*.npy"))
+        for name in sorted({*here, *listed}):
+            yield self._entry(motion, "texts", name, listed.get(name), draft, unlisted=folder is not None)
+
+    def _entry(
+        self,
+        motion: str,
+        texts: str,
+        name: str,
+        split: Split | None,
+        draft: ConversionPlan[ReleaseClip],
+        unlisted: bool = False,
+    ) -> Entry:
+        original = original_of(name)
+        said = tuple(self._texts(f"{texts}/{name}.txt", draft))
+        problem = "in no split list" if unlisted and split is None else ""
+        facts: dict[str, Fact] = {
+            "subset": name.split("/")[0] if "/" in name else "",
+            "mirrored": float(original is not None),
+        }
+        stem = f"{motion}/{name}" if motion.endswith("_stream") else name
+        return Entry(
+            stem, f"{motion}/{name}.npy", said, split, original or name, facts,
+            mirror_of=original, problem=problem,
+        )  # fmt: skip
+
+    def _texts(self, file: str, draft: ConversionPlan[ReleaseClip]) -> Iterator[Caption]:
+        """Captions in HumanML3D's grammar, two in a row of BABEL's stream, or plain lines."""
+        path = self.config.source / file
+        if not path.is_file():
+            return
+        try:
+            lines = [line for line in read_text_file(path, file).split("\n") if line.strip()]
+            if any(line.count("#") >= 3 for line in lines):
+                captions, wrong = read_humanml_captions(path, seconds=None, name=file)
+                draft.notes += [f"{file}: {problem}" for problem in wrong]
+                yield from captions
+                return
+            for line in lines:
+                if file.split("/")[0].endswith("_stream_text") and (row := _STREAMED.fullmatch(line)):
+                    change = int(row["frames"]) / FPS
+                    yield from captions_of(row["first"], "babel", 0.0, change)
+                    yield from captions_of(row["second"], "babel", change)
+                else:
+                    yield from captions_of(line, "texts")
+        except UserError as error:
+            note_broken(draft, file, error)
+
+    def length(self, path: Path, label: str) -> tuple[int, float]:
+        return check_array_header(path, width=WIDTH, name=label), FPS
+
+    def figure(self, path: Path, label: str) -> Figure:
+        return Figure(joints=joints_of_272(load_array(path, width=WIDTH, name=label, limit=1e3)))
+
+
+def joints_of_272(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Columns [T, 272] -> joints [T, 22, 3] in metres, the first root above the origin."""
+    columns: NDArray[np.float64] = np.asarray(values, dtype=np.float64)
+    turns = columns[:, _TURN]
+    heading = np.cumsum(np.arctan2(turns[:, 2], turns[:, 0]))  # first row of a turn about Y: cos, 0, sin
+    positions = columns[:, _POSITIONS].reshape(len(columns), BODY_JOINTS, 3)
+    return walked(positions, heading, columns[1:, _STEP])
