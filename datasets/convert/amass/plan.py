@@ -216,7 +216,8 @@ def _whole_clips(
 ) -> Iterator[tuple[AmassClip, str]]:
     """Every file as one clip, and why it must be left out."""
     headers = read_headers(files, settings, draft)
-    listing = config.listing([file.label for file in files])
+    labels = [file.label for file in files]
+    listing = config.with_subjects(config.listing(labels), labels)
     draft.notes += listing.notes
     seen: dict[str, str] = {}
     for file, header in headers:

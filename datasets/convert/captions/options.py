@@ -8,15 +8,16 @@ with (`/data/mocap/walks/walk.bvh`). A name that two files fit is an error.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from pydantic import field_validator
 
 from motionloom.datasets.base.files import sha256_of, sha256_of_json
-from motionloom.datasets.convert.captions.read import CaptionRow, bare, read_captions
+from motionloom.datasets.convert.captions.names import label_words, subject_splits
+from motionloom.datasets.convert.captions.read import CaptionRow, bare, joined, read_captions
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
 from motionloom.datasets.convert.common.splits import SplitNames, hash_split, read_split_files
@@ -46,6 +47,14 @@ class FileNames:
         if len(fits) > 1:
             raise UserError(f"{where}: '{name}' may mean {' or '.join(fits[:_SHOWN])}; write the folder too")
         return fits[0] if fits else next((self._whole[e] for e in _ends(name) if e in self._whole), None)
+
+    def find_end(self, name: str) -> str | None:
+        """The only file whose path ends as a name of another collection's does, by as much of it as fits."""
+        for end in _ends(bare(name)):
+            fits = {*self._by_end.get(end, ()), *([self._whole[end]] if end in self._whole else ())}
+            if fits:
+                return fits.pop() if len(fits) == 1 else None
+        return None
 
 
 def _ends(name: str) -> list[str]:
@@ -99,10 +108,16 @@ def list_clips(
     missing: dict[str, str] = {}
     unused: list[CaptionRow] = []
     for row in rows:
-        path = (names.find(row.file, row.where) if row.file else None) or names.find(row.id, row.where)
+        if row.catalogue:
+            path = names.find_end(row.file or row.id) or names.find_end(row.id)
+        else:
+            path = (names.find(row.file, row.where) if row.file else None) or names.find(row.id, row.where)
         if path is None:
             unused.append(row)
-            missing[row.file or row.id] = row.id
+            if not row.catalogue:
+                missing[row.file or row.id] = row.id
+        elif path in found and row.catalogue:
+            found[path] = joined(found[path], replace(row, id=found[path].id, file=None))
         elif path in found:
             raise UserError(f"{row.where}: '{row.id}' and '{found[path].id}' both mean {path}")
         else:
@@ -137,6 +152,9 @@ def _stem(name: str) -> str:
     return bare(name).rsplit("/", 1)[-1].lower()
 
 
+BY_NAMES, BY_SUBJECTS = "names", "subjects"
+"""What stands for a file of captions and for a folder of splits."""
+
 _SHOWN = 3
 """Names that a sentence lists."""
 
@@ -145,11 +163,14 @@ class CaptionConfig(ConvertConfig):
     """Options of converters that take captions in any form."""
 
     captions: Path | None = None
-    """Captions by the clips' names: JSON lines, JSON, CSV, TSV, or a folder of .txt files (docs/sources.md).
-    Without it clips have no captions.
+    """Captions by the clips' names: JSON lines, JSON, CSV, TSV, CMU's or KIT-ML's lists, or a folder of .txt
+    files or of such lists (docs/sources.md); `names` for the words of the files' names. Without it clips
+    have no captions.
     """
     splits: Path | None = None
-    """Folder of train.txt, val.txt, test.txt; else the captions' `split`, else 80/5/15 by hash of the id."""
+    """Folder of train.txt, val.txt, test.txt, or `subjects` for all clips of a person in one split; else the
+    captions' `split`, else 80/5/15 by hash of the id.
+    """
     splits_map: str = ""
     """What other names of splits mean: `fold1=train,extra=drop`; `NAME=ignore` as if none were stated;
     `ignore` or `drop` alone for all others. `valid`, `dev`, `training` and the like need none.
@@ -177,9 +198,33 @@ class CaptionConfig(ConvertConfig):
     def listing(self, paths: Sequence[str]) -> Listing:
         """What captions and split files say of motion files, by their paths in the source."""
         names = SplitNames(self.splits_map)
-        rows = read_captions(self.captions, names).values() if self.captions else ()
-        listed, notes = read_split_files(self.splits, names) if self.splits else (None, [])
+        rows: Iterable[CaptionRow] = ()
+        if str(self.captions) == BY_NAMES and not Path(BY_NAMES).exists():
+            rows = _rows_of_names(paths)
+        elif self.captions is not None:
+            rows = read_captions(self.captions, names).values()
+        by_files = self.splits is not None and not self.by_subjects
+        listed, notes = read_split_files(self.splits, names) if self.splits and by_files else (None, [])
         return list_clips(paths, rows, listed, notes)
+
+    @property
+    def by_subjects(self) -> bool:
+        """Whether all clips of a person go into one split."""
+        return str(self.splits) == BY_SUBJECTS and not Path(BY_SUBJECTS).exists()
+
+    def with_subjects(self, listing: Listing, readable: Sequence[str]) -> Listing:
+        """A listing with the readable files split by subject, where that is asked for."""
+        if not self.by_subjects:
+            return listing
+        splits, notes = subject_splits(readable)
+        return replace(listing, splits=splits, notes=[*listing.notes, *notes])
+
+
+def _rows_of_names(paths: Sequence[str]) -> Iterator[CaptionRow]:
+    for path in paths:
+        if words := label_words(path):
+            texts = (Caption(text=words, source="file name"),)
+            yield CaptionRow(bare(path), texts, path, None, False, None, path)
 
 
 def digest_of(path: Path) -> dict[str, str]:
@@ -252,6 +297,8 @@ def _unused(found: Listing) -> str:
     for row in found.unused[:_SHOWN]:
         near = found.nearest(row)
         shown.append(f"'{row.file or row.id}'" + (f", nearest: {' and '.join(near)}" if near else ""))
+    if all(row.catalogue for row in found.unused):
+        return f"{len(found.unused)} clips of its collection that are not in the source"
     more = f"; and {len(found.unused) - _SHOWN} more" if len(found.unused) > _SHOWN else ""
     which = "clip that is" if len(found.unused) == 1 else "clips that are"
     return f"{len(found.unused)} {which} not in the source ({'; '.join(shown)}{more})"

@@ -1,8 +1,8 @@
-"""Captions that people bring for their clips, in any of five forms that are recognised by themselves.
+"""Captions that people bring for their clips, in any of six forms that are recognised by themselves.
 
-JSON lines begin with `{`, a JSON list with `[`, a folder of .txt files is HumanML3D's where a first line has
-its grammar, and any other file is CSV or TSV with a header (docs/sources.md). Every error begins with
-`FILE:LINE`, and what a record says passes through pydantic.
+JSON lines begin with `{`, one object by clips' names does too, a JSON list begins with `[`, a folder of .txt
+files is HumanML3D's where a first line has its grammar, and any other file is CSV or TSV with a header
+(docs/sources.md). Every error begins with `FILE:LINE`, and what a record says passes through pydantic.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ _TEXT = {word: re.compile(rf"{word}s?(?:_?\d+)?") for word in TEXT_KEYS}
 _SUFFIX = re.compile(r"\.(?:bvh|amc|npz|npy|pkl|fbx|c3d|glb|txt|json|csv|mp4|wav)$", re.IGNORECASE)
 _NUMBER = r"\s*(?:nan|[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|[-+]?\.\d+)\s*"
 _HUMANML = re.compile(rf"[^#].*#.*#{_NUMBER}#{_NUMBER}")
+_AMASS = re.compile(r"_(?:poses|stageii)$")
 _DELIMITERS = {",": "a ','", "\t": "a tab", ";": "a ';'"}
+_CATALOGUE = "<catalogue>"
 _RECORD = '{"id": "walk-001", "captions": ["a person walks"]}'
 
 
@@ -51,6 +53,8 @@ class CaptionRow:
     fps: float | None
     where: str
     """`FILE:LINE`, or the file and which of its records."""
+    catalogue: bool = False
+    """Whether it is from a list of a whole collection, of which a source need not have every clip."""
 
 
 class _Given(Config):
@@ -79,13 +83,15 @@ def read_captions(path: Path, splits: SplitNames | None = None) -> dict[str, Cap
     """
     names, rows, files = splits or SplitNames(), dict[str, CaptionRow](), dict[str, str]()
     for where, values in _records(path):
+        catalogue = bool(values.pop(_CATALOGUE, False))
         row, is_list = _row(where, values, names)
+        row = replace(row, catalogue=catalogue)
         before = rows.get(row.id)
         if row.file and files.setdefault(row.file, row.id) != row.id:
             raise UserError(f"{where}: file '{row.file}' has a record already ('{files[row.file]}')")
-        if before is not None and is_list:
+        if before is not None and is_list and not catalogue:
             raise UserError(f"{where}: clip id '{row.id}' has a record already ({before.where})")
-        rows[row.id] = row if before is None else _joined(before, row)
+        rows[row.id] = row if before is None else joined(before, row)
     if not rows:
         raise UserError(f"{path}: no captions in it")
     names.require_known()
@@ -140,8 +146,8 @@ def _text_keys(keys: tuple[str, ...]) -> tuple[str, ...]:
     return next((keys for keys in found if keys), ())
 
 
-def _joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
-    """One row of two records that hold a caption each of the same clip."""
+def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
+    """One row of two records of the same clip."""
     for what in ("file", "split", "fps"):
         old, new = getattr(before, what), getattr(row, what)
         if old is not None and new is not None and old != new:
@@ -164,6 +170,8 @@ def _records(path: Path) -> Iterator[tuple[str, dict[str, object]]]:
         return _of_folder(path)
     text = read_text_file(path)
     start = text.lstrip()[:1]
+    if start == "{" and (named := _by_name(path, text)) is not None:
+        return iter(named)
     if start == "[" or (start and path.suffix.lower() == ".json" and start != "{"):
         values = _decode(str(path), text)
         listed = enumerate(values if isinstance(values, list) else [values], start=1)
@@ -172,6 +180,35 @@ def _records(path: Path) -> Iterator[tuple[str, dict[str, object]]]:
         return _of_table(path, text)
     places = ((f"{path}:{n}", line) for n, line in enumerate(text.split("\n"), start=1) if line.strip())
     return (_record(place, _decode(place, line)) for place, line in places)
+
+
+def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object]]] | None:
+    """The records of one JSON object by the clips' names; None for any other text.
+
+    A name has a caption, a list of them (as text, or as `{text, start, end}`), or, as in KIT-ML's annotations
+    of AMASS, `{path, annotations}`. Sentences about mirror images (`M/…`) are of clips that nobody recorded.
+    """
+    try:
+        named = json.loads(text, object_pairs_hook=_without_repeats)
+    except (ValueError, RecursionError):
+        return None  # JSON lines; or they will say what is wrong
+    if not isinstance(named, dict) or _text_keys(tuple(named)) or {*ID_KEYS, *FILE_KEYS} & named.keys():
+        return None
+    records: list[tuple[str, dict[str, object]]] = []
+    for name, value in named.items():
+        where, record = f"{path}: '{name}'", {"id": name, _CATALOGUE: True}
+        if isinstance(value, dict) and {"path", "annotations"} <= value.keys():
+            place, value = str(value["path"]), value["annotations"]
+            if place.startswith("M/"):
+                continue
+            record |= {"id": _AMASS.sub("", place), "file": place}
+        if not isinstance(value, str | list):
+            raise UserError(f"{where}: expected a caption, a list of captions, or path and annotations")
+        listed = [value] if isinstance(value, str) else value
+        kept = [{k: one[k] for k in ("text", "start", "end") if k in one} if isinstance(one, dict) else one
+                for one in listed]  # fmt: skip
+        records.append((where, {**record, "captions": kept}))
+    return records
 
 
 def _record(where: str, value: object) -> tuple[str, dict[str, object]]:
@@ -199,6 +236,14 @@ def _of_folder(folder: Path) -> Iterator[tuple[str, dict[str, object]]]:
 
     The folder is in HumanML3D's grammar when the first line of any file is: then all lines must be.
     """
+    catalogues = [
+        found
+        for path in sorted(folder.glob("*.json"))
+        for found in _by_name(path, read_text_file(path)) or ()
+    ]
+    if catalogues:
+        yield from catalogues
+        return
     paths = sorted(p for p in folder.rglob("*.txt") if p.is_file() and not p.name.startswith("."))
     if not paths:
         raise UserError(f"{folder}: no .txt file in it; expected one caption a line in FOLDER/CLIP.txt")

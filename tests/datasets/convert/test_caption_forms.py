@@ -15,6 +15,7 @@ from bvh_clips import write_clip, write_map
 from rich.console import Console
 
 from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.captions.names import label_words, subject_of, subject_splits
 from motionloom.datasets.convert.captions.options import list_clips, nearest
 from motionloom.datasets.convert.captions.read import read_captions
 from motionloom.datasets.convert.common.splits import SplitNames, hash_split, read_split_files
@@ -150,6 +151,11 @@ BROKEN = [  # (file, content, where and what)
     ("c.json", '[\n{"id": "a", "caption": "x"}\n{"id": "b"}]', ": not valid JSON"),
     ("c.json", '{"id": "a", "caption": "y", "id": "z"}', ":1: not valid JSON (a key appears twice)"),
     ("c.json", '"a"', ": record 1: no record"),
+    ("c.json", '{"a": "walks", "b": 5}', ": 'b': expected a caption, a list"),
+    ("c.json", '{"a": "walks", "../b": "sits"}', ": '../b': clip id '../b' is not a plain relative name"),
+    ("c.json", '{"a": [{"text": "walks", "start": 3, "end": 2}]}', ": 'a': 'captions': the caption ends"),
+    ("c.json", '{"a": ["walks"], "a": ["sits"]}', ":1: not valid JSON (a key appears twice)"),
+    ("c.json", '{"1": {"path": "KIT/3/x_poses", "annotations": {}}}', ": '1': expected a caption, a list"),
     ("c.csv", "name,words\na,x", ":1: the first line must name a column for the clip"),
     ("c.csv", "name,caption\na,he walks, then sits", ":2: 3 columns, but the first line names 2 (name"),
     ("c.csv", 'name,caption\na,"x\n\ny"\nb', ":5: 1 columns, but the first line names 2"),
@@ -175,6 +181,75 @@ def test_a_broken_line_is_named(name: str, content: str | bytes, place: str, tmp
     with pytest.raises(UserError) as caught:
         read_captions(path if path.parent == tmp_path else path.parent)
     assert str(caught.value).startswith(f"{path}{place}")
+
+
+PATHS = ["amc/01_01.amc", "amc/01_02.amc", "amc/02_09.amc", "more/88_01.amc"]
+
+
+@pytest.mark.parametrize(
+    ("given", "captioned", "timed"),
+    [("cmu/cmu_descriptions.json", 4, 0), ("kitml/kitml_annotations.json", 2, 2), ("cmu", 4, 2)],
+)
+def test_lists_of_whole_collections(given: str, captioned: int, timed: int, shared: Path) -> None:
+    """CMU's own descriptions, KIT-ML's sentences by AMASS's path, and a folder of both kinds."""
+    listing = BvhConfig(source=shared, captions=shared / "data/real" / given).listing(PATHS)
+    assert (len(listing.rows), listing.missing) == (captioned, {}) and len(listing.unused) > 700
+    texts = {path: row.texts for path, row in listing.rows.items()}
+    ends = [text.end for text in texts["amc/01_01.amc"] + texts["amc/02_09.amc"] if text.end is not None]
+    assert ends == [22.925, 8.608][:timed]
+    assert all(text.text for row in texts.values() for text in row)
+
+
+def test_mirrored_sentences_and_names_that_fit_twice_are_left_alone(tmp_path: Path) -> None:
+    entry = {
+        "path": "KIT/3/walk_poses",
+        "annotations": [{"seg_id": "x", "text": "walks", "start": 0, "end": 1}],
+    }
+    mirrored = {**entry, "path": "M/KIT/3/walk_poses", "annotations": [{"text": "mirrored"}]}
+    (tmp_path / "c.json").write_text(json.dumps({"00001": entry, "M00001": mirrored}))
+    config = BvhConfig(source=tmp_path, captions=tmp_path / "c.json")
+    for paths in (["KIT/3/walk_poses.npz", "KIT/4/walk_poses.npz"], ["3/walk.bvh"], ["x/walk.bvh"]):
+        (row,) = config.listing(paths).rows.values()
+        assert [text.text for text in row.texts] == ["walks"]
+    assert not config.listing(["a/walk.bvh", "b/walk.bvh"]).rows
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "subject"),
+    [
+        ("h/HDM_bd_kickLFront1Reps_003_120.amc", "kick left front once", "HDM_bd"),
+        ("HDM_mm_clap5Reps_003_120.amc", "clap 5 times", "HDM_mm"),
+        ("HDM_mm_hopRLeg1hops_003_120.amc", "hop right leg 1 hop", "HDM_mm"),
+        (
+            "HDM_tr_elbowToKnee1RepsRelbowStart_001_120.amc",
+            "elbow to knee once, starting with the right elbow",
+            "HDM_tr",
+        ),
+        ("HDM_dg_walk4StepsLstart_001_120.amc", "walk 4 steps, starting with the left", "HDM_dg"),
+        ("HDM_dg_throwFarR_001_120.amc", "throw far right", "HDM_dg"),
+        ("CMU/07/07_12_poses.npz", "", "07"),
+        ("mocap/walk_fast_001.bvh", "walk fast", "mocap"),
+        ("anna-waves.bvh", "anna waves", "anna"),
+        ("12.bvh", "", "12"),
+    ],
+)
+def test_names_of_files_tell_words_and_subject(name: str, words: str, subject: str) -> None:
+    assert (label_words(name), subject_of(name)) == (words, subject)
+
+
+def test_a_subject_is_in_one_split() -> None:
+    paths = [f"{subject:02}_{trial:02}.amc" for subject in range(40) for trial in range(1 + subject % 7)]
+    splits, notes = subject_splits(paths)
+    of_subject = {
+        subject: {splits[p] for p in paths if subject_of(p) == subject} for subject in map(subject_of, paths)
+    }
+    assert all(len(found) == 1 for found in of_subject.values())
+    share = Counter(splits.values())
+    assert 0.10 < share["test"] / len(paths) < 0.20 and 0.02 < share["val"] / len(paths) < 0.10
+    assert notes[0].startswith("split by subject: ")
+    few = [f"{subject}_{trial:02}.amc" for subject in (1, 2, 3) for trial in range(9)]
+    assert set(subject_splits(few)[0].values()) == {"train", "val", "test"}
+    assert set(subject_splits(few[:9])[0].values()) == {"train"}
 
 
 def test_nothing_to_read(tmp_path: Path) -> None:
