@@ -21,15 +21,17 @@ THRESHOLD = 0.35 * APEX
 _BLINK, _TALK = 4, slice(5, 8)
 
 
-def _basis() -> Array:
+def _basis(count: int) -> Array:
     index = np.arange(FACE_DIMS)
-    columns = np.stack([np.cos(np.pi * (index + 0.5) * (k + 1) / 24) * np.exp(-index / 18) for k in range(8)])
-    q, r = np.linalg.qr(columns.T)
+    waves = [np.cos(np.pi * (index + 0.5) * (k + 1) / 24) * np.exp(-index / 18) for k in range(count)]
+    q, r = np.linalg.qr(np.stack(waves).T)
     return np.asarray(q * np.sign(np.diag(r)))
 
 
-BASIS = _basis()
+BASIS = _basis(8)
 """Orthonormal columns [50, 8]; see the module's description."""
+DETAIL = _basis(22)[:, 8:]
+"""Orthonormal columns [50, 14] across those of `BASIS`, for what recorded faces do beside them."""
 
 
 def express(emotion: str, t: Array, rng: np.random.Generator) -> Array:

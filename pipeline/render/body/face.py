@@ -16,9 +16,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.body.arkit import ARKIT, ArkitBases
+from motionloom.datasets.motion.body.arkit import ARKIT, ArkitBases, bounded_least_squares
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.synth.face import APEX, BASIS
+from motionloom.datasets.synth.face import APEX, BASIS, DETAIL
 from motionloom.pipeline.render.body.mesh import body_for
 
 Floats = NDArray[np.float64]
@@ -35,6 +35,8 @@ _EYE_OPEN = np.array([0.75, 0.85, 0.8, 1.6])
 BLINK_HEIGHT = 1.6
 """Length of a full blink along its column of the synthetic basis."""
 _WIDE_EYE = 1.6
+DETAIL_METRES = 0.02
+"""Displacement over all vertices of 1 along a column of `DETAIL`: recorded faces reach a few of it."""
 
 
 def synthetic_face_controls(expression: Values) -> Floats:
@@ -98,6 +100,37 @@ def own_bases() -> ArkitBases:
     return ArkitBases(np.stack([shapes[n] for n in EXPRESSIONS]), np.stack([shapes[n] for n in ARKIT]))
 
 
+@cache
+def _with_detail() -> ArkitBases:
+    """The own bases, with the strongest movements of ARKit's shapes beside the expressions."""
+    bases = own_bases()
+    source, arkit = (basis.reshape(len(basis), -1) for basis in (bases.source, bases.arkit))
+    _, directions = np.linalg.eigh(arkit @ arkit.T)
+    strongest = directions[:, ::-1][:, : DETAIL.shape[1]].T @ arkit
+    strongest *= DETAIL_METRES / np.linalg.norm(strongest, axis=-1, keepdims=True)
+    return ArkitBases(np.concatenate([source, strongest]).reshape(-1, *bases.source.shape[1:]), bases.arkit)
+
+
 def synthetic_arkit(expression: Values) -> Floats:
     """ARKit weights [T, 52] of synthetic expression values [T, 50], by the bases of the body's own head."""
-    return own_bases().weights(expression_weights(expression))
+    detail = np.asarray(expression, np.float64) @ DETAIL
+    return _with_detail().weights(np.concatenate([expression_weights(expression), detail], axis=1))
+
+
+def recorded_expression(weights: Values) -> Floats:
+    """Synthetic expression values [T, 50] of ARKit weights [T, 52]: the way back of `synthetic_arkit`.
+
+    The mixture of expressions that is nearest on the body's head, then what is left along `DETAIL`.
+    """
+    bases = _with_detail()
+    source, arkit = (basis.reshape(len(basis), -1) for basis in (bases.source, bases.arkit))
+    known, detail = source[: len(EXPRESSIONS)], source[len(EXPRESSIONS) :]
+    moved = np.asarray(weights, np.float64) @ arkit
+    mixed = bounded_least_squares(known @ known.T, moved @ known.T)
+    left = (moved - mixed @ known) @ detail.T / DETAIL_METRES**2
+    emotions, blink, talk = mixed[:, :4], mixed[:, 4], mixed[:, 5:]
+    opened = np.maximum(1 + emotions @ (_EYE_OPEN - 1), 1e-6)
+    along = np.concatenate(
+        [emotions * APEX, (np.clip(blink / opened, 0, 1) * BLINK_HEIGHT)[:, None], talk], axis=1
+    )
+    return np.asarray(along @ BASIS.T + left @ DETAIL.T)
