@@ -28,6 +28,8 @@ MotionType = Literal["float32", "float16"]
 
 MANIFEST_FILE, INDEX_FILE = "manifest.json", "index.npz"
 """In the folder of a data set, beside its shards."""
+CLEANED_FILE = "cleaned.json"
+"""Beside them where somebody has cleaned the set."""
 
 
 class UserError(Exception):
@@ -220,3 +222,31 @@ class Manifest(Config):
     notes: list[str] = []
     audit: list[AuditRow] = []
     """What the makers of the source say there is, for sources with published numbers."""
+    excluded: dict[str, str] = {}
+    """Ids of clips that readers skip, and why: what `motionloom data clean` was told to leave out."""
+
+    @model_serializer(mode="wrap")
+    def _without_no_excluded(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Sets of which nothing is excluded are written as they always were."""
+        return {name: value for name, value in handler(self).items() if name != "excluded" or value}
+
+
+class Decisions(Config):
+    """`cleaned.json`, and what the page of `motionloom data clean` saves: verdicts about suspect clips."""
+
+    left_out: dict[str, str] = {}
+    """Id of a clip -> why."""
+    kept: tuple[str, ...] = ()
+    """Ids of suspects that are good, which nobody is asked about again."""
+
+    @classmethod
+    def of(cls, root: Path) -> Decisions:
+        """Those that were made about a data set; none where there is no file of them."""
+        path = root / CLEANED_FILE
+        return cls.load_json(path) if path.is_file() else cls()
+
+    def then(self, later: Decisions) -> Decisions:
+        """These and `later` ones, which count where a clip is in both."""
+        left_out = {clip: why for clip, why in self.left_out.items() if clip not in later.kept}
+        left_out |= later.left_out
+        return Decisions(left_out=left_out, kept=tuple(sorted({*self.kept, *later.kept} - {*left_out})))

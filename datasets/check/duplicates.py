@@ -27,6 +27,7 @@ from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import ClipMeta, ShardInfo
 from motionloom.datasets.shards.tar import TarClip, scan_tar
 
@@ -155,9 +156,7 @@ class ClipTable:
         if first.shape != second.shape:
             return ""
         here, there = (joints_of(motion, self.layout) for motion in (first, second))
-        if _distance(mirror(here, self.layout.skeleton), there) < SAME_METRES:
-            return "the mirror image of"
-        return "the same recording as" if _distance(here, there) < SAME_METRES else ""
+        return likeness(here, there, self.layout.skeleton)
 
     def _height_hash(self, motion: NDArray[np.floating]) -> int:
         """0 when the heights could belong to any clip."""
@@ -186,6 +185,13 @@ class ClipTable:
         path, clip = self._clip(row)
         with path.open("rb") as file:
             return read_motion(file, path, clip)
+
+
+def likeness(here: NDArray[np.float64], there: NDArray[np.float64], skeleton: Skeleton) -> str:
+    """What joints `there` [T, N, 3] are to those `here`, as the beginning of a phrase; empty for others."""
+    if _distance(here, there) < SAME_METRES:
+        return "the same recording as"
+    return "the mirror image of" if _distance(mirror(here, skeleton), there) < SAME_METRES else ""
 
 
 def _runs(values: array[int]) -> Iterator[list[int]]:

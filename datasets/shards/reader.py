@@ -1,5 +1,7 @@
 """`ShardDataset`: random access to the clips of one split, in a folder or on a server.
 
+Clips that the manifest excludes (`motionloom data clean`) are skipped: numbers count the others alone.
+
 Opening reads `manifest.json` and the split's arrays of `index.npz`, and, in a folder, looks at the sizes of
 the shard files; no shard is opened before one of its clips is asked for. A motion is then a view into the
 memory-mapped tar (of the folder, or of the local cache of a server's shards), so the page cache is the only
@@ -85,7 +87,15 @@ def manifest_layout(manifest: Manifest) -> MotionLayout:
 class ShardDataset:
     """The clips of one split, in shard order (already shuffled). Cheap to pickle into loader workers."""
 
-    def __init__(self, store: Store, split: Split, manifest: Manifest, digest: str, reading: Reading) -> None:
+    def __init__(
+        self,
+        store: Store,
+        split: Split,
+        manifest: Manifest,
+        digest: str,
+        reading: Reading,
+        every: bool = False,
+    ) -> None:
         self.where = store.place
         self.split: Split = split
         self.manifest = manifest
@@ -100,6 +110,11 @@ class ShardDataset:
                 self._index = read_index(file, store.where(INDEX_FILE), split, self._shards)
         except MissingFileError as error:
             raise UserError(f"{error}; convert the dataset again") from None
+        self.every = every
+        self._rows = np.arange(len(self._index))
+        if manifest.excluded and not every:
+            kept = [self._index.id(row) not in manifest.excluded for row in self._rows.tolist()]
+            self._rows = self._rows[np.array(kept, dtype=np.bool_)]
         self._access: Access
         if reading.mode == "streamed":
             self._access = StreamedShards(
@@ -111,9 +126,15 @@ class ShardDataset:
 
     @staticmethod
     def open(
-        root: Path | str, split: str, *, verify: bool = False, reading: Reading | None = None
+        root: Path | str,
+        split: str,
+        *,
+        verify: bool = False,
+        reading: Reading | None = None,
+        every: bool = False,
     ) -> ShardDataset:
-        """Open one split of a folder or URL (`file:`, `http:`, `https:`, `s3:`).
+        """Open one split of a folder or URL (`file:`, `http:`, `https:`, `s3:`); `every` clip of it, or all
+        that the manifest does not exclude.
 
         In a folder every shard's size is checked and, with `verify`, its sha256; on a server a shard is
         checked when it is first read (`reading` says how).
@@ -130,35 +151,35 @@ class ShardDataset:
         if isinstance(store, LocalStore):
             for shard in shards:
                 require_intact(LocalShard(store.root / shard.name, shard), content=verify)
-        dataset = ShardDataset(store, known, manifest, digest, reading)
+        dataset = ShardDataset(store, known, manifest, digest, reading, every)
         dataset._check_motion_sizes()
         return dataset
 
     def __len__(self) -> int:
-        return len(self._index)
+        return len(self._rows)
 
     @cached_property
     def frames(self) -> NDArray[np.int64]:
-        return self._index.frames.astype(np.int64)
+        return self._index.frames[self._rows].astype(np.int64)
 
     @property
     def present(self) -> NDArray[np.uint8]:
-        return self._index.held
+        return self._index.held[self._rows]
 
     @cached_property
     def ids(self) -> list[str]:
-        return [self._index.id(i) for i in range(len(self))]
+        return [self._index.id(row) for row in self._rows.tolist()]
 
     def has(self, member: str) -> NDArray[np.bool_]:
-        return self._index.sizes[:, MEMBERS.index(member)] > 0
+        return np.asarray(self._index.sizes[self._rows, MEMBERS.index(member)] > 0, dtype=np.bool_)
 
     def motion(self, i: int) -> NDArray[np.float32]:
         """Features of clip `i`, [T, D]: a read-only view of the stored bytes (a copy if float16)."""
-        index = self._index
-        buffer, start = self._access.member(self._shard_of(i), i, _MOTION)
-        start += int(index.data[i]) - int(index.offsets[i, _MOTION])
-        shape = (int(index.frames[i]), self.layout.dim)
-        if index.itemsize[i] == 4:
+        index, row = self._index, self._row(i)
+        buffer, start = self._access.member(self._shard_of(row), row, _MOTION)
+        start += int(index.data[row]) - int(index.offsets[row, _MOTION])
+        shape = (int(index.frames[row]), self.layout.dim)
+        if index.itemsize[row] == 4:
             return np.ndarray(shape, np.float32, buffer, start)
         return np.ndarray(shape, np.float16, buffer, start).astype(np.float32)
 
@@ -193,7 +214,7 @@ class ShardDataset:
 
     def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
         if isinstance(self._access, StreamedShards):
-            self._access.prefetch({self._shard_of(i) for i in clips}, members)
+            self._access.prefetch({self._shard_of(self._row(i)) for i in clips}, members)
 
     def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
         """One source: `clips` (all when None), with their shards if the order is the streamed one."""
@@ -203,32 +224,37 @@ class ShardDataset:
         shards = np.repeat(
             np.arange(len(self._shards), dtype=np.int32), [shard.samples for shard in self._shards]
         )
-        group = self.reading.shards_per_group
-        return (
-            Source(0, count, shards=shards if clips is None else shards[clips], group=group, name=self.where),
-        )
+        shards = shards[self._rows if clips is None else self._rows[clips]]
+        return (Source(0, count, shards=shards, group=self.reading.shards_per_group, name=self.where),)
 
     def parts(self) -> list[tuple[ClipDataset, float]]:
         return [(self, 1.0)]
 
     def _member(self, i: int, member: str) -> bytes:
-        column = MEMBERS.index(member)
-        size = int(self._index.sizes[i, column])
+        column, row = MEMBERS.index(member), self._row(i)
+        size = int(self._index.sizes[row, column])
         if size == 0:
             return b""
-        buffer, start = self._access.member(self._shard_of(i), i, column)
+        buffer, start = self._access.member(self._shard_of(row), row, column)
         return buffer[start : start + size]
 
-    def _shard_of(self, i: int) -> int:
-        if not 0 <= i < self._first[-1]:
+    def _row(self, i: int) -> int:
+        """Where clip `i` is in the index, among those that are skipped."""
+        if not 0 <= i < len(self._rows):
             raise IndexError(f"clip {i} of {len(self)}")
-        return bisect_right(self._first, i) - 1
+        return int(self._rows[i])
+
+    def _shard_of(self, row: int) -> int:
+        return bisect_right(self._first, row) - 1
 
     def _where(self, i: int, member: str) -> str:
-        shard = self._shard_of(i)
+        return self._place(self._row(i), member)
+
+    def _place(self, row: int, member: str) -> str:
+        shard = self._shard_of(row)
         name = self._shards[shard].name
         number = name.removesuffix(".tar").rpartition("-")[2]
-        return f"{self._store.where(name)}: '{number}-{i - self._first[shard]:06d}.{member}'"
+        return f"{self._store.where(name)}: '{number}-{row - self._first[shard]:06d}.{member}'"
 
     def _check_motion_sizes(self) -> None:
         """Every motion fills its member exactly, so no later read can leave the file or mix two clips."""
@@ -237,14 +263,14 @@ class ShardDataset:
         size = index.frames.astype(np.int64) * self.layout.dim * index.itemsize
         bad = np.flatnonzero((index.data + size != end) | (index.data < index.offsets[:, column]))
         if len(bad):
-            where = self._where(int(bad[0]), "motion.npy")
+            where = self._place(int(bad[0]), "motion.npy")
             raise UserError(f"{where}: not {self.layout.dim} columns wide as layout {self.layout.name} wants")
 
-    def __getstate__(self) -> tuple[str, Split, str, Reading]:
-        return self._store.place, self.split, self._digest, self.reading
+    def __getstate__(self) -> tuple[str, Split, str, Reading, bool]:
+        return self._store.place, self.split, self._digest, self.reading, self.every
 
-    def __setstate__(self, state: tuple[str, Split, str, Reading]) -> None:
-        place, split, digest, reading = state
+    def __setstate__(self, state: tuple[str, Split, str, Reading, bool]) -> None:
+        place, split, digest, reading, every = state
         store = open_store(place, reading.cache)
         manifest, _ = read_manifest(store, digest)
-        ShardDataset.__init__(self, store, split, manifest, digest, reading)
+        ShardDataset.__init__(self, store, split, manifest, digest, reading, every)

@@ -28,7 +28,7 @@ from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import MANIFEST_FILE, SPLITS, Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.schema import MANIFEST_FILE, SPLITS, Decisions, Manifest, ShardInfo, Split, UserError
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
@@ -206,6 +206,7 @@ class DatasetWriter(Generic[T]):
             audio=facts.audio,
             notes=list(facts.notes),
             audit=list(facts.audit),
+            excluded=Decisions.of(self.out).left_out,
         )
         if self._how.part is None:
             write_left_out(self.out, manifest.dropped)

@@ -86,6 +86,11 @@ def measure(joints: NDArray[np.floating], fps: float) -> Measured:
     )
 
 
+def described(joints: NDArray[np.floating], fps: float, action: str) -> Record:
+    """Direction, side, count and speed of joints [T, N >= 22, 3], as `action` defines them."""
+    return _attributes(signals_of(joints, fps), action)
+
+
 def agrees(
     truth: Mapping[str, Any],
     joints: NDArray[np.floating],

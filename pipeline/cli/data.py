@@ -235,6 +235,62 @@ def report(
 
 
 @data_app.command()
+def clean(
+    root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The page; default ROOT/clean.html.")
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option(help="Also judge captions by this run's, export's or shipped model's TMA.")
+    ] = None,
+    clips: Annotated[int, typer.Option(min=1, help="Suspects on the page, at most: the worst.")] = 60,
+    decisions: Annotated[
+        Path | None, typer.Option(help="Leave out and keep what a file that the page saved says.")
+    ] = None,
+    undo: Annotated[bool, typer.Option("--undo", help="Forget all decisions: every clip is back.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Suspect clips on a page to watch and decide about; what is left out is listed, and nothing deleted.
+
+    Duplicates, mirrored twins, feet off the floor, jumps, jitter, swapped sides, nobody at all, captions that
+    say another thing than the motion.
+
+    Example: `motionloom data clean shards -o clean.html`
+
+    Example: `motionloom data clean shards --decisions decisions.json`
+    """
+    console, page = make_console(aside=as_json), out or root / "clean.html"
+    if decisions is not None or undo:
+        from motionloom.datasets.check import decisions as cleaning
+        from motionloom.datasets.schema import Decisions
+
+        if decisions is not None and undo:
+            raise UserError("--undo forgets all decisions: give --decisions afterwards")
+        if decisions is None:
+            manifest = cleaning.undo(root)
+        else:
+            manifest = cleaning.decide(root, Decisions.load_json(decisions), str(decisions))
+        say(
+            console,
+            f"{root}: {len(manifest.excluded)} clips are left out; stages that read this set run again",
+        )
+        if as_json:
+            print_json({"path": root, "excluded": manifest.excluded})
+        return
+    from motionloom.pipeline.results.clean_page import kinds_of, suspects_of, write_clean_page
+
+    require_file_place(page)
+    found = suspects_of(root, model, progress=console.is_terminal)
+    for suspect in list(found.values())[: None if as_json else clips]:
+        say(console, f"{suspect.id}: {'; '.join(fault.text for fault in suspect.faults)}")
+    write_clean_page(root, page, found, clips)
+    kinds = ", ".join(f"{count} {kind}" for kind, count in kinds_of(found).items())
+    say(console, f"{page}: {len(found)} suspects{f' ({kinds})' if kinds else ''}")
+    if as_json:
+        print_json({"path": root, "page": page, "suspects": list(found.values())})
+
+
+@data_app.command()
 def stats(
     root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
     group: Annotated[

@@ -34,6 +34,7 @@ from motionloom.pipeline.cli.options import (
     print_json,
     sampling_of,
 )
+from motionloom.pipeline.cli.search import search
 from motionloom.pipeline.launch.console import SafeConsole, make_console, quiet_libraries
 from motionloom.pipeline.launch.process import LOST, Interrupted, JointError, TeamError, leave, process_rank
 
@@ -253,6 +254,7 @@ def serve(
 
 
 app.command()(evaluate)
+app.command()(search)
 
 
 @app.command()

@@ -61,6 +61,7 @@ class Page:
         self._viewers = 0
         self._sounding = False
         self._bodies = False
+        self._choosing = False
 
     def add_heading(self, text: str) -> Page:
         """Start a section; sections are listed at the head of the page."""
@@ -157,6 +158,20 @@ class Page:
         )
         return self
 
+    def add_choices(self, choices: Sequence[tuple[str, str] | None], file: str) -> Page:
+        """To be decided about each motion of the last viewer: leave it out, or keep it; saved as `file`.
+
+        `choices` are name and reason of a motion, or None where there is nothing to decide.
+        """
+        self._choosing, name = True, f"viewer-{self._viewers}"
+        data = safe_json({"choices": choices, "file": file})
+        self._blocks.append(
+            f'<div class="choices" id="{name}-choices"></div>'
+            f'<script>motionloomChoices(document.getElementById("{name}"), '
+            f'document.getElementById("{name}-choices"), {data});</script>'
+        )
+        return self
+
     def html(self) -> str:
         links = "".join(f'<a href="#{anchor}">{escape(text)}</a>' for anchor, text in self._contents)
         contents = f'<nav aria-label="Sections">{links}</nav>' if len(self._contents) > 1 else ""
@@ -166,7 +181,8 @@ class Page:
             TITLE=escape(self.title),
             SUBTITLE=f"<p>{escape(self.subtitle)}</p>" if self.subtitle else "",
             STYLE=resource("report/page.css") + (resource("viewer/viewer.css") if self._viewers else ""),
-            SCRIPT=viewer_script(self._bodies) if self._viewers else "",
+            SCRIPT=(viewer_script(self._bodies) if self._viewers else "")
+            + (resource("report/choices.js") if self._choosing else ""),
             CONTENTS=contents,
             BODY="\n".join(self._blocks),
             HOVER=resource("report/page.js"),

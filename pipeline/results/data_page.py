@@ -162,10 +162,12 @@ def to_watch(opened: Mapping[str, ShardDataset], count: int) -> list[ViewerMotio
     return [*first.values(), *rest][:count]
 
 
-def watch(dataset: ShardDataset, clip: int) -> ViewerMotion:
-    """One clip for the viewer."""
+def watch(
+    dataset: ShardDataset, clip: int, *, start: int = 0, seconds: float = WATCH_SECONDS
+) -> ViewerMotion:
+    """One clip for the viewer, from the frame `start` on."""
     layout = dataset.layout
-    motion = dataset.motion(clip)[: int(WATCH_SECONDS * layout.fps)]
+    motion = dataset.motion(clip)[start : start + int(seconds * layout.fps)]
     joints = joints_of(motion, layout)
     if layout.family == "raw":
         joints = canonicalize(joints)  # sources have their own axes

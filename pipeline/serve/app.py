@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import json
 import sys
 import traceback
 import uuid
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
-from importlib import resources
 from typing import TypeVar
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp
 
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
+from motionloom.pipeline.serve.guard import BROKEN, Guard, broken, own, read_body, refused
 from motionloom.pipeline.serve.requests import (
     Answer,
     MotionRequest,
@@ -38,8 +37,6 @@ from motionloom.pipeline.serve.requests import (
 from motionloom.pipeline.serve.work import Busy, Stopped, Worker
 
 T = TypeVar("T")
-
-_BROKEN = "something broke here; the server's log says what"
 
 _UPLOADS = 4
 """Sounds that are received at a time; others wait unread."""
@@ -76,7 +73,7 @@ class Site:
                 Route("/api/stream", self.stream, methods=["POST"]),
                 Route("/api/sounds", self.add_sound, methods=["POST"]),
             ],
-            exception_handlers={HTTPException: _said, Exception: _broken},
+            exception_handlers={HTTPException: refused, Exception: broken},
         )
 
     async def page(self, request: Request) -> Response:
@@ -138,8 +135,8 @@ class Site:
                     if gone or self.worker.stopped:
                         break
             except Exception as error:
-                words = str(error) if isinstance(error, UserError) else _BROKEN
-                if words is _BROKEN:
+                words = str(error) if isinstance(error, UserError) else BROKEN
+                if words is BROKEN:
                     traceback.print_exception(error, file=sys.stderr)
                 said = json.dumps({"error": words, "request": asked.request}) + "\n"
                 loop.call_soon_threadsafe(pieces.put_nowait, said)
@@ -172,7 +169,7 @@ class Site:
         if "audio" not in self.model.modalities:
             raise HTTPException(400, "this model knows no music; give it captions")
         async with self._uploads:
-            data = await _body(request, "the sound", _bytes(self.config), self.config.patience)
+            data = await read_body(request, "the sound", _bytes(self.config), self.config.patience)
         try:
             name, sound = await asyncio.to_thread(self.sounds.add, data)
         except UserError as error:
@@ -184,7 +181,7 @@ class Site:
         if kind != "application/json":
             raise HTTPException(415, "send JSON with Content-Type: application/json")
         most = round(self.config.max_request_kb * 1024)
-        data = await _body(request, "the request", most, self.config.patience)
+        data = await read_body(request, "the request", most, self.config.patience)
         try:
             given = json.loads(data)
             json.dumps(given, ensure_ascii=False).encode()
@@ -228,11 +225,6 @@ class Site:
             raise HTTPException(503, "the server is stopping", named) from None
 
 
-def own(name: str) -> str:
-    """Text of a file that ships beside this module."""
-    return (resources.files("motionloom.pipeline.serve") / name).read_text(encoding="utf-8")
-
-
 def _plain(name: object) -> str:
     """A request's name as a header can carry it."""
     return "".join(letter for letter in str(name)[:64] if letter.isascii() and letter.isprintable()).strip()
@@ -240,130 +232,3 @@ def _plain(name: object) -> str:
 
 def _bytes(config: ServeConfig) -> int:
     return round(config.max_sound_mb * 2**20)
-
-
-async def _body(request: Request, what: str, most: int, patience: float) -> bytes:
-    """The body, refused as soon as it is too large or too slow."""
-    data = bytearray()
-
-    async def read() -> None:
-        async for piece in request.stream():
-            data.extend(piece)
-            if len(data) > most:
-                raise HTTPException(
-                    413,
-                    f"{what} is larger than this server takes: at most {most} bytes",
-                    {"connection": "close"},
-                )
-
-    try:
-        await asyncio.wait_for(read(), patience)
-    except TimeoutError:
-        raise HTTPException(
-            408, f"not all of it came within {patience:g} s", {"connection": "close"}
-        ) from None
-    return bytes(data)
-
-
-async def _said(request: Request, error: Exception) -> Response:
-    """A refusal as JSON of one sentence, which names its request."""
-    assert isinstance(error, HTTPException)
-    words = {404: "no such page", 405: "no such method here"}.get(error.status_code, error.detail)
-    said: dict[str, str] = {"error": words}
-    headers = dict(error.headers or {})
-    if "x-request" in headers:
-        said["request"] = headers["x-request"]
-    return JSONResponse(said, error.status_code, headers)
-
-
-async def _broken(request: Request, error: Exception) -> Response:
-    """A bug: the log has it, by Starlette's own way, and the client a sentence."""
-    return JSONResponse({"error": _BROKEN}, 500)
-
-
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
-
-POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
-    "media-src blob:; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
-)
-
-HEADERS = {
-    "content-security-policy": POLICY,
-    "x-content-type-options": "nosniff",
-    "x-frame-options": "DENY",
-    "referrer-policy": "no-referrer",
-    "cross-origin-resource-policy": "same-origin",
-    "cross-origin-opener-policy": "same-origin",
-    "cache-control": "no-store",
-}
-
-
-class Guard:
-    """Checks every request, and adds the headers of every answer (ASGI middleware).
-
-    A page from elsewhere in the same browser must not reach the model. By its own name it is stopped by
-    `Origin`; by a name of its own that it has made to point at this machine (DNS rebinding) it is stopped by
-    `Host`, which then is that name: only localhost, the names in `allowed`, and where others may come in
-    plain addresses pass. `host` is the address that is listened at.
-    """
-
-    def __init__(self, app: ASGIApp, host: str, allowed: Collection[str] = ()) -> None:
-        self.app = app
-        self.names = {*LOOPBACK, host.lower(), *(name.lower() for name in allowed)}
-        self.addresses = not is_loopback(host)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            return
-
-        async def send_with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                own = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-                message["headers"] = [*message.get("headers", []), *own]
-            await send(message)
-
-        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        refused = self.refusal(headers, scope["method"])
-        if refused:
-            await JSONResponse({"error": refused}, 403)(scope, receive, send_with_headers)
-            return
-        await self.app(scope, receive, send_with_headers)
-
-    def refusal(self, headers: dict[str, str], method: str) -> str:
-        """Why a request with these headers is refused; empty where it is not."""
-        host = headers.get("host", "")
-        if not self.knows(host):
-            return f"this server is not called {host[:80]!r}; use localhost, or start it with --allow-host"
-        origin = headers.get("origin")
-        if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
-            return f"a page of {origin[:80]!r} asks; only this server's own page may"
-        followed = method == "GET" and headers.get("sec-fetch-mode") == "navigate"  # a link to here
-        if headers.get("sec-fetch-site", "none") not in ("none", "same-origin") and not followed:
-            return "a page of another site asks; only this server's own page may"
-        return ""
-
-    def knows(self, host: str) -> bool:
-        """Whether a `Host` header names this server."""
-        try:
-            name = urlsplit(f"//{host}").hostname or ""
-        except ValueError:
-            return False
-        if name in self.names:
-            return True
-        return self.addresses and _is_address(name)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address."""
-    if host == "localhost":
-        return True
-    return _is_address(host) and ipaddress.ip_address(host).is_loopback
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True

@@ -1,4 +1,4 @@
-"""`motionloom serve`: a model as a page and an API, until Ctrl-C."""
+"""`motionloom serve`, a model as a page and an API, and the page of `motionloom search`, until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -8,19 +8,24 @@ import socket
 from contextlib import closing
 from pathlib import Path
 from types import FrameType
+from typing import Protocol
 
 import numpy as np
 import uvicorn
 from rich.console import Console
+from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import StreamingGenerator
+from motionloom.pipeline.evaluation.search import Search
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import model_folder, say_model
-from motionloom.pipeline.serve.app import Site, is_loopback
+from motionloom.pipeline.serve.app import Site
+from motionloom.pipeline.serve.guard import is_loopback
 from motionloom.pipeline.serve.requests import ServeConfig
+from motionloom.pipeline.serve.search import SearchSite
 from motionloom.pipeline.serve.work import Worker
 
 _LAST = 5
@@ -36,23 +41,46 @@ def serve(folder: Path, config: ServeConfig, *, device: str = "auto", console: C
         if (taken := say_model(folder)) is not None:
             console.print(taken, markup=False, highlight=False, soft_wrap=True)
         warm(model)
-        worker = Worker(config.waiting)
-        host, port = place.getsockname()[:2]
-        shown = f"[{host}]" if ":" in host else host
-        if not is_loopback(config.host):
-            console.print(
-                f"[yellow]others can reach this server: it listens at {shown}, without a password and in "
-                f"plain text; leave --host out to keep it to this machine[/]",
-                soft_wrap=True,
-            )
-        console.print(f"{folder.resolve().name}: http://{shown}:{port}/ (Ctrl-C stops)", soft_wrap=True)
-        site = Site(model, config, worker, folder.resolve().name)
-        try:
-            server_of(site, worker).run([place])
-        except KeyboardInterrupt:  # uvicorn passes it on when all is closed
-            pass
-        finally:
-            worker.stop()
+        worker, name = Worker(config.waiting), folder.resolve().name
+        run_site(Site(model, config, worker, name), place, worker, name, console)
+
+
+def serve_search(root: Path, model: str, config: ServeConfig, *, device: str, console: Console) -> None:
+    """Serve the page about the data set in `root`; returns after Ctrl-C."""
+    with closing(listen(config)) as place:
+        search = Search.open(root, model, device=device, progress=True)
+        search.words("a person stands")  # loads what reads words, so that the first search does not wait
+        site = SearchSite(search, config, root.resolve().name)
+        run_site(site, place, Worker(config.waiting), site.name, console)
+
+
+class Served(Protocol):
+    """What a server answers with."""
+
+    @property
+    def app(self) -> ASGIApp: ...
+
+    @property
+    def config(self) -> ServeConfig: ...
+
+
+def run_site(site: Served, place: socket.socket, worker: Worker, name: str, console: Console) -> None:
+    """Say where a site is, and answer until Ctrl-C."""
+    host, port = place.getsockname()[:2]
+    shown = f"[{host}]" if ":" in host else host
+    if not is_loopback(site.config.host):
+        console.print(
+            f"[yellow]others can reach this server: it listens at {shown}, without a password and in "
+            f"plain text; leave --host out to keep it to this machine[/]",
+            soft_wrap=True,
+        )
+    console.print(f"{name}: http://{shown}:{port}/ (Ctrl-C stops)", soft_wrap=True)
+    try:
+        server_of(site, worker).run([place])
+    except KeyboardInterrupt:  # uvicorn passes it on when all is closed
+        pass
+    finally:
+        worker.stop()
     console.print("stopped")
 
 
@@ -83,7 +111,7 @@ def warm(model: MotionModel) -> None:
         beats(clicks, rate)
 
 
-def server_of(site: Site, worker: Worker) -> uvicorn.Server:
+def server_of(site: Served, worker: Worker) -> uvicorn.Server:
     """What speaks HTTP for a site."""
     config = uvicorn.Config(
         site.app,

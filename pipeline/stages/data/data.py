@@ -166,6 +166,7 @@ def say_shards(context: StageContext, manifest: Manifest) -> None:
     clips = sum(s.samples for s in manifest.shards)
     seconds = sum(s.frames for s in manifest.shards) / manifest.fps
     dropped = f", {tally(manifest.dropped)}" if manifest.dropped else ""
+    dropped += f", {len(manifest.excluded)} of them left out by data clean" if manifest.excluded else ""
     context.console.print(
         f"    {clips} clips, {seconds / 60:.1f} minutes at {manifest.fps:g} fps, "
         f"layout {manifest.layout} ({manifest.family}), {len(manifest.shards)} shards{dropped}"

@@ -1,0 +1,149 @@
+"""The clips of a data set that look wrong, for a person to decide about: what `motionloom data clean` shows.
+
+Motions by `faults.py`, captions by `claims.py`, and clips that are another one again, as they are or
+mirrored: by a signature that a mirror image shares, heights at eight moments, whose near neighbours are
+compared joint by joint. Mirror images that say so (`mirror_of`) in the split of their original are meant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.base.progress import Meter
+from motionloom.datasets.check.claims import caption_faults
+from motionloom.datasets.check.duplicates import SAME_METRES, likeness
+from motionloom.datasets.check.faults import Fault, motion_faults
+from motionloom.datasets.motion.canonical import canonicalize
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import SPLITS, Split
+from motionloom.datasets.shards.clips import in_order
+from motionloom.datasets.shards.reader import ShardDataset, load_manifest
+
+MOMENTS = 8
+"""Frames of a clip, evenly spread, that its signature is of."""
+NEIGHBOURS = 4
+"""Clips of near signatures that each is compared with."""
+
+_NAMED = Skeleton.named("smpl22")
+_PAIRS = [
+    [_NAMED.index(f"{side}_{joint}") for side in ("left", "right")]
+    for joint in ("wrist", "elbow", "knee", "ankle")
+]
+
+
+class Place(NamedTuple):
+    """Where a clip is in its data set."""
+
+    split: Split
+    clip: int
+
+
+Splits = Mapping[Split, ShardDataset]
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A clip and all that is wrong with it, the worst first."""
+
+    place: Place
+    id: str
+    faults: tuple[Fault, ...]
+    twin: Place | None = None
+    """The clip that it is again."""
+
+
+def open_splits(root: Path, *, every: bool = False) -> dict[Split, ShardDataset]:
+    """The splits of a data set, those that are tested on first: of two clips that are the same the later, the
+    training's, is the one to go.
+    """
+    there = {shard.split for shard in load_manifest(root).shards}
+    return {s: ShardDataset.open(root, s, every=every) for s in reversed(SPLITS) if s in there}
+
+
+def find_suspects(
+    splits: Splits, kept: Collection[str] = (), *, progress: bool = False
+) -> dict[Place, Suspect]:
+    """The suspects of a data set, the worst first; clips whose id was `kept` before are none."""
+    places: list[Place] = []
+    signatures: list[NDArray[np.float32]] = []
+    faults: dict[Place, list[Fault]] = {}
+    with Meter("looking at clips", sum(map(len, splits.values())), shown=progress) as meter:
+        for split, dataset in splits.items():
+            for clip in in_order(dataset, "motion.npy", "texts.json", "meta.json"):
+                joints, fps = floored_joints(dataset, clip), dataset.layout.fps
+                places.append(Place(split, clip))
+                signatures.append(signature(joints))
+                found = [*motion_faults(joints, fps), *caption_faults(dataset.texts(clip), joints, fps)]
+                if found:
+                    faults[places[-1]] = found
+                meter.advance()
+    twins: dict[Place, Place] = {}
+    for first, second in _near(np.array(signatures)) if places else ():
+        one, other = places[first], places[second]
+        again = None if other in twins else _again(splits, one, other)
+        if again is not None:
+            twins[other] = one
+            faults.setdefault(other, []).append(again)
+    return ranked(
+        Suspect(place, splits[place.split].ids[place.clip], tuple(found), twins.get(place))
+        for place, found in faults.items()
+        if splits[place.split].ids[place.clip] not in kept
+    )
+
+
+def ranked(suspects: Iterable[Suspect]) -> dict[Place, Suspect]:
+    """Suspects by their places, the worst first, and each one's faults likewise."""
+    found = [(sorted(each.faults, key=lambda fault: -fault.weight), each) for each in suspects]
+    found.sort(key=lambda pair: -pair[0][0].weight)
+    return {each.place: Suspect(each.place, each.id, tuple(faults), each.twin) for faults, each in found}
+
+
+def floored_joints(dataset: ShardDataset, clip: int) -> NDArray[np.float64]:
+    """Joints [T, N, 3] of a clip; those of raw parameters are moved from their source's axes to the floor."""
+    joints = joints_of(dataset.motion(clip), dataset.layout)
+    return canonicalize(joints) if dataset.layout.family == "raw" else joints
+
+
+def signature(joints: NDArray[np.floating]) -> NDArray[np.float32]:
+    """What a clip of joints [T, N, 3] shares with its mirror image and no other: its length in frames, and
+    heights of the pelvis and of the higher and the lower of pairs of joints at some moments [S].
+    """
+    heights = joints[np.linspace(0, len(joints) - 1, MOMENTS).round().astype(int), :, 1]
+    pairs = np.sort(heights[:, _PAIRS], axis=-1)
+    return np.concatenate([[len(joints)], heights[:, 0], pairs.ravel()]).astype(np.float32)
+
+
+def _near(signatures: NDArray[np.float32]) -> Iterator[tuple[int, int]]:
+    """Pairs (earlier, later) of signatures [n, S] that hardly differ, by the later."""
+    from scipy.spatial import KDTree
+
+    reach = SAME_METRES * np.sqrt(signatures.shape[1])
+    most = min(NEIGHBOURS + 1, len(signatures))
+    _, near = KDTree(signatures).query(signatures, k=most, distance_upper_bound=reach)
+    for later, others in enumerate(near.reshape(len(signatures), -1).tolist()):
+        yield from ((other, later) for other in sorted(others) if other < later)
+
+
+def _again(splits: Splits, one: Place, other: Place) -> Fault | None:
+    """What there is to say of the clip `other` that is the clip `one` again; None of those that are not, or
+    are meant to be.
+    """
+    first, second = splits[one.split], splits[other.split]
+    original, copy = first.meta(one.clip), second.meta(other.clip)
+    said = (original.mirror_of or original.id) == (copy.mirror_of or copy.id)
+    if said and one.split == other.split:
+        return None
+    joints = floored_joints(first, one.clip), floored_joints(second, other.clip)
+    how = likeness(*joints, first.layout.skeleton)
+    if not how:
+        return None
+    kind = "mirrored twin" if "mirror" in how else "duplicate"
+    where = f" of split {one.split}" if one.split != other.split else ""
+    return Fault(kind, f"{how} '{original.id}'{where}", 2.0 + (one.split != other.split))

@@ -1,0 +1,72 @@
+"""`motionloom search`: clips of a data set by words or by likeness, here or on a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cli.convert import say
+from motionloom.pipeline.cli.options import AsJson, Device, print_json
+from motionloom.pipeline.launch.console import make_console
+
+
+def search(
+    root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
+    words: Annotated[str, typer.Argument(help="What the person does; without it, a page to type it.")] = "",
+    like: Annotated[
+        str, typer.Option(help="A clip's id, or a file (.npz of generate, .npy): clips like it.")
+    ] = "",
+    model: Annotated[
+        str, typer.Option(help="Run, export or shipped model whose TMA reads words and motions.")
+    ] = "synthetic",
+    count: Annotated[int, typer.Option(min=1, help="Clips to list.")] = 12,
+    port: Annotated[int, typer.Option(help="Port of the page; 0 takes a free one.")] = 8000,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """The clips of a data set that are nearest to words, or to a clip; without either, a page that asks.
+
+    Embeddings of all clips are made once and kept beside the shards.
+
+    Example: `motionloom search shards "turns left and waves"`
+
+    Example: `motionloom search shards --like synth-0-000012`
+
+    Example: `motionloom search shards --port 0`
+    """
+    console = make_console(aside=as_json)
+    if words and like:
+        raise UserError("search: give words or --like, not both")
+    if not (words or like):
+        from motionloom.pipeline.serve.requests import ServeConfig
+
+        config = ServeConfig.parse({"port": port}, "search")
+        try:
+            from motionloom.pipeline.serve.command import serve_search
+        except ModuleNotFoundError as error:
+            if error.name not in ("starlette", "uvicorn"):
+                raise
+            raise UserError(f"the page needs {error.name}: pip install 'motionloom[serve]'") from None
+        serve_search(root, model, config, device=device, console=console)
+        return
+    from motionloom.pipeline.evaluation.search import Search
+
+    found = Search.open(root, model, device=device, progress=True)
+    file = Path(like)
+    if words:
+        query = found.words(words)
+    elif file.is_file():
+        query = found.motion(*found.motion_file(file.read_bytes(), like))
+    else:
+        query = found.clip(like)
+    hits = []
+    for hit in found.best(query, count, like):
+        texts = found.splits[hit.place.split].texts(hit.place.clip)
+        caption = texts[0].text if texts else ""
+        say(console, f"{hit.score:5.2f}  {hit.place.split:5}  {hit.id}  {caption}")
+        hits.append({"id": hit.id, "split": hit.place.split, "score": hit.score, "caption": caption})
+    if as_json:
+        print_json(hits)

@@ -1,0 +1,269 @@
+"""Clips of a data set by words and by likeness: TMA's embeddings of all clips, in 8 bits, in one file.
+
+A motion's embedding has length 1 and is stored as integers of -127 to 127 with one scale; cosines with a
+query are sums over them. The file beside the shards says which clips and which weights it was made of, and is
+made again for others. Words are read by the text encoder that the TMA was trained with; nothing is fetched.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.base.files import atomic_file, sha256_of, sha256_of_json
+from motionloom.datasets.base.progress import Meter
+from motionloom.datasets.check.clip import require_sensible
+from motionloom.datasets.check.faults import Fault
+from motionloom.datasets.check.suspects import Place, Splits, floored_joints, open_splits
+from motionloom.datasets.motion.canonical import canonicalize, resample
+from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.motion.npz import NpzFile
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import HANDS, PRESENT_ALL, UserError
+from motionloom.datasets.shards.reader import load_manifest
+from motionloom.datasets.shards.tar import npy_from_bytes
+from motionloom.pipeline.contract.lookup import finished_stages, open_exported
+from motionloom.pipeline.contract.stage import ALIGNMENT, StageCache
+from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
+from motionloom.pipeline.launch.hardware import choose_device
+from motionloom.pipeline.store.networks import LoadedTma, embed_motions
+from motionloom.pipeline.store.run_folder import BUNDLE_FILE
+from motionloom.pipeline.store.weights import MODEL_FILES
+
+INDEX_FILE = "search.npz"
+_VERSION = 1
+_BLOCK = 4096
+"""Rows that are multiplied at a time: their floats stay in the processor's cache."""
+_BATCH = 256
+MISFIT = 0.5
+"""Share of a data set's captions that fit a motion better than all of its own, from which these are suspect:
+those of another clip, drawn at random, would do as well."""
+_OTHERS = 500
+"""Captions, evenly spread, that a motion's own are compared with."""
+_WRISTS = [Skeleton.named("smpl22").index(f"{side}_wrist") for side in ("left", "right")]
+
+Vectors = NDArray[np.float32]
+
+
+class Hit(NamedTuple):
+    """A clip that was found."""
+
+    place: Place
+    id: str
+    score: float
+    """Cosine with what was asked for."""
+
+
+@dataclass(frozen=True)
+class Codes:
+    """Vectors of length 1 in 8 bits: about `values` [n, Z] int8 times `scales` [n]."""
+
+    values: NDArray[np.int8]
+    scales: Vectors
+
+    @staticmethod
+    def of(vectors: Vectors) -> Codes:
+        """Vectors [n, Z] of any length."""
+        unit = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+        scales = np.maximum(np.abs(unit).max(axis=1, initial=0), 1e-12) / 127
+        return Codes(np.rint(unit / scales[:, None]).astype(np.int8), scales.astype(np.float32))
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def vector(self, row: int) -> Vectors:
+        return np.asarray(self.values[row] * self.scales[row])
+
+    def cosines(self, query: Vectors) -> Vectors:
+        """With a query [Z] of any length -> [n]."""
+        unit = (query / max(float(np.linalg.norm(query)), 1e-12)).astype(np.float32)
+        out = np.empty(len(self), np.float32)
+        for start in range(0, len(self), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            out[block] = self.values[block].astype(np.float32) @ unit
+        return out * self.scales
+
+
+def alignment_model(name: Path | str, device: str = "auto") -> tuple[LoadedTma, str]:
+    """The TMA of a run, of an export or of a model of the package, and the checksum of its weights."""
+    folder = model_folder(name)
+    if (folder / BUNDLE_FILE).is_file():
+        stages = [s for maker in open_exported(folder) for s in (maker, *maker.upstream())]
+    elif folder.is_dir():
+        stages = sorted(finished_stages(folder).values(), key=lambda stage: stage.name != "tma")
+    else:
+        raise UserError(no_such_model(name))
+    found = next((stage for stage in stages if stage.gives(ALIGNMENT)), None)
+    if found is None:
+        raise UserError(
+            f"{folder}: has no TMA, which embeds words and motions alike; choose another --model, such as "
+            f"synthetic"
+        )
+    tma: LoadedTma = StageCache(choose_device(device)).get(found)
+    return tma, sha256_of(found.folder / MODEL_FILES[0])
+
+
+@dataclass(frozen=True)
+class Search:
+    """A data set's clips, embedded."""
+
+    splits: Splits
+    """With every clip, also those that are excluded, which are never found."""
+    tma: LoadedTma
+    codes: Codes
+    places: tuple[Place, ...]
+    excluded: frozenset[str] = field(default_factory=frozenset)
+
+    @staticmethod
+    def open(root: Path, model: Path | str, *, device: str = "auto", progress: bool = False) -> Search:
+        """The embeddings beside the shards; made first where there are none of these clips by this model."""
+        splits, (tma, weights) = open_splits(root, every=True), alignment_model(model, device)
+        manifest = load_manifest(root)
+        clips = manifest.model_copy(update={"excluded": {}}).dump()
+        made_from = sha256_of_json([_VERSION, clips, weights])
+        places = tuple(Place(split, clip) for split, part in splits.items() for clip in range(len(part)))
+        codes = _stored(root / INDEX_FILE, made_from, len(places), tma.net.config.latent)
+        if codes is None:
+            codes = Codes.of(np.concatenate(list(_embedded(splits, places, tma, progress))))
+            with atomic_file(root / INDEX_FILE) as file:
+                said = np.frombuffer(made_from.encode(), np.uint8)
+                np.savez(file, allow_pickle=False, made_from=said, values=codes.values, scales=codes.scales)
+        return Search(splits, tma, codes, places, frozenset(manifest.excluded))
+
+    @cached_property
+    def ids(self) -> list[str]:
+        return [self.splits[place.split].ids[place.clip] for place in self.places]
+
+    def words(self, text: str) -> Vectors:
+        """The embedding [Z] of words."""
+        if not text.strip():
+            raise UserError("search: no words; say what the person does")
+        return np.asarray(self._texts([text])[0])
+
+    def clip(self, clip_id: str) -> Vectors:
+        """The embedding [Z] of a clip of the set, by its id."""
+        if clip_id not in self.ids:
+            raise UserError(f"no clip '{clip_id}' in this data set; its ids are in the answers of a search")
+        return self.codes.vector(self.ids.index(clip_id))
+
+    def motion(self, joints: NDArray[np.floating], fps: float) -> Vectors:
+        """The embedding [Z] of joints [T, 22 or 52, 3] in metres, Y up."""
+        features, present = features_for(self.tma, joints, fps)
+        return np.asarray(embed_motions(self.tma, [features], [present])[0])
+
+    def motion_file(self, raw: bytes, where: str) -> tuple[NDArray[np.float64], float]:
+        """Joints [T, 22 or 52, 3] and frame rate of a file: the .npz of `generate`, or an .npy of joints or
+        of the set's columns [T, D], at the set's frame rate.
+        """
+        layout, fps = next(iter(self.splits.values())).layout, None
+        if raw.startswith(b"PK"):
+            with NpzFile(io.BytesIO(raw), where) as stored:
+                values = stored.numbers("joints")
+                if "metadata" in stored.names:
+                    fps = _stated_fps(str(stored.array("metadata")), where)
+        else:
+            values = npy_from_bytes(raw, where).astype(np.float64)
+        if values.ndim == 2:
+            values = joints_of(values, layout)
+        if values.ndim != 3 or values.shape[1] not in (22, 52) or values.shape[2] != 3 or len(values) < 4:
+            raise UserError(f"{where}: {list(values.shape)}, wanted joints [T >= 4, 22 or 52, 3]")
+        try:
+            require_sensible("joints", values.reshape(len(values), -1))
+        except ValueError as error:
+            raise UserError(f"{where}: {error}") from None
+        return values, fps or layout.fps
+
+    def best(self, query: Vectors, count: int = 12, without: str = "") -> list[Hit]:
+        """The clips nearest to an embedding [Z], but the one with the id `without`."""
+        scores, hits = self.codes.cosines(query), list[Hit]()
+        some = min(len(scores), count + 1 + len(self.excluded))
+        near = np.argpartition(-scores, some - 1)[:some] if some else np.zeros(0, int)
+        for row in near[np.argsort(-scores[near], kind="stable")].tolist():
+            if self.ids[row] not in self.excluded and self.ids[row] != without:
+                hits.append(Hit(self.places[row], self.ids[row], float(scores[row])))
+        return hits[:count]
+
+    def misfits(self) -> Iterator[tuple[Place, Fault]]:
+        """Clips whose captions fit them worse than most captions of the others do."""
+        texts = [[c.text for c in self.splits[place.split].texts(place.clip)] for place in self.places]
+        different = sorted({text for own in texts for text in own})
+        if len(different) < 2:
+            return
+        row = {text: k for k, text in enumerate(different)}
+        vectors = Codes.of(self._texts(different))
+        spread = np.unique(np.linspace(0, len(different) - 1, _OTHERS).round().astype(int))
+        others = Codes(vectors.values[spread], vectors.scales[spread])
+        for at, (place, own) in enumerate(zip(self.places, texts, strict=True)):
+            if own:
+                motion = self.codes.vector(at)
+                mine, theirs = [vectors.vector(row[text]) @ motion for text in own], others.cosines(motion)
+                share = float((theirs > max(mine)).mean())
+                if share > MISFIT:
+                    said, best = own[int(np.argmax(mine))], different[int(spread[int(theirs.argmax())])]
+                    text = f"'{said}' fits worse than {share:.0%} of all captions, such as '{best}'"
+                    yield place, Fault("caption disagrees", text, share / MISFIT)
+
+    def _texts(self, texts: Sequence[str]) -> Vectors:
+        return np.asarray(self.tma.embed_captions(list(texts), self.tma.given["text"]))
+
+
+def features_for(tma: LoadedTma, joints: NDArray[np.floating], fps: float) -> tuple[Vectors, int]:
+    """What a TMA reads of joints [T, 22 or 52, 3] of any frame rate, and which parts it then holds."""
+    layout, present = tma.layout, PRESENT_ALL
+    if layout.num_joints > joints.shape[1]:
+        present &= ~HANDS  # fingers stay at the wrists, and are not looked at
+        fingers = (layout.num_joints - BODY_JOINTS) // 2
+        joints = np.concatenate([joints, np.repeat(joints[:, _WRISTS], fingers, axis=1)], axis=1)
+    joints = canonicalize(resample(joints[:, : layout.num_joints], fps, layout.fps))
+    return encode(joints, layout.without_face()), present
+
+
+def _stated_fps(metadata: str, where: str) -> float:
+    try:
+        fps = float(json.loads(metadata)["fps"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        fps = 0.0
+    if not 1 <= fps <= 1000:
+        raise UserError(f"{where}: its metadata states no frame rate of 1 to 1000; write it by generate")
+    return fps
+
+
+def _embedded(splits: Splits, places: Sequence[Place], tma: LoadedTma, progress: bool) -> Iterator[Vectors]:
+    with Meter("embedding clips", len(places), shown=progress) as meter:
+        for start in range(0, len(places), _BATCH):
+            motions, present = [], []
+            for split, clip in places[start : start + _BATCH]:
+                dataset = splits[split]
+                if dataset.layout == tma.layout:
+                    motion = dataset.motion(clip)[:, dataset.layout.part(tma.part)]
+                    held = int(dataset.present[clip])
+                else:
+                    motion, held = features_for(tma, floored_joints(dataset, clip), dataset.layout.fps)
+                motions.append(motion)
+                present.append(held)
+            yield np.asarray(embed_motions(tma, motions, present))
+            meter.advance(len(motions))
+
+
+def _stored(path: Path, made_from: str, clips: int, width: int) -> Codes | None:
+    """What a file holds of these clips and weights; None where it is of others, damaged, or not there."""
+    limit = clips * max(width, 8) + 4096
+    try:
+        with NpzFile(path) as stored:
+            if bytes(stored.array("made_from", limit=4096)) != made_from.encode():
+                return None
+            values, scales = (stored.array(name, limit=limit) for name in ("values", "scales"))
+    except UserError:
+        return None
+    fits = values.shape == (clips, width) and scales.shape == (clips,)
+    return Codes(values, scales) if fits and values.dtype == np.int8 and scales.dtype == np.float32 else None

@@ -1,0 +1,114 @@
+"""`motionloom search` as a page: type words, or choose or drop a clip, and watch the nearest clips move."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp
+
+from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.evaluation.search import Hit, Search, Vectors
+from motionloom.pipeline.render.viewer import ViewerData, resource, viewer_data, viewer_script
+from motionloom.pipeline.results.data_page import watch
+from motionloom.pipeline.serve.guard import Guard, broken, own, read_body, refused
+from motionloom.pipeline.serve.requests import ServeConfig
+
+SHOWN, SECONDS = 12, 5.0
+"""Clips of an answer, and how much of each is shown."""
+_LARGEST = 2**24
+"""Bytes of a clip that is dropped: 25 minutes of body joints at 20 frames a second."""
+
+
+class SearchRequest(Config):
+    """What is looked for: words, or clips like one of the set."""
+
+    words: str = ""
+    like: str = ""
+
+
+class SearchSite:
+    """A data set's embeddings and the answers."""
+
+    def __init__(self, search: Search, config: ServeConfig, name: str) -> None:
+        self.search, self.config, self.name = search, config, name
+        self._one = threading.Lock()
+        self.assets = {
+            "serve.css": (resource("viewer/viewer.css") + own("serve.css"), "text/css; charset=utf-8"),
+            "viewer.js": (viewer_script(), "text/javascript; charset=utf-8"),
+            "search.js": (own("search.js"), "text/javascript; charset=utf-8"),
+        }
+
+    @property
+    def app(self) -> ASGIApp:
+        """The ASGI application, guarded as that of `serve`."""
+        routes = [
+            Route("/", self.page),
+            Route("/assets/{name}", self.asset),
+            Route("/api/info", self.info),
+            Route("/api/search", self.find, methods=["POST"]),
+            Route("/api/like", self.find_like, methods=["POST"]),
+        ]
+        handlers = {HTTPException: refused, Exception: broken}
+        app = Starlette(routes=routes, exception_handlers=handlers)  # type: ignore[arg-type]
+        return Guard(app, self.config.host, self.config.allow_hosts)
+
+    async def page(self, request: Request) -> Response:
+        return Response(own("search.html"), media_type="text/html; charset=utf-8")
+
+    async def asset(self, request: Request) -> Response:
+        """Script and style, from memory."""
+        found = self.assets.get(request.path_params["name"])
+        if found is None:
+            raise HTTPException(404)
+        return Response(found[0], media_type=found[1])
+
+    async def info(self, request: Request) -> Response:
+        return JSONResponse({"name": self.name, "clips": len(self.search.places) - len(self.search.excluded)})
+
+    async def find(self, request: Request) -> Response:
+        """Clips by words, or like one of the set."""
+        most = round(self.config.max_request_kb * 1024)
+        raw = await read_body(request, "the request", most, self.config.patience)
+        try:
+            asked = SearchRequest.parse(json.loads(raw), "request")
+        except (ValueError, RecursionError):
+            raise HTTPException(400, "the request is not JSON") from None
+        except UserError as error:
+            raise HTTPException(400, str(error)) from None
+        if len(asked.words) > self.config.max_caption:
+            raise HTTPException(400, f"at most {self.config.max_caption} letters are read")
+        search = self.search
+        return await self._answer(
+            lambda: search.clip(asked.like) if asked.like else search.words(asked.words), asked.like
+        )
+
+    async def find_like(self, request: Request) -> Response:
+        """Clips like the motion file that the body is."""
+        raw = await read_body(request, "the clip", _LARGEST, self.config.patience)
+        return await self._answer(lambda: self.search.motion(*self.search.motion_file(raw, "the clip")))
+
+    async def _answer(self, query: Callable[[], Vectors], without: str = "") -> Response:
+        def work() -> dict[str, object]:
+            with self._one:
+                hits = self.search.best(query(), SHOWN, without)
+                return {"found": [hit.id for hit in hits], "viewer": shown(self.search, hits)}
+
+        try:
+            return JSONResponse(await asyncio.to_thread(work))
+        except UserError as error:
+            raise HTTPException(400, str(error)) from None
+
+
+def shown(search: Search, hits: list[Hit]) -> ViewerData:
+    """The clips that were found, for the viewer."""
+    motions = [(hit, watch(search.splits[hit.place.split], hit.place.clip, seconds=SECONDS)) for hit in hits]
+    return viewer_data([replace(one, label=f"{hit.score:.2f} · {one.label}") for hit, one in motions])

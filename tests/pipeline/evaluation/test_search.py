@@ -1,0 +1,186 @@
+"""Search by words and likeness: 8-bit codes against floats, one file that goes stale, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.check.decisions import decide
+from motionloom.datasets.loading.statistics import FeatureStats, compute
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Decisions, UserError
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.pipeline.evaluation import search as searching
+from motionloom.pipeline.evaluation.search import INDEX_FILE, Codes, Search, alignment_model
+from motionloom.pipeline.store.networks import LoadedTma
+
+RNG = np.random.default_rng(0)
+
+
+def test_eight_bits_keep_the_nearest() -> None:
+    """A component's error is half a step, the largest component over 254; a cosine's is that by the root of
+    the width at most, and a tenth of it at random.
+    """
+    vectors = RNG.standard_normal((5000, 64)).astype(np.float32)
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    codes = Codes.of(vectors)
+    assert codes.values.dtype == np.int8 and codes.values.nbytes == vectors.nbytes // 4
+    recalls = []
+    for query in RNG.standard_normal((20, 64)).astype(np.float32):
+        exact, found = unit @ query / np.linalg.norm(query), codes.cosines(query)
+        assert np.abs(exact - found).max() < 0.01
+        recalls.append(len(set(np.argsort(-exact)[:10]) & set(np.argsort(-found)[:10])) / 10)
+    assert np.mean(recalls) > 0.9
+    assert len(Codes.of(vectors[:0]).cosines(vectors[0])) == 0
+
+
+class Words:
+    """Token features by the text alone, as an encoder gives them."""
+
+    def tokens(self, captions: Sequence[str]) -> tuple[Any, Any]:
+        seeds = [int.from_bytes(hashlib.sha256(text.encode()).digest()[:4]) for text in captions]
+        rows = [np.random.default_rng(seed).standard_normal((3, 6)) for seed in seeds]
+        return np.array(rows, np.float32), np.ones((len(rows), 3), bool)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    synthesize(SynthConfig(clips=24, seed=5, layout="body133", val_fraction=0.0), folder)
+    return folder
+
+
+@pytest.fixture
+def model(root: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A TMA that has learned nothing, in the place of all that are asked for, and how often it embeds."""
+    torch.manual_seed(0)
+    train = ShardDataset.open(root, "train")
+    sizes = TmaConfig(latent=16, ff=32, layers=1, heads=2, frame_stride=4)
+    net = Tma.of_layout(sizes, train.layout, "bodyhand", 6).eval()
+    stats: FeatureStats = compute(train)
+    found = SimpleNamespace(weights="one", embedded=0)
+    tma = LoadedTma(net, train.layout, 196, "bodyhand", {"stats": stats, "text": Words()})
+    plain = searching._embedded
+
+    def embedded(*arguments: Any) -> Any:
+        found.embedded += 1
+        return plain(*arguments)
+
+    monkeypatch.setattr(searching, "alignment_model", lambda name, device: (tma, found.weights))
+    monkeypatch.setattr(searching, "_embedded", embedded)
+    (root / INDEX_FILE).unlink(missing_ok=True)
+    return found
+
+
+def test_made_once_for_these_clips_and_weights(root: Path, model: SimpleNamespace) -> None:
+    first = Search.open(root, "any")
+    content = (root / INDEX_FILE).read_bytes()
+    again = Search.open(root, "any")
+    assert model.embedded == 1 and (root / INDEX_FILE).read_bytes() == content
+    np.testing.assert_array_equal(first.codes.values, again.codes.values)
+    model.weights = "other"
+    Search.open(root, "any")
+    assert model.embedded == 2 and (root / INDEX_FILE).read_bytes() != content
+    model.weights = "one"
+    objects = io.BytesIO()
+    np.savez(objects, allow_pickle=True, made_from=np.array([print]), values=np.array([print]))
+    for spoilt in (content[:-40], b"", content.replace(b"values", b"valued"), objects.getvalue()):
+        (root / INDEX_FILE).write_bytes(spoilt)
+        Search.open(root, "any")
+        assert (root / INDEX_FILE).read_bytes() == content
+
+
+def test_words_neighbours_and_what_is_left_out(root: Path, model: SimpleNamespace) -> None:
+    found = Search.open(root, "any")
+    hits = found.best(found.words("a person waves"), 5)
+    scores = [hit.score for hit in hits]
+    assert scores == sorted(scores, reverse=True) and len({hit.id for hit in hits}) == 5
+    own = found.best(found.clip(hits[0].id), 3)
+    assert own[0].id == hits[0].id and own[0].score == pytest.approx(1, abs=0.01)
+    assert hits[0].id not in {hit.id for hit in found.best(found.clip(hits[0].id), 30, hits[0].id)}
+    decide(root, Decisions(left_out={hits[0].id: "bad"}), "given")
+    later = Search.open(root, "any")
+    assert model.embedded == 1, "what was decided leaves the embeddings as they are"
+    assert len(later.best(later.words("a person waves"), 30)) == 23
+    decide(root, Decisions(kept=(hits[0].id,)), "given")
+    with pytest.raises(UserError, match="no clip 'nobody'"):
+        found.clip("nobody")
+    with pytest.raises(UserError, match="no words"):
+        found.words("  ")
+
+
+def test_clips_from_files(root: Path, model: SimpleNamespace) -> None:
+    """A clip of the set finds itself, by its columns, by its joints and at another frame rate."""
+    found = Search.open(root, "any")
+    dataset = found.splits["train"]
+    joints = searching.floored_joints(dataset, 0)
+    facts = np.array(json.dumps({"fps": 2 * dataset.layout.fps}))
+    twice = np.repeat(joints, 2, axis=0)
+    for name, arrays in (
+        ("npy", dataset.motion(0)),
+        ("npy", joints),
+        ("npz", {"joints": twice, "metadata": facts}),
+    ):
+        raw = io.BytesIO()
+        np.savez(raw, **arrays) if name == "npz" else np.save(raw, arrays)  # type: ignore[arg-type]
+        [hit] = found.best(found.motion(*found.motion_file(raw.getvalue(), "x")), 1)
+        assert hit.id == dataset.ids[0] and hit.score > 0.98
+
+
+def npy(values: Any) -> bytes:
+    out = io.BytesIO()
+    np.save(out, values, allow_pickle=True)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("raw", "said"),
+    [
+        (b"", "x: "),
+        (b"PK nonsense", "not an .npz"),
+        (npy(np.zeros((9, 7, 3))), r"\[9, 7, 3\]"),
+        (npy(np.zeros((9, 17))), "body133 has 133 columns"),
+        (npy(np.full((9, 22, 3), np.nan)), "NaN"),
+        (npy(np.full((9, 22, 3), 1e9)), "absurd"),
+        (npy(np.array([print])), "x: "),
+    ],
+)
+def test_files_that_are_no_clips(raw: bytes, said: str, root: Path, model: SimpleNamespace) -> None:
+    found = Search.open(root, "any")
+    with pytest.raises(UserError, match=said):
+        found.motion_file(raw, "x")
+
+
+def test_captions_that_fit_worse_than_all_others(root: Path, model: SimpleNamespace) -> None:
+    """Of a TMA that has learned nothing, the share of misfits is that of the bound."""
+    found = Search.open(root, "any")
+    misfits = [*found.misfits()]
+    assert len(misfits) < 12
+    for place, fault in misfits:
+        own = {caption.text for caption in found.splits[place.split].texts(place.clip)}
+        assert fault.weight > 1 and any(f"'{text}' fits worse" in fault.text for text in own)
+
+
+def test_a_body_without_hands_in_a_layout_with_hands(model: SimpleNamespace, root: Path) -> None:
+    layout = MotionLayout.named("wholebody313", fps=20.0)
+    joints = searching.floored_joints(Search.open(root, "any").splits["train"], 0)
+    features, present = searching.features_for(SimpleNamespace(layout=layout), joints, 20.0)  # type: ignore[arg-type]
+    assert features.shape == (len(joints), 313) and not present & 1
+
+
+def test_models_without_a_tma(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such folder"):
+        alignment_model(tmp_path / "nowhere", "cpu")
+    with pytest.raises(UserError, match="has no TMA"):
+        alignment_model("dance", "cpu")
