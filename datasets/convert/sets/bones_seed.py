@@ -10,22 +10,15 @@ person's.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.bvh.plan import BvhConfig
-from motionloom.datasets.convert.captions.options import Listing, list_clips
-from motionloom.datasets.convert.captions.read import CaptionRow
 from motionloom.datasets.convert.common.audit import Published
 from motionloom.datasets.convert.common.scan import ARCHIVES, Batch, list_batches
-from motionloom.datasets.convert.common.splits import hash_split, read_split_files
-from motionloom.datasets.convert.common.where import Facts
+from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state
 from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv, read_json_lines
-from motionloom.datasets.motion.bvh.joint_map import Unit, Up
 from motionloom.datasets.schema import Caption, UserError
 
 FPS = 120.0
@@ -45,35 +38,19 @@ _CAPTIONS = {
 Kind = Literal["natural", "short", "technical", "timeline"]
 
 
-@dataclass(frozen=True)
-class Row:
-    """What the metadata say of a file."""
-
-    facts: dict[str, str]
-    texts: tuple[Caption, ...]
-
-
-class BonesSeedConfig(BvhConfig):
+class BonesSeedConfig(BvhSetConfig):
     """Options of the BONES-SEED converter; `source` is the folder that holds metadata/."""
 
     name: str = "bones-seed"
     """Name of the data set; part of the shards' file names."""
     licence: str | None = "bones-seed-license"
     """Licence of the clips."""
-    unit: Unit = "cm"
-    """Length unit of the files."""
-    up: Up = "y"
-    """Upward axis of the files."""
     variant: Literal["uniform", "proportional"] = "uniform"
     """Motion on one skeleton for all, or on each actor's own."""
     kinds: tuple[Kind, ...] = ("natural", "short", "timeline")
     """Captions to keep: natural, short and technical descriptions, and the sentences of the timeline."""
     split_by: Literal["actor_uid", "take_org_name", "move_name"] = "actor_uid"
     """The column that a split never tears apart: by default nobody who is tested was trained on."""
-
-    @property
-    def has_captions(self) -> bool:
-        return True
 
     def batches(self) -> list[Batch]:
         name = f"soma_{self.variant}"
@@ -83,39 +60,12 @@ class BonesSeedConfig(BvhConfig):
             raise UserError(f"{self.source}: no {name}/ and no archive {name}.tar.gz in it")
         return list_batches(place)
 
-    def about(self, path: str) -> Facts:
-        row = _rows(self.source, self.kinds).get(_stem(path))
-        return row.facts if row else {}
-
-    def listing(self, paths: Sequence[str]) -> Listing:
-        if self.captions is not None:
-            return super().listing(paths)
-        known = _rows(self.source, self.kinds)
-        here = {_stem(path): path for path in paths}
-        rows = [
-            CaptionRow(
-                name,
-                row.texts,
-                here[name],
-                hash_split(row.facts.get(self.split_by) or name),
-                False,
-                None,
-                name,
-            )
-            for name, row in known.items()
-            if name in here
-        ]
-        found = list_clips(paths, rows, read_split_files(self.splits)[0] if self.splits else None, [])
-        found.missing.update({name: name for name in known.keys() - here.keys()})
-        return found
-
-
-def _stem(path: str) -> str:
-    return PurePosixPath(path).stem
+    def rows(self) -> dict[str, Row]:
+        return _rows(self.source, self.kinds, self.split_by, state(*(self.source / "metadata").glob("*")))
 
 
 @lru_cache(maxsize=2)
-def _rows(source: Path, kinds: tuple[Kind, ...]) -> dict[str, Row]:
+def _rows(source: Path, kinds: tuple[Kind, ...], split_by: str, made: tuple[int, ...]) -> dict[str, Row]:
     """The metadata by file name."""
     folder = source / "metadata"
     tables = sorted(folder.glob("seed_metadata_v*.csv"))
@@ -125,9 +75,12 @@ def _rows(source: Path, kinds: tuple[Kind, ...]) -> dict[str, Row]:
         raise UserError(f"{folder}: no seed_metadata_v00N.csv in it{hint}")
     labels = sorted(folder.glob("*temporal_labels.jsonl")) if "timeline" in kinds else []
     timeline = _timeline(labels[-1]) if labels else {}
-    found = {}
+    found: dict[str, Row] = {}
     for row in read_csv(tables[-1], ("filename", "move_duration_frames", "is_mirror", "actor_uid")):
-        name, seconds = row["filename"], float(row["move_duration_frames"] or 0) / FPS
+        name, frames = row["filename"], row["move_duration_frames"]
+        if not frames.strip().isdigit():
+            raise UserError(f"{tables[-1].name}: '{name}' has {frames or 'no'} move_duration_frames")
+        seconds = int(frames) / FPS
         texts = [
             text
             for kind in kinds
@@ -138,7 +91,7 @@ def _rows(source: Path, kinds: tuple[Kind, ...]) -> dict[str, Row]:
             if text.start < seconds:
                 texts.append(text.model_copy(update={"end": min(text.end or seconds, seconds)}))
         facts = {key: sys.intern(row[key]) for key in _FACTS if row.get(key)}
-        found[name] = Row(facts, tuple(texts))
+        found[name] = Row(tuple(texts), facts.get(split_by) or name, facts)
     return found
 
 

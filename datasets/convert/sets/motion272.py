@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
@@ -53,6 +54,8 @@ class Motion272Config(ReleaseConfig):
 
     name: str = "motion272"
     """Name of the data set; part of the shards' file names."""
+    source_fps: float = Field(default=FPS, gt=0, le=240)
+    """Frame rate of the files; a copy that was made at another than 30 does not say so."""
     list_folder: str = ""
     """Folder of the split lists in the source, such as split/version1/tokenizer_96; else the usual ones."""
 
@@ -134,7 +137,7 @@ class Motion272(Release[Motion272Config]):
                 return
             for line in lines:
                 if file.split("/")[0].endswith("_stream_text") and (row := _STREAMED.fullmatch(line)):
-                    change = int(row["frames"]) / FPS
+                    change = int(row["frames"]) / self.config.source_fps
                     yield from captions_of(row["first"], "babel", 0.0, change)
                     yield from captions_of(row["second"], "babel", change)
                 else:
@@ -143,7 +146,7 @@ class Motion272(Release[Motion272Config]):
             note_broken(draft, file, error)
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
-        return check_array_header(path, width=WIDTH, name=label), FPS
+        return check_array_header(path, width=WIDTH, name=label), self.config.source_fps
 
     def figure(self, path: Path, label: str) -> Figure:
         return Figure(joints=joints_of_272(load_array(path, width=WIDTH, name=label, limit=1e3)))

@@ -44,6 +44,8 @@ class MotionHubConfig(BodyConfig):
     """Frame rate of the shards; clips are resampled by time."""
     tasks: tuple[str, ...] = TASKS
     """Of which lists clips are taken."""
+    subsets: tuple[str, ...] = ()
+    """Convert only these subsets (`aist`, `interx`, ...), and read only their captions; empty means all."""
     levels: tuple[str, ...] = ("macro", "meso", "micro")
     """Depths of the captions to keep."""
     script: bool = True
@@ -73,6 +75,8 @@ class MotionHub(BodyRelease[MotionHubConfig]):
         moved = 0
         for task, split, key, row in self._rows(draft):
             for file in _motions(row):
+                if self.config.subsets and file.split("/")[0] not in self.config.subsets:
+                    continue
                 before = found.get(file)
                 if before is None:
                     found[file] = self._entry(file, task, split, key, row, draft)

@@ -7,19 +7,13 @@ frame of every movement (`FW_START`, `FW_STOP`); what is before and after is the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.bvh.plan import BvhConfig
-from motionloom.datasets.convert.captions.options import Listing, list_clips
-from motionloom.datasets.convert.captions.read import CaptionRow
 from motionloom.datasets.convert.common.audit import Published
-from motionloom.datasets.convert.common.splits import hash_split, read_split_files
-from motionloom.datasets.convert.common.where import Facts
+from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state, stem
 from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv
-from motionloom.datasets.motion.bvh.joint_map import Unit, Up
 from motionloom.datasets.schema import UserError
 
 CUTS, STYLES = "Frame_Cuts.csv", "Dataset_List.csv"
@@ -37,53 +31,25 @@ MOVEMENTS = {
 }
 
 
-class Style100Config(BvhConfig):
+class Style100Config(BvhSetConfig):
     """Options of the 100STYLE converter; `source` is the folder that holds Frame_Cuts.csv."""
 
     name: str = "100style"
     """Name of the data set; part of the shards' file names."""
     licence: str | None = "CC-BY-4.0"
     """Licence of the clips."""
-    unit: Unit = "cm"
-    """Length unit of the files."""
-    up: Up = "y"
-    """Upward axis of the files."""
-
-    @property
-    def has_captions(self) -> bool:
-        return True
 
     def cut(self, label: str) -> slice:
-        return _cuts(self.source).get(_stem(label), slice(None))
+        return self._cuts().get(stem(label), slice(None))
 
     def unfit(self, path: str) -> str:
-        return "" if _stem(path) in _cuts(self.source) else f"no frames of it in {CUTS}"
+        return "" if stem(path) in self._cuts() else f"no frames of it in {CUTS}"
 
-    def about(self, path: str) -> Facts:
-        style, _, movement = _stem(path).rpartition("_")
-        return {"style": style, "movement": movement}
+    def _cuts(self) -> dict[str, slice]:
+        return _cuts(self.source, state(self.source / CUTS))
 
-    def listing(self, paths: Sequence[str]) -> Listing:
-        if self.captions is not None:
-            return super().listing(paths)
-        cuts, described = _cuts(self.source), _descriptions(self.source)
-        rows = []
-        for path in paths:
-            style, _, movement = _stem(path).rpartition("_")
-            words = _words(style)
-            texts = []
-            if movement in MOVEMENTS:
-                texts = captions_of(f"a person {MOVEMENTS[movement]} in the style {words}", "style")
-                about = described.get(words)
-                texts += (
-                    captions_of(f"a person {MOVEMENTS[movement]}: {about}", "description") if about else []
-                )
-            # New styles are for testing: clips of one style stay together.
-            row = CaptionRow(_stem(path), tuple(texts), path, hash_split(style), False, None, path)
-            rows.append(row)
-        found = list_clips(paths, rows, read_split_files(self.splits)[0] if self.splits else None, [])
-        found.missing.update({name: name for name in cuts.keys() - {_stem(path) for path in paths}})
-        return found
+    def rows(self) -> dict[str, Row]:
+        return _rows(self.source, state(self.source / CUTS, self.source / STYLES))
 
 
 class Style100(Bvh):
@@ -94,11 +60,7 @@ class Style100(Bvh):
     summary = "100STYLE: walks and runs in a hundred styles (BVH) to shards."
     example = "100STYLE shards"
     config_class = Style100Config
-    published = Published("Zenodo record", {"clips": 810, "style": 100, "hours": 18.8})
-
-
-def _stem(path: str) -> str:
-    return PurePosixPath(path).stem
+    published = Published("paper, 2022, and the list of files", {"clips": 810, "style": 100, "hours": 18.5})
 
 
 def _words(style: str) -> str:
@@ -108,7 +70,7 @@ def _words(style: str) -> str:
 
 
 @lru_cache(maxsize=4)
-def _cuts(source: Path) -> dict[str, slice]:
+def _cuts(source: Path, made: tuple[int, ...]) -> dict[str, slice]:
     """First and last frame of every file that has them, by its name without suffix."""
     if not (source / CUTS).is_file():
         raise UserError(f"{source}: no {CUTS} in it; give the folder of the release")
@@ -127,8 +89,15 @@ def _cuts(source: Path) -> dict[str, slice]:
 
 
 @lru_cache(maxsize=4)
-def _descriptions(source: Path) -> dict[str, str]:
-    if not (source / STYLES).is_file():
-        return {}
-    rows = read_csv(source / STYLES, ("Style Name", "Description"))
-    return {_words(row["Style Name"]): row["Description"].strip().rstrip(".") for row in rows}
+def _rows(source: Path, made: tuple[int, ...]) -> dict[str, Row]:
+    """Captions of every file that has frames. Clips of one style stay together: new styles are tested."""
+    styles = read_csv(source / STYLES, ("Style Name", "Description")) if (source / STYLES).is_file() else []
+    described = {_words(row["Style Name"]): row["Description"].strip().rstrip(".") for row in styles}
+    found = {}
+    for name in _cuts(source, made[:1]):
+        style, _, movement = name.rpartition("_")
+        words, does = _words(style), f"a person {MOVEMENTS[movement]}"
+        texts = captions_of(f"{does} in the style {words}", "style")
+        texts += captions_of(f"{does}: {described[words]}", "description") if words in described else []
+        found[name] = Row(tuple(texts), style, {"style": style, "movement": movement})
+    return found

@@ -105,6 +105,8 @@ def test_motionhub_joins_what_its_lists_say_of_a_motion(built: Callable[[str], P
     assert {text.source for text in texts} == {"macro", "meso"}
     _, texts = meta_of(tmp_path / "out", "ted_db/talk")
     assert [text.text for text in texts if text.source == "speech"] == ["so this is how we walk"]
+    some = planned("motionhub", built("motionhub"), subsets=["ted_db"]).plan
+    assert [clip.id for _, clip in some.items] == ["ted_db/talk"] and not some.missing
     alone = planned("motionhub", built("motionhub"), tasks=["music_dance"], sound="require")
     assert [clip.id for _, clip in alone.plan.items] == ["aist/gBR_1"]
 
@@ -253,6 +255,7 @@ DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
     ("finedance", lambda root: cut(root / "label_json/001.json"), "label_json/001.json: not valid JSON"),
     ("bones_seed", lambda root: text(root / META, "actor_uid", "actor"), "no column 'actor_uid'"),
     ("bones_seed", lambda root: text(root / META, ",A1,", ","), "6 columns, the header has 7"),
+    ("bones_seed", lambda root: text(root / META, ",361,Dances", ",long,Dances"), "move_duration_frames"),
     ("bones_seed", lambda root: cut(root / LABELS), f"{Path(LABELS).name}:1: not valid JSON"),
     ("bones_seed", lambda root: text(root / LABELS, "end_time", "end"), "needs filename, and events with"),
     ("bones_seed", lambda root: cut(root / TAKE), "walk_001__A1.bvh"),

@@ -1,0 +1,71 @@
+"""Published sets of BVH files: the `bvh` converter, with captions and splits from the set's own tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.captions.options import Listing, list_clips
+from motionloom.datasets.convert.captions.read import CaptionRow
+from motionloom.datasets.convert.common.splits import hash_split, read_split_files
+from motionloom.datasets.convert.common.where import Facts
+from motionloom.datasets.motion.bvh.joint_map import Unit, Up
+from motionloom.datasets.schema import Caption
+
+
+class Row(NamedTuple):
+    """What a set's tables say of a file."""
+
+    texts: tuple[Caption, ...]
+    group: str
+    """Files that a split never tears apart."""
+    facts: Facts
+
+
+class BvhSetConfig(BvhConfig):
+    """Options of published sets of BVH files."""
+
+    unit: Unit = "cm"
+    """Length unit of the files."""
+    up: Up = "y"
+    """Upward axis of the files."""
+
+    def rows(self) -> Mapping[str, Row]:
+        """What the tables say, by the names of files without folder and suffix; made once."""
+        raise NotImplementedError
+
+    @property
+    def has_captions(self) -> bool:
+        return True
+
+    def about(self, path: str) -> Facts:
+        row = self.rows().get(stem(path))
+        return row.facts if row else {}
+
+    def unfit(self, path: str) -> str:
+        return "" if stem(path) in self.rows() else "not in the tables of the set"
+
+    def listing(self, paths: Sequence[str]) -> Listing:
+        if self.captions is not None:
+            return super().listing(paths)
+        known, here = self.rows(), {stem(path): path for path in paths}
+        rows = [
+            CaptionRow(name, row.texts, here[name], hash_split(row.group), False, None, name)
+            for name, row in known.items()
+            if name in here
+        ]
+        found = list_clips(paths, rows, read_split_files(self.splits)[0] if self.splits else None, [])
+        found.missing.update({name: name for name in known if name not in here})
+        return found
+
+
+def state(*paths: Path) -> tuple[int, ...]:
+    """When tables were changed: what is read of them is kept as long as that is the same."""
+    return tuple(path.stat().st_mtime_ns if path.exists() else 0 for path in paths)
+
+
+def stem(path: str) -> str:
+    """The name of a file without folder and suffix."""
+    return PurePosixPath(path).stem
