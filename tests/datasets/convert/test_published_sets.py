@@ -86,7 +86,7 @@ def test_a_set_gives_the_walk_it_was_made_from(
     assert meta_of(tmp_path / "out", case["clip"])[0].has_hands == (layout.num_joints > 22)
 
 
-@pytest.mark.parametrize("name", ["motionhub"])  # BVH has the same test for itself
+@pytest.mark.parametrize("name", ["motion272"])  # BVH has the same test for itself
 def test_two_workers_write_the_same_bytes(built: Callable[[str], Path], name: str, tmp_path: Path) -> None:
     for workers in (1, 2):
         make(name, built(name), tmp_path / str(workers), workers)
