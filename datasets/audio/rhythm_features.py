@@ -30,8 +30,6 @@ COLUMNS = (
     "brightness", "bass", "dynamics",
 )  # fmt: skip
 RHYTHM_DIM = len(COLUMNS)
-VERSION = 1
-"""Raised whenever the same sound gives other numbers."""
 
 _SPLIT = (band_from(250.0), band_from(2500.0))
 """The bands from which on is middle and high."""

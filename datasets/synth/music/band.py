@@ -1,31 +1,24 @@
-"""A band that plays songs: FluidSynth with a General MIDI sound font, so with the sounds of real instruments.
+"""A band that plays songs, with the sounds of real instruments (`instruments.py`).
 
 What it plays is a pure function of the song: a line-up (a whole drum kit, one that leaves out beats, hats or
 hands alone, none at all), a feel (straight, swung, half-time, double-time, syncopated), harmony, bass, pads,
 melodies and choirs that come and go with the energy of each section, fills before sections, and the small
 unevenness of hands. In a break one chord rings. Beats are those of the song's grid, whoever plays on them.
-
-Needs `pip install 'motionloom[band]'`, the library FluidSynth and a sound font: the file that
-`MOTIONLOOM_SOUND_FONT` names, or FluidR3 (MIT licence; Debian's `fluid-soundfont-gm`).
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.synth.music.instruments import DRUMS, Instruments
 from motionloom.datasets.synth.music.song import Section, Song
 
-SOUND_FONT = Path("/usr/share/sounds/sf2/FluidR3_GM.sf2")
-_DRUMS = 9
-"""The channel of drums."""
 _KICK, _SNARE, _CLAP, _HAT, _OPEN_HAT, _CRASH, _RIDE, _SHAKER, _RIM = 36, 38, 39, 42, 46, 49, 51, 70, 37
 _TOMS = (50, 48, 45, 43)
 _BASS, _CHORDS, _PAD, _LEAD = range(4)
@@ -114,35 +107,18 @@ def score(song: Song) -> list[Note]:
 
 def play_band(song: Song, rate: int) -> NDArray[np.float32]:
     """The song as dry mono samples [seconds * rate], loudest 1; `UserError` where there is no band."""
-    synth = _synthesizer(rate)
+    band = Instruments(rate)
     rng = np.random.default_rng([song.seed, song.number, 251])
     line_up = LineUp.drawn(song, np.random.default_rng([song.seed, song.number, 241]))
-    font = synth.sfload(str(_sound_font()))
     for part, program in line_up.programs.items():
-        synth.program_select(part, font, 0, program)
-    synth.program_select(_DRUMS, font, 128, int(rng.choice([0, 8, 16, 24, 25, 32, 40])))
-    total = round(song.seconds * rate)
-    events: list[tuple[int, int, Note]] = []
+        band.select(part, program)
+    band.select(DRUMS, int(rng.choice([0, 8, 16, 24, 25, 32, 40])))
+    strokes = []
     for note in score(song):
-        at = max(0, round((note.at + _SOFT_HANDS * rng.standard_normal()) * rate))
-        events += [(at, 1, note), (at + max(1, round(note.seconds * rate)), 0, note)]
-    events.sort(key=lambda event: event[:2])
-    blocks, now = [], 0
-    for at, begins, note in events:
-        if at >= total:
-            break
-        if at > now:
-            blocks.append(synth.get_samples(at - now))
-            now = at
-        if begins:
-            synth.noteon(note.channel, note.pitch, note.loud)
-        else:
-            synth.noteoff(note.channel, note.pitch)
-    if now < total:
-        blocks.append(synth.get_samples(total - now))
-    synth.delete()
-    sound = np.concatenate(blocks).reshape(-1, 2).mean(axis=1)
-    return np.asarray(sound / max(1.0, float(np.abs(sound).max())), dtype=np.float32)
+        at = max(0.0, note.at + _SOFT_HANDS * rng.standard_normal())
+        strokes.append((at, 1, partial(band.synth.noteon, note.channel, note.pitch, note.loud)))
+        strokes.append((at + note.seconds, 0, partial(band.synth.noteoff, note.channel, note.pitch)))
+    return band.play(strokes, song.seconds)
 
 
 # ---- who plays what
@@ -252,7 +228,7 @@ def _when(song: Song, bar: int, step: float, how: LineUp) -> float:
 
 
 def _stroke(song: Song, bar: int, step: int, how: LineUp, drum: int, loud: float) -> Note:
-    return Note(_when(song, bar, step, how), 0.1, _DRUMS, drum, int(np.clip(loud, 1, 127)))
+    return Note(_when(song, bar, step, how), 0.1, DRUMS, drum, int(np.clip(loud, 1, 127)))
 
 
 def _note(
@@ -261,28 +237,3 @@ def _note(
     at = _when(song, bar, step, how)
     seconds = max(0.05, 0.92 * (_when(song, bar, until, how) - at))
     return Note(at, seconds, part, int(np.clip(pitch, 21, 108)), int(np.clip(loud, 1, 127)))
-
-
-# ---- FluidSynth
-
-
-def _sound_font() -> Path:
-    path = Path(os.environ.get("MOTIONLOOM_SOUND_FONT", SOUND_FONT))
-    if not path.is_file():
-        raise UserError(
-            f"{path}: no such sound font, which songs of `music: played` need; install one (Debian: "
-            f"apt install fluid-soundfont-gm libfluidsynth3) or name it in MOTIONLOOM_SOUND_FONT"
-        )
-    return path
-
-
-def _synthesizer(rate: int) -> Any:
-    try:
-        import fluidsynth
-    except ImportError as error:  # the binding, or the library that it binds
-        raise UserError(
-            f"songs of `music: played` need FluidSynth ({error}); pip install 'motionloom[band]' and the "
-            f"library (Debian: apt install libfluidsynth3)"
-        ) from None
-    dry = {"synth.reverb.active": 0, "synth.chorus.active": 0}
-    return fluidsynth.Synth(gain=0.5, samplerate=rate, channels=16, **dry)

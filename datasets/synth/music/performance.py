@@ -19,7 +19,10 @@ from motionloom.datasets.synth.music.synthesizer import synthesize
 @lru_cache(maxsize=64)
 def render_song(song: Song, rate: int) -> NDArray[np.float32]:
     """The whole song as mono samples [seconds * rate] in -1..1; read-only, the same bytes each time."""
-    samples = record(play_band(song, rate), rate, song) if song.played else synthesize(song, rate)
+    if song.played:
+        samples = record(play_band(song, rate), rate, np.random.default_rng([song.seed, song.number, 257]))
+    else:
+        samples = synthesize(song, rate)
     samples.setflags(write=False)
     return samples
 

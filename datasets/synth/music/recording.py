@@ -8,17 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.synth.actions.maths import Array
-from motionloom.datasets.synth.music.song import Song
 
 _CODECS = (("OGG", "VORBIS"), ("MP3", "MPEG_LAYER_III"))
 
 
-def record(dry: NDArray[np.float32], rate: int, song: Song) -> NDArray[np.float32]:
+def record(dry: NDArray[np.float32], rate: int, rng: np.random.Generator) -> NDArray[np.float32]:
     """Dry samples [n], loudest 1 -> a recording of them [n] in -1..1, at the same times.
 
-    Each step is drawn for the song; none moves a beat by more than the room's first reflections.
+    Each step is drawn; none moves a beat by more than the room's first reflections.
     """
-    rng = np.random.default_rng([song.seed, song.number, 257])
     out = np.asarray(dry, dtype=np.float64)
     if rng.random() < 0.6:
         out = _room(out, rate, rng)

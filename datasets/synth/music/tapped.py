@@ -27,6 +27,8 @@ from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.music.performance import render_song
+from motionloom.datasets.synth.music.recording import record
+from motionloom.datasets.synth.music.scores import excerpt, scores
 from motionloom.datasets.synth.music.song import Song, draw_song
 
 RENDER_RATE = 32_000
@@ -48,8 +50,22 @@ class SongPoolConfig(Config):
     played: bool = True
     """By a band; otherwise by the built-in synthesiser, as metronomes."""
 
+    scores: Path | None = None
+    """A folder of MIDI files (*.mid); every second song is an excerpt of one of them."""
+
+    def tapped(self, number: int) -> TappedSong:
+        """One of the songs, rendered; seconds of work."""
+        if self.scores is None or number % 2 == 0:
+            return TappedSong.of(self.song(number))
+        pieces = scores(self.scores)
+        kept = max(1, round(len(pieces) * self.validation))  # whole pieces are kept back
+        own = pieces[-kept:] if number in self.split(True) else pieces[:-kept] or pieces
+        rng = np.random.default_rng([self.seed, number, 263])
+        dry, beats, downbeats = excerpt(own[number // 2 % len(own)], self.song_seconds, RENDER_RATE, rng)
+        return TappedSong.heard_in(record(dry, RENDER_RATE, rng), beats, downbeats)
+
     def song(self, number: int) -> Song:
-        """One of the songs."""
+        """One of the band's songs."""
         return draw_song(
             number,
             self.seed,
@@ -79,10 +95,17 @@ class TappedSong:
     @classmethod
     def of(cls, song: Song) -> TappedSong:
         """Render a song; seconds of work."""
-        sound = Sound(render_song.__wrapped__(song, RENDER_RATE), RENDER_RATE)
         first = song.beat_number(0.0)
         beats = np.array(song.beats_within(0.0, song.seconds))
         downbeats = (first + np.arange(len(beats))) % song.meter == 0
+        return cls.heard_in(render_song.__wrapped__(song, RENDER_RATE), beats, downbeats)
+
+    @classmethod
+    def heard_in(
+        cls, samples: NDArray[np.float32], beats: NDArray[np.float64], downbeats: NDArray[np.bool_]
+    ) -> TappedSong:
+        """Samples [n] at the rate of rendering, with the seconds of their beats."""
+        sound = Sound(samples, RENDER_RATE)
         return cls(levels(band_power(sound)).astype(np.float16), beats, downbeats)
 
     def save(self, path: Path) -> None:

@@ -63,7 +63,7 @@ def _path(folder: Path, number: int) -> Path:
 
 
 def _render(config: SongsConfig, folder: Path, number: int) -> None:
-    TappedSong.of(config.song(number)).save(_path(folder, number))
+    config.tapped(number).save(_path(folder, number))
 
 
 register(SongsStage())
