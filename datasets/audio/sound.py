@@ -31,6 +31,8 @@ MAX_SECONDS = 3600
 """Longest sound that is read."""
 MAX_RATE = 48_000
 """Sound of higher sample rates is brought to this one while it is read, unless another is asked for."""
+_LAST_BLOCK = 0.05
+"""Seconds that a decoder may lack of what a header states, as it does of whole and genuine OGG files."""
 _SAMPLES_A_BYTE = 200
 """No music is packed so tightly (speech at 8 kbit/s has 48); beyond a minute of it, a file is a bomb."""
 
@@ -124,9 +126,10 @@ def read_sound(
             wanted = resampled_length(wanted, found, rate)
             made = list(_resampled(blocks, found, rate))
     samples = np.concatenate(made)
-    if len(samples) < wanted:
+    missing = wanted - len(samples)
+    if missing > _LAST_BLOCK * rate:
         raise UserError(f"{name}: cut short: {len(samples)} samples of {wanted}")
-    return samples[:wanted], rate
+    return np.pad(samples[:wanted], (0, max(0, missing))), rate
 
 
 def sound_seconds(path: Path, name: str | None = None) -> float:

@@ -242,6 +242,23 @@ def test_no_sound_of_an_mp3_is_lost_or_added(
             read_sound(path)
 
 
+@pytest.mark.parametrize(("missing", "read"), [(100, True), (RATE, False)])
+def test_a_whole_file_may_lack_its_last_block(
+    tmp_path: Path, tone: np.ndarray, monkeypatch: pytest.MonkeyPatch, missing: int, read: bool
+) -> None:
+    path = tmp_path / "a.ogg"
+    soundfile.write(path, tone, RATE)
+    samples = read_sound(path)[0]
+    monkeypatch.setattr("motionloom.datasets.audio.sound._length", lambda *_: (len(samples) + missing, RATE))
+    if read:
+        longer = read_sound(path)[0]
+        assert np.array_equal(longer[: len(samples)], samples) and not longer[len(samples) :].any()
+        assert len(longer) == len(samples) + missing
+    else:
+        with pytest.raises(UserError, match=r"a\.ogg: cut short"):
+            read_sound(path)
+
+
 def test_damaged_mp3s_and_oggs(tmp_path: Path, tone: np.ndarray) -> None:
     path = tmp_path / "a.mp3"
     raw = mp3(path, np.tile(tone, 5))
