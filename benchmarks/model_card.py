@@ -60,7 +60,7 @@ ASKED = 60
 CARD = Path(__file__).with_suffix(".md")
 
 MUSIC = {
-    "real_songs": "Dances to real songs; the tracker was tuned on most of them (`benchmarks/real_songs.py`)",
+    "real_songs": "Dances to real songs that were kept back (`benchmarks/real_songs.py`)",
     "dances": "Dances to unheard played songs (`evaluate_dances` of the recipe)",
 }
 """Records of a model of music, by title."""
@@ -206,7 +206,7 @@ def main() -> None:
     bundle = Bundle.open(model)
     asked = {"top_p": args.top_p, "cfg_scale": args.cfg, "candidates": args.candidates}
     asked = {name: value for name, value in asked.items() if value is not None}
-    sampling = bundle.drawing(asked or before.get("sampling"))
+    sampling = bundle.drawing(SamplingConfig.of(asked or before.get("sampling")))
     said = {
         FAMILIAR: ([t.caption for t in truths], [t.face_caption for t in truths]),
         OTHER: ([body for body, _ in other], [face or body for body, face in other]),

@@ -7,7 +7,7 @@ Stretches of every song are danced to, from several seeds. The beats are those o
 (`song.beats`, a line of seconds each) or librosa's of the whole song, whatever the model itself hears, and no
 part of any choice. librosa's come late by what `benchmarks/beats.py` measures on songs whose beats are
 known, which is taken off (`--late 0` leaves it). Beat Align is UDE's (each of the music's beats looks for
-the nearest of the dance's).
+the nearest of the dance's), at 60 frames a second.
 
 - *own against shifted*: the score over that of the same beats moved by a random part of a beat; 1 is a dance
   that does not hear. *any octave* takes the best of the beats, every second one and twice as many, for both.
@@ -54,7 +54,9 @@ from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import read_music
 
 Array = NDArray[np.float64]
-SIGMA = 3 / 60
+RATE = 60.0
+"""Frames a second that the published measures count in; slower, a motion's beats come half a frame early."""
+SIGMA = 3 / RATE
 """Seconds, of UDE's formula."""
 SHIFTS = 20
 LATE = 0.028
@@ -129,14 +131,14 @@ def energy(joints: Array, fps: float, sound: Sound) -> float:
         np.sqrt(np.square(sound.slice(k / fps, (k + width) / fps).samples, dtype=np.float64).mean())
         for k in windows
     ]
-    return float(spearmanr(moving, loud).statistic)
+    return float(spearmanr(moving, loud).statistic) if np.ptp(moving) else float("nan")
 
 
 def kinetics(joints: Array, fps: float) -> list[Array]:
     """Kinetic features of windows of four seconds."""
     width = round(4 * fps)
     cut = [joints[k : k + width] for k in range(0, len(joints) - width + 1, width // 2)]
-    return [kinetic_features(zero_start(resample(part[:, :BODY_JOINTS], fps, 60.0))) for part in cut]
+    return [kinetic_features(zero_start(resample(part[:, :BODY_JOINTS], fps, RATE))) for part in cut]
 
 
 def spread(rows: Sequence[Array], scale: Array) -> float:
@@ -190,7 +192,7 @@ def figures(
 ) -> dict[str, float]:
     """All figures of one dance for each stretch."""
     rng = np.random.default_rng(seed)
-    beats = [motion_beats(dance[:, :BODY_JOINTS], fps, "ude") for dance in dances]
+    beats = [motion_beats(resample(dance[:, :BODY_JOINTS], fps, RATE), RATE, "ude") for dance in dances]
     out: dict[str, float] = {}
     for name, octave in (("", False), (", any octave", True)):
         own = np.mean([score(part.beats, found, octave) for part, found in zip(parts, beats, strict=True)])
