@@ -20,7 +20,7 @@ from motionloom.datasets.check.suspects import find_suspects, open_splits
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, Decisions, Manifest, Split, UserError
+from motionloom.datasets.schema import Caption, Decisions, Split, UserError
 from motionloom.datasets.shards.options import DatasetFacts, Reading, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 from motionloom.datasets.shards.sample import Sample
@@ -253,8 +253,3 @@ def test_stages_that_have_read_other_clips_run_again(root: Path, tmp_path: Path)
     every = statistics()
     decide(root, Decisions(left_out={"c7": "bad"}), "given.json")
     assert statistics() != every
-
-
-def test_old_manifests_are_as_they_were(root: Path) -> None:
-    manifest = load_manifest(root)
-    assert "excluded" not in manifest.dump() and Manifest.parse(manifest.dump(), "x") == manifest

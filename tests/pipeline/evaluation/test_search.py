@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -118,6 +118,17 @@ def test_words_neighbours_and_what_is_left_out(root: Path, model: SimpleNamespac
         found.clip("nobody")
     with pytest.raises(UserError, match="no words"):
         found.words("  ")
+
+
+def test_command(root: Path, model: SimpleNamespace, call: Callable[..., Any]) -> None:
+    """Three ways to ask, the last with a clip that is not in the set."""
+    by_words = json.loads(call("search", root, "a person waves", "--count", 3, "--json").out)
+    assert [*by_words[0]] == ["id", "split", "score", "caption"] and len(by_words) == 3
+    first = by_words[0]["id"]
+    alike = call("search", root, "--like", first)
+    assert alike.code == 0 and first not in alike.out and len(alike.out.splitlines()) >= 12
+    assert call("search", root, "--like", "nobody").code == 2
+    assert call("search", root, "words", "--like", first).code == 2
 
 
 def test_clips_from_files(root: Path, model: SimpleNamespace) -> None:
