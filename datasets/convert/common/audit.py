@@ -7,6 +7,7 @@ clips found; a condition of `where.py` (`subset=aist`), the clips that meet it; 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -28,18 +29,18 @@ class Audit:
     """Counts the clips of a plan beside what is published. Without published numbers it stays empty."""
 
     published: Published | None = None
-    _found: dict[str, float] = field(default_factory=dict)
-    _taken: dict[str, float] = field(default_factory=dict)
-    _values: dict[str, set[str]] = field(default_factory=dict)
+    _found: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    _taken: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    _values: set[tuple[str, bool, str]] = field(default_factory=set)
+    """Different values of facts: name, whether of clips that are taken, value."""
 
     def add(self, facts: Facts, *, taken: bool) -> None:
         """One clip that was found; `facts` has its length as `seconds`."""
         for name in self.published.counts if self.published else ():
-            more = self._worth(name, facts)
-            self._found[name] = self._found.get(name, 0.0) + more
-            self._taken[name] = self._taken.get(name, 0.0) + (more if taken else 0.0)
+            self._found[name] += self._worth(name, facts, False)
+            self._taken[name] += self._worth(name, facts, True) if taken else 0
 
-    def _worth(self, name: str, facts: Facts) -> float:
+    def _worth(self, name: str, facts: Facts, taken: bool) -> float:
         if name == "clips":
             return 1.0
         if name == "hours":
@@ -47,11 +48,10 @@ class Audit:
             return seconds / 3600 if isinstance(seconds, int | float) else 0.0
         if not name.isidentifier():
             return float(all(condition.holds(facts) for condition in parse_where(name)))
-        seen = self._values.setdefault(name, set())
-        before = len(seen)
-        if name in facts:
-            seen.add(str(facts[name]))
-        return float(len(seen) - before)
+        value = (name, taken, str(facts.get(name, "")))
+        new = name in facts and value not in self._values
+        self._values.add(value)
+        return float(new)
 
     def rows(self, clips: int, why: str) -> list[AuditRow]:
         """The table; `clips` is how many are left in the plan, and `why` says why others are not."""
@@ -63,8 +63,8 @@ class Audit:
                 what=name,
                 stated=count,
                 by=self.published.by,
-                found=round(self._found.get(name, 0.0), 3),
-                taken=round(self._taken.get(name, 0.0), 3),
+                found=round(self._found[name], 3),
+                taken=round(self._taken[name], 3),
                 why=why if name == "clips" else "",
             )
             for name, count in self.published.counts.items()
