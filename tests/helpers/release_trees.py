@@ -55,10 +55,11 @@ def rows_of(rotvecs: Floats) -> Floats:
 
 
 def motionhub(root: Path) -> Path:
-    """Four motions: a captioned one, a dance in two lists, a talk, and one that is listed but not there."""
+    """Five motions: a captioned one and its mirror image, a dance in two lists, a talk, and one that is listed but not there."""
     lists: dict[str, dict[str, Any]] = {}
     for name, split, task, more in (
         ("HumanML3D_AMASS/smplh_52/000/000001", "train", "text_motion", {}),
+        ("HumanML3D_AMASS/smplh_52/M000/M000001", "train", "text_motion", {}),
         ("aist/smplh_52/gBR_1", "train", "text_motion", {}),
         ("aist/smplh_52/gBR_1", "test", "music_dance", {"music_path": "aist/music/m.wav", "genre": "break"}),
         ("ted_db/smplh_52/talk", "train", "speech_gesture",
@@ -70,7 +71,9 @@ def motionhub(root: Path) -> Path:
         lists.setdefault(f"{task}/{split}", {})[name.rsplit("/", 1)[-1]] = row
         put(root / caption, {"macro": ["a person walks"], "meso": ["someone walks to the left"], "micro": []})
         if "gone" not in name:
-            poses, trans = walk({"000001": 0.0, "gBR_1": 0.3}.get(name.rsplit("/", 1)[-1], 0.6))
+            poses, trans = walk(
+                {"000001": 0.0, "gBR_1": 0.3, "M000001": 0.9}.get(name.rsplit("/", 1)[-1], 0.6)
+            )
             translation = {"transl" if "talk" in name else "trans": trans}
             path = root / f"{name}.npz"
             path.parent.mkdir(parents=True, exist_ok=True)

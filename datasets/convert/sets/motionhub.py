@@ -9,13 +9,14 @@ own place.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from motionloom.datasets.convert.common.audit import Published
 from motionloom.datasets.convert.common.files import inside, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.splits import hash_share, original_of
+from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.where import Fact
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.sets.shared.release import Entry, ReleaseClip, note_broken
@@ -29,6 +30,8 @@ _SUBSETS = {
     "MotionGV": 833121, "nturgbd120": 106864, "permo": 6610, "trumans": 3623, "aist": 1408,
     "finedance": 4194, "beat_v2.0.0": 21603, "ted_db": 22548, "chi3d": 912, "hi4d": 300, "interx": 34161,
 }  # fmt: skip
+_MIRRORED = re.compile(r"(?<![^/])M(?=\d+(?:/|$))")
+"""What a mirrored clip's folder and file begin with: `M000/M000001` mirrors `000/000001`."""
 _FACTS = ("genre", "speaker_id", "language", "has_hand", "interactor_key")
 """Fields of a row that are kept as facts."""
 
@@ -132,11 +135,12 @@ class MotionHub(BodyRelease[MotionHubConfig]):
     ) -> Entry:
         clip_id = file.removesuffix(".npz").replace("/smplh_52/", "/")
         subset = file.split("/")[0]
-        original = original_of(clip_id)
+        plain = _MIRRORED.sub("", clip_id)
+        original = plain if plain != clip_id else None
         facts: dict[str, Fact] = {"subset": subset, "task": (task,), "key": key}
         facts |= {name: str(row[name]) for name in _FACTS if row.get(name) is not None}
         return Entry(
-            clip_id, file, tuple(self._texts(row, draft)), split, original or clip_id, facts, _sound(row),
+            clip_id, file, tuple(self._texts(row, draft)), split, plain, facts, _sound(row),
             mirror_of=original, licence=f"MotionHub, terms of {subset}",
         )  # fmt: skip
 

@@ -28,7 +28,7 @@ QUICK = {"audio_features": False, "sound_rate": 8000}
 """Without the 438 features, whose first use compiles for half a minute."""
 
 SETS: dict[str, dict[str, Any]] = {
-    "motionhub": {"clip": "HumanML3D_AMASS/000/000001", "layout": "wholebody313", "more": QUICK, "found": 3},
+    "motionhub": {"clip": "HumanML3D_AMASS/000/000001", "layout": "wholebody313", "more": QUICK, "found": 4},
     "finedance": {"clip": "001", "layout": "wholebody313", "more": QUICK, "found": 3},
     "bones_seed": {"clip": "walk_001__A1", "layout": "wholebody313", "more": {}, "found": 3},
     "motion272": {"clip": "000000", "layout": "body133", "more": {}, "found": 3},
@@ -105,6 +105,8 @@ def test_motionhub_joins_what_its_lists_say_of_a_motion(built: Callable[[str], P
     meta, texts = meta_of(tmp_path / "out", "aist/gBR_1")
     assert (meta.split, meta.song, meta.licence) == ("test", "aist/music/m.wav", "MotionHub, terms of aist")
     assert {text.source for text in texts} == {"macro", "meso"}
+    mirrored = meta_of(tmp_path / "out", "HumanML3D_AMASS/M000/M000001")[0]
+    assert mirrored.mirror_of == "HumanML3D_AMASS/000/000001"
     _, texts = meta_of(tmp_path / "out", "ted_db/talk")
     assert [text.text for text in texts if text.source == "speech"] == ["so this is how we walk"]
     some = planned("motionhub", built("motionhub"), subsets=["ted_db"]).plan
