@@ -55,7 +55,8 @@ def rows_of(rotvecs: Floats) -> Floats:
 
 
 def motionhub(root: Path) -> Path:
-    """Five motions: a captioned one and its mirror image, a dance in two lists, a talk, and one that is listed but not there."""
+    """A captioned motion and its mirror image, a dance in two lists, a talk, and one that is not there."""
+    bent = {"000001": 0.0, "gBR_1": 0.3, "M000001": 0.9}
     lists: dict[str, dict[str, Any]] = {}
     for name, split, task, more in (
         ("HumanML3D_AMASS/smplh_52/000/000001", "train", "text_motion", {}),
@@ -71,9 +72,7 @@ def motionhub(root: Path) -> Path:
         lists.setdefault(f"{task}/{split}", {})[name.rsplit("/", 1)[-1]] = row
         put(root / caption, {"macro": ["a person walks"], "meso": ["someone walks to the left"], "micro": []})
         if "gone" not in name:
-            poses, trans = walk(
-                {"000001": 0.0, "gBR_1": 0.3, "M000001": 0.9}.get(name.rsplit("/", 1)[-1], 0.6)
-            )
+            poses, trans = walk(bent.get(name.rsplit("/", 1)[-1], 0.6))
             translation = {"transl" if "talk" in name else "trans": trans}
             path = root / f"{name}.npz"
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -264,7 +264,7 @@ DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
     ("motionhub", lambda root: cut(root / HML), f"{HML}: not an .npz file, or cut off"),
     ("motionhub", lambda root: nan_at(root / HML, "poses"), f"{HML}: poses: nan at frame 5, column 1"),
     ("motionhub", lambda root: cut(root / LIST), f"{LIST}: not valid JSON"),
-    ("motionhub", lambda root: text(root / LIST, "HumanML3D_AMASS/s", "../s"), "not a plain relative"),
+    ("motionhub", lambda root: text(root / LIST, "aist/s", "../s"), "not a plain relative"),
     ("motionhub", lambda root: cut(root / "aist/music/m.wav"), "aist/music/m.wav"),
     ("finedance", lambda root: cut(root / DANCE), f"{DANCE}: truncated array"),
     ("finedance", lambda root: nan_at(root / DANCE), f"{DANCE}: nan at frame 5, column 9"),
