@@ -6,7 +6,7 @@
 | `.npy` | a motion array of the layout asked for (Motion-X's `smplx322` unless given), or joints |
 | `.npz` | SMPL parameters as AMASS publishes them |
 | `.pkl` | an AIST++ annotation, through the restricted unpickler |
-| `.bvh` | BVH |
+| `.bvh`, `.amc` | BVH; AMC with its ASF beside it; the frame rate is judged by falls and steps |
 | `.wav`, `.flac`, `.ogg`, `.mp3` | sound |
 | `.txt` | captions of HumanML3D's grammar, plain lines, or a list of ids |
 
@@ -28,12 +28,14 @@ from motionloom.datasets.audio.sound import read_sound
 from motionloom.datasets.check.clip import ABSURD, beyond, human_limits, require_sensible
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
+from motionloom.datasets.convert.bvh.plan import read_motion as read_mocap
+from motionloom.datasets.convert.bvh.settle import doubted_rate
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import load_array, read_array_header
 from motionloom.datasets.convert.common.features import require_human
 from motionloom.datasets.convert.common.files import read_text_file
+from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.convert.common.splits import read_ids, read_split_files
-from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import SPLITS, UserError
 from motionloom.datasets.shards.tar import npy_from_bytes, scan_tar
@@ -214,9 +216,14 @@ def _check_pickle(path: Path, rules: FileRules) -> Verdict:
     return Verdict(path, f"AIST++ motion, {len(motion.poses)} frames")
 
 
-def _check_bvh(path: Path, rules: FileRules) -> Verdict:
-    motion = read_bvh(path)
-    return Verdict(path, f"BVH, {len(motion.joints)} joints, {motion.frames} frames, {motion.fps:g} fps")
+def _check_mocap(path: Path, rules: FileRules) -> Verdict:
+    (file,) = Batch(path.parent, None, (path.name,)).read()
+    if file.error:
+        raise UserError(f"{path}: {file.error}")
+    motion = read_mocap(file.data, str(path))
+    kind, doubt = path.suffix[1:].upper(), doubted_rate(motion)
+    what = f"{kind}, {len(motion.joints)} joints, {motion.frames} frames, {motion.fps:g} fps"
+    return Verdict(path, what, notes=[doubt] if doubt else [])
 
 
 def _check_sound(path: Path, rules: FileRules) -> Verdict:
@@ -259,7 +266,7 @@ _READERS: dict[str, Callable[[Path, FileRules], Verdict]] = {
     ".npy": _check_npy,
     ".npz": _check_npz,
     ".pkl": _check_pickle,
-    ".bvh": _check_bvh,
+    **dict.fromkeys((".bvh", ".amc"), _check_mocap),
     **dict.fromkeys((".wav", ".flac", ".ogg", ".mp3"), _check_sound),
     ".txt": _check_text,
 }

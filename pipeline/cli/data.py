@@ -85,8 +85,8 @@ def check(
 ) -> None:
     """Checksums, schema, finite values, ranges, people on a floor, duplicates, leaks. Exit code 1 and a list.
 
-    Without manifest.json, single files are checked: .tar, .npy, .npz, .pkl, .bvh, .wav, .txt. Several data
-    sets are also compared with each other: no clip of one may be in another split of the next.
+    Without manifest.json, single files are checked: .tar, .npy, .npz, .pkl, .bvh, .amc, .wav, .txt. Several
+    data sets are also compared with each other: no clip of one may be in another split of the next.
 
     Example: `motionloom data check shards`
 

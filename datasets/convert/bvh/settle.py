@@ -12,8 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.convert.bvh.joint_guess.guess import guess_joint_map
 from motionloom.datasets.motion.bvh.joint_map import METRES, JointMap, NamedUnit, Unit, Up, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
+from motionloom.datasets.motion.frame_rate import wrong_rate
 from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
 from motionloom.datasets.motion.skeleton import Skeleton
 
@@ -35,6 +37,17 @@ _ARMS, _LEGS = (
     for joints in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 )
 _PELVIS, _HEAD = _NAMED.index("pelvis"), _NAMED.index("head")
+
+
+def doubted_rate(motion: BvhMotion) -> str:
+    """Why a motion's frame rate cannot be true; empty where nothing speaks against it, or no figure seen."""
+    guess = guess_joint_map(motion, _NAMED)
+    if not guess.certain:
+        return ""
+    joint_map = guess.joint_map(motion.name)
+    unit, up, _ = settled(joint_map, [motion])
+    joints = joint_map.apply(motion, unit=unit, up=up)
+    return wrong_rate(joints[added_frames(joints) :], motion.fps)
 
 
 def named_unit(height: float) -> NamedUnit | None:

@@ -123,6 +123,23 @@ def test_a_folder_is_checked_file_by_file(broken: Path) -> None:
     }
 
 
+def test_a_rate_that_cannot_be_true_is_a_note(shared: Path) -> None:
+    odd = shared / "data/real/odd_bvh"
+    notes = {verdict.path.stem: verdict.notes for verdict in check_folder(odd, RULES) if verdict.ok}
+    (doubt,) = notes.pop("virvig_dancedb_metres")
+    assert "about 60 rather than 120" in doubt and len(notes) == 4 and not any(notes.values())
+
+
+def test_an_amc_is_checked_with_its_skeleton(tmp_path: Path) -> None:
+    path = tmp_path / "07_01.amc"
+    path.write_text("1\nroot 0 0 0 0 0 0\n2\nroot 0 1 0 0 0 0\n")
+    assert "07.asf" in str(check_file(path, RULES))
+    bone = "begin\nid 1\nname leg\ndirection 0 -1 0\nlength 2\naxis 0 0 0 XYZ\nend"
+    root = ":root\norder TX TY TZ RX RY RZ"
+    (tmp_path / "07.asf").write_text(f"{root}\n:bonedata\n{bone}\n:hierarchy\nroot leg\n")
+    assert str(check_file(path, RULES)).endswith("ok, AMC, 2 joints, 2 frames, 120 fps")
+
+
 def test_splits_that_overlap_are_an_error(broken: Path, tmp_path: Path) -> None:
     folder = tmp_path / "split_folder"
     folder.mkdir()
