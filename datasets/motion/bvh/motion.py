@@ -88,9 +88,18 @@ class BvhMotion:
         )
 
     def local_offsets(self) -> Floats:
-        """Translation of every joint against its parent [T, N, 3]: OFFSET, replaced by position channels."""
+        """Translation of every joint against its parent [T, N, 3]: OFFSET, replaced by position channels.
+
+        Where those of all joints but the root are zero in every frame, they replace nothing: some writers
+        list six channels on every joint and fill three.
+        """
         out = np.repeat(self.offsets[None], self.frames, axis=0)
-        joints, axes, columns = _channel_columns(self.channels).positions
+        joints, axes, columns = (
+            np.array(one, dtype=int) for one in _channel_columns(self.channels).positions
+        )
+        inner = np.array(self.parents)[joints] >= 0
+        if inner.any() and not self.values[:, columns[inner]].any():
+            joints, axes, columns = joints[~inner], axes[~inner], columns[~inner]
         out[:, joints, axes] = self.values[:, columns]
         return out
 

@@ -91,6 +91,18 @@ def test_any_channels_in_any_order() -> None:
 
 
 @pytest.mark.parametrize(
+    ("written", "expected"), [("0", [1, 2, 3]), ("7", [7, 0, 0])], ids=["filled with zeros", "filled"]
+)
+def test_six_channels_on_every_joint(written: str, expected: list[float]) -> None:
+    """Position channels that no frame fills leave the OFFSET; any that is filled replaces it."""
+    six = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
+    text = TINY.replace("CHANNELS 1 Xrotation", six).replace("CHANNELS 4 Yposition", "CHANNELS 3")
+    rows = "1 2 3 10 20 30 {} 0 0 40 0 0 50 60 70\n-1 -2 -3 -10 -20 -30 {} 0 0 -40 0 0 -50 -60 -70\n"
+    motion = read_bvh(text[: text.index("1 2 3 10")] + rows.format(written, written))
+    assert motion.local_offsets()[:, 1].tolist() == [expected] * 2
+
+
+@pytest.mark.parametrize(
     ("text", "fps"),
     [
         ("0.0333333", 30),
