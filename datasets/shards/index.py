@@ -81,7 +81,12 @@ class ShardIndex(Config):
     clips: list[ClipEntry]
     dropped: list[Dropped]
     made_on: str = ""
-    """The kind of processor, by which the last digits of a clip may differ."""
+    """Kinds of processor, by which the last digits of a clip may differ; of clips that were kept, theirs."""
+
+    @property
+    def kinds(self) -> set[str]:
+        """`made_on` one by one; empty for shards that were made before this was kept."""
+        return set(filter(None, self.made_on.split(", ")))
 
 
 def index_path(tar: Path) -> Path:

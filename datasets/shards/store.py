@@ -121,7 +121,7 @@ class RemoteStore:
                 with found:
                     return found.read()
         where = self.where(MANIFEST_FILE)
-        raw = _as_before(persist(where, lambda: self._system().cat_file(where)), digest, where)
+        raw = _as_before(persist(where, lambda: self._system().cat_file(where), first=True), digest, where)
         name = f"{hashlib.sha256(raw).hexdigest()}.manifest.json"
         self.cache.get(name, len(raw), lambda path: path.write_bytes(raw)).close()
         return raw
@@ -217,8 +217,12 @@ class MissingFileError(UserError):
     """A data set has no file of that name."""
 
 
-def persist(what: str, action: Callable[[], T]) -> T:
-    """Run `action`, again after failures that may pass; `UserError` naming `what` when it stays refused."""
+def persist(what: str, action: Callable[[], T], *, first: bool = False) -> T:
+    """Run `action`, again after failures that may pass; `UserError` naming `what` when it stays refused.
+
+    A connection that is refused is an answer where a server is asked for the `first` time, most likely to a
+    mistyped address; one that has answered before may be starting again.
+    """
     failure: BaseException = OSError("never tried")
     for attempt in range(ATTEMPTS):
         if attempt:
@@ -235,6 +239,8 @@ def persist(what: str, action: Callable[[], T]) -> T:
             refusal = _refusal(error)
             if isinstance(error, FileNotFoundError) or refusal == _ABSENT:
                 raise MissingFileError(f"{what}: {_ABSENT}") from None
+            if first and refusal is None and _nobody_listens(error):
+                refusal = "the connection is refused: no server listens there; check host and port"
             if refusal is not None:
                 raise UserError(f"{what}: {refusal}") from None
             failure = error
@@ -264,6 +270,14 @@ def _refusal(error: Exception) -> str | None:
     if status is not None and 400 <= status < 500 and status not in (408, 425, 429):
         return f"the server refuses the request (HTTP {status}: {' '.join(str(error).split())[:200]})"
     return None
+
+
+def _nobody_listens(error: BaseException | None) -> bool:
+    while error is not None:
+        if getattr(error, "errno", None) == errno.ECONNREFUSED:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _status(error: BaseException | None) -> int | None:

@@ -100,11 +100,13 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
 
     written: list[Written] = []
     dropped: list[Dropped] = []
+    made_on: set[str] = set()
     with atomic_file(task.path) as file:
         hashing = HashingFile(file)
         with TarWriter(hashing, encoder=False, user="", group="", mtime=0) as tar:
             for item in task.items:
                 old = task.kept.get(item.made_from)
+                made_on |= _index_of(old)[0] if old else {_processor()}
                 samples = _kept(old, item.made_from) if old else _convert_item(task, convert, item)
                 if isinstance(samples, Dropped):
                     dropped.append(samples)
@@ -126,7 +128,11 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
     else:
         task.path.unlink()  # webdataset treats a shard without samples as an error
     index = ShardIndex(
-        fingerprint=task.fingerprint, shard=info, clips=entries, dropped=dropped, made_on=_processor()
+        fingerprint=task.fingerprint,
+        shard=info,
+        clips=entries,
+        dropped=dropped,
+        made_on=", ".join(sorted(made_on)),
     )
     write_json(index_path(task.path), index.dump())
     return info, dropped
@@ -147,7 +153,7 @@ def _kept(tar: Path, made_from: str) -> Encoded:
     """The samples as an earlier run wrote them."""
     out = []
     with tar.open("rb") as file:
-        for clip in _clips_of(tar).get(made_from, []):
+        for clip in _index_of(tar)[1].get(made_from, []):
             members = {}
             for name, (start, size) in clip.members.items():
                 file.seek(start)
@@ -156,12 +162,18 @@ def _kept(tar: Path, made_from: str) -> Encoded:
     return out
 
 
+def _index_of(tar: Path) -> tuple[set[str], dict[str, list[ClipEntry]]]:
+    """The kinds of processor of an earlier run's shard, and its clips by what they are made from."""
+    return _read_index(tar, tar.stat().st_mtime_ns)
+
+
 @lru_cache(maxsize=8)
-def _clips_of(tar: Path) -> dict[str, list[ClipEntry]]:
-    found: dict[str, list[ClipEntry]] = {}
-    for clip in ShardIndex.load_json(index_path(tar)).clips:
+def _read_index(tar: Path, changed: int) -> tuple[set[str], dict[str, list[ClipEntry]]]:
+    """`changed` tells the shards apart that lay at this place."""
+    index, found = ShardIndex.load_json(index_path(tar)), dict[str, list[ClipEntry]]()
+    for clip in index.clips:
         found.setdefault(clip.made_from, []).append(clip)
-    return found
+    return index.kinds, found
 
 
 def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -> Encoded | Dropped:

@@ -312,11 +312,11 @@ def _finish_index(out: Path, shards: list[ShardInfo]) -> set[str]:
             if shard.split == split
         )
     save_index(out, splits)
-    return made_on - {""}  # unknown of shards that were made before this was kept
+    return made_on
 
 
 def _unique(index: ShardIndex, shard: str, owners: dict[str, str], made_on: set[str]) -> ShardIndex:
-    made_on.add(index.made_on)
+    made_on |= index.kinds
     for clip in index.clips:
         if clip.id in owners:
             raise UserError(

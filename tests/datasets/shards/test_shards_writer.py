@@ -226,7 +226,12 @@ def test_parts_of_several_kinds_of_processor_are_noted(
         made.write(tmp_path, part=Part(number, 2))
     (note,) = made.write(tmp_path).notes
     assert "2 kinds of processor (x86_64 AVX2, x86_64 AVX512)" in note
-    assert not made.write(tmp_path / "of one").notes
+    assert made.write(tmp_path, clips_per_shard=10).notes == [note], "clips that are taken over bring theirs"
+    one = {"out": tmp_path / "of one", "options": {}}
+    assert not made.write(count=30, **one).notes
+    monkeypatch.setattr(tasks, "_processor", lambda: "x86_64 AVX2")
+    assert not made.write(count=20, **one).notes
+    assert made.write(count=40, **one).notes == [note]
 
 
 def test_parts_work_at_once_and_leave_each_others_files(made: ModuleType, tmp_path: Path) -> None:
