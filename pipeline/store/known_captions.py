@@ -6,7 +6,7 @@ them lie beside the encoder, with their sentence embeddings: no caption of the t
 these. Embeddings are MiniLM's, which comes with the installation, whatever encoder the networks read.
 
 A caption is known if it has no word that training had nothing like, and if a caption of the training is near
-it, both as a sentence and as the model itself reads the two.
+it, both as a sentence and as the model itself reads the two, and has the words that decide by themselves.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from safetensors.numpy import load_file, save_file
 from motionloom.datasets.base.files import atomic_path, write_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Config, UserError
-from motionloom.datasets.text.words import Encode, HeardWords, words_of
+from motionloom.datasets.text.words import Encode, HeardWords, deciding, words_of
 
 KNOWN_FILES = ("known.json", "known.safetensors")
 
@@ -32,13 +32,13 @@ COUNT = 384
 """Number of representative captions of each kind, of bodies and of faces."""
 
 FAR = 0.5
-"""Cosine of sentence embeddings below which a caption is far from another; like `ALIKE` chosen on the
-development half of `benchmarks/known_words.yaml`."""
+"""Cosine of sentence embeddings below which a caption is far from another, where nothing else is known; like
+`NEAR` chosen on the development part of `benchmarks/known_words.yaml`."""
 
-ALIKE = 0.6
-"""Cosine of the model's own readings from which it takes two captions for the same."""
-NEAREST = 32
-"""Known captions that the model reads beside a new one."""
+NEAR = 1.25
+"""Sum of that cosine and of the cosine of the model's own readings from which a caption is near another."""
+NEAREST, AT_ONCE = 128, 32
+"""Known captions that the model reads beside a new one at most, and how many at a time."""
 
 
 class _Texts(Config):
@@ -101,20 +101,30 @@ class KnownCaptions:
         meant = [heard.spelt(caption) for caption in captions]
         cosines = np.asarray(heard.encode(meant), dtype=np.float32) @ self.embeddings.T
         for said, caption, row in zip(captions, meant, cosines, strict=True):
-            nearest = [self.captions[k] for k in np.argsort(-row, kind="stable")]
-            near = nearest[: min(NEAREST, int((row >= FAR).sum()))]
-            if near and read is not None:
-                readings = read([caption, *near])
-                near = [
-                    text
-                    for text, vector in zip(near, readings[1:], strict=True)
-                    if vector @ readings[0] >= ALIKE
-                ]
-            if not near or (self.words and heard.unheard(caption)):
+            order = np.argsort(-row, kind="stable")
+            nearest = [self.captions[k] for k in order]
+            if heard.unheard(caption) or not _near(caption, nearest, row[order], read):
                 found.setdefault(said, Unknown(said, tuple(nearest[:count])))
             elif caption != said:
                 found.setdefault(said, Unknown(said, (), caption))
         return list(found.values())
+
+
+def _near(caption: str, nearest: Sequence[str], cosines: NDArray[np.float32], read: Encode | None) -> bool:
+    """Whether captions of the training are near one, and together have its words that decide."""
+    missing, found = set(deciding(caption)), False
+    for first in range(0, min(NEAREST, len(nearest)), AT_ONCE):
+        texts, near = nearest[first : first + AT_ONCE], cosines[first : first + AT_ONCE]
+        if read is None:
+            enough = near >= FAR
+        else:
+            readings = read([caption, *texts])
+            enough = near + readings[1:] @ readings[0] >= NEAR
+        found = found or bool(enough.any())
+        missing.difference_update(*(deciding(text) for text, yes in zip(texts, enough, strict=True) if yes))
+        if found and not missing:
+            return True
+    return False
 
 
 def representatives(

@@ -19,7 +19,7 @@ from motionloom.datasets.base.places import hub_is_away
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
-from motionloom.datasets.text.words import Encode, HeardWords
+from motionloom.datasets.text.words import MOODS, Encode, HeardWords, words_of
 from motionloom.pipeline.store.files import copy_files, remove_tree, write_json
 from motionloom.pipeline.store.known_captions import KNOWN_FILES, KnownCaptions, Unknown, load_known
 
@@ -133,7 +133,9 @@ class TextSource:
             return counts
 
         return HeardWords(
-            known.words if known else frozenset(),
+            known.words | (words_of(self.known["face"].captions) & MOODS)
+            if known and known.words
+            else frozenset(),
             lambda texts: self._sentences.encode(texts).sentence,
             pieces,
         )
