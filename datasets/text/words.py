@@ -25,7 +25,7 @@ LIKE_FORMS = 0.6
 """The same for forms of one word: "comes" and "come" have 0.72, "point" and "pointing" 0.55."""
 _NOTHING_ALONE = """
 a an the this that these those his her their its my your our i you he she it they we him them of to in on at
-by for from with and as is are was be been am while some few who up down very just
+by for from with and as is are was be been am while some few who up down very just time times
 person people man men woman women boy boys girl girls child children kid kids guy guys lady gentleman human
 adult player athlete fighter boxer dancer actor student teacher friend somebody someone one young old
 put puts putting go goes going get gets getting give gives giving make makes making take takes taking move
@@ -93,7 +93,7 @@ class HeardWords:
         if word in self.words or word in _SMALL:
             return True
         if decides(word):
-            return False
+            return bool(deciding(word) & deciding(" ".join(self.words)))
         cosines = self._embeddings @ self.encode([word])[0]
         if cosines.max() >= LIKE:
             return True

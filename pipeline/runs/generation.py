@@ -136,13 +136,14 @@ def generate_motions(
                 strict=True,
             )
         said = captions if segments is None else [segment.prompt.text for segment in segments]
-        for unknown in unknown_captions(bundle, said, face or (), sampling.face_model):
+        unknown_ones = unknown_captions(bundle, said, face or (), sampling.face_model)
+        for unknown in unknown_ones:
             _print_note(aside, unknown)
         driven = motions if segments is None else segments
         for remark in remarks_of(one.prompt for one in driven):
             _print_note(aside, remark)
         title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
-        note = page_note(len(motions), folder.resolve().name, seed)
+        note = page_note(len(motions), folder.resolve().name, seed, unknown_ones)
         named = [Excerpt.named(path).path.stem for path in audio for _ in range(samples)]
         with film_progress(aside) as progress:
             paths = write_motions(

@@ -101,10 +101,11 @@ def warm(model: MotionModel) -> None:
     """Load what is loaded at the first use, so that the first request does not wait for it."""
     generator = model.bundle.generator
     if "text" in generator.modalities:
+        caption = (model.examples(1) or ["a person stands"])[0]  # a known one: a note here would be nobody's
         if isinstance(generator, StreamingGenerator):
-            next(model.stream("a person stands", seconds=1.0))
+            next(model.stream(caption, seconds=1.0))
         else:
-            model.generate(["a person stands"])
+            model.generate([caption])
     if "audio" in generator.modalities:
         rate = 22_050
         clicks = (np.arange(4 * rate) % (rate // 2) < 100).astype(np.float32)
@@ -116,7 +117,7 @@ def server_of(site: Served, worker: Worker) -> uvicorn.Server:
     config = uvicorn.Config(
         site.app,
         http=connection_of(site.config),
-        backlog=site.config.connections,
+        backlog=_most(site.config),  # so many are also accepted at a time, before any can be refused
         ws="none",
         lifespan="off",
         log_level="error",
@@ -132,7 +133,7 @@ def server_of(site: Served, worker: Worker) -> uvicorn.Server:
 
 def connection_of(config: ServeConfig) -> type[H11Protocol]:
     """What reads a connection: so many at a time, and closed where headers do not come in time."""
-    most, patience = min(config.connections, _descriptors() // 4), config.patience
+    most, patience = _most(config), config.patience
 
     class Connection(H11Protocol):
         _late: asyncio.TimerHandle | None = None
@@ -170,13 +171,13 @@ def connection_of(config: ServeConfig) -> type[H11Protocol]:
     return Connection
 
 
-def _descriptors() -> int:
-    """Files and connections that this process may have open."""
+def _most(config: ServeConfig) -> int:
+    """Connections at a time: a quarter of what this process may have open at most."""
     try:
         import resource
     except ModuleNotFoundError:  # Windows
-        return 512
-    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        return min(config.connections, 128)
+    return min(config.connections, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4)
 
 
 class _Server(uvicorn.Server):

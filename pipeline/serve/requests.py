@@ -21,7 +21,7 @@ from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import clip_of, file_stem
+from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
 from motionloom.pipeline.inference.requests import remarks_of
 from motionloom.pipeline.inference.stream import MotionStream, stream_of
 from motionloom.pipeline.inference.stream_lines import frame_lines, heading, rounded
@@ -161,7 +161,10 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
         strict=True,
     )[0]
     if asked.format in WRITERS:
-        return _file(motion, asked)
+        note = (
+            "\n".join(map(str, model.unknown(asked.captions, asked.faces))) if asked.format == "html" else ""
+        )
+        return _file(motion, asked, note)
     facts = {**_facts(motion, asked), **notes_of(model, asked, sound)}
     if asked.format == "viewer":
         facts["viewer"] = viewer_data([cell_of(clip_of(motion))])
@@ -211,10 +214,12 @@ def _facts(motion: GeneratedMotion, asked: MotionRequest) -> dict[str, object]:
     }
 
 
-def _file(motion: GeneratedMotion, asked: MotionRequest) -> Answer:
+def _file(motion: GeneratedMotion, asked: MotionRequest, note: str) -> Answer:
     writer, name = WRITERS[asked.format], file_stem(asked.seed, motion.caption)
     with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
-        body = motion.save(Path(folder) / f"motion{writer.suffix}").read_bytes()
+        path = Path(folder) / f"motion{writer.suffix}"
+        save(path, motion, note)
+        body = path.read_bytes()
     return Answer(body, writer.mime, f"{name}{writer.suffix}")
 
 

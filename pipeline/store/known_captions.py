@@ -103,7 +103,8 @@ class KnownCaptions:
         for said, caption, row in zip(captions, meant, cosines, strict=True):
             order = np.argsort(-row, kind="stable")
             nearest = [self.captions[k] for k in order]
-            if heard.unheard(caption) or not _near(caption, nearest, row[order], read):
+            strange = bool(self.words and heard.unheard(caption))
+            if strange or not _near(caption, nearest, row[order], read):
                 found.setdefault(said, Unknown(said, tuple(nearest[:count])))
             elif caption != said:
                 found.setdefault(said, Unknown(said, (), caption))

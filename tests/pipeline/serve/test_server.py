@@ -116,6 +116,8 @@ def test_words_that_the_model_does_not_know_are_noted(served: Any) -> None:
             f"'{asked[k]}'" for k in ("caption", "face")
         ]
     assert served.post("/api/generate", WAVE).json["notes"] == []
+    page = served.post("/api/generate", {**asked, "format": "html"}).body.decode()
+    assert page.count(" is unlike all captions") == 2 and "The nearest it knows" in page
 
 
 def test_what_is_no_request(served: Any) -> None:

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
-from motionloom.datasets.text.words import HeardWords
+from motionloom.datasets.text.words import HeardWords, words_of
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.store.known_captions import (
     FAR,
@@ -97,6 +98,34 @@ def test_a_caption_that_the_model_reads_as_something_else_is_unknown() -> None:
     assert known.unknown([said], words(encoder), read)
 
 
+@pytest.mark.parametrize(
+    "said, known",
+    [
+        ("the boxer does a left kick once", True),  # who moves decides nothing
+        ("a woman jumps twice", True),
+        ("a woman is jumping 2 times", True),
+        ("the person kicks twice", False),  # a number that only another action had
+        ("a person waves with the right hand, then jumps twice", False),
+        ("the person doesn't kick", False),
+        ("a woman jumps up the stairs", False),
+    ],
+)
+def test_words_decide_beside_what_training_said_with_them(said: str, known: bool) -> None:
+    """A model that takes captions of one action for the same."""
+    encoder, actions = load_text_encoder("minilm"), ("wav", "walk", "rais", "kick", "jump")
+
+    def read(texts: Sequence[str]) -> NDArray[np.float32]:
+        found = [[float(action in text) for action in actions] for text in texts]
+        return np.asarray(found, np.float32) / np.linalg.norm(found, axis=1, keepdims=True)
+
+    def embedded(texts: Sequence[str]) -> NDArray[np.float32]:
+        return encoder.encode(texts).sentence
+
+    heard = HeardWords(words_of(TRAINED), embedded, lambda texts: np.ones(len(texts), np.int64))
+    trained = KnownCaptions(TRAINED, embedded(TRAINED), heard.words)
+    assert (trained.unknown([said], heard, read) == []) is known
+
+
 def test_files_come_back(tmp_path: Path) -> None:
     heard = frozenset({"b", "a"})
     body = KnownCaptions(("a", "b"), unit(2, 8, 4), heard)
@@ -130,8 +159,9 @@ def test_damaged_files_are_named(tmp_path: Path, damage: str) -> None:
 
 def test_generate_says_so_from_a_run_and_from_an_export(small_run: Any, call: Any, tmp_path: Path) -> None:
     words = ["a person walks forward", "a person plays the violin"]
-    said = call("generate", small_run.folder, *words, "-o", tmp_path / "run", "-f", "npz").err
+    said = call("generate", small_run.folder, *words, "-o", tmp_path / "run").err
     assert said.count("note: ") == 1 and "'a person plays the violin' is unlike" in said
+    assert (tmp_path / "run" / "index.html").read_text().count("'a person plays the violin' is unlike") == 1
     call("export", small_run.folder, "-o", tmp_path / "model")
     said = call("generate", tmp_path / "model", *words, "-o", tmp_path / "model-out", "-f", "npz").err
     assert said.count("note: ") == 1
