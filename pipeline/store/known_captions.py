@@ -37,6 +37,9 @@ FAR = 0.5
 
 NEAR = 1.25
 """Sum of that cosine and of the cosine of the model's own readings from which a caption is near another."""
+BESIDE = 1.05
+"""The same for a caption that has a word that decides: it may have other hands."""
+
 NEAREST, AT_ONCE = 128, 32
 """Known captions that the model reads beside a new one at most, and how many at a time."""
 
@@ -117,12 +120,13 @@ def _near(caption: str, nearest: Sequence[str], cosines: NDArray[np.float32], re
     for first in range(0, min(NEAREST, len(nearest)), AT_ONCE):
         texts, near = nearest[first : first + AT_ONCE], cosines[first : first + AT_ONCE]
         if read is None:
-            enough = near >= FAR
+            enough = beside = near >= FAR
         else:
             readings = read([caption, *texts])
-            enough = near + readings[1:] @ readings[0] >= NEAR
+            both = near + readings[1:] @ readings[0]
+            enough, beside = both >= NEAR, both >= BESIDE
         found = found or bool(enough.any())
-        missing.difference_update(*(deciding(text) for text, yes in zip(texts, enough, strict=True) if yes))
+        missing.difference_update(*(deciding(text) for text, yes in zip(texts, beside, strict=True) if yes))
         if found and not missing:
             return True
     return False
