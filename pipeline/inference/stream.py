@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 
 GUIDANCE = 2.0
-"""At which the model of the package walks on for ten minutes as fast as in the first ten seconds; at the 1.25
-that it recommends for single clips it loses a quarter of its speed."""
+"""At which `synthetic` walks on for ten minutes as fast as in the first ten seconds; at the 1.25 that it
+recommends for single clips it loses a quarter of its speed, and `dance` at its 1.5 comes to a stand."""
 
 
 @dataclass(frozen=True)
@@ -244,11 +244,9 @@ class MotionStream(Iterator[MotionChunk]):
 
 
 def drawing(bundle: Bundle, asked: SamplingConfig) -> SamplingConfig:
-    """How a stream draws: as the model recommends. One that chooses among candidates, which a stream cannot,
-    is guided more instead [ours].
-    """
+    """How a stream draws: as the model recommends, but one that is guided at least by `GUIDANCE` [ours]."""
     out = bundle.drawing(asked)
-    if out.candidates > 1 and 1 < out.cfg_scale < GUIDANCE and "cfg_scale" not in asked.model_fields_set:
+    if 1 < out.cfg_scale < GUIDANCE and "cfg_scale" not in asked.model_fields_set:
         return out.model_copy(update={"cfg_scale": GUIDANCE})
     return out
 
