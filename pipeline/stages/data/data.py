@@ -8,6 +8,8 @@ from typing import Any, Literal
 import torch
 from pydantic import Field
 
+from motionloom.datasets.audio.beat_net import WEIGHTS
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, UserError
@@ -65,6 +67,11 @@ class ShardsStage(DataStage):
 
 class SynthStage(DataStage):
     """Synthetic shards."""
+
+    def external(self, config: SynthConfig) -> dict[str, str]:
+        """Checksum of the tracker of beats, where dances hold its columns."""
+        rhythm = config.dances is not None and config.dances.columns == "rhythm"
+        return {WEIGHTS.name: sha256_of(WEIGHTS)} if rhythm else {}
 
     def disk(self, config: SynthConfig) -> int:
         """Motion in float32, of clips of the mean length."""

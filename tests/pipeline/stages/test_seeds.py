@@ -11,7 +11,7 @@ from rich.console import Console
 from motionloom.datasets.schema import Manifest
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, make_sample
-from motionloom.pipeline.contract.stage import StageCache, StageContext
+from motionloom.pipeline.contract.stage import StageCache, StageContext, stage_kind
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.stages.data.data import SynthStageConfig, run_synth
@@ -58,3 +58,20 @@ def test_zero_is_a_seed(given: dict[str, int], want: int, tmp_path: Path) -> Non
     for i in range(2):
         index = int(found.ids[i].rpartition("-")[2])
         np.testing.assert_array_equal(found.motion(i), make_sample(index, config=same).motion)
+
+
+def test_dances_to_rhythm_are_made_again_for_another_tracker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "beats.safetensors"
+    other.write_bytes(b"another tracker")
+    kind = stage_kind("synth", "data")
+
+    def facts(columns: str) -> object:
+        dances = {"dances": {"songs": 2, "columns": columns}, "min_seconds": 4.0}
+        return kind.external(SynthStageConfig.parse(dances, "data"))
+
+    before = [facts(columns) for columns in ("public", "rhythm")]
+    monkeypatch.setattr("motionloom.pipeline.stages.data.data.WEIGHTS", other)
+    after = [facts(columns) for columns in ("public", "rhythm")]
+    assert before[0] == after[0] == {} and before[1] != after[1]
