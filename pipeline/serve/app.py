@@ -12,7 +12,6 @@ from concurrent.futures import Future
 from typing import TypeVar
 from urllib.parse import quote
 
-from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
@@ -22,8 +21,7 @@ from starlette.types import ASGIApp
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.render.viewer import resource, viewer_script
-from motionloom.pipeline.serve.guard import BROKEN, Guard, broken, own, read_body, refused
+from motionloom.pipeline.serve.guard import BROKEN, guarded, read_body
 from motionloom.pipeline.serve.requests import (
     Answer,
     MotionRequest,
@@ -52,39 +50,17 @@ class Site:
         self.model, self.config, self.worker, self.name = model, config, worker, name
         self.sounds = Sounds(config)
         self._uploads = asyncio.Semaphore(_UPLOADS)
-        self.assets = {
-            "serve.css": (resource("viewer/viewer.css") + own("serve.css"), "text/css; charset=utf-8"),
-            "viewer.js": (viewer_script(), "text/javascript; charset=utf-8"),
-            "serve.js": (own("serve.js"), "text/javascript; charset=utf-8"),
-        }
 
     @property
     def app(self) -> ASGIApp:
-        """The ASGI application. The guard is outermost, so that every answer has its headers."""
-        return Guard(self._routes(), self.config.host, self.config.allow_hosts)
-
-    def _routes(self) -> Starlette:
-        return Starlette(
-            routes=[
-                Route("/", self.page),
-                Route("/assets/{name}", self.asset),
-                Route("/api/info", self.info),
-                Route("/api/generate", self.generate, methods=["POST"]),
-                Route("/api/stream", self.stream, methods=["POST"]),
-                Route("/api/sounds", self.add_sound, methods=["POST"]),
-            ],
-            exception_handlers={HTTPException: refused, Exception: broken},
-        )
-
-    async def page(self, request: Request) -> Response:
-        return Response(own("page.html"), media_type="text/html; charset=utf-8")
-
-    async def asset(self, request: Request) -> Response:
-        """Script and style, from memory."""
-        found = self.assets.get(request.path_params["name"])
-        if found is None:
-            raise HTTPException(404)
-        return Response(found[0], media_type=found[1])
+        """The ASGI application."""
+        routes = [
+            Route("/api/info", self.info),
+            Route("/api/generate", self.generate, methods=["POST"]),
+            Route("/api/stream", self.stream, methods=["POST"]),
+            Route("/api/sounds", self.add_sound, methods=["POST"]),
+        ]
+        return guarded("page.html", "serve.js", routes, self.config.host, self.config.allow_hosts)
 
     async def info(self, request: Request) -> Response:
         bundle, limits = self.model.bundle, self.config

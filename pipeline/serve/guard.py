@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from importlib import resources
 from urllib.parse import urlsplit
 
+from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from motionloom.pipeline.render.viewer import resource, viewer_script
 
 BROKEN = "something broke here; the server's log says what"
 
@@ -19,6 +23,33 @@ BROKEN = "something broke here; the server's log says what"
 def own(name: str) -> str:
     """Text of a file that ships beside this module."""
     return (resources.files("motionloom.pipeline.serve") / name).read_text(encoding="utf-8")
+
+
+def guarded(page: str, script: str, routes: Sequence[Route], host: str, allowed: Collection[str]) -> ASGIApp:
+    """The application of a page, its script, the viewer and what they ask for. The guard is outermost, so
+    that every answer has its headers.
+    """
+    assets = {
+        "serve.css": (resource("viewer/viewer.css") + own("serve.css"), "text/css; charset=utf-8"),
+        "viewer.js": (viewer_script(), "text/javascript; charset=utf-8"),
+        script: (own(script), "text/javascript; charset=utf-8"),
+    }
+
+    async def index(request: Request) -> Response:
+        return Response(own(page), media_type="text/html; charset=utf-8")
+
+    async def asset(request: Request) -> Response:
+        """Script and style, from memory."""
+        found = assets.get(request.path_params["name"])
+        if found is None:
+            raise HTTPException(404)
+        return Response(found[0], media_type=found[1])
+
+    app = Starlette(
+        routes=[Route("/", index), Route("/assets/{name}", asset), *routes],
+        exception_handlers={HTTPException: refused, Exception: broken},
+    )
+    return Guard(app, host, allowed)
 
 
 async def read_body(request: Request, what: str, most: int, patience: float) -> bytes:

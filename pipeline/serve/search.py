@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
@@ -17,9 +16,9 @@ from starlette.types import ASGIApp
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.evaluation.search import Hit, Search, Vectors
-from motionloom.pipeline.render.viewer import ViewerData, resource, viewer_data, viewer_script
+from motionloom.pipeline.render.viewer import ViewerData, viewer_data
 from motionloom.pipeline.results.data_page import watch
-from motionloom.pipeline.serve.guard import Guard, broken, own, read_body, refused
+from motionloom.pipeline.serve.guard import guarded, read_body
 from motionloom.pipeline.serve.requests import ServeConfig
 
 SHOWN, SECONDS = 12, 5.0
@@ -41,35 +40,16 @@ class SearchSite:
     def __init__(self, search: Search, config: ServeConfig, name: str) -> None:
         self.search, self.config, self.name = search, config, name
         self._one = threading.Lock()
-        self.assets = {
-            "serve.css": (resource("viewer/viewer.css") + own("serve.css"), "text/css; charset=utf-8"),
-            "viewer.js": (viewer_script(), "text/javascript; charset=utf-8"),
-            "search.js": (own("search.js"), "text/javascript; charset=utf-8"),
-        }
 
     @property
     def app(self) -> ASGIApp:
         """The ASGI application, guarded as that of `serve`."""
         routes = [
-            Route("/", self.page),
-            Route("/assets/{name}", self.asset),
             Route("/api/info", self.info),
             Route("/api/search", self.find, methods=["POST"]),
             Route("/api/like", self.find_like, methods=["POST"]),
         ]
-        handlers = {HTTPException: refused, Exception: broken}
-        app = Starlette(routes=routes, exception_handlers=handlers)  # type: ignore[arg-type]
-        return Guard(app, self.config.host, self.config.allow_hosts)
-
-    async def page(self, request: Request) -> Response:
-        return Response(own("search.html"), media_type="text/html; charset=utf-8")
-
-    async def asset(self, request: Request) -> Response:
-        """Script and style, from memory."""
-        found = self.assets.get(request.path_params["name"])
-        if found is None:
-            raise HTTPException(404)
-        return Response(found[0], media_type=found[1])
+        return guarded("search.html", "search.js", routes, self.config.host, self.config.allow_hosts)
 
     async def info(self, request: Request) -> Response:
         return JSONResponse({"name": self.name, "clips": len(self.search.places) - len(self.search.excluded)})
