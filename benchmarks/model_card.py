@@ -60,7 +60,7 @@ ASKED = 60
 CARD = Path(__file__).with_suffix(".md")
 
 MUSIC = {
-    "real_songs": "Dances to real songs that were kept back (`benchmarks/real_songs.py`)",
+    "real_songs": "Dances to real songs, thirteen of them kept back (`benchmarks/real_songs.py`)",
     "dances": "Dances to unheard played songs (`evaluate_dances` of the recipe)",
 }
 """Records of a model of music, by title."""
