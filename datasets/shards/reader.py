@@ -162,7 +162,7 @@ class ShardDataset:
     def frames(self) -> NDArray[np.int64]:
         return self._index.frames[self._rows].astype(np.int64)
 
-    @property
+    @cached_property
     def present(self) -> NDArray[np.uint8]:
         return self._index.held[self._rows]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -32,9 +33,9 @@ class BvhSetConfig(BvhConfig):
     up: Up = "y"
     """Upward axis of the files."""
 
+    @abstractmethod
     def rows(self) -> Mapping[str, Row]:
         """What the tables say, by the names of files without folder and suffix; made once."""
-        raise NotImplementedError
 
     @property
     def has_captions(self) -> bool:
