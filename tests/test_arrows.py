@@ -135,8 +135,8 @@ def test_no_room_imports_itself_by_way_of_others() -> None:
 
 FLOORS = {
     "pipeline": "cli serve runs stages results evaluation training inference contract store render launch",
-    "models": "utt diffusion gpt tokenizer pretrained tma evaluator quantize discriminator condition metrics "
-    "training layers",
+    "models": "baselines utt diffusion gpt tokenizer pretrained tma evaluator quantize discriminator "
+    "condition metrics training layers",
     "datasets": "check synth loading convert shards modalities text motion audio base",
 }
 """The rooms of each folder, from the top floor to the ground: a room imports from those after it."""

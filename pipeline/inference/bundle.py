@@ -33,6 +33,7 @@ from motionloom.pipeline.contract.generation import (
 from motionloom.pipeline.contract.lookup import exported_sampling, generators_of, open_exported
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CPU, Finished, StageCache
+from motionloom.pipeline.inference.generators.standing import stood
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
     PromptEncoder,
@@ -48,7 +49,6 @@ from motionloom.pipeline.inference.requests import (
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model, say_model
-from motionloom.pipeline.inference.standing import stood
 from motionloom.pipeline.render.score import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.known_captions import Unknown

@@ -30,10 +30,10 @@ from motionloom.pipeline.contract.generation import Prompt, StreamingGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.inference.bundle import Bundle, split_columns, unknown_captions
+from motionloom.pipeline.inference.generators.standing import Standing
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import require_driven, require_seed, require_used, weight_bytes
 from motionloom.pipeline.inference.script import DrivenSegment, Script, segment_frames
-from motionloom.pipeline.inference.standing import Standing
 from motionloom.pipeline.launch.hardware import threads_for
 from motionloom.pipeline.render.score import Driver, Segment
 from motionloom.pipeline.store.known_captions import Unknown

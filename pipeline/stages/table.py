@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from pkgutil import iter_modules
 
-from motionloom.pipeline.stages import data, networks, results
+from motionloom.pipeline.stages import baselines, data, networks, results
 
-for package in (data, networks, results):
+for package in (data, networks, baselines, results):
     for module in iter_modules(package.__path__, f"{package.__name__}."):
         import_module(module.name)

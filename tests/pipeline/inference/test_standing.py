@@ -7,7 +7,7 @@ import pytest
 
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.pipeline.inference.standing import EASE, Standing
+from motionloom.pipeline.inference.generators.standing import EASE, Standing
 
 FPS = 20
 MOVING = ("body133", "wholebody363", "h3d263", "tomato623", "smpl75", "smplx322")
