@@ -17,7 +17,7 @@ Legend: B batch, L positions, S visible positions, D width, H heads.
 from __future__ import annotations
 
 import math
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import torch
 import torch.nn.functional as F
@@ -133,29 +133,68 @@ class SelfAttention(nn.Module):
         return merged
 
 
+class CrossAttention(SelfAttention):
+    """Multi-head attention to another sequence of the same width; the weights are laid out as its base's."""
+
+    def attend(self, x: Tensor, memory: Tensor, mask: Tensor | None = None) -> Tensor:
+        """x [B, L, D], memory [B, S, D]; mask bool, broadcastable to [B, H, L, S]."""
+        dim = x.shape[2]
+        weight, bias = self.qkv.weight, self.qkv.bias
+        query = self._heads(F.linear(x, weight[:dim], bias[:dim]))
+        pairs = F.linear(memory, weight[dim:], bias[dim:])
+        key, value = (self._heads(half) for half in pairs.chunk(2, dim=-1))
+        rate = self.attention_dropout if self.training else 0.0
+        out = F.scaled_dot_product_attention(query, key, value, mask, dropout_p=rate)
+        merged: Tensor = self.out(out.transpose(1, 2).reshape(x.shape))
+        return merged
+
+    def _heads(self, x: Tensor) -> Tensor:
+        return x.view(*x.shape[:2], self.heads, -1).transpose(1, 2)
+
+
 class Block(nn.Module):
-    """Transformer block: attention, then a GELU feed-forward."""
+    """Transformer block: attention, attention to a memory where there is one, then a GELU feed-forward."""
 
     def __init__(
-        self, dim: int, heads: int, ff: int, dropout: float, attention_dropout: float, norm: Norm = "pre"
+        self,
+        dim: int,
+        heads: int,
+        ff: int,
+        dropout: float,
+        attention_dropout: float,
+        norm: Norm = "pre",
+        memory: bool = False,
     ) -> None:
         super().__init__()
         self.post = norm == "post"
         self.norm_attention = nn.LayerNorm(dim)
         self.attention = SelfAttention(dim, heads, attention_dropout)
+        if memory:
+            self.norm_memory = nn.LayerNorm(dim)
+            self.memory = CrossAttention(dim, heads, attention_dropout)
         self.norm_ff = nn.LayerNorm(dim)
         self.ff_in = nn.Linear(dim, ff)
         self.ff_out = nn.Linear(ff, dim)
         self.dropout = nn.Dropout(dropout)
 
     def forward(
-        self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: LayerCache | None = None
+        self,
+        x: Tensor,
+        mask: Tensor | None = None,
+        causal: bool = False,
+        cache: LayerCache | None = None,
+        memory: Tensor | None = None,
+        memory_mask: Tensor | None = None,
     ) -> Tensor:
         if self.post:
             x = self.norm_attention(x + self.dropout(self.attention(x, mask, causal, cache)))
+            if memory is not None:
+                x = self.norm_memory(x + self.dropout(self.memory.attend(x, memory, memory_mask)))
             last: Tensor = self.norm_ff(x + self.dropout(self._feed(x)))
             return last
         x = x + self.dropout(self.attention(self.norm_attention(x), mask, causal, cache))
+        if memory is not None:
+            x = x + self.dropout(self.memory.attend(self.norm_memory(x), memory, memory_mask))
         out: Tensor = x + self.dropout(self._feed(self.norm_ff(x)))
         return out
 
@@ -165,7 +204,8 @@ class Block(nn.Module):
 
 
 class Transformer(nn.Module):
-    """A stack of blocks and, of pre-norm blocks, a last LayerNorm.
+    """A stack of blocks and, of pre-norm blocks, a last LayerNorm. With `memory` each block also attends to
+    another sequence, which `forward` then takes.
 
     Weights start at N(0, 2 / (5 dim)), which is GPT-2's 0.02 at width 1024 and grows with narrower stacks so
     that attention carries signal from the first step; outputs into the residual stream are smaller by sqrt(2
@@ -173,14 +213,20 @@ class Transformer(nn.Module):
     """
 
     def __init__(
-        self, config: StackConfig, layers: int, *, attention_dropout: float | None = None, norm: Norm = "pre"
+        self,
+        config: StackConfig,
+        layers: int,
+        *,
+        attention_dropout: float | None = None,
+        norm: Norm = "pre",
+        memory: bool = False,
     ) -> None:
         super().__init__()
         assert config.width is not None
         dim, drop = config.width[1], config.dropout
         inner = drop if attention_dropout is None else attention_dropout
         self.blocks = nn.ModuleList(
-            Block(dim, config.heads, config.ff, drop, inner, norm) for _ in range(layers)
+            Block(dim, config.heads, config.ff, drop, inner, norm, memory) for _ in range(layers)
         )
         self.norm = nn.LayerNorm(dim) if norm == "pre" else nn.Identity()
         self.checkpointed = False
@@ -188,26 +234,88 @@ class Transformer(nn.Module):
         std = math.sqrt(2 / (5 * dim))
         for name, parameter in self.named_parameters():
             if parameter.dim() == 2:
-                residual = name.endswith(("attention.out.weight", "ff_out.weight"))
+                residual = name.endswith((".out.weight", "ff_out.weight"))
                 nn.init.normal_(parameter, std=std / math.sqrt(2 * layers) if residual else std)
             elif name.endswith("bias"):
                 nn.init.zeros_(parameter)
 
     def forward(
-        self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: KVCache | None = None
+        self,
+        x: Tensor,
+        mask: Tensor | None = None,
+        causal: bool = False,
+        cache: KVCache | None = None,
+        memory: Tensor | None = None,
+        memory_mask: Tensor | None = None,
     ) -> Tensor:
-        """x [B, L, D]; mask bool [B, L] of visible positions or [B, L, S], or `causal`; cache to decode."""
-        if mask is not None:
-            mask = mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
-        again = self.checkpointed and torch.is_grad_enabled() and cache is None
+        """x [B, L, D]; mask bool [B, L] of visible positions or [B, L, S], or `causal`; cache to decode;
+        memory [B, M, D] and its mask [B, M] or [B, L, M].
+        """
+        given = (_to_heads(mask), causal)
+        seen = (memory, _to_heads(memory_mask))
         for index, block in enumerate(self.blocks):
-            if again:
-                x = checkpoint(block, x, mask, causal, use_reentrant=False)
+            if cache is None:
+                x = self.through(block, x, *given, None, *seen)
             else:
-                x = block(x, mask, causal, None if cache is None else cache.layers[index])
+                x = block(x, *given, cache.layers[index], *seen)
         out: Tensor = self.norm(x)
+        return out
+
+    def through(self, block: nn.Module, x: Tensor, *given: object) -> Tensor:
+        """One block, whose inside may be computed again in the backward pass."""
+        if self.checkpointed and torch.is_grad_enabled():
+            again: Tensor = checkpoint(block, x, *given, use_reentrant=False)
+            return again
+        out: Tensor = block(x, *given)
         return out
 
     def cache(self, size: int) -> KVCache:
         """An empty cache of `size` positions for this stack."""
         return KVCache(len(self.blocks), size)
+
+
+class SkipTransformer(Transformer):
+    """Post-norm blocks in a U and a last LayerNorm: what the blocks of the first half make is merged, last
+    one first, into what those of the second half read (MLD).
+
+    Weights start as by Glorot.
+    """
+
+    def __init__(self, config: StackConfig, layers: int, **kind: Any) -> None:
+        if layers % 2 == 0:
+            raise ValueError(f"a U of {layers} layers has no middle; take an odd number")
+        super().__init__(config, layers, norm="post", **kind)
+        dim = config.width[1] if config.width else 0
+        self.merge = nn.ModuleList(nn.Linear(2 * dim, dim) for _ in range(layers // 2))
+        self.norm = nn.LayerNorm(dim)
+        for parameter in self.parameters():
+            if parameter.dim() == 2:
+                nn.init.xavier_uniform_(parameter)
+
+    def forward(
+        self,
+        x: Tensor,
+        mask: Tensor | None = None,
+        causal: bool = False,
+        cache: KVCache | None = None,
+        memory: Tensor | None = None,
+        memory_mask: Tensor | None = None,
+    ) -> Tensor:
+        """As the base class; all frames at once, so without a cache."""
+        given = (_to_heads(mask), causal, None, memory, _to_heads(memory_mask))
+        half, kept = len(self.merge), list[Tensor]()
+        for index, block in enumerate(self.blocks):
+            if index > half:
+                x = self.merge[index - half - 1](torch.cat([x, kept.pop()], dim=-1))
+            x = self.through(block, x, *given)
+            if index < half:
+                kept.append(x)
+        out: Tensor = self.norm(x)
+        return out
+
+
+def _to_heads(mask: Tensor | None) -> Tensor | None:
+    """A mask [B, S] or [B, L, S] as attention takes it."""
+    if mask is None:
+        return None
+    return mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]

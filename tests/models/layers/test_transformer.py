@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from motionloom.models.diffusion.network import DiffusionConfig
-from motionloom.models.layers.transformer import Norm, Transformer, length_mask
+from motionloom.models.layers.transformer import Norm, SkipTransformer, Transformer, length_mask
 
 
 def theirs(ours: Transformer, norm: Norm, heads: int, ff: int) -> nn.TransformerEncoder:
@@ -83,3 +83,49 @@ def test_checkpointed_activations_draw_again_what_they_drew() -> None:
         grads.append([p.grad.clone() for p in stack.parameters() if p.grad is not None])
     for one, two in zip(*grads, strict=True):
         assert torch.equal(one, two)
+
+
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("norm", get_args(Norm))
+def test_attention_to_a_memory_equals_torchs(norm: Norm) -> None:
+    net = Transformer(DiffusionConfig(dim=16, heads=4, ff=40, dropout=0), 2, norm=norm, memory=True).eval()
+    for parameter in net.parameters():
+        nn.init.normal_(parameter, std=0.3)
+    layer = nn.TransformerDecoderLayer(
+        16, 4, 40, dropout=0.0, activation="gelu", batch_first=True, norm_first=norm == "pre"
+    )
+    own = nn.TransformerDecoder(layer, 2, norm=nn.LayerNorm(16) if norm == "pre" else None).eval()
+    names = {
+        "attention.qkv": "self_attn.in_proj", "attention.out": "self_attn.out_proj",
+        "memory.qkv": "multihead_attn.in_proj", "memory.out": "multihead_attn.out_proj",
+        "norm_attention": "norm1", "norm_memory": "norm2", "norm_ff": "norm3",
+        "ff_in": "linear1", "ff_out": "linear2", "blocks": "layers",
+    }  # fmt: skip
+    state = {}
+    for name, value in net.state_dict().items():
+        for here, there in names.items():
+            name = name.replace(here, there)
+        state[name.replace("in_proj.", "in_proj_")] = value
+    own.load_state_dict(state)
+    x, memory, length = torch.randn(3, 9, 16), torch.randn(3, 5, 16), torch.tensor([9, 5, 1])
+    mask, seen = length_mask(length, 9), length_mask(torch.tensor([2, 5, 1]), 5)
+    found = net(x, mask, memory=memory, memory_mask=seen)
+    want = own(x, memory, tgt_key_padding_mask=~mask, memory_key_padding_mask=~seen)
+    torch.testing.assert_close(found[mask], want[mask], rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.usefixtures("float64")
+def test_a_u_of_blocks_merges_what_the_first_half_made_last_one_first() -> None:
+    net = SkipTransformer(DiffusionConfig(dim=8, heads=2, ff=16, dropout=0), 5, memory=True).eval()
+    x, memory = torch.randn(2, 6, 8), torch.randn(2, 1, 8)
+    mask = length_mask(torch.tensor([6, 3]), 6)
+    a, b, c, d, e = (
+        lambda y, block=block: block(y, mask[:, None, None], memory=memory) for block in net.blocks
+    )
+    first = a(x)
+    second = b(first)
+    fourth = d(net.merge[0](torch.cat([c(second), second], dim=-1)))
+    fifth = e(net.merge[1](torch.cat([fourth, first], dim=-1)))
+    torch.testing.assert_close(net(x, mask, memory=memory), net.norm(fifth))
+    with pytest.raises(ValueError, match="odd"):
+        SkipTransformer(DiffusionConfig(dim=8, heads=2, ff=16), 4)
