@@ -100,6 +100,9 @@ class GenerationRequest:
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     noise_seeds: Sequence[int] | None = None
     """Of the noise of a diffusion decoder; None takes `seeds`. Others take no notice of it."""
+    seed_motions: Sequence[NDArray[np.float32]] | None = None
+    """What a `SeededGenerator` goes on from, its `seed_frames` long: the generator's columns [T0, C] in their
+    own units; None takes motions of its own. Others take no notice of it."""
 
     def text(self, who: str) -> Condition:
         """The encoded texts; `who` is conditioned on them, for the message where there are none."""
@@ -171,6 +174,15 @@ class DenoisingGenerator(MotionGenerator, Protocol):
 
     def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
         """Sampler and number of steps: as asked for, or else the model's own."""
+
+
+@runtime_checkable
+class SeededGenerator(MotionGenerator, Protocol):
+    """A generator that goes on from a motion, with which what it makes begins."""
+
+    @property
+    def seed_frames(self) -> int:
+        """Frames of it."""
 
 
 @runtime_checkable

@@ -16,6 +16,7 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.synth.dances import beats_of
+from motionloom.pipeline.contract.generation import SeededGenerator
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.render.score import Score, Segment
@@ -33,6 +34,8 @@ class DanceClip:
     id: str
     song: str
     """Clips to one song have one name here; the clip's own id where the data do not say."""
+    motion: NDArray[np.float32]
+    """What the data store of it [T, D]."""
     joints: NDArray[np.float64]
     """[T, N, 3] in metres."""
     fps: float
@@ -63,7 +66,22 @@ class DanceClip:
         inside = self.beats[self.beats < seconds]
         sound = self.sound.slice(0.0, seconds)
         music = None if self.music is None else self.music[:frames]
-        return replace(self, joints=self.joints[:frames], sound=sound, beats=inside, music=music)
+        motion, joints = self.motion[:frames], self.joints[:frames]
+        return replace(self, motion=motion, joints=joints, sound=sound, beats=inside, music=music)
+
+    def after(self, frames: int) -> DanceClip:
+        """What follows its first `frames`; itself after none."""
+        if not frames:
+            return self
+        seconds = frames / self.fps
+        return replace(
+            self,
+            motion=self.motion[frames:],
+            joints=self.joints[frames:],
+            sound=self.sound.slice(seconds),
+            beats=self.beats[self.beats >= seconds] - seconds,
+            music=None if self.music is None else self.music[frames:],
+        )
 
 
 def with_music(dataset: ClipDataset) -> NDArray[np.bool_]:
@@ -94,6 +112,7 @@ def dance_at(
         index,
         dataset.ids[index],
         song_of(dataset, index),
+        motion[:frames],
         joints_of(motion[:frames], dataset.layout),
         fps,
         sound,
@@ -130,9 +149,37 @@ def song_of(dataset: ClipDataset, index: int) -> str:
     return dataset.ids[index] if song is None else str(song)
 
 
+def dances_for(
+    bundle: Bundle,
+    dataset: ClipDataset,
+    count: int | None,
+    *,
+    seconds: float | None,
+    least: int = 1,
+    unit: int | None = None,
+) -> list[DanceClip]:
+    """`dances_of` in lengths that a model can make, at most `seconds` and with `least` frames of its own;
+    in whole units of the model, unless another `unit` is given.
+    """
+    longest, frames = min(seconds or np.inf, bundle.max_seconds), least + seed_frames(bundle)
+    cut = None if np.isinf(longest) else float(longest)
+    found = dances_of(dataset, count, unit=unit or bundle.generator.unit_frames, seconds=cut)
+    return [clip for clip in found if len(clip.joints) >= frames]
+
+
+def seed_frames(bundle: Bundle) -> int:
+    """Frames of a recording that a model's dance begins with."""
+    return bundle.generator.seed_frames if isinstance(bundle.generator, SeededGenerator) else 0
+
+
 def dance_to(bundle: Bundle, clips: Sequence[DanceClip], **drawn: Any) -> list[GeneratedMotion]:
-    """Dances to the music of clips, each as long as its clip; `drawn` is for `Bundle.generate`."""
+    """Dances to the music of clips, each as long as its clip; `drawn` is for `Bundle.generate`.
+
+    A model that goes on from a motion begins with the clip's own first frames.
+    """
+    begun = seed_frames(bundle)
     return bundle.generate(
+        seed_motions=[clip.motion[:begun] for clip in clips] if begun else None,
         sounds=[clip.sound for clip in clips],
         conditions={"audio": [clip.music for clip in clips]},
         seconds=[clip.seconds for clip in clips],

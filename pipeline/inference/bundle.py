@@ -45,6 +45,7 @@ from motionloom.pipeline.inference.requests import (
     require_seed,
     require_used,
     require_words,
+    seeds_of,
     ticks_of,
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
@@ -212,6 +213,7 @@ class Bundle:
         seed: int = 0,
         noise_seed: int | None = None,
         sampling: SamplingConfig | None = None,
+        seed_motions: Sequence[NDArray[np.float32]] | None = None,
         batch: int = _AT_ONCE,
         strict: bool = False,
     ) -> list[GeneratedMotion]:
@@ -219,8 +221,9 @@ class Bundle:
 
         As `MotionModel.generate`. `conditions` are more of what motions are conditioned on, by modality: of
         "audio" the sounds' features [T, 438], where they are known, such as those that a data set stores.
-        `noise_seed` decodes the same tokens with other noise, where a diffusion model decodes. With `strict`,
-        empty captions and options without effect are refused.
+        `noise_seed` decodes the same tokens with other noise, where a diffusion model decodes. `seed_motions`
+        are the layout's columns [T0, D] of motions that a `SeededGenerator` goes on from, one for each or one
+        for all. With `strict`, empty captions and options without effect are refused.
         """
         require_seed(seed)
         texts = None if captions is None else caption_list(captions)
@@ -232,13 +235,15 @@ class Bundle:
         prompts = prompts_of(texts, faces, sounds, conditions)
         require_driven(self.generator, prompts)
         frames = frames_of(self.generator, seconds, prompts)
+        begun = seeds_of(self.generator, seed_motions, len(prompts))
         # One seed per motion, so that results do not depend on batching.
         seeds = sample_seeds(seed, 2 * len(prompts))
         noise = seeds if noise_seed is None else sample_seeds(noise_seed, len(prompts))
         out: dict[int, GeneratedMotion] = {}
         for rows in _alike(frames, batch):
             own = tuple([draws[row] for row in rows] for draws in (seeds, seeds[len(prompts) :], noise))
-            made = self._batch([prompts[row] for row in rows], [frames[row] for row in rows], own, sampling)
+            some = [prompts[row] for row in rows], [frames[row] for row in rows]
+            made = self._batch(*some, own, sampling, begun and [begun[row] for row in rows])
             out.update((row, replace(one, seed=seed)) for row, one in zip(rows, made, strict=True))
         return [out[row] for row in range(len(prompts))]
 
@@ -336,13 +341,15 @@ class Bundle:
         frames: list[int | None],
         seeds: Sequence[list[int]],
         sampling: SamplingConfig,
+        seed_motions: list[NDArray[np.float32]] | None,
     ) -> list[GeneratedMotion]:
         generator, layout = self.generator, self.layout
         conditions = self.encoder(self.main).encode(
             prompts, [p.text for p in prompts], generator.modalities, layout.fps
         )
         lengths = None if None in frames else [n for n in frames if n is not None]
-        body = generator.generate(GenerationRequest(conditions, lengths, seeds[0], sampling, seeds[2]))
+        request = GenerationRequest(conditions, lengths, seeds[0], sampling, seeds[2], seed_motions)
+        body = generator.generate(request)
         face: list[NDArray[np.float32]] | list[None] = [None] * len(prompts)
         stage = self.choose_face(sampling.face_model)
         if stage is not None:

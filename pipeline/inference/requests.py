@@ -9,11 +9,17 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.generation import MotionGenerator, Prompt, StreamingGenerator
+from motionloom.pipeline.contract.generation import (
+    MotionGenerator,
+    Prompt,
+    SeededGenerator,
+    StreamingGenerator,
+)
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.store.text import TextSource
@@ -153,6 +159,11 @@ def frames_of(
                 f"many seconds"
             )
         units = round(length * fps / unit) if math.isfinite(length) else 0
+        if isinstance(generator, SeededGenerator) and 0 < units * unit <= generator.seed_frames:
+            raise UserError(
+                f"{length:g} s were asked for, and the first {generator.seed_frames / fps:g} s are what this "
+                f"model goes on from; ask for more"
+            )
         if units < 1 or (most is not None and units * unit > most):
             least = unit / fps
             span = f"any length from {least:.1f} s" if most is None else f"{least:.2g} to {most / fps:.1f} s"
@@ -161,6 +172,36 @@ def frames_of(
             raise UserError(f"{length:g} s is out of reach: this model makes {span}{more if longer else ''}")
         out.append(units * unit)
     return out
+
+
+def seeds_of(
+    generator: MotionGenerator, given: Sequence[NDArray[np.float32]] | None, count: int
+) -> list[NDArray[np.float32]] | None:
+    """The last frames of motions [T, D] in the layout's columns, as a request has them; one may be for all.
+
+    Refuses those that are too short, or that nothing would go on from.
+    """
+    if given is None:
+        return None
+    if not isinstance(generator, SeededGenerator):
+        raise UserError(f"this model ({generator.method}) goes on from no motion: leave the seed motion out")
+    layout, frames = generator.layout, generator.seed_frames
+    if len(given) not in (1, count):
+        raise UserError(f"{count} motions but {len(given)} seed motions; give one, or one for each")
+    for motion in given:
+        if motion.ndim != 2 or motion.shape[1] != layout.dim or not np.isfinite(motion).all():
+            raise UserError(
+                f"a seed motion is finite columns [T, {layout.dim}] of layout {layout.name}, not "
+                f"{list(motion.shape)}"
+            )
+        if len(motion) < frames:
+            raise UserError(
+                f"a seed motion of {len(motion)} frames: this model goes on from {frames} "
+                f"({frames / layout.fps:g} s); give a longer one"
+            )
+    columns = layout.part(generator.part)
+    own = [np.asarray(motion[-frames:, columns], np.float32) for motion in given]
+    return own * count if len(own) == 1 else own
 
 
 class PromptEncoder:

@@ -29,10 +29,11 @@ from motionloom.pipeline.evaluation.dances import (
     DanceClip,
     commonest,
     dance_to,
-    dances_of,
+    dances_for,
     digest_of_dances,
     other_songs,
     require_dances,
+    seed_frames,
 )
 from motionloom.pipeline.evaluation.estimate import plain, row_estimates, set_estimates
 from motionloom.pipeline.evaluation.figures import (
@@ -107,14 +108,15 @@ class _DanceEvaluation(Evaluation):
         require_dances(self.dataset)
         require_dances(self.train)
         self.fps = self.dataset.layout.fps
-        self.clips = self._dances(self.dataset, self.config.clips, self.bundle.generator.unit_frames)
+        self.begun = seed_frames(self.bundle)
+        """Frames that the model is given of each recording: they are not measured."""
+        self.whole = self._dances(self.dataset, self.config.clips)
+        self.clips = [clip.after(self.begun) for clip in self.whole]
 
-    def _dances(self, dataset: ClipDataset, count: int | None, unit: int = 1) -> list[DanceClip]:
+    def _dances(self, dataset: ClipDataset, count: int | None, unit: int | None = None) -> list[DanceClip]:
         """Dances that are long enough to be measured, cut to what the generator can make."""
-        longest = min(self.config.seconds or np.inf, self.bundle.max_seconds)
-        cut = None if np.isinf(longest) else float(longest)
-        found = dances_of(dataset, count, unit=unit, seconds=cut)
-        found = [clip for clip in found if len(clip.joints) >= MIN_FRAMES]
+        seconds = self.config.seconds
+        found = dances_for(self.bundle, dataset, count, seconds=seconds, least=MIN_FRAMES, unit=unit)
         if not found:
             raise UserError(
                 f"{self.dataset.where}: no clip with music of split '{dataset.split}' is long enough to be "
@@ -137,11 +139,11 @@ class _DanceEvaluation(Evaluation):
 
     def dance(self, draw: int, piece: slice) -> Arrays:
         """Joints [T, N, 3] of dances to some clips' own music, by their numbers."""
-        some = self.clips[piece]
+        some = self.whole[piece]
         seed, noise_seed = self.seeds(draw, piece.start)
         drawn = {"seed": seed, "noise_seed": noise_seed, "sampling": self.config.sampling}
         motions = dance_to(self.bundle, some, **drawn)
-        return {f"{number:06d}": motion.joints for number, motion in enumerate(motions)}
+        return {f"{number:06d}": motion.joints[self.begun :] for number, motion in enumerate(motions)}
 
     @cached_property
     def protocol(self) -> dict[str, Fact]:
@@ -154,6 +156,7 @@ class _DanceEvaluation(Evaluation):
             "clips_sha256": digest_of_dances(clips),
             "shuffles": config.shuffles,
             "feature_fps": config.feature_fps,
+            **({"seed_motion": f"the first {self.begun} frames of each recording"} if self.begun else {}),
             **self.drawn_as(self.bundle),
         }
 
@@ -179,7 +182,7 @@ class _DanceEvaluation(Evaluation):
 
     def answers(self) -> dict[str, list[list[Joints]]]:
         """Dances that need no model, once or several times."""
-        clips, pool = self.clips, self._dances(self.train, self.config.pool)
+        clips, pool = self.clips, self._dances(self.train, self.config.pool, unit=1)
         real = [clip.joints for clip in clips]
         rng = np.random.default_rng([self.context.seed, 17])
         out = {

@@ -17,7 +17,7 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
     register,
 )
-from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_of, with_music
+from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_for, with_music
 from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions
@@ -110,8 +110,7 @@ def _danced(context: StageContext) -> list[tuple[GeneratedMotion, DanceClip]]:
     bundle = bundle_driven_by("audio", context.every("generators"), context.stage_cache)
     if bundle is None:
         return []
-    longest = min(config.dance_seconds, bundle.max_seconds)
-    clips = dances_of(dataset, config.dances, unit=bundle.generator.unit_frames, seconds=longest)
+    clips = dances_for(bundle, dataset, config.dances, seconds=config.dance_seconds)
     if not clips:
         return []
     made = dance_to(bundle, clips, seed=context.seed, sampling=config.sampling)

@@ -31,7 +31,7 @@ from motionloom.pipeline.contract.stage import (
     stage_kind,
 )
 from motionloom.pipeline.evaluation.cases import Clips
-from motionloom.pipeline.evaluation.dances import dance_to, dances_of, with_music
+from motionloom.pipeline.evaluation.dances import dance_to, dances_of, seed_frames, with_music
 from motionloom.pipeline.evaluation.truth import (
     Truth,
     has_caption,
@@ -197,6 +197,8 @@ def _danced(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
     if bundle is not None:
         unit, longest = math.lcm(unit, bundle.generator.unit_frames), min(longest, bundle.max_seconds)
     clips = dances_of(dataset, config.dances, unit=unit, seconds=longest)
+    if bundle is not None:
+        clips = [clip for clip in clips if len(clip.joints) > seed_frames(bundle)]
     made: Sequence[GeneratedMotion | None] = [None] * len(clips)
     if bundle is not None and clips:
         made = dance_to(bundle, clips, seed=context.seed, sampling=config.sampling)
