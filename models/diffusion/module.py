@@ -15,7 +15,7 @@ from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
-from motionloom.models.training.distributed import masked_mean
+from motionloom.models.training.distributed import mean_of_rows
 from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 
 
@@ -32,7 +32,8 @@ class DiffusionModule(StageModule):
         """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
         [B, D] (optional: all).
 
-        Time steps and noise are drawn in each call; in evaluation no caption is dropped.
+        Every clip counts alike, as in MDM. Time steps and noise are drawn in each call; in evaluation no
+        caption is dropped.
         """
         motion, length, text = batch["motion"], batch["length"], batch["conditions"]["text"].pooled
         schedule = self.net.config.schedule
@@ -45,7 +46,7 @@ class DiffusionModule(StageModule):
         found = self.net(noisy, step, text, mask, conditioned)
         target = motion if schedule.predicts == "sample" else noise
         error = (found - target.float()).square()
-        return {"loss": masked_mean(error, mask, batch.get("present"))}
+        return {"loss": mean_of_rows(error, mask, batch.get("present"))}
 
 
 class DmdModule(StageModule):

@@ -2,7 +2,8 @@
 
 The condition, projected text plus embedded time step, is one token in front of the frames; every frame is
 one more token. The output at the frames is the clean motion (or the noise, as the schedule predicts).
-`condition_dropout` hides the text from some samples, for classifier-free guidance.
+`condition_dropout` hides the text from some samples, for classifier-free guidance: zeros are projected in its
+place. With `norm: post` it is MDM's `trans_enc`.
 
 Legend: B batch, T frames, D motion features, E text width.
 """
@@ -16,7 +17,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from motionloom.models.diffusion.schedule import ScheduleConfig
-from motionloom.models.layers.transformer import Norm, StackConfig, Transformer, sinusoid
+from motionloom.models.layers.transformer import Norm, StackConfig, Transformer, sinusoid, waves
 
 
 class DiffusionConfig(StackConfig):
@@ -45,6 +46,7 @@ class MotionDiffusion(nn.Module):
         self.time = nn.Sequential(
             nn.Linear(config.dim, config.dim), nn.SiLU(), nn.Linear(config.dim, config.dim)
         )
+        self.dropout = nn.Dropout(config.dropout)
         self.stack = Transformer(config, config.layers, norm=config.norm)
         self.leave = nn.Linear(config.dim, motion_dim)
 
@@ -58,19 +60,18 @@ class MotionDiffusion(nn.Module):
             mask: bool [B, T], True = real frame.
             conditioned: bool [B], False hides the text.
         """
-        condition = self.text(text) * conditioned[:, None] + self.time(
-            step_waves(step, self.config.dim).to(self.text.weight.dtype)
-        )
+        time = self.time(waves(step, self.config.dim).to(self.text.weight.dtype))
+        condition = self.text(text * conditioned[:, None]) + time
         frames = self.enter(noisy)
         x = torch.cat([condition[:, None].to(frames.dtype), frames], dim=1)
-        x = x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype)
+        x = self.dropout(x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype))
         visible = torch.cat([mask.new_ones(len(mask), 1), mask], dim=1)
         out: Tensor = self.leave(self.stack(x, visible)[:, 1:]).float()
         return out * mask[..., None]
 
 
 def step_waves(step: Tensor, dim: int) -> Tensor:
-    """Sinusoidal embedding [B, dim] of time steps [B]."""
+    """Embedding [B, dim] of time steps [B]: all sines, then all cosines."""
     half = torch.arange(dim // 2, device=step.device)
     angle = step[:, None].float() * torch.exp(-math.log(10_000.0) * half / (dim // 2))
     return torch.cat([angle.sin(), angle.cos()], dim=-1)

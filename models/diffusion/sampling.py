@@ -45,7 +45,8 @@ def sample_motions(
     """
     if guidance != 1 and net.config.condition_dropout == 0:
         raise UserError(
-            "guidance needs a diffusion model trained with condition_dropout > 0; set face_cfg_scale to 1"
+            "guidance needs a diffusion model trained with condition_dropout > 0; set cfg_scale, of a face "
+            "face_cfg_scale, to 1"
         )
     net.eval()
     guided = guidance != 1.0

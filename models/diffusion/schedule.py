@@ -1,5 +1,8 @@
 """Noise schedules and samplers: all of them diffusers' own, built from one config.
 
+Their tables are replaced by the same in float64: in float32 1 - beta of the last cosine steps is rounded in
+its fifth digit.
+
 diffusers takes seconds to import, so each is imported where it is built: a command that lists or plans stages
 starts without it.
 """
@@ -10,7 +13,9 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
@@ -44,27 +49,43 @@ class ScheduleConfig(Config):
     """The noising process; the defaults are MDM's, which HumanTOMATO's facial baseline follows (B.5.2)."""
 
     steps: int = Field(default=1000, ge=2)
-    betas: Literal["squaredcos_cap_v2", "linear"] = "squaredcos_cap_v2"
-    """Cosine (MDM) or linear from 1e-4 to 0.02 (UDE), by diffusers' names."""
+    betas: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2"
+    """Cosine (MDM), linear from 1e-4 to 0.02 (UDE, MotionDiffuse), or between the roots of 0.00085 and 0.012
+    (MLD), by diffusers' names."""
     predicts: Literal["sample", "epsilon"] = "sample"
-    """x0 (MDM) or the noise (UDE)."""
+    """x0 (MDM) or the noise (UDE, MotionDiffuse, MLD)."""
+    steps_offset: int = Field(default=0, ge=0)
+    """Added to each time step that ddpm and ddim take; MLD's is 1."""
+    set_alpha_to_one: bool = True
+    """Whether ddim's last step ends without noise; MLD's ends with that of time step 0."""
 
-    def arguments(self) -> dict[str, Any]:
-        """What every scheduler is built from."""
-        return {
-            "num_train_timesteps": self.steps,
-            "beta_schedule": self.betas,
-            "beta_start": 1e-4,
-            "beta_end": 0.02,
-            "prediction_type": self.predicts,
-        }
+    def beta_table(self) -> NDArray[np.float64]:
+        """Variance that each step adds [steps]."""
+        if self.betas == "linear":
+            return np.linspace(1e-4, 0.02, self.steps)
+        if self.betas == "scaled_linear":
+            return np.linspace(0.00085**0.5, 0.012**0.5, self.steps) ** 2
+        at = np.arange(self.steps + 1) / self.steps
+        kept = np.cos((at + 0.008) / 1.008 * np.pi / 2) ** 2
+        cosine: NDArray[np.float64] = np.minimum(1 - kept[1:] / kept[:-1], 0.999)
+        return cosine
 
     def noiser(self) -> Scheduler:
         """For training: `add_noise`. Motion is not bounded, so nothing is clipped."""
         from diffusers import DDPMScheduler
 
-        made: Scheduler = DDPMScheduler(clip_sample=False, **self.arguments())  # type: ignore
-        return made
+        return self._made(DDPMScheduler, clip_sample=False, steps_offset=self.steps_offset)
+
+    def _made(self, kind: Any, **options: object) -> Scheduler:
+        """A scheduler of diffusers with tables in float64."""
+        made = kind(num_train_timesteps=self.steps, prediction_type=self.predicts, **options)
+        made.betas = torch.from_numpy(self.beta_table())
+        made.alphas = 1 - made.betas
+        made.alphas_cumprod = made.alphas.cumprod(0)
+        if kind.__name__ == "DDIMScheduler" and not self.set_alpha_to_one:
+            made.final_alpha_cumprod = made.alphas_cumprod[0]
+        scheduler: Scheduler = made
+        return scheduler
 
     def sampler(self, kind: Sampler, steps: int) -> Scheduler:
         """A sampler set to `steps` denoising steps, at most those of the training."""
@@ -78,15 +99,11 @@ class ScheduleConfig(Config):
         elif kind == "ddim":
             from diffusers import DDIMScheduler
 
-            made = DDIMScheduler(  # type: ignore
-                clip_sample=False, set_alpha_to_one=True, **self.arguments()
-            )
+            made = self._made(DDIMScheduler, clip_sample=False, steps_offset=self.steps_offset)
         else:
             from diffusers import DPMSolverMultistepScheduler
 
-            made = DPMSolverMultistepScheduler(  # type: ignore
-                algorithm_type="dpmsolver++", **self.arguments()
-            )
+            made = self._made(DPMSolverMultistepScheduler, algorithm_type="dpmsolver++")
         made.set_timesteps(steps)
         return made
 

@@ -8,8 +8,9 @@ Notable choices:
 - Masks are boolean and mark what *may* be attended (True = visible), as SDPA wants them.
 - A causal stack needs no padding mask when sequences are padded on the right: real positions never see
   padding.
-- Dropout acts on the residual branches (`dropout`) and on the attention weights (`attention_dropout`); CPUs
-  have no fused kernel for the second, so small CPU configs set it to 0.
+- Dropout acts on the residual branches (`dropout`), of "post" also inside the feed-forward as torch's does,
+  and on the attention weights (`attention_dropout`); CPUs have no fused kernel for the last, so small CPU
+  configs set it to 0.
 
 Legend: B batch, L positions, S visible positions, D width, H heads.
 """
@@ -38,9 +39,13 @@ def length_mask(length: Tensor, size: int) -> Tensor:
 
 def sinusoid(size: int, dim: int, device: torch.device | None = None) -> Tensor:
     """Fixed sine/cosine position codes, float32 [size, dim]."""
-    position = torch.arange(size, device=device, dtype=torch.float32)[:, None]
-    rate = torch.exp(torch.arange(0, dim, 2, device=device, dtype=torch.float32) * (-math.log(10000.0) / dim))
-    angle = position * rate
+    return waves(torch.arange(size, device=device), dim)
+
+
+def waves(position: Tensor, dim: int) -> Tensor:
+    """Codes of positions [L] or time steps: sine and cosine in turn, float32 [L, dim]."""
+    rate = torch.arange(0, dim, 2, device=position.device, dtype=torch.float32)
+    angle = position[:, None].float() * torch.exp(rate * (-math.log(10000.0) / dim))
     return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(1)[:, :dim]
 
 
@@ -199,7 +204,8 @@ class Block(nn.Module):
         return out
 
     def _feed(self, x: Tensor) -> Tensor:
-        out: Tensor = self.ff_out(F.gelu(self.ff_in(x)))
+        inner = F.gelu(self.ff_in(x))
+        out: Tensor = self.ff_out(self.dropout(inner) if self.post else inner)
         return out
 
 

@@ -73,6 +73,17 @@ def masked_mean(values: Tensor, mask: Tensor, present: Tensor | None = None) -> 
     return torch.where(full, values, 0.0).sum() / count.clamp(min=1)
 
 
+def mean_of_rows(values: Tensor, mask: Tensor, present: Tensor | None = None) -> Tensor:
+    """Mean over the rows of values [B, T, D] of each row's own mean where mask [B, T] is True: short clips
+    count as long ones do. `present` and ranks as in `masked_mean`; a row without columns counts for nothing.
+    """
+    columns = torch.ones_like(values[:, 0], dtype=torch.bool) if present is None else present
+    number = mask.sum(1) * columns.sum(1)
+    full = mask[..., None] & columns[:, None]
+    rows = torch.where(full, values, 0.0).sum((1, 2)) / number.clamp(min=1)
+    return masked_mean(rows, number > 0)
+
+
 def gather_rows(x: Tensor) -> Tensor:
     """Rows of every rank in rank order, [W*B, ...], without gradient. Every rank must hold the same shape."""
     if not is_distributed():

@@ -1,55 +1,44 @@
-"""Expressions by a motion diffusion model: the second facial baseline (HumanTOMATO B.5.2)."""
+"""Motion of text by a diffusion model: MDM, and the second facial baseline (HumanTOMATO B.5.2)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from torch import Tensor
 
-from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.store.networks import device_of
 
 
 @dataclass(frozen=True)
-class DiffusionFace:
-    """Denoising from a sentence embedding (B.5.2)."""
+class DiffusionMotion(WholeMotion):
+    """Denoising from a sentence embedding, of any part of the body (MDM; B.5.2)."""
 
     net: MotionDiffusion
-    layout: MotionLayout
-    given: Mapping[str, Any]
+    who = "this diffusion model"
     method = "diffusion"
-    modalities = frozenset({"text"})
-    settings = frozenset({"cfg_scale", "face_cfg_scale", "sampler", "denoising_steps"})
-    unit_frames = 1
-    max_frames = None
-    part: Part = "face"
 
     @property
-    def prepared(self) -> Mapping[str, object]:
-        return {"text": self.given.get("text")}
+    def settings(self) -> frozenset[str]:  # type: ignore[override]
+        more = {"face_cfg_scale"} if self.part == "face" else set()
+        return frozenset({"cfg_scale", "sampler", "denoising_steps"} | more)
 
     def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
-        """As asked for, or else DDPM in 50 steps."""
-        return sampling.sampler or "ddpm", sampling.denoising_steps or 50
+        """As asked for, or else DDPM in 50 steps, or the training's where those are fewer."""
+        steps = sampling.denoising_steps or min(50, self.net.config.schedule.steps)
+        return sampling.sampler or "ddpm", steps
 
-    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
-        if request.frames is None:
-            raise UserError("the face's diffusion model makes a length that it is given, and none was")
+    def normalised(self, request: GenerationRequest, frames: Sequence[int]) -> list[Tensor]:
         sampler, steps = self.denoising(request.sampling)
-        made = sample_motions(
-            self.net, request.pooled_text("the face's diffusion model").to(device_of(self.net)),
-            request.frames, seeds=request.seeds, sampler=sampler, steps=steps,
-            guidance=request.sampling.face_guidance,
+        sampling = request.sampling
+        return sample_motions(
+            self.net, request.pooled_text(self.who).to(device_of(self.net)), frames, seeds=request.seeds,
+            sampler=sampler, steps=steps,
+            guidance=sampling.face_guidance if self.part == "face" else sampling.cfg_scale,
         )  # fmt: skip
-        columns = self.layout.part(self.part)
-        values = [motion.cpu().numpy() for motion in made]
-        return [np.asarray(self.given["stats"].denormalize(v, columns), dtype=np.float32) for v in values]

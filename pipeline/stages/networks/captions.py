@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast, get_args
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import Inputs
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.text import TextSource
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -91,3 +92,13 @@ def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:
     if not layout.has_part(part):
         raise UserError(f"layout {layout.name} has no {part} columns; choose another part or data set")
     return layout.part(part)
+
+
+def part_of(facts: ModelFacts) -> Part:
+    """The part that a stage noted in its facts, `extra.part`."""
+    part = facts.fact("part", str)
+    if part not in get_args(Part):
+        raise UserError(
+            f"{facts.where}: key 'extra.part' = {part!r} is no part; run or export the stage again"
+        )
+    return cast(Part, part)

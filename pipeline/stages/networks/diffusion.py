@@ -1,24 +1,25 @@
-"""Motion diffusion stage, of the face: the paper's second facial baseline (HumanTOMATO B.5.2)."""
+"""Motion diffusion stage: MDM, and of the face the paper's second facial baseline (HumanTOMATO B.5.2)."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import torch
-from pydantic import field_validator
 
+from motionloom.datasets.motion.layout import Part
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
-from motionloom.pipeline.inference.generators.diffusion import DiffusionFace
+from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
     CaptionStage,
     CaptionStageConfig,
     part_columns,
+    part_of,
 )
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts
 from motionloom.pipeline.training.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -30,15 +31,9 @@ class DiffusionStageConfig(CaptionStageConfig):
 
     net: DiffusionConfig = DiffusionConfig()
     train: TrainConfig = TrainConfig(steps=200_000, batch_size=64)
-    part: Literal["face"] = "face"
-    """What is denoised: the face, conditioned on the face captions."""
-
-    @field_validator("part", mode="before")
-    @classmethod
-    def _faces_only(cls, part: str) -> str:
-        if part != "face":
-            raise ValueError(f"a diffusion stage makes faces only, not {part}: leave `part` out")
-        return part
+    part: Part = "face"
+    """What is denoised; `face` takes the face captions, any other the body's. Of MDM it is `bodyhand`, or
+    `body`."""
 
 
 class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDiffusion]):
@@ -46,6 +41,7 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
 
     name = "diffusion"
     summary = "motion diffusion"
+    version = 2  # MDM's time steps, positions, hidden texts and mean over clips
     config = DiffusionStageConfig
     inputs = CaptionInputs
     curves = (Curve("loss"),)
@@ -74,8 +70,8 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
         return DiffusionModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
-        layout = given["stats"].layout
-        return DiffusionFace(self.load(stage, given, device), layout, given)
+        net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
+        return DiffusionMotion(given["stats"].layout, part, given, net)
 
 
 register(DiffusionStage())

@@ -5,12 +5,11 @@ B.5.1, D).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal, cast, get_args
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from pydantic import model_validator
 
-from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.tma.losses import TmaLossConfig
 from motionloom.models.tma.network import Tma, TmaConfig
@@ -32,6 +31,7 @@ from motionloom.pipeline.stages.networks.captions import (
     CaptionStage,
     CaptionStageConfig,
     part_columns,
+    part_of,
 )
 from motionloom.pipeline.store.networks import LoadedTma
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
@@ -112,7 +112,7 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
         return ModelFacts(kind="tma", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra)
 
     def network(self, facts: ModelFacts, inputs: TmaInputs) -> Tma:
-        layout, part = facts.layout.layout(), _part(facts)
+        layout, part = facts.layout.layout(), part_of(facts)
         if not layout.has_part(part):
             raise UserError(f"{facts.where}: layout {layout.name} has no {part} columns; run the stage again")
         config = TmaConfig.parse(facts.config, facts.where)
@@ -132,20 +132,12 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
         return TmaModule(net, config.optim, seed=seed, max_steps=config.train.steps, loss=config.loss)
 
     def loaded(self, net: Tma, facts: ModelFacts, inputs: TmaInputs) -> LoadedTma:
-        frames, part = facts.fact("max_frames", int), _part(facts)
+        frames, part = facts.fact("max_frames", int), part_of(facts)
         return LoadedTma(net, facts.layout.layout(), frames, part, inputs)
 
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
-        return VaeMotion(self.load(stage, given, device))
-
-
-def _part(facts: ModelFacts) -> Part:
-    part = facts.fact("part", str)
-    if part not in get_args(Part):
-        raise UserError(
-            f"{facts.where}: key 'extra.part' = {part!r} is no part; run or export the stage again"
-        )
-    return cast(Part, part)
+        tma: LoadedTma = self.load(stage, given, device)
+        return VaeMotion(tma.layout, tma.part, given, tma)
 
 
 register(TmaStage())

@@ -97,10 +97,6 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "no caption": (["generate", "nowhere"], "give at least one caption"),
     "unknown format": (["generate", "nowhere", "a person walks", "-f", "npz,bhv"], "did you mean 'bvh'"),
     "export nothing": (["export", "nowhere"], "nowhere: no such folder"),
-    "diffusion of the body": (
-        ["run", "baselines-tiny", "--set", "face_diffusion.part=bodyhand"],
-        "a diffusion stage makes faces only, not bodyhand",
-    ),
     "check nothing": (["data", "check", "nowhere"], "nowhere: no such folder"),
     "stats of nothing": (["data", "stats", "nowhere"], "nowhere/manifest.json: no such file"),
     "convert nothing": (

@@ -27,7 +27,7 @@ from motionloom.pipeline.contract.generation import GenerationRequest, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.generators.diffusion import DiffusionFace
+from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.inference.generators.gpt import (
     GptGenerator,
     candidate_seeds,
@@ -92,9 +92,9 @@ def bundle(
         made.append(of(levels, net, True))
     if "diffusion" in faces:
         denoiser = MotionDiffusion(face or DENOISER, 50, 8)
-        made.append(DiffusionFace(denoiser.eval().requires_grad_(False), layout, given))
+        made.append(DiffusionMotion(layout, "face", given, denoiser.eval().requires_grad_(False)))
     if "vae" in faces:
-        made.append(VaeMotion(SimpleNamespace(given=given, part="face")))  # type: ignore[arg-type]
+        made.append(VaeMotion(layout, "face", given, SimpleNamespace()))  # type: ignore[arg-type]
     return Bundle([stage(f"stage{k}", one) for k, one in enumerate(made)], StageCache())
 
 

@@ -1,0 +1,58 @@
+"""What generators share that make all frames of a motion at once, of a length that they are given."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.generation import GenerationRequest
+
+
+@dataclass(frozen=True)
+class WholeMotion(ABC):
+    """A generator of one part of a layout from text; a kind of it adds its network and says `normalised`."""
+
+    layout: MotionLayout
+    part: Part
+    given: Mapping[str, Any]
+    """What the stage's inputs give: "stats", "text"."""
+
+    who: ClassVar[str]
+    """For messages, such as "this VAE"."""
+    method: ClassVar[str]
+    settings: ClassVar[frozenset[str]] = frozenset()
+    modalities = frozenset({"text"})
+    unit_frames = 1
+
+    @property
+    def max_frames(self) -> int | None:
+        return None
+
+    @property
+    def prepared(self) -> Mapping[str, object]:
+        return {"text": self.given.get("text")}
+
+    @abstractmethod
+    def normalised(
+        self, request: GenerationRequest, frames: Sequence[int]
+    ) -> Sequence[NDArray[np.float32] | torch.Tensor]:
+        """One motion [T, C] of the part's columns for each row, T of `frames`, as the network was trained."""
+
+    @torch.no_grad()
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        if request.frames is None:
+            raise UserError(
+                f"{self.who} makes a motion of a length that it is given, and none was; give --seconds, or "
+                f"to evaluate it lengths: recorded"
+            )
+        columns, stats = self.layout.part(self.part), self.given["stats"]
+        made = (torch.as_tensor(one).cpu().numpy() for one in self.normalised(request, request.frames))
+        return [np.asarray(stats.denormalize(one, columns), dtype=np.float32) for one in made]
