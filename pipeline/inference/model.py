@@ -116,7 +116,7 @@ class MotionModel(
 
     def examples(self, count: int = 6) -> list[str]:
         """Some captions that it knows, unlike each other; none where it does not say what it knows."""
-        text = getattr(self.bundle.generator, "text", None)
+        text = self.bundle.generator.prepared.get("text")
         known = text.known.get("body") if isinstance(text, TextSource) else None
         return list(known.captions[:count]) if known else []
 

@@ -36,6 +36,9 @@ from motionloom.pipeline.serve.work import Busy, Stopped, Worker
 
 T = TypeVar("T")
 
+_SCRIPTS = ("serve.js",)
+"""Of the page, besides the viewer's."""
+
 _UPLOADS = 4
 """Sounds that are received at a time; others wait unread."""
 
@@ -60,7 +63,7 @@ class Site:
             Route("/api/stream", self.stream, methods=["POST"]),
             Route("/api/sounds", self.add_sound, methods=["POST"]),
         ]
-        return guarded("page.html", "serve.js", routes, self.config.host, self.config.allow_hosts)
+        return guarded("page.html", _SCRIPTS, routes, self.config.host, self.config.allow_hosts)
 
     async def info(self, request: Request) -> Response:
         bundle, limits = self.model.bundle, self.config

@@ -21,18 +21,20 @@ BROKEN = "something broke here; the server's log says what"
 
 
 def own(name: str) -> str:
-    """Text of a file that ships beside this module."""
-    return (resources.files("motionloom.pipeline.serve") / name).read_text(encoding="utf-8")
+    """Text of a file of the folder `web`."""
+    return (resources.files("motionloom.pipeline.serve") / "web" / name).read_text(encoding="utf-8")
 
 
-def guarded(page: str, script: str, routes: Sequence[Route], host: str, allowed: Collection[str]) -> ASGIApp:
-    """The application of a page, its script, the viewer and what they ask for. The guard is outermost, so
+def guarded(
+    page: str, scripts: Sequence[str], routes: Sequence[Route], host: str, allowed: Collection[str]
+) -> ASGIApp:
+    """The application of a page, its scripts, the viewer and what they ask for. The guard is outermost, so
     that every answer has its headers.
     """
     assets = {
         "serve.css": (resource("viewer/viewer.css") + own("serve.css"), "text/css; charset=utf-8"),
         "viewer.js": (viewer_script(), "text/javascript; charset=utf-8"),
-        script: (own(script), "text/javascript; charset=utf-8"),
+        **{script: (own(script), "text/javascript; charset=utf-8") for script in scripts},
     }
 
     async def index(request: Request) -> Response:

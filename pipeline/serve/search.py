@@ -49,7 +49,7 @@ class SearchSite:
             Route("/api/search", self.find, methods=["POST"]),
             Route("/api/like", self.find_like, methods=["POST"]),
         ]
-        return guarded("search.html", "search.js", routes, self.config.host, self.config.allow_hosts)
+        return guarded("search.html", ("search.js",), routes, self.config.host, self.config.allow_hosts)
 
     async def info(self, request: Request) -> Response:
         return JSONResponse({"name": self.name, "clips": len(self.search.places) - len(self.search.excluded)})

@@ -29,6 +29,7 @@ def test_each_gets_the_motion_of_its_own_seed(small_run: Any, run_server: Callab
         assert said["request"] == f"{number}"
         np.testing.assert_allclose(said["joints"], wanted[number], atol=1e-5)
 
+    assert len(model.examples()) == 6, "what the page offers before anything is asked"
     with run_server(model, waiting=12) as served, ThreadPoolExecutor(12) as clients:
         list(clients.map(ask, range(12)))
         got = served.post("/api/stream", {"caption": captions[0], "seconds": 0.6, "request": "s"})

@@ -53,6 +53,13 @@ def status(page: Any) -> str:
     return str(page.locator("#status").text_content())
 
 
+def test_what_it_knows_is_offered_before_anything_is_asked(visit: Any, until: Any, quick: Any) -> None:
+    page = visit()
+    page.get_by_role("button", name="a person bows").click()
+    until(page, DRAWN)
+    assert quick.asked == ["a person bows"] and page.locator("#start").is_hidden()
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_type_and_watch(visit: Any, until: Any, quick: Any, size: str, tmp_path: Path) -> None:
     page = visit(*SIZES[size])

@@ -4,7 +4,7 @@
 
 const one = (id) => document.getElementById(id);
 const form = one("ask"), status = one("status"), go = one("go"), save = one("save");
-const notes = one("notes");
+const notes = one("notes"), start = one("start");
 let info = null, shown = null, asked = null, music = null, turn = 0;
 
 function say(words, wrong) {
@@ -68,25 +68,28 @@ async function generate() {
 
 function show(answer, body) {
   if (shown) shown.remove();
+  start.hidden = true;
   shown = window.motionloomViewer(one("viewer"), answer.viewer, { page: false });
   asked = body;
   save.hidden = false;
   note(answer.notes, answer.nearest);
 }
 
-/* Lines of text, and captions to be clicked. */
+/* Captions to be clicked. */
+const choices = (captions) => captions.map((caption) => {
+  const known = document.createElement("button");
+  known.type = "button";
+  known.textContent = caption;
+  known.addEventListener("click", () => { one("caption").value = caption; generate(); });
+  return known;
+});
+
 function note(lines, captions) {
   notes.replaceChildren(...lines.map((words) => {
     const line = document.createElement("p");
     line.textContent = words;
     return line;
-  }), ...captions.map((caption) => {
-    const known = document.createElement("button");
-    known.type = "button";
-    known.textContent = caption;
-    known.addEventListener("click", () => { one("caption").value = caption; generate(); });
-    return known;
-  }));
+  }), ...choices(captions));
   notes.hidden = !notes.children.length;
 }
 
@@ -129,7 +132,7 @@ for (const name of ["dragover", "drop", "dragleave"]) {
   document.addEventListener(name, (event) => {
     if (!info || !info.modalities.includes("audio")) return;
     event.preventDefault();
-    form.classList.toggle("serve-over", name === "dragover");
+    document.body.classList.toggle("serve-over", name === "dragover");
     if (name === "drop" && event.dataTransfer.files.length) {
       one("sound").files = event.dataTransfer.files;
       take(event.dataTransfer.files[0]);
@@ -155,7 +158,9 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   one("sound-field").hidden = !info.modalities.includes("audio");
   const drivers = info.modalities.map((name) => (name === "audio" ? "music" : name)).join(" or ");
   say(`${info.model}: ${drivers} to motion, at most ${info.limits.seconds} s`);
-  if (info.examples.length) note(["It knows, for example:"], info.examples);
-  one("caption").focus();
+  one("start-words").textContent = info.examples.length ? "It knows, for example:" : "What you ask for is shown here.";
+  one("start-examples").replaceChildren(...choices(info.examples));
+  start.hidden = false;
+  if (!window.matchMedia("(pointer: coarse)").matches) one("caption").focus(); // a phone would cover the page with its keyboard
 })();
 })();

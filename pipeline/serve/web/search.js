@@ -26,6 +26,7 @@ async function find(path, body, what) {
     const answer = await ask(path, { method: "POST", body, headers: { "Content-Type": "application/octet-stream" } });
     if (mine !== turn) return;
     if (shown) shown.remove();
+    one("start").hidden = true;
     shown = window.motionloomViewer(one("viewer"), answer.viewer, { page: false });
     [...document.querySelectorAll(".mlv-cell")].forEach((cell, k) => {
       const more = Object.assign(document.createElement("button"), { type: "button", textContent: "More like this" });
@@ -49,7 +50,7 @@ form.addEventListener("submit", (event) => {
 for (const name of ["dragover", "drop", "dragleave"]) {
   document.addEventListener(name, (event) => {
     event.preventDefault();
-    form.classList.toggle("serve-over", name === "dragover");
+    document.body.classList.toggle("serve-over", name === "dragover");
     if (name === "drop" && event.dataTransfer.files.length) find("/api/like", event.dataTransfer.files[0], event.dataTransfer.files[0].name);
   });
 }
