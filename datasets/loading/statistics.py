@@ -79,6 +79,27 @@ class FeatureStats:
             raise UserError(f"{path}: {len(mean)} columns, not {layout.dim}; run {stage} again")
         return FeatureStats(mean, std, layout, frames)
 
+    @staticmethod
+    def of_arrays(mean: Path, std: Path, layout: MotionLayout) -> FeatureStats:
+        """From a release's `.npy` files [D] of a layout's columns; `UserError` where a file is not that."""
+        found = []
+        for path in (mean, std):
+            try:
+                values = np.load(path, allow_pickle=False)
+            except (OSError, ValueError) as error:
+                raise UserError(f"{path}: cannot be read as an array of numbers ({error})") from None
+            if values.shape != (layout.dim,) or values.dtype.kind != "f" or not np.isfinite(values).all():
+                raise UserError(
+                    f"{path}: {values.dtype} {list(values.shape)} is not the {layout.dim} finite numbers of "
+                    f"layout {layout.name}; take the statistics of this layout"
+                )
+            found.append(np.asarray(values, dtype=np.float32))
+        if not (found[1] > 0).all():
+            raise UserError(
+                f"{std}: holds deviations that are not above 0; exchange `mean` and `std`, perhaps"
+            )
+        return FeatureStats(found[0], found[1], layout)
+
     def _like(self, values: Values, columns: Columns | None) -> tuple[Values, Values]:
         """Mean and std of the columns, as numpy or torch."""
         mean: Any = self.mean

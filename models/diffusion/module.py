@@ -45,7 +45,7 @@ class DiffusionModule(StageModule):
         noisy = self.noiser.add_noise(motion, noise, step)
         found = self.net(noisy, step, text, mask, conditioned)
         target = motion if schedule.predicts == "sample" else noise
-        error = (found - target.float()).square()
+        error = (found - target.to(found.dtype)).square()
         return {"loss": mean_of_rows(error, mask, batch.get("present"))}
 
 

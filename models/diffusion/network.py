@@ -66,8 +66,8 @@ class MotionDiffusion(nn.Module):
         x = torch.cat([condition[:, None].to(frames.dtype), frames], dim=1)
         x = self.dropout(x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype))
         visible = torch.cat([mask.new_ones(len(mask), 1), mask], dim=1)
-        out: Tensor = self.leave(self.stack(x, visible)[:, 1:]).float()
-        return out * mask[..., None]
+        out: Tensor = self.leave(self.stack(x, visible)[:, 1:])
+        return out.to(torch.promote_types(out.dtype, torch.float32)) * mask[..., None]
 
 
 def step_waves(step: Tensor, dim: int) -> Tensor:

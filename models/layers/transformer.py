@@ -209,6 +209,19 @@ class Block(nn.Module):
         return out
 
 
+def name_in_torch(name: str, *, memory: bool = False) -> str:
+    """Name of a block's tensor in torch's encoder layer; of a block with `memory` in its decoder layer."""
+    part, _, kind = name.rpartition(".")
+    if part.endswith("qkv"):
+        return f"{'multihead_attn' if part == 'memory.qkv' else 'self_attn'}.in_proj_{kind}"
+    known = {
+        "attention.out": "self_attn.out_proj", "memory.out": "multihead_attn.out_proj", "ff_in": "linear1",
+        "ff_out": "linear2", "norm_attention": "norm1", "norm_memory": "norm2",
+        "norm_ff": "norm3" if memory else "norm2",
+    }  # fmt: skip
+    return f"{known[part]}.{kind}"
+
+
 class Transformer(nn.Module):
     """A stack of blocks and, of pre-norm blocks, a last LayerNorm. With `memory` each block also attends to
     another sequence, which `forward` then takes.

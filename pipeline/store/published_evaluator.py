@@ -20,8 +20,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
 from motionloom.datasets.base.files import sha256_of
@@ -30,6 +28,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
 from motionloom.pipeline.store.evaluator import LoadedEvaluator, Words
+from motionloom.pipeline.store.weights import Release, exact_tensors
 
 FACTS, MODEL, STATS, VECTORS, WORDS = (
     "evaluator.json", "model.safetensors", "stats.safetensors", "words.safetensors", "words.json",
@@ -136,14 +135,14 @@ def load_published(
     facts = check_published(folder)
     layout = MotionLayout.named(facts.layout)
     vocabulary = _vocabulary(folder / WORDS)
-    vectors = _tensors(folder / VECTORS, {"vectors": (len(vocabulary.words), _WIDTH)})["vectors"]
-    stats = _tensors(folder / STATS, {"mean": (layout.dim,), "std": (layout.dim,)})
+    vectors = exact_tensors(folder / VECTORS, {"vectors": (len(vocabulary.words), _WIDTH)}, _MAKE)["vectors"]
+    stats = exact_tensors(folder / STATS, {"mean": (layout.dim,), "std": (layout.dim,)}, _MAKE)
     if not (stats["std"] > 0).all():
         raise UserError(f"{folder / STATS}: std has columns that are not above 0; {_MAKE}")
     # The published deviations hold the gain of the root already.
     config = EvaluatorConfig(root_gain=1.0)
     net = Evaluator(config, layout, _WIDTH, MAX_FRAMES, classes=len(vocabulary.classes))
-    net.load_state_dict(_renamed(folder / MODEL, net))
+    Release(published_names(net), fix=_MAKE).fill(folder / MODEL, net)
     return LoadedEvaluator(
         net.to(device or torch.device("cpu")).eval().requires_grad_(False),
         layout,
@@ -195,17 +194,6 @@ def _published_name(name: str) -> str:
     return f"{encoder}.{ {own: published for published, own in known.items()}[layer] }.{kind}"
 
 
-def _renamed(path: Path, net: Evaluator) -> dict[str, Tensor]:
-    """The release's tensors under our names."""
-    names, own = published_names(net), net.state_dict()
-    shapes = {
-        there: (2, 1, own[here].shape[1]) if here.endswith(".start") else tuple(own[here].shape)
-        for here, there in names.items()
-    }
-    stored = _tensors(path, shapes)
-    return {here: stored[there].reshape(own[here].shape) for here, there in names.items()}
-
-
 def _vocabulary(path: Path) -> PublishedVocabulary:
     found = PublishedVocabulary.load_json(path)
     lacking = [word for word in (_FIRST, _LAST, _UNKNOWN) if word not in found.words]
@@ -215,19 +203,3 @@ def _vocabulary(path: Path) -> PublishedVocabulary:
     if unnamed:
         raise UserError(f"{path}: key 'classes' lacks '{unnamed[0]}'; {_MAKE}")
     return found
-
-
-def _tensors(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
-    """The tensors of a file as float32: exactly those of `shapes`, all finite."""
-    try:
-        found = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]}); {_MAKE}") from None
-    for name in sorted(shapes.keys() | found.keys()):
-        shape = list(found[name].shape) if name in found else None
-        if shape is None or shape != list(shapes.get(name, ())):
-            wanted = list(shapes[name]) if name in shapes else "no tensor"
-            raise UserError(f"{path}: tensor '{name}' is {shape}, and the published one {wanted}; {_MAKE}")
-        if not bool(found[name].isfinite().all()):
-            raise UserError(f"{path}: tensor '{name}' holds numbers that are not finite; {_MAKE}")
-    return {name: value.float() for name, value in found.items()}

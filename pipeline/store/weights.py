@@ -1,9 +1,14 @@
-"""Trained networks on disk: `model.safetensors`, and `model.json` with all that building them needs."""
+"""Trained networks on disk: `model.safetensors`, and `model.json` with all that building them needs.
+
+Also weights that others published, under their names for what is ours (`Release`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TypeVar
 
@@ -154,6 +159,85 @@ def built(folder: Path, build: Callable[[], N]) -> N:
         _BUILDING.reset(building)
         for hook in hooks:
             hook.remove()
+
+
+@dataclass(frozen=True)
+class Rows:
+    """One of `of` equal parts of a tensor's rows, as torch joins the weights of queries, keys and values."""
+
+    name: str
+    part: int
+    of: int
+
+
+Source = str | Rows | tuple[str, ...]
+"""Where a tensor of ours lies in a release: in one of its shape (axes of length 1 aside), in some rows of
+one, or in several of equally many rows, one below the other."""
+
+
+@dataclass(frozen=True)
+class Release:
+    """What published weights are called, for a network of ours (`TrainedStage.release`)."""
+
+    names: Mapping[str, Source]
+    """Name of each tensor in the network's state -> where it lies. What is not named stays as it was made;
+    parameters must be."""
+    unread: tuple[str, ...] = ()
+    """Patterns (`*`, `?`) of tensors that may lie there and are of no use, such as tables of positions."""
+    fix: str = "take weights of this size of the model, or set the stage's net as theirs are"
+    """Ends the message of what is refused."""
+
+    def fill(self, path: Path, net: torch.nn.Module) -> None:
+        """Load the safetensors of a release into `net`; a `UserError` names file, tensor and both shapes
+        where they differ, where one is missing, or where there are others.
+        """
+        own = net.state_dict()
+        lacking = dict(net.named_parameters()).keys() - self.names.keys()
+        assert not lacking, f"no published name for {sorted(lacking)}"
+        shapes: dict[str, tuple[int, ...]] = {}
+        for name, source in self.names.items():
+            shape = tuple(own[name].shape)
+            if isinstance(source, Rows):
+                shapes[source.name] = (shape[0] * source.of, *shape[1:])
+            elif isinstance(source, tuple):
+                shapes |= dict.fromkeys(source, (shape[0] // len(source), *shape[1:]))
+            else:
+                shapes[source] = shape
+        found = exact_tensors(path, shapes, self.fix, self.unread)
+        net.load_state_dict(own | {name: _taken(found, source) for name, source in self.names.items()})
+
+
+def _taken(found: Mapping[str, torch.Tensor], source: Source) -> torch.Tensor:
+    if isinstance(source, Rows):
+        return found[source.name].chunk(source.of)[source.part]
+    return torch.cat([found[name] for name in source]) if isinstance(source, tuple) else found[source]
+
+
+def exact_tensors(
+    path: Path, shapes: Mapping[str, tuple[int, ...]], fix: str, unread: tuple[str, ...] = ()
+) -> dict[str, torch.Tensor]:
+    """The tensors of a file as float32: exactly those of `shapes` (axes of length 1 aside), all finite.
+
+    `fix` ends the message of what is refused; tensors that match a pattern of `unread` are passed over.
+    """
+    try:
+        found = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise UserError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]}); {fix}") from None
+    idle = {name for name in found.keys() - shapes.keys() if any(fnmatchcase(name, one) for one in unread)}
+    for name in sorted((shapes.keys() | found.keys()) - idle):
+        shape = list(found[name].shape) if name in found else None
+        wanted = list(shapes[name]) if name in shapes else None
+        if shape is None or wanted is None or _without_ones(shape) != _without_ones(wanted):
+            here, there = ("no tensor" if one is None else one for one in (shape, wanted))
+            raise UserError(f"{path}: tensor '{name}' is {here}, and the published one {there}; {fix}")
+        if not bool(found[name].isfinite().all()):
+            raise UserError(f"{path}: tensor '{name}' holds numbers that are not finite; {fix}")
+    return {name: found[name].float().reshape(shape) for name, shape in shapes.items()}
+
+
+def _without_ones(shape: list[int]) -> list[int]:
+    return [size for size in shape if size != 1]
 
 
 def load_weights(folder: Path, net: torch.nn.Module) -> None:

@@ -6,6 +6,7 @@ It is apart from `trainer.py` because a recipe is read and planned without Light
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import ClassVar, Literal
 
 from pydantic import BaseModel, Field
@@ -82,6 +83,9 @@ class TrainedStageConfig(StageConfig):
 
     optim: OptimConfig = OptimConfig()
     train: TrainConfig = TrainConfig()
+    published: Path | None = Field(None, json_schema_extra=RUNTIME)
+    """Safetensors of the release of a published model: they are loaded, and nothing is trained. Kinds that
+    know the names of one: diffusion (MDM). The file's checksum counts, not its place."""
 
     def require_fit(self, hardware: Hardware) -> None:
         """The global batch must divide over the processes, and FSDP suit the network and the arithmetic."""

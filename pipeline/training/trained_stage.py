@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
 import torch
 from torch import nn
 
+from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank
 from motionloom.models.training.lora import trained_share
 from motionloom.pipeline.contract.showing import ModelCard
@@ -24,6 +26,7 @@ from motionloom.pipeline.store.files import copy_files
 from motionloom.pipeline.store.weights import (
     MODEL_FILES,
     ModelFacts,
+    Release,
     built,
     load_facts,
     load_weights,
@@ -103,8 +106,31 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         """What other stages get: the trained network, frozen, or an object around it."""
         return net
 
+    def release(self, net: N) -> Release | None:
+        """The names that published weights have for the tensors of such a network, so that `published` may
+        load them in place of a training; None of a kind that nobody has published, or of other settings.
+        """
+        return None
+
     def gives(self, config: C) -> frozenset[str]:
         return frozenset({SHOWING})
+
+    def external(self, config: C) -> object:
+        """The checksum of published weights."""
+        if config.published is None:
+            return None
+        path = config.published.expanduser()
+        if not path.is_file():
+            raise UserError(
+                f"{path}: no such file (key 'published' of a {self.name} stage); name the weights"
+            )
+        return {"published": sha256_of(path)}
+
+    def exported_config(self, config: C) -> C:
+        """Without the folder in which published weights lay."""
+        if config.published is None:
+            return config
+        return config.model_copy(update={"published": Path(config.published.name)})
 
     def run(self, context: StageContext) -> None:
         from motionloom.pipeline.training.trainer import fit
@@ -115,8 +141,14 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         torch.manual_seed(seed)
         net = self.network(facts, inputs)
         self.prepare(config, net, inputs)
-        module = self.module(config, net, inputs, seed)
         log = _printer(context)
+        if config.published is not None:
+            if rank() == 0:
+                self._fill(net, config.published.expanduser())
+                log(f"weights of {config.published}; nothing is trained")
+                save_model(context.folder, net, facts)
+            return
+        module = self.module(config, net, inputs, seed)
         batches = self.batches(config, net, inputs, seed, log)
         part, whole = trained_share(net)
         if part < whole:
@@ -125,6 +157,14 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         if rank() == 0:
             self.trained(config, net)
             save_model(context.folder, net, facts)
+
+    def _fill(self, net: N, path: Path) -> None:
+        release = self.release(net)
+        if release is None:
+            raise UserError(
+                f"no published weights are known of such a network of kind {self.name}; leave `published` out"
+            )
+        release.fill(path, net)
 
     def preview(self, config: C, given: Inputs) -> object:
         inputs = self.inputs.of(given)
@@ -155,6 +195,8 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     def step_seconds(self, config: C, given: Inputs, hardware: Hardware) -> float | None:
         from motionloom.pipeline.training.memory import seconds_a_step
 
+        if config.published is not None:
+            return None
         size = config.train.local_batch(hardware.world())
         return seconds_a_step(lambda: self._dry(config, given, size), config.train, hardware)
 

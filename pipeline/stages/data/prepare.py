@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from pydantic import Field, model_validator
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.loading.statistics import FeatureStats, compute
+from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
 from motionloom.pipeline.contract.stage import (
     CPU,
+    RUNTIME,
     Finished,
     Inputs,
     StageConfig,
@@ -31,6 +35,25 @@ class StatsConfig(StageConfig):
 
     group: bool = False
     """Average the deviation over each kind of feature, as HumanML3D does."""
+    mean: Path | None = Field(None, json_schema_extra=RUNTIME)
+    """The `Mean.npy` of a release whose weights a stage loads (`published`), in place of the data's own."""
+    std: Path | None = Field(None, json_schema_extra=RUNTIME)
+    """Its `Std.npy`. Their checksums count, not their places."""
+
+    @model_validator(mode="after")
+    def _both(self) -> StatsConfig:
+        if (self.mean is None) != (self.std is None):
+            raise ValueError("mean and std are given together, or neither")
+        if self.mean is not None and self.group:
+            raise ValueError("group is of the data's own statistics: leave it out beside mean and std")
+        return self
+
+    @property
+    def release(self) -> tuple[Path, Path] | None:
+        """The files of a release."""
+        if self.mean is None or self.std is None:
+            return None
+        return self.mean.expanduser(), self.std.expanduser()
 
 
 class TextConfig(StageConfig):
@@ -52,8 +75,27 @@ class StatsStage(StageKind[StatsConfig]):
     config = StatsConfig
     takes = ("data",)
 
+    def external(self, config: StatsConfig) -> object:
+        paths = config.release
+        lost = [path for path in paths or () if not path.is_file()]
+        if lost:
+            raise UserError(f"{lost[0]}: no such file; name the release's mean and std")
+        return None if paths is None else [sha256_of(path) for path in paths]
+
+    def exported_config(self, config: StatsConfig) -> StatsConfig:
+        """Without the folders in which a release's statistics lay."""
+        places = {n: Path(p.name) for n, p in (("mean", config.mean), ("std", config.std)) if p is not None}
+        return config.model_copy(update=places)
+
     def run(self, context: StageContext) -> None:
         dataset = context.given["data"].split("train")
+        paths: tuple[Path, Path] | None = context.config.release
+        if paths is not None:
+            FeatureStats.of_arrays(*paths, dataset.layout).save(context.folder / _STATS)
+            context.console.print(
+                f"    of {paths[0].name} and {paths[1].name}, {dataset.layout.dim} dimensions"
+            )
+            return
         compute(dataset, group=context.config.group).save(context.folder / _STATS)
         context.console.print(
             f"    {len(dataset)} clips, {int(dataset.frames.sum())} frames, {dataset.layout.dim} dimensions"

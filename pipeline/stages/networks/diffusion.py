@@ -8,6 +8,7 @@ import torch
 
 from motionloom.datasets.motion.layout import Part
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.layers.transformer import name_in_torch
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
@@ -19,7 +20,7 @@ from motionloom.pipeline.stages.networks.captions import (
     part_columns,
     part_of,
 )
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, Release, load_facts
 from motionloom.pipeline.training.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -62,6 +63,10 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
         dims = (facts.fact(key, int) for key in ("motion_dim", "text_dim"))
         return MotionDiffusion(config, *dims)
 
+    def release(self, net: MotionDiffusion) -> Release | None:
+        """MDM's `trans_enc`."""
+        return None if net.config.norm == "pre" else Release(mdm_names(net), unread=("*.pe", "clip_model.*"))
+
     def module(
         self, config: DiffusionStageConfig, net: MotionDiffusion, inputs: CaptionInputs, seed: int
     ) -> DiffusionModule:
@@ -72,6 +77,27 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
         net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
         return DiffusionMotion(given["stats"].layout, part, given, net)
+
+
+_AROUND = {
+    "enter": "input_process.poseEmbedding",
+    "leave": "output_process.poseFinal",
+    "text": "embed_text",
+    "time": "embed_timestep.time_embed",
+}
+
+
+def mdm_names(net: MotionDiffusion) -> dict[str, str]:
+    """Names of the network's tensors -> their names in MDM's release."""
+    out = {}
+    for name in net.state_dict():
+        first, _, rest = name.partition(".")
+        if first == "stack":
+            _, number, inner = rest.split(".", 2)
+            out[name] = f"seqTransEncoder.layers.{number}.{name_in_torch(inner)}"
+        else:
+            out[name] = f"{_AROUND[first]}.{rest}"
+    return out
 
 
 register(DiffusionStage())

@@ -204,7 +204,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "missing": (
         lambda f: spoil(f, "model.safetensors", lambda t: t.pop(BIAS)),  # type: ignore[arg-type, return-value]
-        f"tensor '{BIAS}' is None",
+        f"tensor '{BIAS}' is no tensor",
     ),
     "unknown": (
         lambda f: spoil(f, "model.safetensors", lambda t: t.update(more=torch.ones(1))),

@@ -28,6 +28,7 @@ from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.motion.body.live_link import read_face
 from motionloom.datasets.motion.body.smpl import BodyModel
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.index import read_index
@@ -163,6 +164,9 @@ def text_cache(folder: Path, bad: str) -> Path:
 
 ARRAYS: dict[str, Callable[[Path], object]] = {
     "a motion's columns": lambda f: load_array(put(f, "a.npy", objects((4, 3))), width=3),
+    "a release's statistics": lambda f: FeatureStats.of_arrays(
+        put(f, "mean.npy", objects((263,))), f / "std.npy", MotionLayout.named("h3d263")
+    ),
     "an expression basis": lambda f: read_basis(put(f, "basis.npy", objects((9, 3, 50)))),
     "a basis that is a pickle": lambda f: read_basis(put(f, "basis.npy", pickle.dumps(Payload()))),
     "a body's poses": lambda f: NpzFile(put(f, "a.npz", archive("poses"))).numbers("poses"),
