@@ -1,14 +1,17 @@
 """The face: eyes, brows and mouth laid on the head, and the expressions as displacements of its vertices.
 
 An expression is what the five controls of the face make of it (`pipeline/render/body/face.py`).
-Each becomes one morph target, and targets add up: sadness and a blink are the sum of both. The skin moves
-too: cheeks rise with a smile, the jaw drops with an open mouth. Talking (columns 5 to 7 of the synthetic
-basis, to which its source gives no shape) opens, widens and purses the mouth **[ours]**.
+Each becomes one morph target, and targets add up: sadness and a blink are the sum of both. Talking (columns
+5 to 7 of the synthetic basis, to which its source gives no shape) opens, widens and purses the mouth
+**[ours]**.
+
+The mouth is a fine patch of skin with lips, and behind them teeth and a dark hollow; the head's own skin is
+dented there. One displacement, `skin_shift`, moves all of it together with the skin around.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +36,7 @@ class Look:
 
 EXPRESSIONS: dict[str, Look] = {
     "happy": Look(smile=1.0, eye_open=0.75, mouth_open=0.25),
-    "sad": Look(brow=0.35, eye_open=0.85, frown=1.0),
+    "sad": Look(brow=0.35, eye_open=0.7, frown=1.0),
     "angry": Look(brow=-0.9, eye_open=0.8, frown=0.6),
     "surprised": Look(brow=1.0, eye_open=1.6, mouth_open=0.9),
     "blink": Look(eye_open=0.0),
@@ -57,6 +60,10 @@ CONTROLS: dict[str, Look] = {
 
 _EYE_WIDTH, _EYE_HEIGHT, _EYE_X, _EYE_Y = 0.0165, 0.0108, 0.0325, 0.006
 _RING = 24
+_MOUTH_Y, _MOUTH_WIDTH = -0.055, 0.025
+_JAW_DROP = 0.022
+PATCH = (0.044, 0.03)
+"""Half width and half height of the skin around the mouth."""
 
 
 @dataclass(frozen=True)
@@ -67,18 +74,29 @@ class Feature:
     triangles: Triangles
     outline: Callable[[Look], Floats]
     """[V, 3]: left, up, lift off the skin; metres from the middle of the head."""
+    jaw: Floats | None = None
+    """Share of the jaw's way that a vertex goes [V]; None for what moves as the skin under it."""
+    round: bool = False
+    """Has its own normals, not those of the skin."""
 
 
 def features() -> list[Feature]:
-    """Eyes, pupils, brows, the inside of the mouth and the lips."""
+    """Eyes, pupils, brows and the mouth."""
     out = []
     for sign in (-1.0, 1.0):
         out.append(Feature("white", _fan(_RING), _eye(sign, _EYE_WIDTH, _EYE_HEIGHT, 0.0012)))
         out.append(Feature("dark", _fan(_RING), _eye(sign, 0.0078, 0.0084, 0.002)))
         out.append(Feature("dark", _ribbon(_RING), _lid(sign)))
-        out.append(Feature("hair", _ribbon(8), _brow(sign)))
-    out.append(Feature("mouth", _ribbon(12), _mouth))
-    out += [Feature("lip", _ribbon(12), _lip(upper)) for upper in (True, False)]
+        out.append(Feature("brow", _ribbon(8), _brow(sign)))
+    return out + _mouth()
+
+
+def behind_mouth(local: Floats, triangles: Triangles) -> NDArray[np.bool_]:
+    """Which vertices [V, 3] of the head's own skin have only neighbours under the patch around the mouth."""
+    x, y, z = local.T
+    under = ((x / PATCH[0]) ** 2 + ((y - _MOUTH_Y) / PATCH[1]) ** 2 < 1) & (z > 0.03)
+    out = np.ones(len(local), dtype=bool)
+    out[triangles[~under[triangles].all(axis=1)]] = False
     return out
 
 
@@ -94,15 +112,25 @@ def on_skin(skin: Field, centre: Floats, places: Floats) -> Floats:
     return np.asarray(point + places[:, 2:] * skin.normals(point), dtype=np.float64)
 
 
-def skin_shift(local: Floats, look: Look) -> Floats:
-    """Displacement [V, 3] of skin at [V, 3]: metres left, up and ahead of the middle of the head."""
+def skin_shift(local: Floats, look: Look, jaw: Floats | None = None) -> Floats:
+    """Displacement [V, 3] of skin at [V, 3]: metres left, up and ahead of the middle of the head.
+
+    `jaw` [V] is the share of the jaw's way that each vertex goes, where it is not that of skin in its place.
+    """
     x, y, z = local.T
     out = np.zeros_like(local)
     ahead = 1 / (1 + np.exp(-(z - 0.03) / 0.012))
-    # The jaw: everything in front and below the mouth, softly.
-    jaw = ahead / (1 + np.exp((y + 0.058) / 0.008))
-    out[:, 1] -= 0.017 * look.mouth_open * jaw
-    out[:, 2] -= 0.004 * look.mouth_open * jaw
+    drop = look.mouth_open * ahead * (_jaw(x, y) if jaw is None else jaw)
+    out[:, 1] -= _JAW_DROP * drop
+    out[:, 2] -= 0.005 * drop
+    # The lips, and less and less the skin around them.
+    u, v = x / _MOUTH_WIDTH, (y - _MOUTH_Y) / 0.011
+    near = np.exp(-np.square(np.maximum(np.hypot(u, v) - 1, 0) / 0.7)) * ahead
+    curve = look.smile - look.frown
+    out[:, 0] += x * near * (0.24 * max(look.smile, 0.0) - 0.14 * look.mouth_open - 0.34 * look.purse)
+    out[:, 1] += near * 0.015 * curve * (np.minimum(u * u, 1.3) - 0.45)
+    out[:, 1] -= near * v * 0.0015 * look.smile
+    out[:, 2] += near * (0.007 * look.purse - 0.004 * max(look.smile, 0.0) * np.minimum(u * u, 1.3))
     for sign in (-1.0, 1.0):
         cheek = np.exp(-((x - sign * 0.042) ** 2 + (y + 0.03) ** 2) / (2 * 0.016**2)) * ahead
         rise = max(look.smile, 0.0) + 0.2 * max(look.frown, 0.0)
@@ -114,16 +142,23 @@ def skin_shift(local: Floats, look: Look) -> Floats:
     return out
 
 
+def _jaw(x: Floats, y: Floats) -> Floats:
+    """Share of the jaw's way that skin goes: none above the mouth, all below, more softly beside it."""
+    square = np.minimum(np.square(x / _MOUTH_WIDTH), 4.0)
+    away = (_MOUTH_Y - 0.018 * square - y) / (0.0022 + 0.006 * square)
+    return np.asarray(1 / (1 + np.exp(-np.clip(away, -60, 60))), dtype=np.float64)
+
+
 def _fan(count: int) -> Triangles:
     """A disc of one vertex in the middle and `count` around it, counter-clockwise from in front."""
     ring = np.arange(count)
     return np.stack([np.zeros(count, np.int64), 1 + ring, 1 + (ring + 1) % count], axis=1)
 
 
-def _ribbon(steps: int) -> Triangles:
-    """A strip of two rows of `steps` + 1 vertices, the upper row first, each from right to left."""
-    k = np.arange(steps)
-    upper, lower = k, k + steps + 1
+def _ribbon(steps: int, rows: int = 2) -> Triangles:
+    """A strip of rows of `steps` + 1 vertices, the uppermost row first, each from right to left."""
+    upper = (np.arange(rows - 1)[:, None] * (steps + 1) + np.arange(steps)).ravel()
+    lower = upper + steps + 1
     one = np.stack([upper, lower, lower + 1], axis=1)
     two = np.stack([upper, lower + 1, upper + 1], axis=1)
     return np.concatenate([one, two])
@@ -133,6 +168,11 @@ def _open(look: Look) -> float:
     return float(np.clip(look.eye_open, 0.04, 1.7)) * _EYE_HEIGHT
 
 
+def _slant(look: Look) -> float:
+    """How much higher the upper lid's inner half is than its outer one, as a share of the open eye."""
+    return 0.35 * look.frown + 0.5 * min(look.brow, 0.0)
+
+
 def _eye(sign: float, wide: float, high: float, lift: float) -> Callable[[Look], Floats]:
     def outline(look: Look) -> Floats:
         angle = 2 * np.pi * np.arange(_RING) / _RING
@@ -140,6 +180,7 @@ def _eye(sign: float, wide: float, high: float, lift: float) -> Callable[[Look],
         tall = min(high, opened) if wide < _EYE_WIDTH else opened
         # An ellipse keeps its shape while it is cut by the lids: its points are moved onto them.
         up = np.clip(tall * np.sin(angle), -opened, opened)
+        up += _slant(look) * np.maximum(up, 0) * -sign * np.cos(angle)
         ring = np.column_stack([sign * _EYE_X + wide * np.cos(angle), _EYE_Y + up, np.full(_RING, lift)])
         return np.concatenate([[[sign * _EYE_X, _EYE_Y, lift]], ring])
 
@@ -152,7 +193,7 @@ def _lid(sign: float) -> Callable[[Look], Floats]:
     def outline(look: Look) -> Floats:
         angle = np.pi * (1 - np.arange(_RING + 1) / _RING)
         x = sign * _EYE_X + 1.06 * _EYE_WIDTH * np.cos(angle)
-        base = _EYE_Y + _open(look) * np.sin(angle)
+        base = _EYE_Y + _open(look) * np.sin(angle) * (1 - _slant(look) * sign * np.cos(angle))
         rows = [np.column_stack([x, base + high, np.full_like(x, 0.0024)]) for high in (0.0022, -0.0002)]
         return np.concatenate(rows)
 
@@ -165,13 +206,13 @@ def _brow(sign: float) -> Callable[[Look], Floats]:
     def outline(look: Look) -> Floats:
         lift = look.brow
         raised = lift * (0.013 if lift > 0 else 0.004)
-        inner = 0.007 * look.frown + min(lift, 0.0) * 0.013
+        inner = 0.0105 * look.frown + min(lift, 0.0) * 0.0155
         x = sign * np.array([0.0135, 0.032, 0.0525])
         y = np.array(
             [
                 0.0295 + raised + inner,
                 0.0365 + raised + 0.25 * inner,
-                0.031 + 0.8 * raised - 0.003 * look.frown,
+                0.031 + 0.8 * raised - 0.005 * look.frown,
             ]
         )
         along = np.linspace(0, 1, 9)
@@ -186,29 +227,47 @@ def _brow(sign: float) -> Callable[[Look], Floats]:
     return outline
 
 
-def _lips(look: Look) -> tuple[Floats, Floats]:
-    """The upper and the lower edge of the mouth [13, 2], from right to left."""
-    curve = float(np.clip(look.smile - look.frown, -1.5, 1.5))
-    opened = look.mouth_open
-    wide = 0.026 + 0.006 * max(curve, 0.0) - 0.005 * min(opened, 1.0) - 0.008 * look.purse
-    u = np.linspace(-1, 1, 13)
-    middle = -0.054 + 0.015 * curve * (u * u - 0.45)
-    part = 1 - u * u
-    upper = np.column_stack([wide * u, middle + 0.004 * opened * part])
-    lower = np.column_stack([wide * u, middle - 0.023 * opened * part])
-    return upper, lower
+def _mouth() -> list[Feature]:
+    """Upper and lower half of the skin around the mouth and of the lips, then the hollow behind and teeth."""
+    out = []
+    lip = _MOUTH_WIDTH * np.linspace(-1, 1, 13)
+    x = np.concatenate([[-PATCH[0], -0.035], lip[::2], [0.035, PATCH[0]]])
+    border = PATCH[1] * np.sqrt(1 - np.square(x / PATCH[0]))
+    part = np.sqrt(1 - np.square(lip / _MOUTH_WIDTH))
+    for up, full in ((1.0, 0.0078), (-1.0, 0.0092)):
+
+        def red(x: Floats, up: float = up, full: float = full) -> Floats:
+            """Height of the lips' red above or below the line between them."""
+            share = np.sqrt(np.maximum(1 - np.square(x / _MOUTH_WIDTH), 0))
+            bow = 1 - 0.3 * np.exp(-np.square(x / 0.004)) if up > 0 else 1.0
+            return full * share * bow
+
+        # Its inner edge lies under the lip.
+        rows = [
+            (up * ((1 - s) * border + 0.85 * s * red(x)), lift)
+            for s, lift in ((0.0, 0.0004), (0.5, 0.0004), (1.0, -0.001))
+        ]
+        out.append(_strip("skin", x, rows, up, None))
+        skin = _jaw(lip, _MOUTH_Y + up * red(lip))
+        profile = ((1.0, 0.0005), (0.7, 0.0028), (0.3, 0.0036), (0.0, 0.0), (-0.15, -0.007))
+        rows = [(up * s * red(lip), lift * part) for s, lift in profile]
+        out.append(_strip("lip", lip, rows, up, skin))
+    below = _jaw(lip, _MOUTH_Y - 0.0092 * part)
+    bag = [(0.0015 * part, -0.005 * part), (0 * part, -0.024 * part), (-0.0015 * part, -0.005 * part)]
+    out.append(_strip("mouth", lip, bag, 1.0, np.concatenate([0 * below, 0.5 * below, below])))
+    teeth = [(0.005 * part, -0.0065), (-0.0055 * part, -0.006)]
+    out.append(_strip("white", 0.86 * lip, teeth, 1.0, np.zeros(2 * len(lip))))
+    return out
 
 
-def _mouth(look: Look) -> Floats:
-    return np.concatenate([np.column_stack([row, np.full(len(row), 0.0012)]) for row in _lips(look)])
-
-
-def _lip(upper: bool) -> Callable[[Look], Floats]:
-    def outline(look: Look) -> Floats:
-        edge = _lips(look)[0 if upper else 1]
-        full = (0.0042 if upper else 0.0052) * (1 - 0.75 * np.linspace(-1, 1, 13) ** 2)
-        high, low = (full, -0.0004) if upper else (0.0004, -full)
-        rows = [np.column_stack([edge[:, 0], edge[:, 1] + side, np.full(13, 0.002)]) for side in (high, low)]
-        return np.concatenate(rows)
-
-    return outline
+def _strip(
+    swatch: str, x: Floats, rows: Sequence[tuple[Floats, Floats | float]], up: float, jaw: Floats | None
+) -> Feature:
+    """Rows of (height over the line between the lips, lift off the skin), `up` from the uppermost down."""
+    rows = rows if up > 0 else rows[::-1]
+    places = np.concatenate(
+        [np.column_stack([x, _MOUTH_Y + y, np.broadcast_to(lift, x.shape)]) for y, lift in rows]
+    )
+    if jaw is not None and len(jaw) == len(x):
+        jaw = np.tile(jaw, len(rows))
+    return Feature(swatch, _ribbon(len(x) - 1, len(rows)), lambda _: places, jaw, round=swatch != "skin")

@@ -132,12 +132,13 @@ def _distance(capsule: Capsule, points: Floats, slope: bool = False) -> tuple[Fl
 
 
 def skin_weights(
-    field: Field, points: Floats, parents: Sequence[int], softness: float
+    field: Field, points: Floats, parents: Sequence[int], softness: float | Floats
 ) -> NDArray[np.float64]:
     """How much each vertex [M] follows each joint: [M, N], rows sum to 1, at most 4 joints a row.
 
-    A joint counts by the distance to its shapes, falling off over `softness` metres; but only joints within
-    two steps of the nearest one along the tree, up or down: the other leg and the next finger never count.
+    A joint counts by the distance to its shapes, falling off over `softness` metres, one or [M]; but only
+    joints within two steps of the nearest one along the tree, up or down: the other leg and the next finger
+    never count.
     """
     count = len(parents)
     distances = field.distances(points)
@@ -145,7 +146,8 @@ def skin_weights(
     for column, joint in enumerate(field.joints):
         nearest[:, joint] = np.minimum(nearest[:, joint], distances[:, column])
     allowed = _kin(parents)[nearest.argmin(axis=1)]
-    fall = np.exp(-np.maximum(nearest - nearest.min(axis=1, keepdims=True), 0) / softness)
+    away = np.maximum(nearest - nearest.min(axis=1, keepdims=True), 0)
+    fall = np.exp(-away / np.reshape(softness, (-1, 1)))
     weights = np.where(allowed, fall, 0.0)
     order = np.argsort(weights, axis=1)
     np.put_along_axis(weights, order[:, :-4], 0.0, axis=1)

@@ -15,31 +15,37 @@ same on every run. Each of the three details holds its arrays under `near_`, `fa
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from arkit_looks import ARKIT_SHAPES, Shape
-from features import CONTROLS, EXPRESSIONS, Look, features, on_skin, skin_shift
+from features import CONTROLS, EXPRESSIONS, Feature, Look, behind_mouth, features, on_skin, skin_shift
 from field import Field, Floats, skin_weights
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from shapes import hand, head, head_centre, nose, trunk_and_limbs
-from surface import mesh_of
+from shapes import collar, cuff, ears, hair, hand, head, head_centre, nose, spread, trunk_and_limbs
+from surface import mesh_of, normals_of
 
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.skeleton import Skeleton
 
 SPACING = {
-    "near": (0.029, 0.0072, 0.0125, 0.006),
-    "far": (0.036, 0.0125, 0.019, 0.009),
+    "near": (0.03, 0.0079, 0.0132, 0.0068),
+    "far": (0.0395, 0.0138, 0.021, 0.0115),
     "shadow": (0.05, 0.02, 0.032, 0.02),
 }
-"""The grid's spacing of trunk and limbs, hands, head and nose in metres; vertices lie on the surface."""
-SOFTNESS = (0.02, 0.004, 0.012, 0.01)
+"""The grid's spacing of trunk and limbs, hands, head, nose and ears; metres, vertices lie on the surface."""
+LIMBS, FINGERS, WRIST, HEAD = 0.02, 0.004, 0.018, 0.012
 """Over how many metres their weights fall off."""
+HIDDEN = 0.004
+"""Surfaces are left out where another one that moves alike is so many metres above them."""
+UNSEEN = 3e-4
+"""Vertices that no shape moves farther, in metres, stay where they are."""
+DENT = 0.03
+"""Metres that the skin is pressed in behind the mouth."""
 COLOURS = {
     "right": (229, 121, 63),
     "centre": (119, 130, 154),
@@ -49,8 +55,8 @@ COLOURS = {
     "white": (244, 244, 240),
     "dark": (42, 38, 46),
     "brow": (90, 68, 54),
-    "lip": (190, 110, 98),
-    "mouth": (96, 40, 44),
+    "lip": (194, 124, 108),
+    "mouth": (82, 34, 38),
 }
 """What a vertex is painted with; the page's style names them in this order."""
 CONTROL_SHAPES = {name: Shape(look) for name, look in CONTROLS.items()}
@@ -83,34 +89,38 @@ class Piece:
 def make_detail(detail: str) -> Piece:
     """The whole body at one detail; the shadow's has no features on its face."""
     skeleton = Skeleton.named("smplx52")
-    limbs, fingers, skull, bridge = zip(SPACING[detail], SOFTNESS, strict=True)
+    limbs, fingers, skull, fine = SPACING[detail]
     shapes = list(SHAPES[detail].values())
-    centre, skin = head_centre(skeleton), head(skeleton)
-    turn = skeleton.index("head")
+    centre, turn = head_centre(skeleton), skeleton.index("head")
+    trunk, skin, hairs = trunk_and_limbs(skeleton), head(skeleton), hair(skeleton)
 
-    def piece(field: Field, size: tuple[float, float], borders: Paint) -> Piece:
-        vertices, triangles = mesh_of(field, size[0])
-        weights = skin_weights(field, vertices, skeleton.parents, size[1])
+    def piece(field: Field, spacing: float, softness: float, swatch: str, *over: Field) -> Piece:
+        vertices, triangles = mesh_of(field, spacing)
+        weights = skin_weights(field, vertices, skeleton.parents, softness)
         local = vertices - centre
         # Skin moves as far as it is the head's: the neck's stays.
-        moves = [skin_shift(local, s.look) * (s.mask(local) * weights[:, turn])[:, None] for s in shapes]
-        return painted(
-            Piece(vertices, field.normals(vertices), triangles, weights, _stacked(moves, len(vertices)),
-                  np.zeros(len(triangles), np.int64)),
-            borders,
-        )  # fmt: skip
+        moves = np.zeros((len(vertices), len(shapes), 3))
+        if swatch == "skin":
+            for k, shape in enumerate(shapes):
+                moves[:, k] = skin_shift(local, shape.look) * (shape.mask(local) * weights[:, turn])[:, None]
+        if field is skin:
+            vertices[behind_mouth(local, triangles), 2] -= DENT
+        triangles = _seen(vertices, triangles, over)
+        paint = np.full(len(triangles), list(COLOURS).index(swatch))
+        return Piece(vertices, field.normals(vertices), triangles, weights, moves, paint)
 
-    pieces = [piece(trunk_and_limbs(skeleton), limbs, lambda points: _limb_borders(points, skeleton))]
-    pieces += [
-        piece(
-            hand(skeleton, side), fingers, lambda points, side=side: [(np.ones(len(points)), "centre", side)]
-        )
-        for side in ("left", "right")
+    pieces = [
+        painted(piece(trunk, limbs, LIMBS, "centre"), lambda points: _limb_borders(points, skeleton)),
+        piece(skin, skull, HEAD, "skin", hairs, trunk),
+        piece(hairs, skull, HEAD, "hair", skin),
     ]
-    pieces.append(piece(skin, skull, lambda points: [(_hair_border(points - centre), "skin", "hair")]))
-    pieces.append(piece(nose(skeleton), bridge, lambda points: [(np.ones(len(points)), "hair", "skin")]))
+    pieces += [_hand(skeleton, side, fingers, len(shapes), trunk) for side in ("left", "right")]
     if detail != "shadow":
-        pieces += _features(skin, centre, shapes, len(skeleton), turn)
+        pieces += [piece(field(skeleton), fine, HEAD, "skin", skin, hairs) for field in (nose, ears)]
+        bands = [(collar(skeleton), "spine3", "centre")]
+        bands += [(cuff(skeleton, side), f"{side}_elbow", side) for side in ("left", "right")]
+        pieces += [_band(*band, len(shapes)) for band in bands]
+        pieces += [_feature(part, skin, centre, shapes, skeleton) for part in features()]
     starts = np.cumsum([0, *(len(p.vertices) for p in pieces)])
     return Piece(
         *(np.concatenate([getattr(p, name) for p in pieces]) for name in ("vertices", "normals")),
@@ -177,30 +187,62 @@ def _cut(piece: Piece, value: Floats) -> tuple[Piece, NDArray[np.bool_]]:
     return cut, np.concatenate(sides)
 
 
-def _features(skin: Field, centre: Floats, shapes: list[Shape], joints: int, turn: int) -> list[Piece]:
-    """Eyes, brows and mouth, laid on the head and moved with it."""
-    looks = list(dict.fromkeys([Look(), *(shape.look for shape in shapes)]))
-    out = []
-    for part in features():
-        laid = {look: _laid(part.outline(look), look, skin, centre) for look in looks}
-        still = laid[Look()]
-        moves = [(laid[s.look] - still) * s.mask(still - centre)[:, None] for s in shapes]
-        weights = np.zeros((len(still), joints))
-        weights[:, turn] = 1.0
-        paint = np.full(
-            len(part.triangles), list(COLOURS).index({"hair": "brow"}.get(part.swatch, part.swatch))
-        )
-        out.append(
-            Piece(still, skin.normals(still), part.triangles, weights, _stacked(moves, len(still)), paint)
-        )
-    return out
+def _seen(vertices: Floats, triangles: NDArray[np.int64], over: Sequence[Field]) -> NDArray[np.int64]:
+    """Those triangles that are not deep inside one of the fields."""
+    for field in over:
+        triangles = triangles[(field.value(vertices) > -HIDDEN)[triangles].any(axis=1)]
+    return triangles
 
 
-def _laid(places: Floats, look: Look, skin: Field, centre: Floats) -> Floats:
-    """A feature's vertices [V, 3]: on the resting skin, and moved with it."""
-    rows = on_skin(skin, centre, places)
-    # What the jaw does to the lower lip is in the mouth's own outline already.
-    return rows + skin_shift(rows - centre, replace(look, mouth_open=0.0))
+def _hand(skeleton: Skeleton, side: str, spacing: float, shapes: int, sleeve: Field) -> Piece:
+    """A hand, made with its fingers apart and brought back into the rest pose by its own weights."""
+    apart, turns = spread(skeleton)
+    field = hand(apart, side)
+    vertices, triangles = mesh_of(field, spacing)
+    wrist, knuckle = (apart.rest_joints[apart.index(f"{side}_{joint}")] for joint in ("wrist", "middle1"))
+    along = np.clip((vertices - wrist) @ (knuckle - wrist) / np.square(knuckle - wrist).sum(), 0, 1)
+    weights = skin_weights(field, vertices, skeleton.parents, WRIST + along * (FINGERS - WRIST))
+    turned = np.einsum("vj,jab->vab", weights, turns)
+    shift = weights @ (apart.rest_joints - np.einsum("jab,jb->ja", turns, skeleton.rest_joints))
+    rest = np.linalg.solve(turned, (vertices - shift)[..., None])[..., 0]
+    normals = np.einsum("vba,vb->va", turned, field.normals(vertices))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    triangles = _seen(vertices, triangles, [sleeve])
+    paint = np.full(len(triangles), list(COLOURS).index(side))
+    return Piece(rest, normals, triangles, weights, np.zeros((len(rest), shapes, 3)), paint)
+
+
+def _band(rows: Floats, joint: str, swatch: str, shapes: int) -> Piece:
+    """A band of rows [R, around, 3], left to right as seen from outside, that moves with one joint."""
+    skeleton, (count, around) = Skeleton.named("smplx52"), rows.shape[:2]
+    one = np.arange((count - 1) * around)
+    two = one - one % around + (one + 1) % around
+    triangles = np.concatenate(
+        [np.stack([one, one + around, two], 1), np.stack([two, one + around, two + around], 1)]
+    )
+    vertices = rows.reshape(-1, 3)
+    weights = np.zeros((len(vertices), len(skeleton)))
+    weights[:, skeleton.index(joint)] = 1.0
+    normals = normals_of(vertices, triangles, vertices)
+    paint = np.full(len(triangles), list(COLOURS).index(swatch))
+    return Piece(vertices, normals, triangles, weights, np.zeros((len(vertices), shapes, 3)), paint)
+
+
+def _feature(part: Feature, skin: Field, centre: Floats, shapes: list[Shape], skeleton: Skeleton) -> Piece:
+    """A patch laid on the head, and moved with it."""
+    laid: dict[Look, Floats] = {}
+    for look in (Look(), *(shape.look for shape in shapes)):
+        rows = on_skin(skin, centre, part.outline(look))
+        laid[look] = rows + skin_shift(rows - centre, look, part.jaw)
+    still = laid[Look()]
+    moves = [(laid[s.look] - still) * s.mask(still - centre)[:, None] for s in shapes]
+    weights = np.zeros((len(still), len(skeleton)))
+    weights[:, skeleton.index("head")] = 1.0
+    normals = skin.normals(still)
+    if part.round:
+        normals = normals_of(still, part.triangles, normals)
+    paint = np.full(len(part.triangles), list(COLOURS).index(part.swatch))
+    return Piece(still, normals, part.triangles, weights, _stacked(moves, len(still)), paint)
 
 
 def _stacked(moves: list[Floats], count: int) -> Floats:
@@ -218,11 +260,6 @@ def _limb_borders(points: Floats, skeleton: Skeleton) -> list[tuple[Floats, str,
         beyond = np.maximum(arm, np.minimum(leg, x + 1e-4))
         out.append((beyond, "centre" if side == "left" else "", side))
     return out
-
-
-def _hair_border(local: Floats) -> Floats:
-    """Above 0 over a plane from the nape to the forehead, around the ears."""
-    return 0.66 * local[:, 1] - 0.75 * local[:, 2] + 0.006 - 0.25 * np.maximum(np.abs(local[:, 0]) - 0.07, 0)
 
 
 def flattened(piece: Piece) -> tuple[Piece, NDArray[np.int64]]:
@@ -274,7 +311,7 @@ def packed(detail: str) -> dict[str, NDArray[np.generic]]:
     shares[:, 0] += 255 - shares.sum(axis=1)
     move_step = max(float(np.abs(piece.moves).max(initial=0.0)), 1e-3) / 32767
     moves = np.round(piece.moves / move_step)
-    moving = np.flatnonzero((np.abs(piece.moves) > 2e-5).any(axis=(1, 2)))
+    moving = np.flatnonzero((np.abs(piece.moves) > UNSEEN).any(axis=(1, 2)))
     arrays = {
         "low": low,
         "step": step,

@@ -1,23 +1,26 @@
 """The shapes of the figure, hung on the rest joints of a skeleton: trunk and limbs, hands, head.
 
-A lay figure, not a likeness: one closed mesh of trunk, arms, legs and feet, hands that sit in the wrists like
-ball joints, a head on its neck. Radii are those of an adult of 1.7 m.
+A lay figure, not a likeness: one closed mesh of trunk, sleeves, legs and feet, hands whose forearms reach
+into the sleeves, a head whose neck reaches into the collar. Radii are those of an adult of 1.7 m.
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from field import Capsule, Field
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.body.rigid import with_offsets
+from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 
-FINGERS = ("index", "middle", "pinky", "ring", "thumb")
+SPREAD = {"index": 48.0, "middle": 14.0, "ring": -16.0, "pinky": -46.0, "thumb": 12.0}
+"""By how many degrees each finger is turned away from the next while a hand's surface is made."""
+_ROUND = 2 * np.pi * np.arange(16) / 16
 HEAD_SIZE = (0.079, 0.112, 0.094)
 """Half width, half height, half depth of the skull in metres."""
 _KNUCKLE = {"index": 0.0108, "middle": 0.0112, "ring": 0.0104, "pinky": 0.0092, "thumb": 0.0122}
@@ -55,10 +58,10 @@ def trunk_and_limbs(skeleton: Skeleton) -> Field:
         add(f"{side}_collar", place("neck", sign * 0.025, -0.02, 0.0), shoulder, 0.044, 0.05)
         add(f"{side}_shoulder", shoulder, elbow, 0.054, 0.039)
         add(f"{side}_shoulder", shoulder, shoulder + 0.3 * (elbow - shoulder), 0.056, 0.05)
-        # The forearm is thickest below the elbow.
-        belly = elbow + 0.28 * (wrist - elbow)
+        # The forearm is thickest below the elbow; the sleeve ends before the wrist.
+        belly, sleeve = (elbow + share * (wrist - elbow) for share in (0.28, 0.72))
         add(f"{side}_elbow", elbow, belly, 0.038, 0.042)
-        add(f"{side}_elbow", belly, wrist, 0.042, 0.0285, 0.92)
+        add(f"{side}_elbow", belly, sleeve, 0.042, 0.033, 0.92)
         hip, knee, ankle, ball = (place(f"{side}_{name}") for name in ("hip", "knee", "ankle", "foot"))
         add(f"{side}_hip", hip, knee, 0.086, 0.047)
         calf = knee + np.array([0.0, 0.0, -0.014]) + 0.3 * (ankle - knee)
@@ -77,13 +80,14 @@ def trunk_and_limbs(skeleton: Skeleton) -> Field:
 
 
 def hand(skeleton: Skeleton, side: str) -> Field:
-    """Palm, fingers and thumb; the heel of the hand ends inside the forearm."""
+    """Palm, fingers and thumb, and the forearm as far as it is inside its sleeve."""
     rest, at = skeleton.rest_joints, skeleton.index
     wrist = rest[at(f"{side}_wrist")]
     out: list[Capsule] = []
-    palm = at(f"{side}_wrist")
-    out.append(Capsule(palm, wrist - 0.02 * _unit(skeleton, f"{side}_wrist"), wrist, 0.022, 0.0235))
-    for finger in FINGERS:
+    palm, bone = at(f"{side}_wrist"), skeleton.offsets[at(f"{side}_wrist")]
+    out.append(Capsule(at(f"{side}_elbow"), wrist - 0.26 * bone, wrist - 0.02 * bone, 0.0275, 0.0235, 0.92))
+    out.append(Capsule(palm, wrist, wrist + 0.06 * bone, 0.023, 0.021, 0.95))
+    for finger in SPREAD:
         first, second, third = (rest[at(f"{side}_{finger}{k}")] for k in (1, 2, 3))
         tip = third + 0.85 * (third - second)
         thick = _KNUCKLE[finger]
@@ -99,8 +103,47 @@ def hand(skeleton: Skeleton, side: str) -> Field:
     return Field(out, 0.0022)
 
 
+def spread(skeleton: Skeleton) -> tuple[Skeleton, Floats]:
+    """The skeleton with fingers apart, and each joint's turn [N, 3, 3] from the rest pose.
+
+    At rest fingers nearly touch: their surface is made where the grid tells them apart, and taken back.
+    """
+    local = np.tile(np.eye(3), (1, len(skeleton), 1, 1))
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for finger, degrees in SPREAD.items():
+            angle = -sign * np.radians(degrees)
+            turn = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+            local[0, skeleton.index(f"{side}_{finger}1")] = turn
+    places, turns = forward_kinematics(local, np.zeros((1, 3)), skeleton.offsets, skeleton.parents)
+    offsets = [
+        place - places[0, max(parent, 0)] for place, parent in zip(places[0], skeleton.parents, strict=True)
+    ]
+    return with_offsets(skeleton, np.array(offsets)), turns[0]
+
+
+def collar(skeleton: Skeleton) -> Floats:
+    """A band along the line where neck and trunk meet, lower in front and behind [rows, around, 3]."""
+    foot = skeleton.rest_joints[skeleton.index("neck")]
+    line = 0.014 - 0.009 * np.cos(2 * _ROUND)
+    profile = [(0.046, -0.004), (0.056, 0.005), (0.06, 0.003), (0.0635, -0.004), (0.065, -0.013)]
+    return np.stack(
+        [foot + np.column_stack([r * np.sin(_ROUND), line + y, r * np.cos(_ROUND)]) for r, y in profile]
+    )
+
+
+def cuff(skeleton: Skeleton, side: str) -> Floats:
+    """A band around the end of a sleeve [rows, around, 3]."""
+    wrist = skeleton.index(f"{side}_wrist")
+    bone = skeleton.offsets[wrist]
+    ahead = bone / np.linalg.norm(bone)
+    middle = skeleton.rest_joints[wrist] - 0.2 * bone
+    profile = [(0.03, -0.03), (0.0345, -0.026), (0.035, -0.006), (0.032, 0.0), (0.022, -0.004)]
+    around = np.column_stack([0 * _ROUND, np.sin(_ROUND), np.cos(_ROUND) * np.sign(bone[0])])
+    return np.stack([middle + r * around + along * ahead for r, along in profile])
+
+
 def head(skeleton: Skeleton) -> Field:
-    """Neck, skull, jaw, nose and ears. Only the skull turns with the head joint."""
+    """Neck, skull and jaw. Only the skull turns with the head joint."""
     rest, at = skeleton.rest_joints, skeleton.index
     centre, neck, top = head_centre(skeleton), rest[at("neck")], rest[at("head")]
     turn, bend = at("head"), at("neck")
@@ -123,11 +166,6 @@ def head(skeleton: Skeleton) -> Field:
         out.append(
             Capsule(turn, place(sign * 0.036, -0.02, 0.046), place(sign * 0.03, -0.036, 0.046), 0.03, 0.03)
         )
-        out.append(
-            Capsule(
-                turn, place(sign * 0.081, 0.016, -0.012), place(sign * 0.077, -0.02, -0.004), 0.014, 0.01, 1.4
-            )
-        )
     return Field(out, 0.008)
 
 
@@ -142,16 +180,42 @@ def nose(skeleton: Skeleton) -> Field:
     return Field([Capsule(turn, bridge, tip, 0.0075, 0.0105), *wings], 0.003)
 
 
+def hair(skeleton: Skeleton) -> Field:
+    """Short hair, parted at the side: what of it is outside the skull shows."""
+    centre, turn = head_centre(skeleton), skeleton.index("head")
+    strands = [
+        ((0, 0.042, -0.022), (0, 0.042, -0.004), 0.083, 0.079),
+        ((0, 0.01, -0.04), (0, -0.048, -0.05), 0.074, 0.048),
+        ((0.046, 0.084, 0.04), (-0.02, 0.09, 0.056), 0.022, 0.02),
+        ((-0.02, 0.09, 0.056), (-0.06, 0.064, 0.036), 0.02, 0.016),
+    ]
+    for sign in (-1.0, 1.0):
+        strands.append(((sign * 0.066, 0.05, 0.022), (sign * 0.071, 0.006, 0.018), 0.014, 0.007))
+    return Field(
+        [Capsule(turn, centre + np.array(a), centre + np.array(b), ra, rb) for a, b, ra, rb in strands], 0.006
+    )
+
+
+def ears(skeleton: Skeleton) -> Field:
+    """Two ears, each a rim around a hollow."""
+    centre, turn = head_centre(skeleton), skeleton.index("head")
+    rim = np.array(
+        [[77, 10, 8], [83, 24, 3], [89, 29, -10], [92, 20, -22], [91, 2, -23], [85, -17, -12], [80, -29, 0]]
+    )  # fmt: skip
+    out = []
+    for sign in (-1.0, 1.0):
+        move = np.array([sign, 1.0, 1.0]) / 1000
+        for a, b in pairwise(rim):
+            out.append(Capsule(turn, centre + a * move, centre + b * move, 0.0055, 0.0055))
+        inner, lobe = np.array([80, 15, -9]) * move, np.array([78, -18, -3]) * move
+        out.append(Capsule(turn, centre + inner, centre + lobe, 0.0105, 0.0075))
+    return Field(out, 0.0025)
+
+
 def head_centre(skeleton: Skeleton) -> Floats:
     """Middle of the skull in the rest pose."""
     top = skeleton.rest_joints[skeleton.index("head")]
     out: Floats = top + np.array([0.0, 0.62 * 0.118, 0.12 * 0.098])
-    return out
-
-
-def _unit(skeleton: Skeleton, joint: str) -> Floats:
-    bone: Any = skeleton.offsets[skeleton.index(joint)]
-    out: Floats = bone / np.linalg.norm(bone)
     return out
 
 

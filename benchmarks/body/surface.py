@@ -68,6 +68,16 @@ def surface_nets(values: Floats) -> tuple[Floats, Triangles]:
     return total / crossings[:, None], triangles
 
 
+def normals_of(vertices: Floats, triangles: Triangles, otherwise: Floats) -> Floats:
+    """Unit normals [V, 3] by the triangles around each vertex; `otherwise` where these have no area."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    out = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(out, triangles[:, k], np.cross(b - a, c - a))
+    size = np.linalg.norm(out, axis=1, keepdims=True)
+    return np.where(size > 1e-9, out / np.maximum(size, 1e-9), otherwise)
+
+
 def _neighbours(triangles: Triangles, count: int) -> tuple[Triangles, NDArray[np.float64]]:
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)

@@ -306,7 +306,10 @@ def cover(
         rise = y[(k + 1) % 3] - y[k]
         slope = (x[(k + 1) % 3] - x[k]) / np.where(rise == 0, 1, rise)
         crossing = (x[k] - y[k] * slope)[of] + at * slope[of]
-        enters, leaves = (((rise > 0) != (area > 0)) & (rise != 0))[of], ((rise > 0) == (area > 0))[of]
+        # Level edges bound no span.
+        enters, leaves = (
+            ((sign & (rise != 0))[of]) for sign in ((rise > 0) != (area > 0), (rise > 0) == (area > 0))
+        )
         np.minimum(end, crossing, out=end, where=leaves)
         np.maximum(start, crossing, out=start, where=enters)
     first = np.ceil(start - 0.5).astype(np.int64)

@@ -30,7 +30,7 @@ FACE_CONTROLS = ("smile", "brow", "eye_open", "mouth_open", "frown")
 FACE_NEUTRAL = (0.0, 0.0, 1.0, 0.0, 0.0)
 EXPRESSIONS = ("happy", "sad", "angry", "surprised", "blink", "talk_open", "talk_wide", "talk_purse")
 """The shapes of the synthetic basis' columns at their apex, in the basis' order."""
-_EYE_OPEN = np.array([0.75, 0.85, 0.8, 1.6])
+_EYE_OPEN = np.array([0.75, 0.7, 0.8, 1.6])
 """How far each emotion leaves the eye open at its apex."""
 BLINK_HEIGHT = 1.6
 """Length of a full blink along its column of the synthetic basis."""

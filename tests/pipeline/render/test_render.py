@@ -160,6 +160,7 @@ def test_viewer_refuses_what_it_cannot_draw(tmp_path: Path, change: dict, words:
 def test_cover_is_what_a_loop_over_pixels_finds() -> None:
     rng = np.random.default_rng(0)
     points, nearness = rng.uniform(-6, 38, (60, 2)), rng.uniform(0.2, 1, 60)
+    points[:20, 1] = 9.25  # level edges too
     triangles = rng.integers(0, 60, (40, 3))
     for both in (False, True):
         found = cover(points, nearness, triangles, (32, 24), both_sides=both)
